@@ -27,25 +27,27 @@ from bodycap_batch.model.optical_flow import (
 from bodycap_batch.model.scene import KeyframeSelection
 
 _CORNERS = 120
-"""Corners that are tracked from each keyframe. Evidence: none."""
+"""Maximum number of corners that are tracked from each keyframe. Evidence: none."""
 _CORNER_SPACING_PX = 12.0
-"""Smallest distance of two corners, px at a long side of 640 px. Evidence: none."""
+"""Minimum distance between two corners, in px of an image with a long side of 640 px. Evidence: none."""
 _WINDOW_PX = 11
 """Width of the tracker's window, px of the reduced image. Evidence: none."""
 _MIN_TRACKS = 12
-"""Tracks that a parallax needs. Evidence: none."""
+"""Minimum number of tracks for a parallax. With fewer tracks, the parallax is 0. Evidence: none."""
 _ROTATION_ROUNDS = 3
-"""Rounds of the robust rotation fit. Evidence: none."""
+"""Number of rounds of the robust rotation fit. Evidence: none."""
 _NOVELTY_PER_MAX_GAP = 0.05
-"""Novelty of a keyframe for each `max_gap_s` since the last one. It decides between keyframes that show
-equally little. Evidence: none."""
-_MIN_RELATIVE_SURVIVAL = 0.5
-"""Survival of a candidate's tracks, relative to the oldest candidate's, below which it is not selected.
+"""Novelty that is added to a keyframe if the time since the previous keyframe is `max_gap_s`; it is
+proportional to that time. If two keyframes show equally little, the keyframe after the longer time is kept.
 Evidence: none."""
+_MIN_RELATIVE_SURVIVAL = 0.5
+"""Minimum ratio of a candidate's track survival to the track survival of the oldest candidate. A candidate
+with a smaller ratio is not selected as keyframe. Evidence: none."""
 _NOISE_SAMPLES = 20_000
-"""Track steps that the noise is estimated from, about. More change nothing."""
+"""Approximate number of track steps from which the tracking noise is estimated. More steps do not change the
+estimate."""
 _RAYLEIGH_MEDIAN = 1.177
-"""Median of a Rayleigh distribution in its sigmas: sqrt(2 ln 2)."""
+"""Ratio of the median of a Rayleigh distribution to its scale parameter sigma: sqrt(2 ln 2)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +56,10 @@ class _Candidate:
 
     Attributes:
         index: Frame index.
-        image: The reduced image.
+        image: The reduced image of the frame.
         sharpness: Sharpness of the frame, arbitrary unit.
-        survival: Ratio of the last keyframe's corners that are still tracked.
-        shot: The frame as it was read.
+        survival: Fraction of the last keyframe's corners that are still tracked in the frame.
+        shot: The frame as it was read from the video.
     """
 
     index: int
@@ -71,17 +73,20 @@ class _Candidate:
 class _KeyframeTracker:
     """Tracks corners from the last keyframe to the newest frame, in reduced images.
 
-    Tracking in reduced images costs a quarter. Its noise is small compared with the parallax of a keyframe.
+    Reduced images (`make_coarse_image`) are smaller copies of the frames. Tracking in reduced images needs a
+    quarter of the time of tracking in full images. The tracking noise in reduced images is small compared
+    with the parallax of a keyframe.
 
     Attributes:
         camera: Intrinsics of the full image.
-        mask: True where the reduced image shows the room; None: everywhere.
+        mask: (H,W) True where the reduced image shows the room; None: it shows the room everywhere.
         start_rays: (N,3) unit directions of the tracked corners in the last keyframe.
-        px: (N,2) their positions in the newest frame, px of the reduced image.
-        image: The newest reduced image.
-        started: Number of corners in the last keyframe.
-        round_trips: Errors of forward and backward tracking, px of the full image.
-        kept_samples: Number of these errors.
+        px: (N,2) positions of the tracked corners in the newest frame, px of the reduced image.
+        image: The reduced image of the newest frame.
+        started: Number of corners that were detected in the last keyframe.
+        round_trips: Distances between each corner and its position after forward and backward tracking, px of
+            the full image; one array for each step.
+        kept_samples: Total number of distances in `round_trips`.
     """
 
     camera: Camera
@@ -94,7 +99,7 @@ class _KeyframeTracker:
     kept_samples: int = 0
 
     def restart(self, image: GreyImage) -> None:
-        """Detect corners in a new keyframe and forget all tracks."""
+        """Remove all tracks, and detect the corners of a new keyframe."""
         spacing = _CORNER_SPACING_PX * pixel_scale(image.shape[1], image.shape[0])
         self.px = detect_corners(image, _CORNERS, spacing, self.mask)
         self.image = image
@@ -112,7 +117,7 @@ class _KeyframeTracker:
         self.image = image
 
     def _full_scale(self, image: GreyImage) -> float:
-        """Return the size of the full image relative to a reduced one."""
+        """Return the ratio of the full image's width to the reduced image's width."""
         return float(self.camera.width_px / image.shape[1])
 
     def _rays(self) -> FloatArray:
@@ -124,11 +129,11 @@ class _KeyframeTracker:
         )
 
     def survival(self) -> float:
-        """Return the ratio of the keyframe's corners that are still tracked."""
+        """Return the fraction of the last keyframe's corners that are still tracked."""
         return len(self.px) / self.started if self.started else 0.0
 
     def parallax_px(self) -> float:
-        """Return the median displacement that no rotation explains, in pixels at the image centre."""
+        """Return the median displacement (px at the image centre) after the best rotation is removed."""
         if len(self.px) < _MIN_TRACKS:
             return 0.0
         rays = self._rays()
@@ -140,10 +145,11 @@ class _KeyframeTracker:
         return float(np.median(np.linalg.norm(second - first @ rotation.T, axis=1))) * self.camera.focal_px
 
     def noise_px(self) -> float:
-        """Return the standard deviation of one track step along an axis, px of the full image."""
+        """Return the standard deviation of a track step's noise along an image axis, px of the full image."""
         if not self.kept_samples:
             return 0.0
-        # The error of a round trip is a Rayleigh variable with the noise of two steps.
+        # The distance after forward and backward tracking has a Rayleigh distribution. Its noise is the sum
+        # of the noise of two track steps.
         return float(np.median(np.concatenate(self.round_trips)) / (_RAYLEIGH_MEDIAN * np.sqrt(2.0)))
 
 
@@ -153,16 +159,20 @@ def select_keyframes(
     context: StageContext,
     keeper: FrameKeeper | None = None,
 ) -> KeyframeSelection:
-    """Select the frames of one camera that the map is built from.
+    """Select the keyframes of one camera: the frames from which the map is built.
 
-    A keyframe is due once the image moved by `parallax_px` more than a rotation explains, too few tracks
-    survive, or `max_gap_s` has passed. Then the sharpest of the last frames is selected.
+    A keyframe is due after `max_gap_s`, if too few tracks survive, or if the parallax exceeds `parallax_px`.
+    The parallax is the image motion that no rotation of the camera explains. If a keyframe is due, the
+    sharpest of the last frames is selected.
 
     Args:
         camera: The camera with its video.
-        options: Thresholds; pixels are for a long side of 640 px.
+        options: Thresholds. Thresholds in pixels are for an image with a long side of 640 px.
         context: Progress and cancellation.
-        keeper: Receives every frame and every keyframe, if given.
+        keeper: Object that receives every frame and every keyframe; None: they are not passed to any object.
+
+    Returns:
+        The frame indices of the keyframes, the sharpness of every frame and the tracking noise.
 
     Raises:
         CaptureError: The camera has no frames.
@@ -218,7 +228,14 @@ def select_keyframes(
 
 
 def _is_due(tracker: _KeyframeTracker, gap_s: float, limit_px: float, options: KeyframeOptions) -> bool:
-    """Return whether a keyframe is due, `gap_s` seconds after the last one."""
+    """Return whether a keyframe is due.
+
+    Args:
+        tracker: Tracks from the last keyframe to the newest frame.
+        gap_s: Time since the last keyframe, seconds.
+        limit_px: Maximum parallax without a new keyframe, px of the full image.
+        options: Thresholds of the times and of the track survival.
+    """
     return (
         gap_s >= options.max_gap_s
         or tracker.survival() < options.min_survival
@@ -227,13 +244,18 @@ def _is_due(tracker: _KeyframeTracker, gap_s: float, limit_px: float, options: K
 
 
 def _limit_keyframes(selected: list[int], novelty: list[float], limit: int) -> list[int]:
-    """Remove the least novel keyframes, never the first or the last, until `limit` are left.
+    """Remove the least novel keyframes until `limit` keyframes are left.
+
+    The first and the last keyframe are always kept. If a keyframe is removed, its novelty is added to the
+    novelty of the next keyframe. In each step, the keyframe with the smallest sum is removed.
 
     Args:
         selected: Frame indices of the keyframes.
-        novelty: How much each keyframe shows that the one before it does not. If a keyframe is removed, its
-            novelty is added to the next one's.
-        limit: Largest number of keyframes; two are always kept.
+        novelty: Novelty of each keyframe: a measure of what it shows and the previous keyframe does not show.
+        limit: Maximum number of keyframes.
+
+    Returns:
+        Frame indices of the remaining keyframes.
     """
     kept, remaining = list(selected), list(novelty)
     while len(kept) > max(2, limit):
@@ -245,7 +267,7 @@ def _limit_keyframes(selected: list[int], novelty: list[float], limit: int) -> l
 
 
 def _coarse_mask(camera: CaptureCamera) -> BoolArray | None:
-    """Return the camera's mask at the size of reduced images; None without a mask."""
+    """Return the camera's mask at the size of the reduced images; None if the camera has no mask."""
     if camera.mask is None:
         return None
     return np.asarray(make_coarse_image(np.where(camera.mask, 255, 0).astype(np.uint8)) > 127)
@@ -256,11 +278,11 @@ def _ignore(_: FrameCandidate) -> None:
 
 
 def _restart_at_sharpest(recent: deque[_Candidate], tracker: _KeyframeTracker) -> _Candidate:
-    """Return the sharpest recent frame that still shows what the keyframe shows, and restart tracks there.
+    """Return the sharpest candidate that still overlaps with the last keyframe, and restart tracking there.
 
     Args:
-        recent: Candidates in time order; those up to the returned one are removed.
-        tracker: Restarted at the returned frame and advanced to the newest one.
+        recent: Candidates in time order. The returned candidate and all earlier candidates are removed.
+        tracker: Tracker that is restarted at the returned candidate, then advanced to the newest frame.
     """
     usable = [frame for frame in recent if frame.survival >= _MIN_RELATIVE_SURVIVAL * recent[0].survival]
     best = max(usable, key=lambda frame: frame.sharpness)

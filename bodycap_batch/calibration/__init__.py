@@ -1,4 +1,4 @@
-"""Camera calibration: intrinsics from a clip of a calibration board."""
+"""Calibrate cameras: estimate intrinsics from a clip of a calibration board."""
 
 from bodycap_batch.calibration.boards import CalibrationBoard
 from bodycap_batch.calibration.calibration_files import write_calibration, write_preview

@@ -1,4 +1,4 @@
-"""Find a marker board that stands in the room, in keyframes."""
+"""Find a marker board that stands in the room, in the images of keyframes."""
 
 from __future__ import annotations
 
@@ -23,17 +23,18 @@ def find_board_views(
     marker_board: MarkerBoard,
     context: StageContext,
 ) -> tuple[BoardView, ...]:
-    """Search for a board in selected frames.
+    """Search for a board in selected frames and estimate its poses.
 
     Args:
-        capture: The videos.
-        frames: Per camera, increasing indices of the frames to inspect.
-        cameras: Per camera, the intrinsics of the map at the work size.
-        marker_board: The board.
+        capture: All cameras with their videos.
+        frames: (K,) increasing indices of the frames to search, by camera name.
+        cameras: Intrinsics from the map, by camera name. They apply to the work size: the image size that all
+            stages work at.
+        marker_board: The board to search for.
         context: Cancellation.
 
     Returns:
-        One view for each frame in which the board was found and its pose estimated.
+        One view for each frame in which the board was found and the board's pose could be estimated.
 
     Raises:
         JobError: The board is not valid.
@@ -72,11 +73,11 @@ def find_board_views(
 
 
 def _estimate_board_pose(board_m: FloatArray, rays: FloatArray) -> FloatArray | None:
-    """Return cam_from_board (4,4) of a flat board, or None if OpenCV finds no pose.
+    """Estimate the pose cam_from_board (4,4) of a flat board; return None if OpenCV finds no pose.
 
     Args:
-        board_m: (N,3) corners on the board, metres, z = 0.
-        rays: (N,2) the same corners as normalised image coordinates.
+        board_m: (N,3) positions of the corners on the board, metres, z = 0.
+        rays: (N,2) positions of the corners in normalised image coordinates.
     """
     import cv2
 

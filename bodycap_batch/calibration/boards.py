@@ -1,4 +1,7 @@
-"""Calibration boards and their corners in a picture. Pixels here have OpenCV's origin: (0, 0)."""
+"""Find the corners of calibration boards in pictures.
+
+Pixels have OpenCV's origin: the centre of the first pixel is (0, 0).
+"""
 
 from __future__ import annotations
 
@@ -13,22 +16,22 @@ from bodycap_batch.core.errors import JobError
 
 GreyImage = npt.NDArray[np.uint8]
 MIN_CORNERS = 8
-"""Corners of a view. The board's pose takes six of their coordinates; fewer say little about the intrinsics.
-Evidence: none."""
+"""Minimum number of corners in a view. Each corner has two coordinates, and the board's pose has six
+unknowns. With fewer corners, little information on the intrinsics remains. Evidence: none."""
 _WINDOW_RATIO = 0.3
-"""Half side of the sub-pixel window as a fraction of the corner distance, so that it holds no second
-corner."""
+"""Ratio of half the side of the window for sub-pixel refinement to the smallest distance between corners. At
+this ratio, the window does not contain a second corner."""
 _MAX_WINDOW_PX = 15
-"""Largest half side of that window, pixels. Evidence: none."""
+"""Maximum of half the side of the window for sub-pixel refinement, px. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardCorners:
-    """A board's corners in one picture.
+    """The visible corners of a board in one picture.
 
     Attributes:
-        board_m: (N,3) corners on the board, z = 0, in units of a square's side.
-        px: (N,2) their pixels, OpenCV's pixel origin.
+        board_m: (N,3) positions of the corners on the board, z = 0, in units of a square's side.
+        px: (N,2) positions of the corners in the picture, px, OpenCV's pixel origin.
     """
 
     board_m: FloatArray
@@ -40,12 +43,15 @@ class CalibrationBoard:
     """A flat calibration board.
 
     Attributes:
-        kind: A plain chessboard, or a ChArUco board (a chessboard with markers in its white squares).
-        columns: Chessboard: inner corners of a row. ChArUco: squares of a row.
-        rows: The same for a column.
-        dictionary: ChArUco: dictionary of its markers, as OpenCV names it without ``DICT_``.
-        marker: ChArUco: side of a marker over the side of a square.
-        legacy: ChArUco: drawn by an OpenCV before 4.6 (differs for an even number of rows).
+        kind: Kind of the board: a plain chessboard, or a ChArUco board (a chessboard with markers in its
+            white squares).
+        columns: Number of inner corners in a row of a chessboard, or of squares in a row of a ChArUco board.
+        rows: Number of inner corners in a column of a chessboard, or of squares in a column of a ChArUco
+            board.
+        dictionary: OpenCV's name, without ``DICT_``, of the dictionary of a ChArUco board's markers.
+        marker: Ratio of the side of a marker to the side of a square, for a ChArUco board.
+        legacy: True for a ChArUco board that was drawn by an OpenCV version before 4.6. Such a board differs
+            if its number of rows is even.
     """
 
     kind: Literal["chessboard", "charuco"]
@@ -75,7 +81,7 @@ class CalibrationBoard:
         return f"ChArUco board of {self.columns}x{self.rows} squares ({self.dictionary})"
 
     def find(self, image: GreyImage) -> BoardCorners | None:
-        """Return the board's corners in a grey picture (H,W), or None if too few are visible."""
+        """Find the board's corners in a grey picture (H,W); return None if too few corners are visible."""
         if self.kind == "chessboard":
             return self._find_chessboard(image)
         detector, board = self._detector()
@@ -89,7 +95,11 @@ class CalibrationBoard:
         )
 
     def picture(self, square_px: int) -> GreyImage:
-        """Return the ChArUco board as it is printed, without margin; a square has `square_px` pixels."""
+        """Return a picture of the ChArUco board for printing, without a margin.
+
+        Args:
+            square_px: Side of a square, px.
+        """
         _, board = self._detector()
         size = (self.columns * square_px, self.rows * square_px)
         return np.asarray(board.generateImage(size), dtype=np.uint8)
@@ -109,7 +119,7 @@ class CalibrationBoard:
         )
 
     def _detector(self) -> tuple[Any, Any]:
-        """Return OpenCV's detector and board, created at the first call."""
+        """Return OpenCV's ChArUco detector and board. Both are created at the first call."""
         import cv2
 
         if not self._charuco:
@@ -129,10 +139,10 @@ class CalibrationBoard:
 
 
 def _refine_corners(image: GreyImage, corners: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Refine corners (R,C,2) to sub-pixels, in windows that hold no second corner.
+    """Refine corners (R,C,2) to sub-pixel accuracy, in windows that contain no second corner.
 
-    The detector's corners have a common bias of about 0.1 px, which moves the principal point by 1 px.
-    Evidence: docs/decisions/calibration.md.
+    The corners of OpenCV's detector have a common bias of about 0.1 px. Without refinement, this bias moves
+    the estimated principal point by 1 px. Evidence: docs/decisions/calibration.md.
     """
     import cv2
 

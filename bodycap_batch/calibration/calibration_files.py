@@ -1,4 +1,4 @@
-"""Write the results of a calibration: the file that jobs read, and a preview picture."""
+"""Write the results of a calibration: the calibration file for jobs, and a preview picture."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 
 
 def write_calibration(result: CalibrationResult, path: Path, camera: str | None) -> None:
-    """Write ``calib.json`` as jobs read it, in COLMAP's pixel origin, together with the error of the fit.
+    """Write a calibration file that jobs read, with COLMAP's pixel origin and the errors of the fit.
 
     Args:
         result: The calibration.
-        path: The file. With `camera` it may exist: the entry of that camera is added or replaced.
-        camera: Name of the camera that the calibration belongs to; None for all cameras.
+        path: Path of the file. If `camera` is given, the file may exist, and the entry of this camera is
+            added or replaced. Without `camera`, an existing file is replaced.
+        camera: Name of the camera to which the calibration applies; None: it applies to all cameras.
 
     Raises:
         JobError: The existing file has other content.
@@ -55,7 +56,7 @@ def _calibration_entry(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _read_camera_entries(path: Path) -> dict[str, Any]:
-    """Return the content of a file with several cameras; empty if there is no file."""
+    """Return the content of a calibration file with one entry for each camera; empty if there is no file."""
     if not path.exists():
         return {}
     try:
@@ -75,7 +76,9 @@ def _read_camera_entries(path: Path) -> dict[str, Any]:
 
 
 def write_preview(result: CalibrationResult, path: Path) -> None:
-    """Write a preview: the clip's picture (left) and the undistorted picture (right) with straight lines.
+    """Write a preview: a picture of the clip (left) and the same picture without distortion (right).
+
+    Straight lines of the room must be straight in the right picture.
 
     Raises:
         StoreError: The file cannot be written.
@@ -83,7 +86,8 @@ def write_preview(result: CalibrationResult, path: Path) -> None:
     fit, (width, height) = result.fit, result.size
     matrix, undistorted_matrix = fit.matrix, fit.matrix.copy()
     if fit.model == "OPENCV_FISHEYE":
-        # An undistorted picture of a fisheye's full view would be unbounded: show its middle.
+        # An undistorted picture of a fisheye lens's full view would be infinitely large. Only its middle is
+        # shown.
         undistorted_matrix[:2, :2] *= 0.6
         maps = cv2.fisheye.initUndistortRectifyMap(
             matrix, fit.distortion, np.eye(3), undistorted_matrix, (width, height), cv2.CV_32FC1

@@ -27,41 +27,44 @@ _MODELS: dict[str, tuple[str, ...]] = {
     "fisheye": ("OPENCV_FISHEYE",),
 }
 _MAX_PICTURES = 160
-"""Number of pictures in which the board is searched. They take some seconds of computation. Evidence:
-none."""
+"""Maximum number of pictures in which the board is searched. They take some seconds of computation.
+Evidence: none."""
 _PICTURES_PER_S = 5.0
-"""Pictures per second of a shorter clip. Evidence: none."""
+"""Number of pictures for each second of a clip in which the board is searched. In a long clip it is smaller,
+because of `_MAX_PICTURES`. Evidence: none."""
 _MAX_VIEWS = 40
-"""Number of views that are used for the fit. Evidence: none."""
+"""Maximum number of views in the fit. Evidence: none."""
 MIN_VIEWS = 8
-"""Least number of views with the board. Evidence: none."""
+"""Minimum number of pictures in which the board must be found. Evidence: none."""
 _MAX_FISHEYE_ERROR_RATIO = 0.9
-"""The fisheye model is used if its error is less than this fraction of the other model's error. Evidence:
-none."""
+"""Maximum ratio of the fisheye model's error to the other model's error if the fisheye model is selected.
+Evidence: none."""
 _COVERAGE_CELLS = (8, 6)
-"""Columns and rows of the grid that measures coverage. Evidence: none."""
+"""Number of columns and number of rows of the grid that measures coverage. Evidence: none."""
 _MIN_COVERAGE = 0.5
-"""Fraction of the cells; with fewer, the distortion is extrapolated in much of the picture. Evidence:
-none."""
+"""Minimum fraction of the grid cells that contain a corner. With a smaller fraction, the distortion is
+extrapolated in a large part of the picture, and the result has a note. Evidence: none."""
 _MAX_FOCAL_SIGMA_RATIO = 0.005
-"""Standard deviation of the focal length over the focal length. Evidence: none."""
+"""Maximum ratio of the focal length's standard deviation to the focal length. With a larger ratio, the result
+has a note. Evidence: none."""
 _MAX_RMS_PX = 1.0
-"""Reprojection error in pixels of a picture that is 640 pixels wide. Evidence: none."""
+"""Maximum reprojection error, in px of a picture with a long side of 640 px. With a larger error, the result
+has a note. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationResult:
-    """Estimated intrinsics with their error.
+    """Estimated intrinsics with their errors.
 
     Attributes:
         board: The board in the clip.
-        fit: The intrinsics.
-        size: Width and height of the upright pictures.
+        fit: The estimated intrinsics and their errors.
+        size: Width and height of the upright pictures, px.
         inspected: Number of pictures in which the board was searched.
-        found: Number of pictures in which it was found.
-        coverage: Fraction of the picture's cells (8x6) with a corner.
-        notes: Reasons to doubt the result, with remedies.
-        preview: Picture (H,W) of the view with most corners, for `write_preview`.
+        found: Number of pictures in which the board was found.
+        coverage: Fraction of the cells of an 8x6 grid in the picture that contain a corner.
+        notes: Notes for the user: reasons why the result may be wrong, with remedies.
+        preview: (H,W) grey picture of the view with the most corners, for `write_preview`.
     """
 
     board: CalibrationBoard
@@ -74,7 +77,7 @@ class CalibrationResult:
     preview: GreyImage
 
     def lines(self) -> list[str]:
-        """Return the result as text for the user."""
+        """Return the result as lines of text for the user."""
         fit, (width, height) = self.fit, self.size
         sigma = ", ".join(f"{value:.2f}" for value in fit.focal_sigma_px)
         worst = max(fit.view_rms_px)
@@ -94,13 +97,14 @@ def calibrate_clip(
     """Calibrate a camera from a clip of a board.
 
     Args:
-        video: The clip, filmed with the settings of the captures (size, zoom, lens mode, stabilisation off).
+        video: Path of the clip. It must be filmed with the same settings as the captures: size, zoom and lens
+            mode, with stabilisation off.
         board: The board in the clip.
-        lens: Camera model to fit; ``auto`` selects OPENCV unless OPENCV_FISHEYE fits better.
+        lens: Camera model to fit. ``auto`` selects OPENCV_FISHEYE if it fits clearly better, else OPENCV.
         context: Progress and cancellation.
 
     Returns:
-        The intrinsics and their error.
+        The intrinsics and their errors.
 
     Raises:
         CaptureError: The video cannot be used, or the board was found in too few pictures.
@@ -143,7 +147,11 @@ def calibrate_clip(
 
 
 def _frame_blocks(camera: CaptureCamera) -> list[tuple[int, int]]:
-    """Return blocks of frames as (first, one past the last); the sharpest picture of each is inspected."""
+    """Divide the frames of a clip into blocks, for `_sharpest_pictures`.
+
+    Returns:
+        First frame index and end index (last frame index plus one) of each block.
+    """
     count = len(camera.times_ns)
     seconds = (int(camera.times_ns[-1]) - int(camera.times_ns[0])) / 1e9 * count / max(count - 1, 1)
     looks = int(np.clip(round(seconds * _PICTURES_PER_S), 1, min(_MAX_PICTURES, count)))
@@ -154,7 +162,10 @@ def _frame_blocks(camera: CaptureCamera) -> list[tuple[int, int]]:
 def _sharpest_pictures(
     camera: CaptureCamera, stretches: Sequence[tuple[int, int]]
 ) -> Iterator[tuple[int, GreyImage]]:
-    """Yield the sharpest picture of each block, because a board in the hand is still for moments only."""
+    """Yield the frame index and the grey picture of the sharpest frame in each block.
+
+    Many other pictures are blurred, because a board in the hand is still only for moments.
+    """
     ends = iter(stretches)
     end = next(ends)[1]
     best: tuple[float, int, GreyImage] | None = None
@@ -173,7 +184,10 @@ def _sharpest_pictures(
 def _best_fit(
     views: Sequence[BoardCorners], size: ImageSize, lens: CameraModelChoice, video: Path
 ) -> IntrinsicsFit:
-    """Return the best fit. OPENCV is preferred if the fisheye model is hardly better."""
+    """Fit the camera models of a choice to views and return the best fit.
+
+    With ``auto``, the fisheye model is the best fit only if its error is clearly smaller.
+    """
     fits = [fit for model in _MODELS[lens] if (fit := fit_intrinsics(model, views, size)) is not None]
     if not fits:
         raise EstimationError(
@@ -189,14 +203,16 @@ def _best_fit(
 
 
 def select_diverse_views(views: Sequence[BoardCorners], size: ImageSize, count: int) -> list[int]:
-    """Select diverse views: first the one with most corners, then always the one farthest from all selected.
+    """Select views in which the board has different positions, sizes and tilts.
 
-    The distance compares the position, size and tilt of the board in the picture.
+    The first selected view is the view with the most corners. Then, in each step, the view with the largest
+    distance from all selected views is added. The distance compares the position, size and tilt of the board
+    in the picture.
 
     Args:
         views: Views of the board.
-        size: Width and height of the pictures.
-        count: Number of views wanted.
+        size: Width and height of the pictures, px.
+        count: Maximum number of views to select.
 
     Returns:
         Increasing indices of the selected views.
@@ -216,7 +232,10 @@ def select_diverse_views(views: Sequence[BoardCorners], size: ImageSize, count: 
 
 
 def _view_descriptor(view: BoardCorners, size: ImageSize) -> FloatArray:
-    """Return the centre, size and perspective of the board in the picture, each scaled to about 0 to 1."""
+    """Return a vector (5,) that describes a view: the centre, size and tilt of the board in the picture.
+
+    All components are scaled to a similar range.
+    """
     homography, _ = cv2.findHomography(view.board_m[:, :2], view.px / max(size))
     centre = view.px.mean(axis=0) / max(size)
     scale = np.log(np.sqrt(np.linalg.det(np.cov((view.px / max(size)).T))) + 1e-6)
@@ -226,7 +245,12 @@ def _view_descriptor(view: BoardCorners, size: ImageSize) -> FloatArray:
 
 
 def corner_coverage(pixels: Sequence[FloatArray], size: ImageSize) -> float:
-    """Return the fraction of the picture's cells that hold a corner."""
+    """Return the fraction of the picture's grid cells that contain at least one corner.
+
+    Args:
+        pixels: (N,2) corners in each picture, px, OpenCV's pixel origin.
+        size: Width and height of the pictures, px.
+    """
     cells = np.zeros(_COVERAGE_CELLS, dtype=bool)
     for px in pixels:
         cell = np.floor((px + 0.5) / np.array(size) * np.array(_COVERAGE_CELLS)).astype(int)

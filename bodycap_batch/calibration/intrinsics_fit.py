@@ -1,4 +1,7 @@
-"""Fit intrinsics to views of a board. Pixels here have OpenCV's origin."""
+"""Fit intrinsics to views of a board.
+
+Pixels have OpenCV's origin: the centre of the first pixel is (0, 0).
+"""
 
 from __future__ import annotations
 
@@ -14,14 +17,15 @@ from bodycap_batch.core.arrays import FloatArray
 
 ImageSize = tuple[int, int]
 _FISHEYE_INITIAL_FOCALS = (0.5, 0.35, 0.7)
-"""Initial focal lengths of the fisheye model, as fractions of the long side. Evidence: none."""
+"""Ratios of the initial focal lengths of the fisheye model to the picture's long side. Evidence: none."""
 _MAX_VIEW_ERROR_RATIO = 3.0
-"""A view is an outlier if its error exceeds this multiple of the median: it is blurred or misdetected.
-Evidence: none."""
+"""Maximum ratio of a view's error to the median error of all views. A view with a larger ratio is an outlier:
+the picture is blurred or a corner is wrong. Evidence: none."""
 _MIN_OUTLIER_ERROR_PX = 0.3
-"""An error below this is never an outlier, pixels of a picture that is 640 pixels wide. Evidence: none."""
+"""Minimum error of an outlier view, in px of a picture with a long side of 640 px. Evidence: none."""
 _MIN_FIT_VIEWS = 6
-"""Views that must remain when outliers are removed. Evidence: none."""
+"""Minimum number of views after outliers are removed. With fewer views, the outliers are kept.
+Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,12 +34,12 @@ class IntrinsicsFit:
 
     Attributes:
         model: COLMAP's name of the camera model: PINHOLE, OPENCV or OPENCV_FISHEYE.
-        matrix: (3,3) focal lengths and principal point, pixels.
-        distortion: Coefficients of the model in OpenCV's order.
-        rms_px: Root mean square reprojection error over all corners.
-        view_rms_px: The same for each view used.
-        focal_sigma_px: Standard deviations of both focal lengths.
-        kept: Indices of the views that were used.
+        matrix: (3,3) camera matrix with focal lengths and principal point, px.
+        distortion: Distortion coefficients of the camera model, in OpenCV's order.
+        rms_px: Root mean square reprojection error over the corners of all used views, px.
+        view_rms_px: Root mean square reprojection error of each used view, px.
+        focal_sigma_px: Standard deviations of the two focal lengths, px.
+        kept: Indices of the used views.
     """
 
     model: str
@@ -48,26 +52,25 @@ class IntrinsicsFit:
 
     @property
     def params(self) -> list[float]:
-        """COLMAP's parameters in COLMAP's pixel origin."""
+        """Parameters of the camera model in COLMAP's order, with COLMAP's pixel origin."""
         fx, fy = self.matrix[0, 0], self.matrix[1, 1]
         centre = self.matrix[:2, 2] + 0.5
         return [float(value) for value in (fx, fy, *centre, *self.distortion)]
 
 
 def fit_intrinsics(model: str, views: Sequence[BoardCorners], size: ImageSize) -> IntrinsicsFit | None:
-    """Fit intrinsics, remove outlier views, and fit again.
+    """Fit intrinsics to views, remove outlier views, and fit again.
 
     Args:
-        model: PINHOLE, OPENCV or OPENCV_FISHEYE.
+        model: COLMAP's name of the camera model: PINHOLE, OPENCV or OPENCV_FISHEYE.
         views: Corners of the board in each view.
-        size: Width and height of the pictures.
+        size: Width and height of the pictures, px.
 
     Returns:
         The fit, or None if the model cannot be fitted to these views.
 
     Source: Z. Zhang, "A flexible new technique for camera calibration", PAMI 2000. The fisheye model is from
-        Kannala, Brandt, "A generic camera model and calibration method", PAMI 2006. Both as implemented in
-        OpenCV.
+        Kannala, Brandt, "A generic camera model and calibration method", PAMI 2006. OpenCV implements both.
     """
     kept = list(range(len(views)))
     fit = None
@@ -89,7 +92,7 @@ def fit_intrinsics(model: str, views: Sequence[BoardCorners], size: ImageSize) -
 
 
 def _with_kept_views(fit: IntrinsicsFit, kept: Sequence[int]) -> IntrinsicsFit:
-    """Return the fit with the indices of its views."""
+    """Return a copy of a fit, with the indices of the views that were used."""
     return IntrinsicsFit(
         model=fit.model,
         matrix=fit.matrix,
@@ -102,7 +105,11 @@ def _with_kept_views(fit: IntrinsicsFit, kept: Sequence[int]) -> IntrinsicsFit:
 
 
 def _opencv_points(views: Sequence[BoardCorners], *, fisheye: bool) -> tuple[list[Any], list[Any]]:
-    """Return corner lists for OpenCV: single precision, or double (1,N,...) for fisheye functions."""
+    """Return the corners on the board and in the picture, in the form that OpenCV needs.
+
+    Each view has one array of each kind. OpenCV's fisheye functions need arrays (1,N,3) and (1,N,2) in double
+    precision. The other functions need arrays (N,3) and (N,2) in single precision.
+    """
     if fisheye:
         return [view.board_m[None] for view in views], [view.px[None] for view in views]
     return [view.board_m.astype(np.float32) for view in views], [view.px.astype(np.float32) for view in views]
@@ -135,9 +142,10 @@ def _fit_pinhole(model: str, views: Sequence[BoardCorners], size: ImageSize) -> 
 
 
 def _fit_fisheye(views: Sequence[BoardCorners], size: ImageSize) -> IntrinsicsFit | None:
-    """Return the best fit from several initial focal lengths.
+    """Fit the fisheye model from several initial focal lengths and return the best fit.
 
-    OpenCV's own initial value assumes a view of 180 degrees along the long side.
+    OpenCV's own initial focal length is not used, because it assumes a field of view of 180 degrees along the
+    long side.
     """
     fits = [_fit_fisheye_from(start * max(size), views, size) for start in _FISHEYE_INITIAL_FOCALS]
     found = [fit for fit in fits if fit is not None]
@@ -170,7 +178,9 @@ def _fisheye_fit_with_errors(
     distortion: FloatArray,
     poses: Sequence[tuple[Any, Any]],
 ) -> IntrinsicsFit:
-    """Compute the errors of a fisheye fit, and its focal sigma from the normal equations without the poses.
+    """Return a fisheye fit with its reprojection errors and the standard deviations of its focal lengths.
+
+    The standard deviations come from the normal equations after the poses of the board are eliminated.
 
     Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999 (the Schur complement).
     """
@@ -199,7 +209,7 @@ def _fisheye_fit_with_errors(
 
 
 def _is_plausible(matrix: Any, size: ImageSize) -> bool:
-    """Check that the view is 5 to 170 degrees, the focal lengths are similar and the centre is plausible."""
+    """Return whether the field of view, the ratio of focal lengths and the principal point are plausible."""
     focal = np.array([matrix[0, 0], matrix[1, 1]])
     centre = np.array([matrix[0, 2], matrix[1, 2]]) / np.array(size)
     sane = np.isfinite(matrix).all() and (focal > 0.1 * max(size)).all() and (focal < 12 * max(size)).all()

@@ -1,4 +1,4 @@
-"""Errors of results against ground truth: trajectories, relative camera poses, motions and covariances."""
+"""Compare results with ground truth: trajectories, relative camera poses, motions and covariances."""
 
 from bodycap_batch.evaluate.motion import MotionOptions, MotionReport, evaluate_motion, score_motion
 from bodycap_batch.evaluate.relative_cameras import (

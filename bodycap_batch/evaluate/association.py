@@ -1,4 +1,4 @@
-"""Associate ground truth with estimates by time: interpolated, or the nearest pose."""
+"""Associate true poses with estimated poses by time: interpolate the truth or take the nearest true pose."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from bodycap_batch.model.geometry import poses_at
 Association = Literal["interpolate", "nearest"]
 
 _SNAP_NS = 1_000_000
-"""Nanoseconds. A true pose this near in time is used even without a second neighbour. Derivation: some files
-have timestamps of only four decimals."""
+"""Maximum time difference (nanoseconds) for a true pose that is used without a second true pose to
+interpolate. Derivation: timestamps in some files have only four decimals."""
 
 
 def interpolate_truth(
     truth: TimedPoses, times_ns: IntArray, max_gap_s: float
 ) -> tuple[FloatArray, BoolArray]:
-    """Interpolate the true poses at given times: rotations by slerp, positions linearly.
+    """Interpolate true poses at given times: rotations by slerp, positions linearly.
 
     Args:
-        truth: True poses in the order of time.
-        times_ns: (N,) times to interpolate at.
-        max_gap_s: Largest time between two true poses; in a longer gap there is no truth.
+        truth: True poses in time order.
+        times_ns: (N,) times at which the truth is interpolated, nanoseconds.
+        max_gap_s: Maximum time (seconds) between two true poses for an interpolation.
 
     Returns:
-        (N,4,4) true poses, the identity without truth, and a mask (N,) of the times with truth.
+        (N,4,4) true poses, identity matrices at times without truth; (N,) mask, True at times with truth.
     """
     return poses_at(
         truth.times_ns,
@@ -40,15 +40,15 @@ def interpolate_truth(
 
 
 def nearest_truth(truth: TimedPoses, times_ns: IntArray, max_diff_s: float) -> tuple[FloatArray, BoolArray]:
-    """Return the true poses that are nearest to given times, as the TUM benchmark tools do.
+    """Return the true pose that is nearest to each given time, as the TUM benchmark tools do.
 
     Args:
-        truth: True poses in the order of time.
-        times_ns: (N,) times of the estimates.
-        max_diff_s: Largest time difference between an estimate and its truth.
+        truth: True poses in time order.
+        times_ns: (N,) times of the estimates, nanoseconds.
+        max_diff_s: Maximum time difference (seconds) between an estimate and its true pose.
 
     Returns:
-        (N,4,4) nearest true poses, and a mask (N,) of those that are near enough.
+        (N,4,4) nearest true poses; (N,) mask, True where the time difference is small enough.
     """
     if len(truth.times_ns) == 0:
         return np.tile(np.eye(4), (len(times_ns), 1, 1)), np.zeros(len(times_ns), dtype=bool)

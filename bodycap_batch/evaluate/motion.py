@@ -1,4 +1,4 @@
-"""Errors of a motion against the true motion. Joints are matched by anatomical role."""
+"""Compare a motion with the true motion. Joints are matched by anatomical role."""
 
 from __future__ import annotations
 
@@ -35,19 +35,20 @@ _ROLE_BY_TRUTH_NAME = {
         }.items()
     },
 }
-"""Anatomical role by the joint names of the ground truth file ``gt/joints.npz``."""
+"""Anatomical role of each joint in the ground truth file ``gt/joints.npz``, by the joint's name there."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionOptions:
-    """How motions are compared.
+    """Options for the comparison of motions.
 
     Attributes:
-        align: One rigid alignment ("se3") for all joints and frames, or no alignment ("none").
+        align: Kind of the alignment: one rigid alignment ("se3") for all joints and frames, or no alignment
+            ("none").
         root: Role of the joint whose position is subtracted for the root-relative error.
-        offset_s: Added to the times of the estimate before the truth is interpolated.
-        max_gap_s: A longer gap of the truth has no true poses.
-        roles: The roles to compare, besides the root; all common ones if empty.
+        offset_s: Time (seconds) that is added to the times of the estimate before the truth is interpolated.
+        max_gap_s: Maximum time (seconds) between two true poses for an interpolation.
+        roles: Roles of the joints to compare, in addition to the root; if empty, all common roles.
     """
 
     align: Literal["se3", "none"] = "se3"
@@ -63,14 +64,20 @@ class MotionReport:
 
     Attributes:
         frames: Number of compared frames.
-        joints: Compared roles.
-        mpjpe_m: Mean per-joint position error: distance of joint centres after alignment, metres.
-        root_relative_m: The same distance with the position of the root subtracted from both motions.
-        procrustes_m: The same distance after a separate similarity alignment of every frame.
-        angle_deg: Angle between orientations after alignment, degrees; None if the truth has no orientations.
-        angle_offset_free_deg: The same angle with a constant rotation offset of each joint removed.
-        per_joint_m: Mean root-relative error by role.
-        per_joint_deg: Mean angle by role, with the constant offset removed.
+        joints: Roles of the compared joints.
+        mpjpe_m: Distance (metres) between estimated and true joint centres after alignment. Its mean is the
+            mean per-joint position error (MPJPE).
+        root_relative_m: Distance (metres) between estimated and true joint centres after alignment, with the
+            position of the root subtracted from both motions.
+        procrustes_m: Distance (metres) between estimated and true joint centres after a separate similarity
+            alignment of each frame.
+        angle_deg: Angle (degrees) between estimated and true joint orientations after alignment; None if the
+            truth has no orientations.
+        angle_offset_free_deg: Angle (degrees) between estimated and true joint orientations, after a constant
+            rotation offset of each joint is removed; None if the truth has no orientations.
+        per_joint_m: Mean root-relative distance (metres) of each joint except the root, by role.
+        per_joint_deg: Mean angle (degrees) of each joint without the constant offset, by role; empty if the
+            truth has no orientations.
     """
 
     frames: int
@@ -93,10 +100,10 @@ class _JointPoses:
     """The poses of J joints at T times.
 
     Attributes:
-        times_ns: (T,) times.
-        roles: (J,) anatomical roles.
-        positions: (T,J,3) joint centres in metres.
-        rotations: (T,J,3,3) orientations; identities if unknown.
+        times_ns: (T,) times, nanoseconds.
+        roles: (J,) anatomical roles of the joints.
+        positions: (T,J,3) joint centres in the world, metres.
+        rotations: (T,J,3,3) joint orientations in the world; identity matrices if unknown.
         oriented: Whether the orientations are known.
     """
 
@@ -108,15 +115,15 @@ class _JointPoses:
 
 
 def evaluate_motion(estimate: Path, truth: Path, options: MotionOptions | None = None) -> MotionReport:
-    """Compare a BVH file with the truth, a BVH file or ``joints.npz`` (positions only).
+    """Compare the motion in a BVH file with the true motion.
 
-    Both motions start at the same instant. Joints are matched by anatomical role, and the truth is
+    Both motions must start at the same instant. Joints are matched by anatomical role, and the truth is
     interpolated at the times of the estimate.
 
     Args:
         estimate: BVH file of the estimated motion.
-        truth: File of the true motion.
-        options: How the motions are compared.
+        truth: File of the true motion: a BVH file, or a file ``joints.npz``, which holds only positions.
+        options: Options of the comparison.
 
     Raises:
         JobError: A file is missing or malformed, or the motions have no common joints or times.
@@ -129,7 +136,10 @@ def evaluate_motion(estimate: Path, truth: Path, options: MotionOptions | None =
 
 
 def score_motion(estimate: Motion, truth: Motion, options: MotionOptions | None = None) -> MotionReport:
-    """Compare two motions with the same clock; see `evaluate_motion`."""
+    """Compare an estimated motion with the true motion. Both motions must have the same clock.
+
+    Joints are matched as in `evaluate_motion`.
+    """
     return _compare_joints(
         _joints_from_motion(estimate), _joints_from_motion(truth), options or MotionOptions()
     )
@@ -158,7 +168,7 @@ def _read_truth(path: Path) -> _JointPoses:
 
 
 def _joints_from_motion(motion: Motion) -> _JointPoses:
-    """Return the poses of the joints with a role."""
+    """Return the poses of all joints of a motion that have an anatomical role."""
     roles = motion.skeleton.roles
     kept = [index for index, role in enumerate(roles) if role]
     poses = motion.world_from_joint()[:, kept]
@@ -172,7 +182,7 @@ def _joints_from_motion(motion: Motion) -> _JointPoses:
 
 
 def _compare_joints(estimate: _JointPoses, truth: _JointPoses, options: MotionOptions) -> MotionReport:
-    """Return the errors of the joints that both motions have."""
+    """Return the errors of the joints whose role occurs in both motions."""
     selected = {*options.roles, options.root} if options.roles else set(truth.roles)
     roles = tuple(role for role in estimate.roles if role in truth.roles and role in selected)
     if options.root not in roles or len(roles) < 3:
@@ -215,7 +225,12 @@ def _compare_joints(estimate: _JointPoses, truth: _JointPoses, options: MotionOp
 def _match_joints(
     estimate: _JointPoses, truth: _JointPoses, roles: tuple[str, ...], options: MotionOptions
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return positions and true positions, rotations and true rotations, at the times with truth."""
+    """Return the estimated and the true joint poses at all times T with truth, for J roles.
+
+    Returns:
+        (T,J,3) estimated positions; (T,J,3) true positions; (T,J,3,3) estimated rotations; (T,J,3,3) true
+        rotations.
+    """
     times = estimate.times_ns + round(options.offset_s * 1e9)
     estimate_joints = [estimate.roles.index(role) for role in roles]
     positions = np.empty((len(times), len(roles), 3))
@@ -238,9 +253,13 @@ def _match_joints(
 
 
 def _angles_without_offset(rotation: FloatArray, true_rotation: FloatArray) -> FloatArray:
-    """Return the angles (T,J), degrees, after removing the mean offset rotation of each joint.
+    """Return the angles (T,J), degrees, between rotations after removing a constant offset of each joint.
 
-    The offset of a joint is the chordal mean of true rotation relative to estimated rotation (T,J,3,3).
+    The offset of a joint is the chordal mean over time of the rotation from the estimate to the truth.
+
+    Args:
+        rotation: (T,J,3,3) estimated rotations.
+        true_rotation: (T,J,3,3) true rotations.
     """
     offset = np.swapaxes(rotation, -1, -2) @ true_rotation
     mean = nearest_rotation(offset.sum(axis=0))
@@ -248,7 +267,10 @@ def _angles_without_offset(rotation: FloatArray, true_rotation: FloatArray) -> F
 
 
 def _procrustes_distances(positions: FloatArray, true_positions: FloatArray) -> FloatArray:
-    """Return the distances (T,J) of positions (T,J,3) after a similarity alignment of each frame."""
+    """Return the distances (T,J) between estimated and true positions (T,J,3) after aligning each frame.
+
+    Each frame has a separate similarity alignment.
+    """
     out = np.empty(positions.shape[:2])
     for frame, (source, target) in enumerate(zip(positions, true_positions, strict=True)):
         out[frame] = np.linalg.norm(align_points(source, target).apply(source) - target, axis=-1)
@@ -256,5 +278,5 @@ def _procrustes_distances(positions: FloatArray, true_positions: FloatArray) -> 
 
 
 def _summary(errors: FloatArray) -> ErrorSummary:
-    """Return the statistics of errors of any shape."""
+    """Return the statistics of all errors in an array of any shape."""
     return ErrorSummary.of(errors.reshape(-1))

@@ -1,4 +1,4 @@
-"""Errors of the relative pose of two cameras on one body, and of poses in units of their covariance."""
+"""Compare the relative position of two cameras with the truth, and pose errors with their covariances."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from bodycap_batch.model.geometry import align_points, invert, so3_log
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelativeCameraError:
-    """Errors of the vector from one camera to another.
+    """Errors of the vector from the reference camera to another camera.
 
     Attributes:
-        frames: Number of frames in which both cameras have a pose and a true pose.
-        vector_m: Error in metres of the vector between the centres, after one rigid alignment of both
-            trajectories.
-        in_reference_m: Error in metres of the camera's centre in the frame of the reference camera, without
-            alignment.
+        frames: Number of frames in which both cameras have an estimated pose and a true pose.
+        vector_m: Error (metres) of the vector between the camera centres in the world, after one rigid
+            alignment of both trajectories with the truth.
+        in_reference_m: Error (metres) of the other camera's centre in the reference camera's frame of
+            reference, without alignment.
     """
 
     frames: int
@@ -43,14 +43,14 @@ def relative_camera_error(
     reference: str,
     options: TrajectoryOptions | None = None,
 ) -> RelativeCameraError:
-    """Compare the vector between two cameras with the truth. The scale is not estimated.
+    """Compare the vector between two cameras with the true vector, without an estimation of the scale.
 
     Args:
-        estimates: By camera, world_from_camera in metres at common time.
-        truths: By camera, the true poses in the same form.
-        camera: The camera on the limb.
-        reference: The camera on the trunk.
-        options: How true poses are associated; the other options are not used.
+        estimates: Estimated poses world_from_camera (metres) at common times, by camera name.
+        truths: True poses world_from_camera (metres) at common times, by camera name.
+        camera: Name of the camera on the limb.
+        reference: Name of the camera on the trunk.
+        options: Options with the association of true poses. All other options are ignored.
 
     Raises:
         JobError: A camera is missing, or fewer than three frames have all four poses.
@@ -90,15 +90,15 @@ def relative_camera_error(
 def normalised_errors(
     gauge_from_cam: FloatArray, covariance: FloatArray, true_gauge_from_cam: FloatArray
 ) -> FloatArray:
-    """Return the squared pose errors (N,) in units of their covariance.
+    """Return the normalised squared errors (N,) of N poses: squared Mahalanobis distances from the truth.
 
-    Their mean is 6 if the covariances are correct.
+    The mean of these errors is 6 if the covariances are correct.
 
     Args:
         gauge_from_cam: (N,4,4) estimated poses.
-        covariance: (N,6,6) covariance of each pose: rotation (rad), then translation, as a right
-            perturbation.
-        true_gauge_from_cam: (N,4,4) true poses in the same gauge.
+        covariance: (N,6,6) covariance of each estimated pose, for a perturbation on the right: rotation
+            (rad), then translation (gauge units).
+        true_gauge_from_cam: (N,4,4) true poses in the gauge of the estimated poses.
 
     Source: Y. Bar-Shalom et al., "Estimation with Applications to Tracking and Navigation", 2001, 5.4
         (normalised estimation error squared).

@@ -1,4 +1,4 @@
-"""Errors of camera trajectories against ground truth: ATE, RPE and coverage.
+"""Compare camera trajectories with ground truth: absolute and relative errors (ATE, RPE) and coverage.
 
 One alignment is estimated for all cameras together.
 """
@@ -23,15 +23,16 @@ Alignment = Literal["sim3", "se3", "none"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryOptions:
-    """How trajectories are compared.
+    """Options for the comparison of trajectories.
 
     Attributes:
-        align: Similarity ("sim3"), rigid ("se3") or no alignment ("none"), the same for all cameras.
-        association: Whether the truth is interpolated at the time of a frame, or the nearest true pose is
-            used.
-        max_gap_s: For interpolation: a longer gap of the truth has no true poses.
-        max_diff_s: For the nearest pose: largest time difference to the frame.
-        rpe_delta_s: Time between the two poses of a relative pose error.
+        align: Kind of the alignment: similarity ("sim3"), rigid ("se3") or no alignment ("none"). All cameras
+            have one common alignment.
+        association: Association of true poses with frames: the truth is interpolated at the frame's time
+            ("interpolate"), or the true pose nearest in time is used ("nearest").
+        max_gap_s: Maximum time (seconds) between two true poses for an interpolation.
+        max_diff_s: Maximum time difference (seconds) between a frame and the nearest true pose.
+        rpe_delta_s: Time (seconds) between the two poses of a relative pose error.
     """
 
     align: Alignment = "sim3"
@@ -43,7 +44,10 @@ class TrajectoryOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorSummary:
-    """Statistics of an error, in the unit that the name of the field ends with."""
+    """Statistics of an error.
+
+    The name of the field that holds the statistics ends with the unit, for example ``ate_m``.
+    """
 
     rmse: float
     mean: float
@@ -53,7 +57,7 @@ class ErrorSummary:
 
     @classmethod
     def of(cls, errors: FloatArray) -> ErrorSummary:
-        """Return the statistics of errors (N,), N ≥ 1."""
+        """Return the statistics of N errors (N,); N must be at least 1."""
         return cls(
             rmse=float(np.sqrt(np.mean(errors**2))),
             mean=float(np.mean(errors)),
@@ -65,17 +69,18 @@ class ErrorSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraScore:
-    """Errors of one camera, or of all cameras together.
+    """Errors of one camera, or of all cameras together. Errors are None if there are no poses to compare.
 
     Attributes:
         frames: Number of frames of the video; None if unknown.
-        registered: Number of frames with a pose.
-        coverage: Ratio of `registered` to `frames`; None if unknown.
-        scored: Number of registered frames with a true pose.
-        ate_m: Absolute trajectory error: distance of camera centres after alignment, metres.
-        rotation_deg: Angle between orientations after alignment, degrees.
-        rpe_m: Relative pose error over `rpe_delta_s`: translation, metres.
-        rpe_deg: Relative pose error over `rpe_delta_s`: rotation, degrees.
+        registered: Number of frames with an estimated pose.
+        coverage: Fraction of the video's frames with an estimated pose; None if `frames` is unknown.
+        scored: Number of frames with an estimated pose and a true pose.
+        ate_m: Absolute trajectory error: distance (metres) between estimated and true camera centre after
+            alignment.
+        rotation_deg: Angle (degrees) between estimated and true orientation after alignment.
+        rpe_m: Translation part (metres) of the relative pose error over `rpe_delta_s`.
+        rpe_deg: Rotation part (degrees) of the relative pose error over `rpe_delta_s`.
     """
 
     frames: int | None
@@ -93,11 +98,11 @@ class TrajectoryReport:
     """Errors of the trajectories of a capture.
 
     Attributes:
-        options: How the trajectories were compared.
+        options: Options of the comparison.
         scale: Scale of the alignment (truth = scale · estimate).
-        cameras: Errors by camera name.
+        cameras: Errors of each camera, by camera name.
         total: Errors of all cameras together.
-        truth_from_estimate: The alignment.
+        truth_from_estimate: The alignment that maps estimated positions to true positions.
     """
 
     options: TrajectoryOptions
@@ -122,13 +127,14 @@ def evaluate_trajectories(
     options: TrajectoryOptions | None = None,
     frames: Mapping[str, int] | None = None,
 ) -> TrajectoryReport:
-    """Compare estimated with true trajectories, given as TUM files.
+    """Compare estimated trajectories with true trajectories, given as TUM files.
 
     Args:
-        estimates: By camera, the file of estimated poses world_from_camera, in one gauge for all cameras.
-        truths: By camera, the file of true poses. Every estimated camera needs one.
-        options: How the trajectories are compared.
-        frames: By camera, the number of frames of its video, for the coverage.
+        estimates: Files of estimated poses world_from_camera in one gauge for all cameras, by camera name.
+        truths: Files of true poses world_from_camera, by camera name. Every camera in `estimates` needs a
+            file.
+        options: Options of the comparison.
+        frames: Number of frames of each camera's video, by camera name, for the coverage.
 
     Raises:
         JobError: A file is missing or malformed, or too few poses have a true pose.
@@ -146,10 +152,10 @@ class _MatchedPoses:
     """The N estimated poses of one camera that have a true pose.
 
     Attributes:
-        times_ns: (N,) times.
+        times_ns: (N,) times of the poses, nanoseconds.
         estimate: (N,4,4) estimated poses.
         truth: (N,4,4) true poses.
-        registered: Number of all estimated poses, also of those without a true pose.
+        registered: Number of all estimated poses, including estimated poses without a true pose.
     """
 
     times_ns: IntArray
@@ -164,7 +170,9 @@ def score_trajectories(
     options: TrajectoryOptions | None = None,
     frames: Mapping[str, int] | None = None,
 ) -> TrajectoryReport:
-    """Compare estimated with true poses; see `evaluate_trajectories`.
+    """Compare estimated poses with true poses.
+
+    The arguments are the same as in `evaluate_trajectories`, with poses instead of files.
 
     Source: S. Umeyama, PAMI 1991 (alignment); J. Sturm et al., "A benchmark for the evaluation of RGB-D
         SLAM systems", IROS 2012 (ATE and RPE).
@@ -207,14 +215,14 @@ def score_trajectories(
 def truth_at(
     truth: TimedPoses, times_ns: IntArray, options: TrajectoryOptions
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the true poses (N,4,4) at given times (N,), and a mask (N,) of the times with truth."""
+    """Return true poses (N,4,4) at given times (N,), and a mask (N,) that is True at times with truth."""
     if options.association == "nearest":
         return nearest_truth(truth, times_ns, options.max_diff_s)
     return interpolate_truth(truth, times_ns, options.max_gap_s)
 
 
 def _match_poses(estimate: TimedPoses, truth: TimedPoses, options: TrajectoryOptions) -> _MatchedPoses:
-    """Return the estimated poses of one camera that have a true pose."""
+    """Associate the estimated poses of one camera with true poses."""
     poses, found = truth_at(truth, estimate.times_ns, options)
     return _MatchedPoses(
         times_ns=estimate.times_ns[found],
@@ -225,7 +233,7 @@ def _match_poses(estimate: TimedPoses, truth: TimedPoses, options: TrajectoryOpt
 
 
 def _truth_from_estimate(pairs: Mapping[str, _MatchedPoses], align: Alignment) -> Similarity:
-    """Return the alignment truth_from_estimate that fits the centres of all cameras best."""
+    """Return the alignment truth_from_estimate that fits the camera centres of all cameras best."""
     if align == "none":
         return Similarity(1.0, np.eye(3), np.zeros(3))
     estimate = np.concatenate([pair.estimate[:, :3, 3] for pair in pairs.values()])
@@ -240,7 +248,12 @@ def _truth_from_estimate(pairs: Mapping[str, _MatchedPoses], align: Alignment) -
 
 
 def _pose_errors(pair: _MatchedPoses, alignment: Similarity, delta_s: float) -> tuple[FloatArray, ...]:
-    """Return the errors of centres (m) and orientations (deg), then the relative errors of both."""
+    """Return the errors of one camera's poses.
+
+    Returns:
+        (N,) errors of the camera centres, metres; (N,) errors of the orientations, degrees; (M,) relative
+        errors of the translation, metres; (M,) relative errors of the rotation, degrees.
+    """
     aligned = alignment.apply_to_poses(pair.estimate)
     centres = np.linalg.norm(aligned[:, :3, 3] - pair.truth[:, :3, 3], axis=1)
     difference = invert(pair.truth) @ aligned
@@ -254,7 +267,10 @@ def _pose_errors(pair: _MatchedPoses, alignment: Similarity, delta_s: float) -> 
 
 
 def _pairs_at_interval(times_ns: IntArray, delta_s: float) -> tuple[IntArray, IntArray]:
-    """Return the indices of pairs of poses whose times differ by `delta_s`, up to half a frame interval."""
+    """Return the indices of the first and the second pose of pairs with a time difference of `delta_s`.
+
+    The time difference may deviate from `delta_s` by half a frame interval.
+    """
     if len(times_ns) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     target_ns = times_ns + round(delta_s * 1e9)
@@ -267,7 +283,14 @@ def _pairs_at_interval(times_ns: IntArray, delta_s: float) -> tuple[IntArray, In
 
 
 def _score(frames: int | None, registered: int, scored: int, errors: tuple[FloatArray, ...]) -> CameraScore:
-    """Return the score of one camera; `errors` are those that `_pose_errors` returns."""
+    """Return the score of one camera, or of all cameras together.
+
+    Args:
+        frames: Number of frames of the video; None if unknown.
+        registered: Number of frames with an estimated pose.
+        scored: Number of frames with an estimated pose and a true pose.
+        errors: The errors in the form that `_pose_errors` returns.
+    """
     ate, rotation, rpe_m, rpe_deg = (ErrorSummary.of(part) if len(part) else None for part in errors)
     return CameraScore(
         frames=frames,

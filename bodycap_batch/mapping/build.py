@@ -53,19 +53,21 @@ def build_map(
 ) -> MapResult:
     """Reconstruct the room and the keyframe poses by incremental structure from motion.
 
-    If the map contradicts a given calibration, it is built again with refined intrinsics.
+    If the map contradicts a given calibration, the map is built again with refined intrinsics.
 
     Args:
         capture: All cameras.
         selections: Keyframes of each camera.
         options: The stage's options.
-        context: Work folder (it holds the database and the models afterwards), threads, progress.
-        reach: Smallest and largest distance of two cameras on the body; None: distances are not checked.
-        skeletal_above: Number of keyframes above which the map is built from skeletal keyframes. The other
-            keyframes are resected.
+        context: Work folder, threads, progress. The database and the models are written to the work folder.
+        reach: Minimum and maximum distance (metres) between the two cameras of each pair on the body; None:
+            the distances are not checked.
+        skeletal_above: Maximum number of keyframes of a map that is built from all keyframes at once. A
+            larger map is built from skeletal keyframes (the reduced set of keyframes, Snavely's skeletal
+            set), and the other keyframes are resected.
 
     Returns:
-        The models, largest first, each in its own gauge.
+        The models, largest first, each in a separate gauge.
 
     Raises:
         EstimationError: No initial pair succeeded, too few keyframes were registered, or the matches
@@ -93,13 +95,13 @@ def build_map_once(
     reach: Reach | None,
     skeletal_above: int,
 ) -> tuple[MapResult, EstimationError | None]:
-    """Build a map with the capture's intrinsics: constant if calibrated, else refined.
+    """Build a map with the capture's intrinsics: calibrated intrinsics stay constant, others are refined.
 
-    The arguments are those of `build_map`.
+    The arguments are the same as in `build_map`.
 
     Returns:
-        The map; an error if it holds too few keyframes or contradicts its matches, since other intrinsics may
-        give a usable map.
+        The map; an error if the map holds too few keyframes or contradicts its matches, else None. The error
+        is returned, not raised, because other intrinsics may give a usable map.
 
     Raises:
         EstimationError: No model was reconstructed.

@@ -9,11 +9,11 @@ from bodycap_batch.model.camera import Camera
 
 @dataclass(frozen=True, slots=True)
 class CameraIntrinsics:
-    """The intrinsics of one camera, and how far to trust them.
+    """The intrinsics of one camera, and whether they come from a calibration.
 
     Attributes:
         camera: Camera model and its parameters.
-        calibrated: True if the intrinsics come from a calibration; False if they are an estimate.
+        calibrated: True if the intrinsics come from a calibration; False if they are only a first estimate.
     """
 
     camera: Camera

@@ -1,4 +1,4 @@
-"""Stage 2 again, after registration: add keyframes to a map."""
+"""Add keyframes to a map. This repeats stage 2 after registration."""
 
 from __future__ import annotations
 
@@ -44,17 +44,19 @@ def extend_map(
     *,
     skeletal_above: int = SKELETAL_ABOVE,
 ) -> MapResult:
-    """Add keyframes to a map: existing poses stay while the new ones are registered, then all are adjusted.
+    """Add keyframes to a map: register the new keyframes while existing poses stay, then adjust all poses.
 
-    Keyframes that are misregistered afterwards are removed.
+    Keyframes that are misregistered after the registration are removed. In a large map, only the poses of
+    the new keyframes are adjusted.
 
     Args:
         capture: All cameras.
-        previous: The map so far; its workspace is copied, not changed.
-        extra_frames: Frame indices by camera: new keyframes, and old ones to be removed and registered again.
+        previous: The map so far. Its workspace is copied, not changed.
+        extra_frames: Frame indices by camera name. Frames that are not in the map are added as keyframes.
+            Frames that are keyframes of the map are removed from it and registered again.
         options: The stage's options.
         context: Work folder, threads, progress.
-        skeletal_above: Number of keyframes above which only new keyframes are adjusted.
+        skeletal_above: Maximum number of keyframes of a map that is not large (`MappingContext.is_large`).
 
     Returns:
         The extended models, each in a new gauge.
@@ -109,5 +111,5 @@ def extend_map(
 
 
 def _image_refs(frames: Mapping[str, IntArray]) -> list[ImageRef]:
-    """Return keyframes by camera, sorted by camera name."""
+    """Return one `ImageRef` for each frame index, sorted by camera name."""
     return [ImageRef(name, int(frame)) for name, indices in sorted(frames.items()) for frame in indices]

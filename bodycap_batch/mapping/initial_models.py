@@ -1,4 +1,4 @@
-"""Reconstruct the first models: from the best initial pairs, with camera models that fit the pictures."""
+"""Reconstruct the first models from the best initial pairs, with camera models that fit the images."""
 
 from __future__ import annotations
 
@@ -18,26 +18,28 @@ from bodycap_batch.mapping.reconstruction.initial_pair import (
 from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
 
 _INITIAL_PAIRS = 3
-"""Ranked pairs that are tried before COLMAP's own search, which verifies hundreds of pairs if few have its 16
-degrees between rays. The maps are as accurate. Evidence: docs/decisions/mapping.md."""
+"""Maximum number of ranked pairs that are tried before COLMAP's own search for an initial pair. COLMAP's
+search requires an angle of 16 degrees between rays, and verifies hundreds of pairs if few pairs have it. The
+maps have the same accuracy. Evidence: docs/decisions/mapping.md."""
 
 _LOGGED_CANDIDATES = 5
-"""Ranked pairs in the log, with the reasons against them, if the first attempt failed."""
+"""Maximum number of ranked pairs that are logged if the first attempt failed. Each is logged with the most
+likely reason why it fails."""
 
 
 def reconstruct_with_intrinsics(
     context: MappingContext, options: MapOptions, uncalibrated: Mapping[int, str], total: int
 ) -> tuple[list[Any], dict[str, Any]]:
-    """Reconstruct models; reconstruct them again if uncalibrated cameras need other intrinsics.
+    """Reconstruct models, and reconstruct them again if uncalibrated cameras need other camera models.
 
     Args:
         context: Workspace, intrinsics, mapper options.
         options: The stage's options.
-        uncalibrated: Names of the cameras with intrinsics to refine, by database id.
-        total: Number of keyframes.
+        uncalibrated: Names of the cameras whose intrinsics are refined, by database id.
+        total: Number of keyframes to reconstruct.
 
     Returns:
-        The models, largest first, and entries for the log.
+        The models, largest first; entries for the log.
     """
     models, log = _reconstruct_from_pairs(context, options, total)
     changed, decentred = dict[str, CameraIntrinsics](), None
@@ -57,7 +59,11 @@ def reconstruct_with_intrinsics(
 def _reconstruct_from_pairs(
     context: MappingContext, options: MapOptions, total: int
 ) -> tuple[list[Any], dict[str, Any]]:
-    """Return models from the user's pair or the best ranked pairs, and the result of each for the log."""
+    """Reconstruct models from the user's initial pair and the best ranked pairs.
+
+    Returns:
+        The models, largest first; entries for the log, with the result of each attempt.
+    """
     pairs, log = _initial_pairs(context, options)
     models, attempts = reconstruct(context.workspace, context.mapper_options(), context.stage, total, pairs)
     log["initial_pair_ladder"] = attempts
@@ -68,7 +74,10 @@ def _reconstruct_from_pairs(
 
 
 def _initial_pairs(context: MappingContext, options: MapOptions) -> tuple[list[InitialPair], dict[str, Any]]:
-    """Return the user's pair, if it is usable, then the best ranked pairs; the user's pair for the log."""
+    """Return the initial pairs to try, and entries for the log on the pair that the user names.
+
+    The user's pair comes first, if its two keyframes have verified matches. The best ranked pairs follow.
+    """
     ranking = rank_initial_pairs(context.workspace, context.intrinsics)
     ranked = [pair for pair in ranking[:_INITIAL_PAIRS] if pair.is_usable]
     if options.init_frames is None:

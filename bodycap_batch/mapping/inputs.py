@@ -23,7 +23,16 @@ def make_mapping_context(
     stage: StageContext,
     skeletal_above: int,
 ) -> MappingContext:
-    """Return the context of a mapping run over a workspace; see `MappingContext` for the arguments."""
+    """Return the context of a mapping run.
+
+    Args:
+        workspace: Folder of the database.
+        capture: All cameras.
+        options: The stage's options.
+        calibrated_ids: Database ids of the calibrated cameras.
+        stage: Threads, progress, cancellation.
+        skeletal_above: Maximum number of keyframes of a map that is not large (`MappingContext.is_large`).
+    """
     scale = threshold_scale(capture)
     return MappingContext(
         workspace=workspace,
@@ -37,20 +46,28 @@ def make_mapping_context(
 
 
 def common_times_ns(capture: Capture) -> dict[str, IntArray]:
-    """Return the common time of all frames by camera, in nanoseconds."""
+    """Return, by camera name, the common times of all its frames (N,), nanoseconds."""
     return {camera.name: camera.common_times_ns() for camera in capture.cameras}
 
 
 def intrinsics_of(capture: Capture) -> dict[str, CameraIntrinsics]:
-    """Return the intrinsics by camera name."""
+    """Return the intrinsics of each camera, by camera name."""
     return {item.name: CameraIntrinsics(item.camera, item.calibrated) for item in capture.cameras}
 
 
 def threshold_scale(capture: Capture) -> float:
-    """Return the factor on pixel thresholds: the one for the largest image of the capture."""
+    """Return the factor that multiplies pixel thresholds.
+
+    Each camera's image size gives a factor (`pixel_scale`). The largest factor is used for all cameras.
+    """
     return max(pixel_scale(item.camera.width_px, item.camera.height_px) for item in capture.cameras)
 
 
 def calibrated_camera_ids(capture: Capture, ids: Mapping[str, int]) -> list[int]:
-    """Return the database ids of the calibrated cameras, sorted; `ids` holds all ids by camera name."""
+    """Return the sorted database ids of the calibrated cameras.
+
+    Args:
+        capture: All cameras.
+        ids: Database ids of all cameras in the database, by camera name.
+    """
     return sorted(number for name, number in ids.items() if capture.camera(name).calibrated)

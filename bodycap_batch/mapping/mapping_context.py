@@ -1,4 +1,4 @@
-"""What the steps of one mapping run share: workspace, camera intrinsics, mapper options."""
+"""The data that all steps of one mapping run share: workspace, camera intrinsics, mapper options."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MappingContext:
-    """What the steps of one mapping run share.
+    """The data that all steps of one mapping run share.
 
     Attributes:
         workspace: Folder of the database.
         intrinsics: Intrinsics by camera name.
-        mapper_options: Makes new options of COLMAP's mapper; a caller may change what it gets.
-        calibrated_ids: Database ids of the calibrated cameras; their intrinsics stay constant.
+        mapper_options: Function that returns a new copy of the options of COLMAP's mapper. A caller may
+            change its copy.
+        calibrated_ids: Database ids of the calibrated cameras. The intrinsics of these cameras stay constant.
         stage: Threads, progress, cancellation.
-        frame_numbers: `CaptureCamera.frame_numbers` by camera name.
-        skeletal_above: Number of keyframes above which a map is large.
+        frame_numbers: `CaptureCamera.frame_numbers` of each camera, by camera name.
+        skeletal_above: Maximum number of keyframes of a map that is not large (`is_large`).
     """
 
     workspace: Path
@@ -36,8 +37,9 @@ class MappingContext:
     skeletal_above: int = SKELETAL_ABOVE
 
     def is_large(self, keyframes: int) -> bool:
-        """Return whether a map of so many keyframes is too large for repeated global adjustments.
+        """Return whether a map of `keyframes` keyframes is too large for repeated global adjustments.
 
-        A large map is built from its skeletal keyframes. New keyframes are adjusted alone.
+        A large map is built from skeletal keyframes (the reduced set of keyframes, Snavely's skeletal set).
+        If keyframes are added to a large map, only the new keyframes are adjusted.
         """
         return keyframes > self.skeletal_above

@@ -1,4 +1,4 @@
-"""Stage 2 again, after registration: correct a map for rolling shutters."""
+"""Correct a map for rolling shutters. This repeats a part of stage 2 after registration."""
 
 from __future__ import annotations
 
@@ -34,28 +34,30 @@ def refine_map(
     *,
     skeletal_above: int = SKELETAL_ABOVE,
 ) -> MapResult:
-    """Correct a map for rolling shutters, with the motion that registration found.
+    """Correct a map for rolling shutters, with the camera motion that registration estimated.
 
-    Keypoints are moved to the instant of their image's middle row, with the velocity given by the poses of
-    neighbouring frames. Then all is adjusted once. A readout time that is not stated is estimated from the
-    keyframes. The result's observations are as detected; `Map.readout_s` says how to move them.
+    Each keypoint is moved to its position at the instant of the image's middle row. The keypoint's velocity
+    follows from the poses of neighbouring frames. Then each model is adjusted. Readout times that are not
+    given in the job are estimated from the keyframes. The observations in the result are at their detected
+    positions; `Map.readout_s` holds the readout times for the same correction.
 
     Args:
         capture: All cameras.
-        previous: The map so far; its workspace is copied, not changed.
-        trajectories: Poses of every frame in one of the previous map's gauges, by camera.
+        previous: The map so far. Its workspace is copied, not changed.
+        trajectories: Trajectories of the cameras, each in the gauge of one of the previous models.
         options: The stage's options.
-        context: Work folder.
-        skeletal_above: Number of keyframes above which a model is adjusted in two steps.
+        context: Work folder, progress, cancellation.
+        skeletal_above: Maximum number of keyframes of a model that is adjusted in one step. A larger model
+            is adjusted in two steps (`adjust_in_two_steps`).
 
     Returns:
-        The corrected models, each in a new gauge; models without a rolling shutter unchanged.
+        The corrected models, each in a new gauge. Models without a rolling shutter are unchanged.
 
     Raises:
         EstimationError: The adjustment failed.
 
-    Source: Hedborg et al., "Rolling shutter bundle adjustment", CVPR 2012, for the idea; velocities come
-        from the neighbouring frames instead of additional unknowns.
+    Source: Hedborg et al., "Rolling shutter bundle adjustment", CVPR 2012, for the idea. Here the velocities
+        come from the poses of neighbouring frames; they are not additional unknowns.
     """
     capture = with_map_intrinsics(capture, previous)
     workspace = context.work_dir / "workspace"

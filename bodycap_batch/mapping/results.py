@@ -1,4 +1,4 @@
-"""Finish models with a last adjustment, and make the stage's result."""
+"""Finish models with a last adjustment, and create the stage's result."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from bodycap_batch.model.scene import MapResult
 def finalise_models(
     models: Sequence[Any], context: MappingContext, capture: Capture, resected: Sequence[set[int] | None]
 ) -> int:
-    """Remove transient points from models, in place, and adjust the models robustly.
+    """Remove transient points from models and adjust the models robustly, in place.
 
     Args:
-        models: Reconstructions.
+        models: Reconstructions, changed in place.
         context: Workspace, mapper options.
         capture: All cameras.
-        resected: Of each model, the images that were resected after the last robust adjustment. Only these
-            are adjusted; None: all are.
+        resected: For each model, the ids of the images that were resected after the last robust adjustment
+            of the model. Only these images are adjusted. If it is None, all images are adjusted.
 
     Returns:
-        Number of points removed.
+        Number of points removed from all models.
     """
     times_ns = common_times_ns(capture)
     total = 0
@@ -43,7 +43,7 @@ def finalise_models(
 
 
 def make_result(models: Sequence[Any], workspace: Path, log: dict[str, Any]) -> MapResult:
-    """Return the stage's result, with the size and mean reprojection error of each model in its log."""
+    """Return the stage's result; add the size and mean reprojection error of each model to the log."""
     maps = tuple(map_from_reconstruction(model, workspace) for model in models)
     log = {
         **log,

@@ -1,1 +1,1 @@
-"""Camera intrinsics and shutter readout times: check them against the map and refine them."""
+"""Check camera intrinsics and shutter readout times against the map, and refine them."""

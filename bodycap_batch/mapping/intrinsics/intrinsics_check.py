@@ -19,46 +19,49 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MAX_KEYFRAMES = 40
-"""Keyframes of the model that the checks adjust, evenly spaced. Evidence: none."""
+"""Maximum number of keyframes in the adjustments of the checks. They are evenly spaced in the model.
+Evidence: none."""
 _ITERATIONS = 40
-"""Iterations of such an adjustment at most. Evidence: none."""
+"""Maximum number of iterations of an adjustment in a check. Evidence: none."""
 _MIN_KEYFRAMES = 10
-"""Keyframes that a check needs. Evidence: none."""
+"""Minimum number of keyframes for a check. Evidence: none."""
 _TOLERANCE = 1e-4
-"""Relative change of the cost that ends such an adjustment. Evidence: none."""
+"""Relative change of the cost at which an adjustment in a check ends. Evidence: none."""
 _LOSS_PX = 1.0
-"""Width of the Cauchy loss of such an adjustment, px. Evidence: none."""
+"""Width (px) of the Cauchy loss of an adjustment in a check. Evidence: none."""
 _MAX_FOCAL_CHANGE = 0.06
-"""Relative change of the focal length above which a given calibration is a misfit.
-Evidence: docs/decisions/mapping.md."""
+"""Maximum relative change of the focal length that a check may find. After a larger change, the given
+calibration is a misfit: it does not fit the images. Evidence: docs/decisions/mapping.md."""
 _MAX_CENTRE_CHANGE = 0.03
-"""The same for the principal point, as a ratio of the image's long side. Evidence:
-docs/decisions/mapping.md."""
+"""Maximum change of the principal point that a check may find, as a fraction of the image's long side. After
+a larger change, the given calibration is a misfit. Evidence: docs/decisions/mapping.md."""
 _MIN_REDUCTION_MISFIT = 0.05
-"""Relative reduction of the cost that free focal lengths and centres must give for a misfit.
-Evidence: docs/decisions/mapping.md."""
+"""Minimum relative reduction of the cost by free focal lengths and principal points. After a smaller
+reduction, no calibration is a misfit. Evidence: docs/decisions/mapping.md."""
 _FISHEYE, _FISHEYE_TWO_TERMS = "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"
-"""The fisheye candidate, and the same with a second radial term. The second term is tried only if the first
-model was selected. Evidence: docs/decisions/mapping.md."""
+"""The fisheye model with one radial term, and the fisheye model with two radial terms. The model with two
+terms is tried only if the model with one term was selected. Evidence: docs/decisions/mapping.md."""
 _CANDIDATES = ("RADIAL", _FISHEYE)
-"""Camera models that are tried for uncalibrated cameras instead of one radial term."""
+"""Camera models that are tried for uncalibrated cameras instead of the model with one radial term."""
 _MIN_REDUCTION_MODEL = 0.15
-"""Relative reduction of the cost that another camera model must give. Evidence: docs/decisions/mapping.md."""
+"""Minimum relative reduction of the cost by another camera model. After a smaller reduction, the camera model
+is not changed. Evidence: docs/decisions/mapping.md."""
 _PRINCIPAL_POINT, _PIXEL_ASPECT = "decentred", "stretched"
-"""Two more candidates: a free principal point, for a cropped picture, and a focal length for each axis, for
-pixels that are not square."""
+"""Names of two more candidates. "decentred" has a free principal point, for cropped images. "stretched" has a
+separate focal length for each axis, for pixels that are not square."""
 _MIN_ASPECT_CHANGE = 0.02
-"""Relative difference of two focal lengths above which pixels are not square. The model with two focal
-lengths also has tangential distortion, so a lower cost alone is no evidence. Evidence:
-docs/decisions/mapping.md."""
+"""Minimum relative difference of the two focal lengths of a camera with pixels that are not square. The model
+with two focal lengths also has tangential distortion, so a lower cost is not sufficient evidence.
+Evidence: docs/decisions/mapping.md."""
 _OBSERVATIONS_PER_PARAMETER = 10
-"""Observations of a camera for each of its parameters, at least, to decide on its pixel aspect. Evidence:
-none."""
+"""Minimum number of observations of a camera, for each parameter of its model, that determine the aspect of
+its pixels. Evidence: none."""
 _MIN_REDUCTION_CENTRE = 0.05
-"""Relative reduction of the cost that a free principal point must give. Evidence:
-docs/decisions/mapping.md."""
+"""Minimum relative reduction of the cost by a free principal point. After a smaller reduction, the principal
+point stays in the image's centre. Evidence: docs/decisions/mapping.md."""
 _MIN_REDUCTION_RECENTRED = 0.005
-"""The same for a principal point that was moved before: a second map shows its position better.
+"""Minimum relative reduction of the cost by a principal point that is refined a second time. It is smaller
+than the first threshold because the second map determines the principal point better.
 Evidence: docs/decisions/mapping.md."""
 _TANGENT_CUBIC = 1.0 / 3.0
 """Cubic coefficient of the tangent's Taylor series."""
@@ -67,19 +70,19 @@ _TANGENT_CUBIC = 1.0 / 3.0
 def find_misfit_intrinsics(
     model: Any, settings: pycolmap.IncrementalPipelineOptions, calibrated: Mapping[int, str]
 ) -> dict[str, float]:
-    """Return the calibrated cameras whose given intrinsics the map contradicts.
+    """Find the calibrated cameras whose given intrinsics contradict the map.
 
-    A part of the map is adjusted twice: with the intrinsics held constant, and with free focal lengths and
-    principal points.
+    A part of the map is adjusted twice: with constant intrinsics, and with free focal lengths and principal
+    points.
 
     Args:
         model: The reconstruction; not changed.
         settings: The mapper's options.
-        calibrated: Names of the calibrated cameras by id.
+        calibrated: Names of the calibrated cameras by database id.
 
     Returns:
-        By camera name, the ratio of the focal length that fits to the given one. Only cameras are named of
-        which the focal length or the principal point changes much.
+        Ratio of the focal length that fits the map to the given focal length, by camera name. Only cameras
+        with a large change of the focal length or of the principal point are included.
 
     Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999.
     """
@@ -105,7 +108,7 @@ def find_misfit_intrinsics(
 
 
 def _principal_point_distance(one: Any, other: Any) -> float:
-    """Return the distance of two principal points of the same picture, as a ratio of its long side."""
+    """Return the distance between two principal points, as a fraction of the image's long side."""
     offset = np.subtract(
         [one.principal_point_x, one.principal_point_y], [other.principal_point_x, other.principal_point_y]
     )
@@ -115,20 +118,20 @@ def _principal_point_distance(one: Any, other: Any) -> float:
 def select_camera_models(
     model: Any, settings: pycolmap.IncrementalPipelineOptions, uncalibrated: Collection[int]
 ) -> tuple[dict[int, pycolmap.Camera], frozenset[int]]:
-    """Select camera models that explain the pictures of uncalibrated cameras much better.
+    """Select camera models that explain the images of uncalibrated cameras much better.
 
-    The current model has one radial term and a centred principal point. A part of the map is adjusted with
-    each candidate in turn, for all uncalibrated cameras at once: another distortion model, then a free
-    principal point, then pixels that are not square.
+    The current camera model has one radial term and a centred principal point. A part of the map is adjusted
+    with each candidate, for all uncalibrated cameras at once. The candidates are first other distortion
+    models, then a free principal point, then pixels that are not square.
 
     Args:
         model: The reconstruction; not changed.
         settings: The mapper's options.
-        uncalibrated: Ids of the uncalibrated cameras.
+        uncalibrated: Database ids of the uncalibrated cameras.
 
     Returns:
-        Adjusted cameras by id, for those that need another model or centre; the ids of those whose principal
-        point moved.
+        Adjusted intrinsics by camera id, for the cameras that need another camera model or principal point;
+        the ids of the cameras whose principal point moved.
     """
     import pycolmap
 
@@ -145,7 +148,8 @@ def select_camera_models(
         centre = name == _PRINCIPAL_POINT
         if name == _FISHEYE_TWO_TERMS and chosen.camera(numbers[0]).model_name != _FISHEYE:
             continue
-        # All cameras change at once: one wrong camera bends the map, and no other one fits a bent map.
+        # The models of all cameras change at once. If one camera had a wrong model, the map would be
+        # deformed, and the correct models of the other cameras would not fit the deformed map.
         trial = copy.deepcopy(plain if name in _CANDIDATES else chosen)
         for number in numbers:
             _change_model(trial.camera(number), name)
@@ -163,7 +167,7 @@ def select_camera_models(
 
 
 def _has_unequal_focal_lengths(part: Any, number: int) -> bool:
-    """Return whether a camera's two focal lengths differ and enough keypoints determine them."""
+    """Return whether the two focal lengths of a camera differ and are determined by enough observations."""
     camera = part.camera(number)
     images = (image for image in map(part.image, part.reg_image_ids()) if image.camera_id == number)
     observations = sum(int(image.num_points3D) for image in images)
@@ -175,18 +179,18 @@ def _has_unequal_focal_lengths(part: Any, number: int) -> bool:
 def refine_principal_points(
     model: Any, settings: pycolmap.IncrementalPipelineOptions, decentred: Collection[int]
 ) -> dict[int, pycolmap.Camera]:
-    """Refine principal points again, with a map that was built with their first estimates.
+    """Refine principal points a second time, in a map that was built with their first estimates.
 
-    The points of the first map fit its wrong principal points and hold the estimates back.
-    Evidence: docs/decisions/mapping.md.
+    The first estimates come from a map with wrong principal points. The points of that map fit the wrong
+    principal points, so the first estimates move by too little. Evidence: docs/decisions/mapping.md.
 
     Args:
-        model: The reconstruction; not changed.
+        model: The reconstruction that was built with the first estimates; not changed.
         settings: The mapper's options.
-        decentred: Ids of the cameras whose principal point moved (`select_camera_models`).
+        decentred: Database ids of the cameras whose principal point moved (`select_camera_models`).
 
     Returns:
-        Adjusted cameras by id, if the cost falls enough.
+        Adjusted intrinsics by camera id; empty if the reduction of the cost is too small.
     """
     import pycolmap
 
@@ -211,18 +215,20 @@ def update_camera_models(
     uncalibrated: Mapping[int, str],
     decentred: Collection[int] | None = None,
 ) -> tuple[dict[str, CameraIntrinsics], Collection[int]]:
-    """Write better intrinsics of uncalibrated cameras into the database.
+    """Find better intrinsics for uncalibrated cameras and write them to the database.
+
+    The first call selects camera models. The second call only refines principal points, in models that were
+    built with the intrinsics that the first call wrote.
 
     Args:
         workspace: Folder of the database.
         models: Reconstructions, the most reliable first; not changed.
         settings: The mapper's options.
-        uncalibrated: Names of the uncalibrated cameras by id.
-        decentred: None at first. Afterwards the ids that an earlier call returned, with models that were
-            built with what it wrote; then only their principal points are refined.
+        uncalibrated: Names of the uncalibrated cameras by database id.
+        decentred: None in the first call. In the second call, the camera ids that the first call returned.
 
     Returns:
-        By camera name, the intrinsics that were written; the ids of the cameras whose principal point moved.
+        The intrinsics that were written, by camera name; the ids of the cameras whose principal point moved.
     """
     import pycolmap
 
@@ -234,7 +240,7 @@ def update_camera_models(
     if cameras:
         with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
             for camera in cameras.values():
-                # COLMAP seeks no initial pair among fisheye cameras without a prior focal length.
+                # COLMAP searches an initial pair only among fisheye cameras with a prior focal length.
                 camera.has_prior_focal_length = True
                 database.update_camera(camera)
     written = {
@@ -245,7 +251,12 @@ def update_camera_models(
 
 
 def _change_model(camera: Any, name: str) -> None:
-    """Change a camera with one focal length to a candidate model that agrees near the image's middle."""
+    """Change the model of a camera in place; the projection near the image's centre stays the same.
+
+    Args:
+        camera: A camera whose model has one focal length.
+        name: The candidate: a camera model, `_PRINCIPAL_POINT` or `_PIXEL_ASPECT`.
+    """
     import pycolmap
 
     if name == _PRINCIPAL_POINT:
@@ -258,7 +269,8 @@ def _change_model(camera: Any, name: str) -> None:
         return
     cubic = radial[0] if radial else 0.0
     if camera.model_name.endswith("FISHEYE") != name.endswith("FISHEYE"):
-        # tan θ = θ + θ³/3 + …: no distortion of a pinhole model is a cubic term of 1/3 in a fisheye model.
+        # tan θ = θ + θ³/3 + …: a pinhole model without distortion corresponds to a fisheye model with a
+        # cubic term of 1/3.
         cubic += _TANGENT_CUBIC if name.endswith("FISHEYE") else -_TANGENT_CUBIC
     extra = [cubic, 0.0] if name.startswith("RADIAL") else [cubic]
     camera.model = getattr(pycolmap.CameraModelId, name)
@@ -266,12 +278,12 @@ def _change_model(camera: Any, name: str) -> None:
 
 
 def misfit_note(camera: str, factor: float, *, freed: bool = False) -> str:
-    """Return the note for the user on a misfit: its likely cause and what to do.
+    """Return the note for the user on a calibration that does not fit the map: likely cause and remedy.
 
     Args:
         camera: Camera name.
-        factor: Focal length that fits, relative to the given one.
-        freed: True if the fitting intrinsics were used instead of the given ones.
+        factor: Ratio of the focal length that fits the map to the given focal length.
+        freed: True if refined intrinsics were used instead of the given intrinsics.
     """
     instead = "; what fits was used instead" if freed else ""
     if abs(factor - 1.0) > _MAX_FOCAL_CHANGE:
@@ -281,7 +293,7 @@ def misfit_note(camera: str, factor: float, *, freed: bool = False) -> str:
             "stabilisation or digital zoom on, or another lens mode or size calibrated? Film with these off"
         )
     else:
-        # Refined intrinsics include distortion; otherwise the check frees the principal point alone.
+        # Refined intrinsics may also have another distortion. The check does not refine the distortion.
         fits = "another centre or distortion than" if freed else "a centre that lies elsewhere than where"
         cause = "the picture cropped, or another lens mode or size calibrated? Film the whole picture"
     return (
@@ -305,15 +317,18 @@ def _adjustment_cost(
     centre: bool = False,
     constant: Collection[int] = (),
 ) -> float | None:
-    """Adjust a model with free or constant intrinsics and return the final cost; None if that fails.
+    """Adjust a model with free or constant intrinsics.
 
     Args:
-        part: The model; it is changed.
+        part: The model to adjust, changed in place.
         settings: The mapper's options.
         free: Whether focal lengths are free.
-        distortion: Whether distortion is free.
+        distortion: Whether distortion parameters are free.
         centre: Whether principal points are free.
-        constant: Ids of cameras whose intrinsics stay constant in any case.
+        constant: Database ids of the cameras whose intrinsics are constant in any case.
+
+    Returns:
+        The final cost; None if the adjustment failed.
     """
     import pycolmap
 

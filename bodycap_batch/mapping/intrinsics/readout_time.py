@@ -23,25 +23,29 @@ if TYPE_CHECKING:
     import pycolmap
 
 _TRIAL_STEP_S = 0.01
-"""First step of the readout time, and the largest step, seconds. Evidence: none."""
+"""First step and maximum step (seconds) in the search for the readout time. Evidence: none."""
 _TRIAL_ITERATIONS = 40
-"""Iterations of a trial adjustment at most. Evidence: none."""
+"""Maximum number of iterations of a trial adjustment. Evidence: none."""
 _TRIAL_KEYFRAMES = 24
-"""Successive keyframes of each camera that trial adjustments use: those that move most. Evidence: none."""
+"""Maximum number of keyframes of each camera in a trial adjustment. The successive keyframes with the largest
+motion are used. Evidence: none."""
 _MAX_TRIALS = 4
-"""Trial values at most. Evidence: none."""
+"""Maximum number of trial values of the readout time after 0. Evidence: none."""
 _CONVERGED_S = 0.001
-"""Step of the readout time below which the search ends, seconds. Evidence: none."""
+"""Step of the readout time (seconds). The search ends once the next step of every camera is smaller.
+Evidence: none."""
 _MAX_READOUT_FRAMES = 1.1
-"""Largest readout time in frame intervals. The true limit is 1; the rest is for its uncertainty."""
+"""Maximum estimated readout time, in frame intervals. The physical limit is 1; the rest is a margin for the
+uncertainty of the estimate."""
 _MIN_READOUT_S = 0.002
-"""Readout time below which a shutter counts as global, seconds. Evidence: none."""
+"""Minimum readout time (seconds) of a rolling shutter. A shutter with a smaller estimate is treated as
+global. Evidence: none."""
 _MIN_SIGMAS = 5.0
-"""Standard deviations by which an estimate must differ from zero. Evidence: none."""
+"""Minimum ratio of an estimated readout time to its standard deviation. Evidence: none."""
 _LOSS_PX = 1.0
-"""Width of the robust weight of a residual, px. Evidence: none."""
+"""Width (px) of the robust weight function of a residual. Evidence: none."""
 _MAX_RESIDUAL_PX = 8.0
-"""Residual above which an observation is ignored, px. Evidence: none."""
+"""Maximum residual (px) of an observation that is used. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +53,13 @@ class Readout:
     """A camera's readout time.
 
     Attributes:
-        seconds: Time from the first row's exposure to the last row's; 0 for a global shutter.
-        sigma_s: Standard deviation; 0 if the time was stated.
-        source: "stated", "estimated", "none found", or why it could not be determined.
-        best_s: Readout time with the smallest residuals, even if it is not significant.
-        sideways: True if the sensor's rows are the picture's columns.
+        seconds: Time (seconds) from the exposure of the sensor's first row to the exposure of the last row;
+            0 for a global shutter.
+        sigma_s: Standard deviation of the readout time, seconds; 0 if the time is given in the job.
+        source: "stated" (given in the job), "estimated", "none found", or the reason why the time could not
+            be determined.
+        best_s: Readout time (seconds) with the smallest residuals, even if it is not significant.
+        sideways: True if the sensor's rows are columns of the image.
     """
 
     seconds: float
@@ -64,7 +70,7 @@ class Readout:
 
     @property
     def significance(self) -> float:
-        """Readout time in standard deviations; 0 if none was found."""
+        """Ratio of the readout time to its standard deviation; 0 if no readout time was found."""
         return abs(self.seconds) / self.sigma_s if self.sigma_s else 0.0
 
 
@@ -73,11 +79,11 @@ class _Keypoints:
     """The observations of one keyframe.
 
     Attributes:
-        image_id: Id of its image in the model.
-        camera: Name of its camera.
-        feature: (N,) indices of features in the image.
-        px: (N,2) as detected, px.
-        velocity: (N,2) px/s.
+        image_id: Id of the keyframe's image in the model.
+        camera: Name of the keyframe's camera.
+        feature: (N,) indices of the features that observe a point of the model.
+        px: (N,2) detected positions of these features, px.
+        velocity: (N,2) velocities of these features in the image, px/s.
     """
 
     image_id: int
@@ -88,12 +94,12 @@ class _Keypoints:
 
 
 class RollingShutterModel:
-    """A model whose keypoints can be moved to where they are at the instant of the middle row.
+    """A model whose keypoints can be moved to their positions at the instant of the image's middle row.
 
     Args:
         model: COLMAP's reconstruction; not changed.
-        trajectories: Poses of every frame in the model's gauge, by camera. Keypoints of a camera without a
-            trajectory stay; its frames were registered against another map.
+        trajectories: Trajectories in the model's gauge, by camera name. A camera without a trajectory was
+            registered against another model; its keypoints are not moved.
         cameras: The capture's cameras by name.
     """
 
@@ -117,17 +123,22 @@ class RollingShutterModel:
         ]
 
     def corrected(self, readout_s: Mapping[str, float]) -> pycolmap.Reconstruction:
-        """Return a copy of the model with all keypoints at the instant of the middle row."""
+        """Return a copy of the model with all keypoints at their positions at the middle row's instant.
+
+        Args:
+            readout_s: Readout time (seconds) of each camera, by camera name.
+        """
         out = copy.deepcopy(self._model)
         self.move_keypoints(out, readout_s)
         return out
 
     def move_keypoints(self, model: pycolmap.Reconstruction, readout_s: Mapping[str, float]) -> None:
-        """Move the keypoints of a copy of the model, in place.
+        """Move the keypoints of a copy of the model to their positions at the middle row's instant, in place.
 
         Args:
-            model: The copy.
-            readout_s: Readout time by camera, seconds. With 0 the keypoints are where they were detected.
+            model: The copy of the model, changed in place.
+            readout_s: Readout time (seconds) of each camera, by camera name. With a readout time of 0, or
+                without a readout time, keypoints are at their detected positions.
         """
         for item in self._keypoints:
             px = px_at_mid_row(
@@ -138,7 +149,7 @@ class RollingShutterModel:
                 points[feature].xy = xy
 
     def most_dynamic_subset(self) -> RollingShutterModel:
-        """Return a model of the successive keyframes of each camera that move most, without all others."""
+        """Return a model with only the successive keyframes of each camera that have the largest motion."""
         kept: set[int] = set()
         for name in self._intrinsics:
             keyframes = [item for item in self._keypoints if item.camera == name]
@@ -155,7 +166,12 @@ class RollingShutterModel:
         return RollingShutterModel(part, self._trajectories, self._cameras).with_sideways(sideways)
 
     def with_sideways(self, sideways: Collection[str]) -> RollingShutterModel:
-        """Return the same model; only in these cameras are the sensor's rows the picture's columns."""
+        """Return a copy with changed row directions.
+
+        Args:
+            sideways: Names of the cameras in which the sensor's rows are columns of the image. In all other
+                cameras, the sensor's rows are rows of the image.
+        """
         out = copy.copy(self)
         out._intrinsics = {
             name: replace(camera, sideways=name in sideways) for name, camera in self._intrinsics.items()
@@ -165,14 +181,18 @@ class RollingShutterModel:
     def estimate(
         self, settings: pycolmap.IncrementalPipelineOptions, calibrated_ids: Sequence[int]
     ) -> dict[str, Readout]:
-        """Estimate readout times by camera, from adjustments of the map with a few trial values.
+        """Estimate the readout time of each camera, from adjustments of the map with a few trial values.
 
-        After poses and points are adjusted, the residuals are almost linear in the readout time. Their change
-        from one trial to the next gives the next step.
+        After an adjustment of poses and points, the residuals are almost a linear function of the readout
+        time. The change of the residuals from one trial value to the next gives the next step.
 
         Args:
             settings: The mapper's options.
-            calibrated_ids: Ids of the calibrated cameras.
+            calibrated_ids: Database ids of the calibrated cameras.
+
+        Returns:
+            Readout time of each camera with a trajectory, by camera name. Readout times that are given in the
+            job are returned unchanged.
 
         Raises:
             EstimationError: An adjustment failed.
@@ -212,7 +232,12 @@ class RollingShutterModel:
         return out
 
     def undetermined(self, reason: str) -> dict[str, Readout]:
-        """Return the stated readout times; those of other cameras are 0 and carry the reason."""
+        """Return a readout time for each camera, without an estimation.
+
+        Args:
+            reason: The reason why readout times could not be estimated. Cameras without a readout time in the
+                job get a readout time of 0 with this reason.
+        """
         out = {}
         for name in self._intrinsics:
             camera = self._cameras[name]
@@ -223,14 +248,14 @@ class RollingShutterModel:
         return out
 
     def _keypoints_of(self, image_id: int, trajectories: Mapping[str, Trajectory]) -> _Keypoints:
-        """Return the observations of one image, with their velocities."""
+        """Return the observations of one image, with the features' velocities."""
         image = self._model.image(image_id)
         ref = ImageRef.parse(image.name)
         feature = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
         px = np.array([image.points2D[index].xy for index in feature.tolist()]).reshape(-1, 2)
         x_in_map = self._points(image, feature)
         path = trajectories.get(ref.camera)
-        if path is None:  # Registered against another map: its motion in this gauge is unknown.
+        if path is None:  # The camera was registered against another model: its motion is unknown here.
             return _Keypoints(image_id, ref.camera, feature, px, np.zeros_like(px))
         velocity = image_velocity(
             self._intrinsics[ref.camera],
@@ -242,14 +267,17 @@ class RollingShutterModel:
         return _Keypoints(image_id, ref.camera, feature, px, velocity)
 
     def _points(self, image: Any, feature: IntArray) -> FloatArray:
-        """Return the points (N,3) that features of an image observe, in the map."""
+        """Return the map points (N,3), in map units, that features of an image observe."""
         points = image.points2D
         return np.array(
             [self._model.point3D(points[index].point3D_id).xyz for index in feature.tolist()]
         ).reshape(-1, 3)
 
     def _residuals(self, model: pycolmap.Reconstruction) -> dict[str, FloatArray]:
-        """Return observed minus projected pixels by camera, in the same order for every copy of the model."""
+        """Return the residuals (observed minus projected position, px) of each camera, by camera name.
+
+        The order of the residuals is the same for every copy of the model.
+        """
         out: dict[str, list[FloatArray]] = {name: [] for name in self._intrinsics}
         for item in self._keypoints:
             residuals = image_residuals_px(model, model.image(item.image_id), item.feature)
@@ -259,12 +287,13 @@ class RollingShutterModel:
 
 @dataclass(frozen=True, slots=True)
 class _ResidualSlope:
-    """How the residuals of an adjusted map change with the readout time.
+    """The change of the residuals of an adjusted map with the readout time, as a linear function.
 
     Attributes:
-        correlation: Weighted product of the residuals with their derivative by the readout time, px²/s.
-        information: Weighted square of the derivative, px²/s².
-        variance: Variance of the residuals about the line, px².
+        correlation: Weighted sum of products of each residual and its derivative with respect to the readout
+            time, px²/s.
+        information: Weighted sum of the squared derivatives, px²/s².
+        variance: Weighted variance of the residuals at the readout time with the smallest residuals, px².
     """
 
     correlation: float
@@ -273,15 +302,15 @@ class _ResidualSlope:
 
     @staticmethod
     def of(before: FloatArray, after: FloatArray, step_s: float) -> _ResidualSlope:
-        """Return the slope at the second of two adjustments.
+        """Return the slope of the residuals at the second of two adjustments.
 
         Args:
-            before: (N,) residuals of the first adjustment, px.
-            after: (N,) residuals of the second adjustment, px.
-            step_s: Difference of their readout times, seconds.
+            before: (N,) residuals after the first adjustment, px.
+            after: (N,) residuals after the second adjustment, px.
+            step_s: Difference (seconds) of the readout times: second adjustment minus first adjustment.
         """
         change = (after - before) / (step_s if step_s else np.inf)
-        # Points that an adjustment moves far away carry no information on the shutter.
+        # The residuals of points that an adjustment moved far away do not depend on the readout time.
         small = np.maximum(np.abs(after), np.abs(before)) < _MAX_RESIDUAL_PX
         weight = np.where(small, 1.0 / (1.0 + (after / _LOSS_PX) ** 2), 0.0)
         information = float((weight * change * change).sum())
@@ -291,10 +320,10 @@ class _ResidualSlope:
         return _ResidualSlope(correlation, information, variance)
 
     def readout(self, at_s: float, frame_s: float) -> Readout:
-        """Return the readout time with the smallest residuals, or 0 if it is not significant.
+        """Return the readout time with the smallest residuals, or 0 if that time is not significant.
 
         Args:
-            at_s: Readout time at which the slope was taken, seconds.
+            at_s: Readout time of the adjustment at which the slope was computed, seconds.
             frame_s: Frame interval, seconds.
         """
         if self.information <= 0.0:
@@ -311,18 +340,19 @@ def estimate_readouts(
     settings: pycolmap.IncrementalPipelineOptions,
     calibrated_ids: Sequence[int],
 ) -> tuple[RollingShutterModel, dict[str, Readout]]:
-    """Estimate readout times by camera, and whether the sensors' rows are the pictures' columns.
+    """Estimate the readout time of each camera, and whether the sensor's rows are columns of the image.
 
-    If a trial adjustment fails, only stated readout times are used, and the result gives the reason.
+    If a trial adjustment fails, only the readout times that are given in the job are used. The result then
+    gives the reason.
 
     Args:
         rolling: The model.
         cameras: The capture's cameras by name.
         settings: The mapper's options.
-        calibrated_ids: Ids of the calibrated cameras.
+        calibrated_ids: Database ids of the calibrated cameras.
 
     Returns:
-        The model with the row directions that fit best, and the readout times.
+        The model with the row directions that fit best; the readout times by camera name.
     """
     stated = {name for name, camera in cameras.items() if camera.camera.sideways}
     rolling = rolling.with_sideways(stated)
@@ -346,7 +376,7 @@ def estimate_readouts(
 
 
 def map_with_readouts(scene: Map, readouts: Mapping[str, Readout]) -> Map:
-    """Return a corrected map with the readout times and row directions it was corrected for."""
+    """Add the readout times and row directions to a map that was corrected with them."""
     nonzero = {name: readout for name, readout in readouts.items() if readout.seconds}
     cameras = {
         name: replace(camera, sideways=name in nonzero and nonzero[name].sideways)
@@ -358,5 +388,5 @@ def map_with_readouts(scene: Map, readouts: Mapping[str, Readout]) -> Map:
 
 
 def _stated_readout(readout_s: float) -> Readout:
-    """Return the readout time that the job states."""
+    """Return the readout time of a camera whose readout time is given in the job."""
     return Readout(readout_s, 0.0, "stated", readout_s)

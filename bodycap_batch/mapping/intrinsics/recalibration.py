@@ -1,4 +1,4 @@
-"""Build the map again with refined intrinsics if it contradicts the given calibration."""
+"""Build the map again with refined intrinsics if the first map contradicts the given calibration."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from bodycap_batch.model.map_diagnostics import RefinedIntrinsics
 from bodycap_batch.model.scene import Map, MapResult
 
 _MIN_KEYFRAME_RATIO = 0.95
-"""Ratio of a map's keyframes, in total and of each camera, that a better map must hold. Evidence: none."""
+"""Minimum ratio of the number of keyframes in a better map to their number in the first map. It applies to
+the total and to each camera. Evidence: none."""
 
 
 def recalibrate_if_misfit(
@@ -24,19 +25,22 @@ def recalibrate_if_misfit(
     build: Callable[[Capture], MapResult],
     refused: EstimationError | None = None,
 ) -> MapResult:
-    """Return the map with the misfit intrinsics refined if that is the better map, else the given map.
+    """Build the map again with refined intrinsics if the map contradicts the given intrinsics of a camera.
 
     Evidence: docs/decisions/mapping.md.
 
     Args:
-        result: The map with all calibrated intrinsics held constant. Its diagnostics name the cameras that
-            it contradicts.
+        result: The map that was built with constant calibrated intrinsics. Its diagnostics name the cameras
+            whose given intrinsics contradict the map (`misfit_factors`).
         capture: All cameras.
-        build: Builds a map of the capture with other intrinsics.
-        refused: Why that map cannot be used, if it cannot: wrong intrinsics may be the cause.
+        build: Function that builds a map of a capture with changed intrinsics.
+        refused: The reason why `result` is unusable; None if it is usable. Wrong intrinsics may be the cause.
+
+    Returns:
+        The new map if it is better than `result`, else `result`.
 
     Raises:
-        EstimationError: `refused`, if refined intrinsics give no better map.
+        EstimationError: `refused`, if it is given and there is no better map.
     """
     refined = _recalibrate(result, capture, build, usable=refused is None)
     if refused is not None and not refined.diagnostics.recalibrated:
@@ -47,7 +51,17 @@ def recalibrate_if_misfit(
 def _recalibrate(
     result: MapResult, capture: Capture, build: Callable[[Capture], MapResult], *, usable: bool
 ) -> MapResult:
-    """Return the map with refined intrinsics if it is better, else the given map; the log says which."""
+    """Return the map with refined intrinsics if it is better, else the given map.
+
+    The log of the returned map reports the decision.
+
+    Args:
+        result: The given map.
+        capture: All cameras.
+        build: Function that builds a map of a capture with changed intrinsics.
+        usable: Whether the given map is usable. If not, every new map that contains all cameras with
+            contradicted intrinsics is better.
+    """
     misfits = result.diagnostics.misfit_factors or {}
     if not misfits:
         return result
@@ -77,9 +91,9 @@ def _recalibrate(
 
 
 def with_map_intrinsics(capture: Capture, previous: MapResult) -> Capture:
-    """Return the capture with the intrinsics that an earlier map of it refined.
+    """Return the capture with the intrinsics that an earlier map of the same capture refined.
 
-    If a camera has no keyframes in that map any more, its intrinsics at the time of refinement are used.
+    A camera may have no keyframes left in the earlier map. Then the intrinsics from the diagnostics are used.
     """
     mapped = previous.maps[0].cameras
     cameras = {
@@ -90,12 +104,17 @@ def with_map_intrinsics(capture: Capture, previous: MapResult) -> Capture:
 
 
 def _with_intrinsics(camera: Camera, refined: RefinedIntrinsics) -> Camera:
-    """Return a camera with another model and parameters."""
+    """Return the camera with the refined camera model and its parameters."""
     return replace(camera, model=refined.model, params=np.array(refined.params))
 
 
 def with_intrinsics_to_refine(capture: Capture, cameras: Mapping[str, Camera]) -> Capture:
-    """Return the capture with other intrinsics of some cameras, as initial values that mapping refines."""
+    """Return the capture with new initial intrinsics for some cameras, to be refined in mapping.
+
+    Args:
+        capture: All cameras.
+        cameras: The new initial intrinsics, by camera name.
+    """
     return replace(
         capture,
         cameras=tuple(
@@ -108,14 +127,15 @@ def with_intrinsics_to_refine(capture: Capture, cameras: Mapping[str, Camera]) -
 
 
 def _initial_guess(camera: Camera, factor: float) -> Camera:
-    """Return initial intrinsics with the focal length that fits and without distortion.
+    """Return initial intrinsics with the focal length that fits the map, and with zero distortion.
 
-    The given distortion is not trusted either. A longer pinhole does not fit the pictures of a lens with
-    barrel distortion. Evidence: docs/decisions/mapping.md.
+    The distortion is estimated again too, so the model has one radial term. A pinhole model with a longer
+    focal length does not fit the images of a lens with barrel distortion.
+    Evidence: docs/decisions/mapping.md.
 
     Args:
         camera: The given intrinsics.
-        factor: Focal length that fits, relative to the given one.
+        factor: Ratio of the focal length that fits the map to the given focal length.
     """
     centre_x, centre_y = camera.principal_point_px
     params = np.array([factor * camera.focal_px, centre_x, centre_y, 0.0])
@@ -129,7 +149,11 @@ def _initial_guess(camera: Camera, factor: float) -> Camera:
 
 
 def _is_better_map(other: Map, one: Map) -> bool:
-    """Return whether `other` has hardly fewer keyframes of any camera and smaller residuals than `one`."""
+    """Return whether the map `other` is better than the map `one`.
+
+    A better map has a smaller mean reprojection error and almost as many keyframes, in total and of each
+    camera.
+    """
     counts, before = _count_keyframes(other), _count_keyframes(one)
     enough = sum(counts.values()) >= _MIN_KEYFRAME_RATIO * sum(before.values())
     enough_of_each = all(

@@ -1,4 +1,7 @@
-"""COLMAP's database of a workspace: cameras, keyframes and their SIFT features, with ids in a fixed order."""
+"""Read and write COLMAP's database of a workspace: cameras, keyframes and the keyframes' SIFT features.
+
+The ids of cameras and images follow a fixed order.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +23,14 @@ if TYPE_CHECKING:
     import pycolmap
 
 DATABASE_NAME = "database.db"
-"""File name of the database in its workspace."""
+"""File name of the database in the workspace folder."""
 _COLOURS_FOLDER = "colours"
-"""Folder of the keypoints' colours beside the database: one array for each image."""
+"""Name of the folder with the colours of the keypoints, in the workspace folder. Each image has one file."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class ImageRef:
-    """One keyframe: its camera's name and the index of the frame in that camera."""
+    """Reference to one keyframe: the name of its camera, and the frame index in that camera's video."""
 
     camera: str
     frame: int
@@ -39,22 +42,22 @@ class ImageRef:
 
     @staticmethod
     def parse(name: str) -> ImageRef:
-        """Return the keyframe with an image name."""
+        """Return the keyframe that has the image name `name` in the database."""
         camera, _, frame = name.rpartition("/")
         return ImageRef(camera, int(frame))
 
 
 Pair = tuple[ImageRef, ImageRef]
-"""Two different keyframes, in increasing order."""
+"""Two different keyframes, the smaller `ImageRef` first."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraKeyframes:
-    """Keyframes of one camera that are added to a database.
+    """Keyframes of one camera, to be added to a database.
 
     Attributes:
         camera: The camera.
-        camera_id: Its id in the database, which is the id of its rig too.
+        camera_id: Database id of the camera. The camera's rig has the same id.
         frames: (K,) frame indices, increasing.
     """
 
@@ -69,7 +72,7 @@ def read_image_ids(database: pycolmap.Database) -> dict[ImageRef, int]:
 
 
 def read_camera_ids(workspace: Path) -> dict[str, int]:
-    """Return the database id of each camera with keyframes, by camera name."""
+    """Return the database id of each camera that has keyframes, by camera name."""
     import pycolmap
 
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
@@ -78,7 +81,7 @@ def read_camera_ids(workspace: Path) -> dict[str, int]:
 
 
 def read_matched_names(database: pycolmap.Database) -> set[str]:
-    """Return the image names of the keyframes that are part of a verified pair."""
+    """Return the image names of all keyframes that belong to at least one verified pair."""
     import pycolmap
 
     pairs, _ = database.read_two_view_geometry_num_inliers()
@@ -87,14 +90,17 @@ def read_matched_names(database: pycolmap.Database) -> set[str]:
 
 
 def add_camera(database: pycolmap.Database, camera: CaptureCamera) -> int:
-    """Write one camera and return its id; its rig holds no other camera, so no synchrony is assumed."""
+    """Write one camera to the database and return its id.
+
+    Each camera has a separate rig, so the map does not assume that cameras expose at the same instants.
+    """
     model = camera.camera.to_pycolmap()
     model.has_prior_focal_length = camera.calibrated
     return _write_camera(database, model)
 
 
 def _write_camera(database: pycolmap.Database, model: pycolmap.Camera) -> int:
-    """Write one camera with a rig of its own, and return its id."""
+    """Write one camera and a separate rig for it, and return the camera's id."""
     import pycolmap
 
     camera_id = database.write_camera(model)
@@ -110,12 +116,12 @@ def add_keyframes(
     options: MapOptions,
     context: StageContext,
 ) -> None:
-    """Extract the SIFT features of keyframes and write them, camera by camera, frame by frame.
+    """Extract the SIFT features of keyframes and write both to the database, camera by camera.
 
     Args:
         workspace: Folder of the database.
         keyframes: The keyframes of each camera.
-        options: The stage's options: the number of features.
+        options: The stage's options, with the maximum number of features.
         context: Threads, progress, cancellation.
 
     Source: Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004, as
@@ -145,11 +151,13 @@ def add_keyframes(
 
 
 def rewrite_without_cameras(workspace: Path, cameras: Collection[str]) -> None:
-    """Rewrite the database without some cameras, with ids as if these cameras had never been in it.
+    """Rewrite the database without some cameras.
+
+    The new ids are the same as in a database to which these cameras were never added.
 
     Args:
         workspace: Folder of a database that holds keyframes and features, but no matches yet.
-        cameras: Names of the cameras to remove; the features of all others are kept as they are.
+        cameras: Names of the cameras to remove. The features of all other cameras are copied unchanged.
     """
     import pycolmap
 
@@ -174,18 +182,18 @@ def rewrite_without_cameras(workspace: Path, cameras: Collection[str]) -> None:
             image_id = write_image(database, ref, new_ids[camera_of[number]])
             database.write_keypoints(image_id, source.read_keypoints(number))
             database.write_descriptors(image_id, source.read_descriptors(number))
-            # No new id is larger than the old one, so this file name is free by now.
+            # A new id is never larger than the old id of the same image, so this file name is already free.
             colour_file.rename(colours / f"{image_id}.npy")
     before.unlink()
 
 
 def read_keypoint_colours(workspace: Path, image_id: int) -> npt.NDArray[np.uint8]:
-    """Return the colour (N,3) RGB at each keypoint of an image."""
+    """Return the RGB colours (N,3), 0 to 255, at the keypoints of an image."""
     return np.asarray(np.load(workspace / _COLOURS_FOLDER / f"{image_id}.npy"), dtype=np.uint8)
 
 
 def write_image(database: pycolmap.Database, ref: ImageRef, camera_id: int) -> int:
-    """Write one keyframe as a frame of its camera's own rig, and return the image id."""
+    """Write one keyframe to the database, as a frame of its camera's rig, and return the image id."""
     import pycolmap
 
     image = pycolmap.Image(name=ref.name, camera_id=camera_id)

@@ -1,4 +1,4 @@
-"""RootSIFT descriptors: types, length, and the limits within which two of them match."""
+"""RootSIFT descriptors: their types, their length, and the limits for a match of two descriptors."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ import numpy as np
 import numpy.typing as npt
 
 ByteDescriptors = npt.NDArray[np.uint8]
-"""(N,128) root-normalised SIFT descriptors, as the database stores them."""
+"""(N,128) root-normalised SIFT descriptors as bytes, as the database stores them."""
 
 FloatDescriptors = npt.NDArray[np.float32]
-"""(N,128) the same descriptors as float32, ready for a matrix product."""
+"""(N,128) root-normalised SIFT descriptors as float32, for matrix products."""
 
 DESCRIPTOR_NORM = 512.0
-"""Euclidean length of a descriptor in the unit of its bytes. Scalar products of two descriptors are whole
-numbers below 2^24. A float32 adds these exactly in any order, so threads and libraries cannot change a
-match."""
+"""Euclidean length of a descriptor, in the unit of its bytes. The scalar product of two descriptors is a
+whole number below 2^24. A float32 sum of such numbers is exact in any order. So the matches do not depend on
+the number of threads or on the library."""
 
 MAX_MATCH_ANGLE_RAD = 0.7
-"""Largest angle between two matching descriptors, radians. COLMAP's default."""
+"""Maximum angle (radians) between two matching descriptors. COLMAP's default."""
 
 MAX_RATIO = 0.8
-"""Largest ratio of the angles to the nearest and to the second nearest descriptor. COLMAP's default."""
+"""Maximum ratio of two angles: the angle to the nearest descriptor over the angle to the second nearest
+descriptor. COLMAP's default."""

@@ -1,4 +1,7 @@
-"""Find cameras with a horizontally flipped picture: they see the room's mirror image and fit no map of it."""
+"""Find and exclude cameras with mirrored images (left and right exchanged).
+
+Mirrored images show the mirror image of the room, so they contradict a map of the room.
+"""
 
 from __future__ import annotations
 
@@ -23,17 +26,21 @@ from bodycap_batch.model.map_diagnostics import CameraGroups, MapDiagnostics
 from bodycap_batch.model.scene import KeyframeSelection
 
 CameraDescriptors = npt.NDArray[np.float32]
-"""(K,128,128) `largest_descriptors` of K keyframes of one camera."""
+"""(K,128,128) descriptors of K keyframes of one camera, each as `largest_descriptors` returns them."""
 
 _KEYFRAMES_PER_CAMERA = 12
-"""Keyframes of each camera that are compared, evenly spaced. Evidence: none."""
+"""Maximum number of keyframes of each camera that are compared. They are evenly spaced. Evidence: none."""
 _MIN_MATCHES = 14
-"""Image pairs with fewer matches are ignored. Evidence: docs/decisions/mapping.md."""
+"""Minimum number of matches of an image pair. Image pairs with fewer matches are ignored.
+Evidence: docs/decisions/mapping.md."""
 _MIN_RATIO = 3.0
-"""Matches in one orientation must exceed those in the other by this factor. Evidence:
-docs/decisions/mapping.md."""
+"""Minimum ratio of stronger to weaker evidence, used in two places. A pair of cameras gives evidence only if
+the numbers of matches in the two orientations have at least this ratio. A contradiction between two pieces of
+evidence is ignored if their strengths have at least this ratio; the stronger evidence is then used.
+Evidence: docs/decisions/mapping.md."""
 _MIN_TOTAL_MATCHES = 60
-"""Matches of two cameras, over all their image pairs, below which they give no evidence. Evidence: none."""
+"""Minimum number of matches of two cameras, over all their image pairs. Two cameras with fewer matches give
+no evidence. Evidence: none."""
 _HINT = (
     "a front camera's setting, or an app, may flip the picture; flip it back: ffmpeg -i in -vf hflip out.mp4"
 )
@@ -45,9 +52,9 @@ _UNDECIDED_HINT = (
 
 
 def mirror_descriptors(descriptors: ByteDescriptors) -> ByteDescriptors:
-    """Return SIFT descriptors (N,128) as they would be in the mirrored picture.
+    """Return the SIFT descriptors (N,128) that the same features would have in the mirrored image.
 
-    The rows of cells are reversed, and the gradient directions are mirrored.
+    The order of the cells is reversed along one axis, and the gradient directions are mirrored.
     """
     cells = descriptors.reshape(-1, 4, 4, 8)[:, ::-1]
     return np.ascontiguousarray(cells[..., (8 - np.arange(8)) % 8].reshape(-1, 128))
@@ -56,20 +63,22 @@ def mirror_descriptors(descriptors: ByteDescriptors) -> ByteDescriptors:
 def exclude_flipped_cameras(
     workspace: Path, selections: Sequence[KeyframeSelection], options: MapOptions
 ) -> tuple[list[KeyframeSelection], MapOptions, MapDiagnostics]:
-    """Remove cameras with a flipped picture from the database: the smaller of two groups of cameras.
+    """Remove cameras with mirrored images from the database.
 
-    Pictures alone cannot distinguish a flipped picture from one of a wall mirror, or of the other half of
-    a symmetric room. So no camera is left out if both groups are equally large, or if the evidence
-    contradicts itself.
+    Cameras whose images match are divided into two groups with opposite orientation. The smaller group is
+    excluded. Images alone cannot show why two groups see mirror images of each other: one group may film a
+    wall mirror, or the other half of a symmetric room. So all cameras are kept if both groups have the same
+    size, or if the evidence contradicts itself.
 
     Args:
-        workspace: Folder of the database with extracted features; it is rewritten if cameras are left out.
+        workspace: Folder of the database with extracted features. The database is rewritten if cameras are
+            excluded.
         selections: Keyframes of each camera.
         options: The stage's options.
 
     Returns:
-        The selections of the remaining cameras. The options, without an initial pair that names a camera
-        that is left out. The diagnostics on flipped cameras.
+        The keyframes of each remaining camera; the stage's options, in which the initial pair is removed if
+        it names an excluded camera; the diagnostics on mirrored cameras.
     """
     if len(selections) < 2:
         return list(selections), options, MapDiagnostics()
@@ -90,7 +99,7 @@ def exclude_flipped_cameras(
 
 
 def flip_notes(diagnostics: MapDiagnostics) -> list[str]:
-    """Return the notes for the user on flipped cameras."""
+    """Return the notes for the user on cameras with mirrored images."""
     return [
         *map(excluded_camera_note, diagnostics.flipped_cameras),
         *(
@@ -105,12 +114,16 @@ def flip_notes(diagnostics: MapDiagnostics) -> list[str]:
 
 
 def excluded_camera_note(camera: str) -> str:
-    """Return the note for the user on a camera that was left out."""
+    """Return the note for the user on an excluded camera."""
     return f"camera {camera} shows the room mirrored (left and right exchanged) and is left out: {_HINT}"
 
 
 def add_flip_hint(error: EstimationError | None, diagnostics: MapDiagnostics) -> EstimationError | None:
-    """Return the same error; put undecided groups of cameras, if there are any, in front of its hint."""
+    """Add the undecided groups of cameras, if there are any, to the start of an error's hint.
+
+    Returns:
+        The error with the longer hint; None if `error` is None.
+    """
     if error is not None and diagnostics.undecided_groups:
         groups = map(_undecided_sentence, diagnostics.undecided_groups)
         error.hint = "; ".join([*groups, _UNDECIDED_HINT, _HINT, *filter(None, [error.hint])])
@@ -118,16 +131,17 @@ def add_flip_hint(error: EstimationError | None, diagnostics: MapDiagnostics) ->
 
 
 def _undecided_sentence(groups: CameraGroups) -> str:
-    """Return the sentence that names two groups of cameras."""
+    """Return the sentence for the user that names two groups of cameras with opposite orientation."""
     one, other = (", ".join(names) for names in groups)
     return f"cameras {one} and {other} see mirror images of each other"
 
 
 def _pair_evidence(workspace: Path, selections: Sequence[KeyframeSelection]) -> dict[tuple[str, str], int]:
-    """Return, by pair of cameras, how many more features match in the same than in mirrored orientation.
+    """Return the evidence on the orientation of each pair of cameras, by pair of camera names.
 
-    A negative number means that the cameras see mirror images of each other. Pairs without clear evidence
-    are left out.
+    The evidence is the number of matches with the unchanged images minus the number of matches with the
+    mirrored images of the second camera. A negative number means that the two cameras see mirror images of
+    each other. Pairs of cameras without clear evidence are not in the result.
     """
     straight, mirrored = _sample_descriptors(workspace, selections)
     out = {}
@@ -141,20 +155,23 @@ def _pair_evidence(workspace: Path, selections: Sequence[KeyframeSelection]) -> 
 
 
 def _count_similar_features(one: CameraDescriptors, other: CameraDescriptors) -> int:
-    """Return the number of matches of two cameras, over the image pairs that show the same."""
+    """Return the number of matches of two cameras, over all image pairs with at least `_MIN_MATCHES`."""
     counts = [count_ratio_test_matches(image, other) for image in one]
     return int(sum(count[count >= _MIN_MATCHES].sum() for count in counts))
 
 
 def _stack(images: Sequence[CameraDescriptors]) -> CameraDescriptors:
-    """Return the descriptors of all images as one array (K,128,128), K may be 0."""
+    """Return the descriptors of K images as one array (K,128,128); K may be 0."""
     return np.array(images, dtype=np.float32).reshape(-1, 128, 128)
 
 
 def _sample_descriptors(
     workspace: Path, selections: Sequence[KeyframeSelection]
 ) -> tuple[dict[str, CameraDescriptors], dict[str, CameraDescriptors]]:
-    """Return, by camera, the largest descriptors of some keyframes, as they are and mirrored."""
+    """Return the `largest_descriptors` of some keyframes of each camera, twice, both by camera name.
+
+    The first result holds the descriptors unchanged, the second result holds the mirrored descriptors.
+    """
     import pycolmap
 
     straight, mirrored = {}, {}
@@ -177,17 +194,23 @@ def _sample_descriptors(
 def label_cameras(
     cameras: Sequence[str], evidence: Mapping[tuple[str, str], int]
 ) -> tuple[set[str], tuple[CameraGroups, ...]]:
-    """Label each camera as one orientation or the other, given signed evidence on pairs of cameras.
+    """Divide cameras into two groups with opposite orientation, given signed evidence on pairs of cameras.
 
-    Cameras are joined into components, the strongest evidence first. Later evidence that contradicts a
-    component leaves it undecided, unless all evidence in the component is `_MIN_RATIO` times as strong.
+    Pairs of cameras are processed in the order of their evidence, the strongest first. A pair joins the
+    components of its two cameras into one component. If the two cameras are already in one component, the
+    pair's evidence may contradict their labels. Then its strength is compared with the strength of the
+    evidence that first joined these two cameras into one component. If the first evidence is less than
+    `_MIN_RATIO` times as strong, the component is undecided. A component with two groups of the same size is
+    undecided too.
 
     Args:
         cameras: Camera names.
-        evidence: By pair of cameras, positive for equal orientation, negative for opposite orientation.
+        evidence: Signed evidence by pair of camera names: positive for equal orientation, negative for
+            opposite orientation.
 
     Returns:
-        The cameras of the smaller group of each decided component, and the two groups of each undecided one.
+        The cameras in the smaller group of each decided component; two groups of cameras that see mirror
+        images of each other, for each undecided component.
     """
     components = {name: {name: 1} for name in cameras}
     strength: dict[tuple[str, str], int] = {}
@@ -221,5 +244,5 @@ def label_cameras(
 
 
 def _size_and_names(names: Sequence[str]) -> tuple[int, Sequence[str]]:
-    """Return the sort key that puts the smaller group first."""
+    """Return the sort key for groups of cameras: the size of the group, then its camera names."""
     return len(names), names

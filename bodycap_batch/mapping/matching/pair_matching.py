@@ -29,33 +29,37 @@ if TYPE_CHECKING:
     import pycolmap
 
 MIN_INLIERS = 15
-"""Matches of a verified pair, at least. COLMAP's default; its mapper ignores pairs with fewer."""
+"""Minimum number of matches of a verified pair. COLMAP's default: its mapper ignores pairs with fewer
+matches."""
 _MAX_ERROR_PX = 4.0
-"""Largest epipolar error of an inlier, px at a long side of 640 px. COLMAP's default."""
+"""Maximum epipolar error of an inlier, in px of an image with a long side of 640 px. COLMAP's default."""
 _MAX_TRIALS = 400
-"""Samples of a robust fit. If one match in three is right, 400 samples of five hold 1.6 right samples
-(0.33^5 x 400). COLMAP's 10,000 samples cost time on every unrelated pair.
-Evidence: docs/decisions/mapping.md."""
+"""Maximum number of random samples of a robust fit. If one match in three is correct, 400 samples of five
+matches contain on average 1.6 samples without a wrong match (0.33^5 x 400). COLMAP's maximum of 10,000
+samples costs time on every unrelated pair. Evidence: docs/decisions/mapping.md."""
 _CONFIDENCE = 0.999
-"""Probability of a right sample at which a robust fit ends early. OpenCV's default."""
+"""Minimum probability that a correct sample was drawn; a robust fit ends early at this probability.
+OpenCV's default."""
 _MAX_TANGENT = 2.5
-"""Tangent of the largest angle between a ray and the optical axis (68 degrees). Beyond it the image plane is
-stretched too much to measure errors in."""
+"""Maximum absolute value of each coordinate of a ray at depth 1. It corresponds to an angle of 68 degrees
+from the optical axis. At larger angles the image plane is stretched too much to measure errors."""
 _PAIRS_PER_TRANSACTION = 512
-"""Pairs that are matched between two writes to the database; limits memory and lost work only."""
+"""Number of pairs that are matched between two writes to the database. It affects only the memory and the
+work that is lost after a crash."""
 _CV_ASSERTION_FAILED = -215
 """OpenCV's error code for a failed assertion."""
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeFeatures:
-    """The features of one keyframe, as matching needs them.
+    """The features of one keyframe, in the form that matching needs.
 
     Attributes:
-        descriptors: (N,128) uint8.
-        rays: (N,2) undistorted image points at depth 1; pixels (OpenCV's origin) if not calibrated.
-        error: Largest error of an inlier, in the unit of `rays`.
-        calibrated: False if the intrinsics are an estimate.
+        descriptors: (N,128) root-normalised descriptors as bytes.
+        rays: (N,2) undistorted image points at depth 1 if the camera is calibrated, else the detected pixels
+            (OpenCV's origin).
+        error: Maximum epipolar error of an inlier, in the unit of `rays`.
+        calibrated: True if the camera is calibrated; False if its intrinsics are only a first estimate.
     """
 
     descriptors: ByteDescriptors
@@ -74,12 +78,12 @@ def match_pairs(
 
     Args:
         workspace: Folder of the database.
-        pairs: Pairs to match.
+        pairs: Pairs of keyframes to match.
         intrinsics: Intrinsics by camera name.
         context: Threads, progress, cancellation.
 
     Returns:
-        Number of matches of each verified pair.
+        Number of verified matches of each verified pair.
 
     Source: Lowe, IJCV 2004 (ratio test); Barath et al., "MAGSAC++", CVPR 2020 and Raguram et al., "USAC",
         PAMI 2013, as implemented in OpenCV, for the robust fit.
@@ -109,7 +113,7 @@ def _read_features(
     refs: set[ImageRef],
     intrinsics: Mapping[str, CameraIntrinsics],
 ) -> dict[ImageRef, KeyframeFeatures]:
-    """Return the features of some keyframes."""
+    """Read the features of the keyframes `refs` from the database."""
     out = {}
     for ref in sorted(refs):
         camera, calibrated = intrinsics[ref.camera].camera, intrinsics[ref.camera].calibrated
@@ -127,7 +131,7 @@ def _read_features(
 def _match_block(
     pairs: Sequence[Pair], features: Mapping[ImageRef, KeyframeFeatures], context: StageContext
 ) -> Iterator[IntArray]:
-    """Yield the verified matches (M,2) of each pair, in the order of the pairs."""
+    """Yield the verified matches (M,2) of each pair as indices of features, in the order of the pairs."""
     parts = [pairs[start :: context.threads] for start in range(context.threads)]
 
     def work(part: Sequence[Pair]) -> list[IntArray]:
@@ -147,11 +151,13 @@ def _match_block(
 
 
 def find_mutual_matches(first: FloatDescriptors, second: FloatDescriptors) -> IntArray:
-    """Return the matches (M,2): features that are each other's nearest and pass the ratio test.
+    """Return the matches (K,2) of two keyframes, as indices of their features.
+
+    Two features match if each is the nearest feature of the other one and they pass the ratio test.
 
     Args:
-        first: (N,128) root-normalised descriptors of one keyframe, as floats.
-        second: (M,128) those of the other keyframe.
+        first: (N,128) root-normalised descriptors of the first keyframe.
+        second: (M,128) root-normalised descriptors of the second keyframe.
     """
     if len(first) < MIN_INLIERS or len(second) < MIN_INLIERS:
         return np.zeros((0, 2), dtype=np.int64)
@@ -164,28 +170,28 @@ def find_mutual_matches(first: FloatDescriptors, second: FloatDescriptors) -> In
     products[near, nearest[near]] = -1.0
     second_best = products[near].max(axis=1, initial=-1.0)
     near = near[_angle_rad(best[near]) < MAX_RATIO * _angle_rad(second_best)]
-    # Two features can be equally near to a third one. The first of the two is matched.
+    # Two features of `first` can be equally near to one feature of `second`. Then only the first one is kept.
     _, once = np.unique(nearest[near], return_index=True)
     near = near[np.sort(once)]
     return np.column_stack([near, nearest[near]])
 
 
 def _angle_rad(products: npt.NDArray[np.float32]) -> FloatArray:
-    """Return the angles between descriptors, given their scalar products."""
+    """Return the angles (radians) between descriptors, given the descriptors' scalar products."""
     return np.asarray(np.arccos(np.clip(products.astype(np.float64) / DESCRIPTOR_NORM**2, -1.0, 1.0)))
 
 
 def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> IntArray:
-    """Return the matches (M,2) that agree with one two-view geometry.
+    """Return the subset (M,2) of the matches that agrees with one two-view geometry.
 
-    It is an essential matrix if both cameras are calibrated, else a fundamental matrix.
+    The two-view geometry is an essential matrix if both cameras are calibrated, else a fundamental matrix.
     """
     import cv2
 
     none = matches[:0]
     if a.calibrated and b.calibrated:
         rays = np.abs(np.column_stack([a.rays[matches[:, 0]], b.rays[matches[:, 1]]]))
-        matches = matches[(rays < _MAX_TANGENT).all(axis=1)]  # False for NaN
+        matches = matches[(rays < _MAX_TANGENT).all(axis=1)]  # The comparison is False for NaN.
     if len(matches) < MIN_INLIERS:
         return none
     first, second = a.rays[matches[:, 0]], b.rays[matches[:, 1]]
@@ -195,12 +201,12 @@ def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> 
             limit = 0.5 * (a.error + b.error)
             _, kept = cv2.findEssentialMat(first, second, np.eye(3), method, _CONFIDENCE, limit, _MAX_TRIALS)
         else:
-            # If one of the two is calibrated, its undistorted image is used, in pixels.
+            # If only one camera is calibrated, the rays of its keyframe are scaled to undistorted pixels.
             first, second = first * (_error_px(a) / a.error), second * (_error_px(b) / b.error)
             limit = 0.5 * (_error_px(a) + _error_px(b))
             _, kept = cv2.findFundamentalMat(first, second, method, limit, _CONFIDENCE, _MAX_TRIALS)
     except cv2.error as error:
-        # If no sample gives a model, an assertion in OpenCV's local optimisation fails.
+        # An assertion in OpenCV's local optimisation fails if no sample gives a two-view geometry.
         if error.code != _CV_ASSERTION_FAILED:
             raise
         return none
@@ -208,14 +214,14 @@ def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> 
 
 
 def _error_px(features: KeyframeFeatures) -> float:
-    """Return the largest error of an inlier in pixels."""
+    """Return the maximum epipolar error (px) of an inlier of a keyframe."""
     return _MAX_ERROR_PX if features.calibrated else features.error
 
 
 def _write_matches(
     database: pycolmap.Database, a: int, b: int, matches: IntArray, *, calibrated: bool
 ) -> None:
-    """Write the verified matches (M,2) of two images."""
+    """Write the verified matches (M,2) of the images `a` and `b` to the database."""
     import pycolmap
 
     configuration = pycolmap.TwoViewGeometryConfiguration

@@ -1,4 +1,7 @@
-"""Select the pairs of keyframes to match: per keyframe, a number that does not grow with their total."""
+"""Select the pairs of keyframes to match.
+
+In a large capture, the number of pairs for each keyframe does not depend on the total number of keyframes.
+"""
 
 from __future__ import annotations
 
@@ -27,41 +30,47 @@ from bodycap_batch.mapping.matching.retrieval import (
 from bodycap_batch.mapping.matching.skeletal_set import select_skeletal_keyframes
 
 _NEIGHBOUR_STEPS = (1, 2, 3, 4, 6, 9, 14)
-"""Distances, in keyframes of one camera, at which a keyframe is matched with its neighbours in time.
-Evidence: none."""
+"""Distances in time order, as numbers of keyframes of one camera. A keyframe is matched with the keyframes at
+these distances before and after it. Evidence: none."""
 _SIMULTANEOUS = 2
-"""Keyframes of each other camera, nearest in time, that a keyframe is matched with. Evidence: none."""
-_RETRIEVED = 64
-"""Retrieved partners of a keyframe. Evidence: docs/decisions/mapping.md."""
-_RETRIEVED_PER_CAMERA = 8
-"""Retrieved partners of a keyframe in each camera, even if those in other cameras are more similar.
+"""Number of keyframes of each other camera with which a keyframe is matched because they are nearest in time.
 Evidence: none."""
+_RETRIEVED = 64
+"""Maximum number of retrieved partners of a keyframe. The partners that `_RETRIEVED_PER_CAMERA` permits are
+always taken, even if their total is larger. Evidence: docs/decisions/mapping.md."""
+_RETRIEVED_PER_CAMERA = 8
+"""Maximum number of retrieved partners of a keyframe that are taken from each camera first. Only then are
+partners taken from all cameras by similarity. Evidence: none."""
 _MIN_LINKS = 24
-"""Links to another camera or another time that a keyframe needs. A keyframe with fewer is also matched with
-the neighbours of its partners. Evidence: docs/decisions/mapping.md."""
+"""Minimum number of links of a keyframe to another camera or another time. A keyframe with fewer links is
+also matched with the neighbours of its partners. Evidence: docs/decisions/mapping.md."""
 _MIN_LINK_MATCHES = 20
-"""Matches that a pair needs to count as a link. Evidence: docs/decisions/mapping.md."""
+"""Minimum number of verified matches of a pair that is a link. Evidence: docs/decisions/mapping.md."""
 _NEAR_KEYFRAMES = 4
-"""Keyframes of one camera up to this distance, in keyframes, show the same and are no links. A hand is back
-within a second."""
+"""Maximum distance, as a number of keyframes, of two keyframes of one camera that are near in time. They show
+the same part of the room, so their pair is not a link. The distance is short because a hand can come back
+to a place within a second."""
 _MAX_RETRY_PAIRS = 50_000
-"""Pairs that are tried at most for a camera without any link: some minutes of computing."""
+"""Approximate maximum number of pairs that are tried for a camera without links to other cameras. They take
+some minutes of computing."""
 _EXHAUSTIVE_UP_TO = 120
-"""Number of keyframes up to which every pair is matched. Evidence: none."""
+"""Maximum number of keyframes for which every pair is matched. Evidence: none."""
 _RESECTION_RETRIEVALS = 8
-"""Most similar keyframes of the map that a keyframe is matched with before its resection.
-Evidence: docs/decisions/mapping.md."""
+"""Number of keyframes of the map with which a keyframe is matched before its resection, because they are the
+most similar to it. Evidence: docs/decisions/mapping.md."""
 
 
 class PairGenerator:
-    """Generates pairs that hold a new keyframe; their number grows with that of the new keyframes only.
+    """Generates the pairs of keyframes to match. Every pair contains at least one new keyframe.
+
+    With retrieval, the number of pairs is proportional to the number of new keyframes.
 
     Args:
         workspace: Folder of the database with extracted features.
         new: Keyframes that are not matched yet.
-        common_ns: Common time of every frame, by camera, nanoseconds.
-        options: The stage's options; ``pairs`` is "retrieval" or "exhaustive". Few keyframes are always
-            matched exhaustively.
+        common_ns: Common time (nanoseconds) of every frame, by camera name.
+        options: The stage's options. ``pairs`` is "retrieval" or "exhaustive". Every pair is matched in any
+            case if there are at most `_EXHAUSTIVE_UP_TO` keyframes.
         context: Threads, progress, cancellation.
     """
 
@@ -94,13 +103,16 @@ class PairGenerator:
         self._index_images()
 
     def _index_images(self) -> None:
-        """Prepare the look-up of rows by keyframe and by camera."""
+        """Prepare the look-up of row numbers by keyframe and by camera name."""
         self._cameras = np.array([ref.camera for ref in self._images])
         self._row = {ref: row for row, ref in enumerate(self._images)}
         self._rows_of = {name: np.flatnonzero(self._cameras == name) for name in np.unique(self._cameras)}
 
     def reduced(self) -> PairGenerator:
-        """Return a generator of the skeletal keyframes alone; `self` if every pair is matched."""
+        """Return a generator for only the skeletal keyframes; return `self` if every pair is matched.
+
+        Skeletal keyframes are the reduced set of keyframes, Snavely's skeletal set.
+        """
         if self.exhaustive:
             return self
         rows = select_skeletal_keyframes(np.array([self._matches[row] for row in self._new]), self._times)
@@ -115,11 +127,14 @@ class PairGenerator:
 
     @property
     def refs(self) -> list[ImageRef]:
-        """The keyframes among which pairs are generated."""
+        """All keyframes from which the generator makes pairs."""
         return list(self._images)
 
     def resection_pairs(self, registered: Collection[ImageRef], missing: Collection[ImageRef]) -> list[Pair]:
-        """Return the pairs that a resection needs: neighbours in time and similar keyframes of the map.
+        """Return the pairs that the resection of keyframes needs.
+
+        Each keyframe is paired with keyframes of the map that are near in time or most similar to it. It is
+        also paired with its neighbours in the same camera.
 
         Args:
             registered: Keyframes of the map.
@@ -142,20 +157,25 @@ class PairGenerator:
         return self._sorted(pairs)
 
     def initial_pairs(self) -> list[Pair]:
-        """Return pairs of neighbours in time, of simultaneous keyframes, and of retrieved keyframes."""
+        """Return the pairs of each new keyframe that are matched first.
+
+        Its partners are its neighbours in time, the simultaneous keyframes of other cameras, and the
+        retrieved keyframes. In exhaustive mode its partners are all keyframes.
+        """
         if self.exhaustive:
             return self._sorted({(row, other) for row in self._new for other in range(len(self._images))})
         return self._sorted({(row, other) for row in self._new for other in self._partners(row)})
 
     def expansion_pairs(self, verified: Mapping[Pair, int], tried: Collection[Pair]) -> list[Pair]:
-        """Return the neighbours of verified pairs, for keyframes with few links.
+        """Return untried pairs near verified pairs, for keyframes with fewer than `_MIN_LINKS` links.
 
-        Two views of one place overlap over some time on both sides, so one verified pair leads to others.
-        A block of keyframes with few links can be metres off in the map.
+        In such a pair, one keyframe of a verified pair is replaced by its neighbour in time. If two cameras
+        see the same place, they usually see a common place shortly before and after too. More links are
+        needed because a block of keyframes with few links can have an error of metres in the map.
 
         Args:
             verified: Number of matches of every verified pair.
-            tried: Pairs that were matched.
+            tried: Pairs that were already matched.
         """
         if self.exhaustive:
             return []
@@ -178,11 +198,14 @@ class PairGenerator:
         return [pair for pair in self._sorted(expanded) if pair not in tried]
 
     def unlinked_camera_pairs(self, verified: Mapping[Pair, int], tried: Collection[Pair]) -> list[Pair]:
-        """Return all pairs of the cameras without links to other cameras; evenly spaced ones if too many.
+        """Return untried pairs for cameras without any verified pair with another camera.
+
+        Every new keyframe of such a camera is paired with every keyframe of all other cameras. If there are
+        more than `_MAX_RETRY_PAIRS` pairs, evenly spaced keyframes are used instead.
 
         Args:
             verified: Number of matches of every verified pair.
-            tried: Pairs that were matched.
+            tried: Pairs that were already matched.
         """
         linked = {ref.camera for a, b in verified if a.camera != b.camera for ref in (a, b)}
         unlinked = [row for row in self._new if self._images[row].camera not in linked]
@@ -197,7 +220,7 @@ class PairGenerator:
         return [pair for pair in self._sorted(pairs) if pair not in tried]
 
     def _adjacent_pairs(self, a: int, b: int) -> Iterator[tuple[int, int]]:
-        """Yield the pairs in which one of two rows is replaced by its neighbour in the same camera."""
+        """Yield the pairs in which row `a` or row `b` is replaced by its neighbour in the same camera."""
         for x, y in ((a - 1, b), (a + 1, b), (a, b - 1), (a, b + 1)):
             inside = min(x, y) >= 0 and max(x, y) < len(self._images)
             if (
@@ -209,16 +232,16 @@ class PairGenerator:
                 yield x, y
 
     def _is_link(self, a: int, b: int) -> bool:
-        """Return whether two rows are of different cameras or of different times."""
+        """Return whether two rows belong to different cameras, or to one camera at distant times."""
         return bool(self._cameras[a] != self._cameras[b]) or abs(a - b) > _NEAR_KEYFRAMES
 
     def _sorted(self, rows: Collection[tuple[int, int]]) -> list[Pair]:
-        """Return pairs of rows as pairs of keyframes, each pair once, in a fixed order."""
+        """Convert pairs of rows to pairs of keyframes. Each pair occurs once, and the order is fixed."""
         ordered = sorted({(min(pair), max(pair)) for pair in rows if pair[0] != pair[1]})
         return [(self._images[a], self._images[b]) for a, b in ordered]
 
     def _partners(self, row: int) -> set[int]:
-        """Return the rows of the keyframes that one keyframe is matched with."""
+        """Return the rows of all partners with which the keyframe `row` is matched first."""
         own = self._rows_of[self._cameras[row]]
         position = int(np.searchsorted(own, row))
         steps = [step * sign for step in _NEIGHBOUR_STEPS for sign in (-1, 1)]
@@ -231,7 +254,11 @@ class PairGenerator:
         return out | self._retrieved(row)
 
     def _retrieved(self, row: int) -> set[int]:
-        """Return the most similar keyframes of each camera, and the most similar ones of all."""
+        """Return the rows of the retrieved partners of the keyframe `row`.
+
+        The most similar keyframes of each camera are taken first, then the most similar keyframes of all
+        cameras.
+        """
         matches = self._matches[row]
         count = int((matches >= MIN_RETRIEVAL_MATCHES).sum())
         likely = np.argsort(-matches, kind="stable")[:count].tolist()
@@ -252,7 +279,7 @@ def match_keyframes(
     intrinsics: Mapping[str, CameraIntrinsics],
     context: StageContext,
 ) -> tuple[set[Pair], dict[str, object]]:
-    """Match the initial pairs, then more pairs for keyframes and cameras with few links.
+    """Match the initial pairs, then further pairs for keyframes with few links and cameras without links.
 
     Args:
         generator: Generates the pairs.
@@ -261,7 +288,8 @@ def match_keyframes(
         context: Threads, progress, cancellation.
 
     Returns:
-        The pairs that were matched, and entries for the log: pairs, verified pairs, links between cameras.
+        All pairs that were matched; entries for the log: numbers of pairs and verified pairs, and the number
+        of verified pairs between each two cameras.
     """
     pairs = generator.initial_pairs()
     verified = match_pairs(workspace, pairs, intrinsics, context)

@@ -1,4 +1,7 @@
-"""Retrieve keyframes that show the same: match their largest features alone, among shortlisted pairs."""
+"""Find keyframes that show the same part of the room.
+
+Each image is compared only with the images on its shortlist, and only the largest features are matched.
+"""
 
 from __future__ import annotations
 
@@ -18,39 +21,42 @@ from bodycap_batch.mapping.matching.descriptors import (
 )
 
 RETRIEVAL_FEATURES = 128
-"""Features of an image that retrieval matches: the largest ones, which survive blur and distance.
-Evidence: docs/decisions/mapping.md."""
+"""Maximum number of features of an image that retrieval matches. The largest features are used, because they
+are still detected in blurred images and from a distance. Evidence: docs/decisions/mapping.md."""
 _BLOCK_SIZE = 32
-"""Images that one matrix product compares; limits memory only."""
+"""Number of images that one matrix product compares. It affects only the memory."""
 _VISUAL_WORDS = 64
-"""Visual words of a VLAD descriptor. Evidence: none."""
+"""Number of visual words of a VLAD descriptor. Evidence: none."""
 _SHORTLIST_SIZE = 128
-"""Images whose features are matched with those of one image, by VLAD similarity among all images: twice as
-many as pair selection takes at most. Evidence: docs/decisions/mapping.md."""
-_SHORTLIST_SIZE_PER_CAMERA = 24
-"""The same among the images of each camera: three times as many as pair selection takes.
+"""Number of images on the shortlist of an image: the most similar images of all cameras by VLAD descriptor.
+It is twice the maximum number of retrieved partners in pair selection.
 Evidence: docs/decisions/mapping.md."""
+_SHORTLIST_SIZE_PER_CAMERA = 24
+"""Number of most similar images of each camera that are on the shortlist too. It is three times the number
+of retrieved partners of each camera in pair selection. Evidence: docs/decisions/mapping.md."""
 _QUANTISATION_STEPS = 2048.0
-"""Steps that a component of a unit VLAD vector is rounded to. Sums of products stay below 2^23, which a
-float32 holds exactly."""
+"""Number of steps from 0 to 1 to which a component of a unit VLAD vector is rounded. Sums of products of
+these whole numbers stay below 2^23, so a float32 holds them exactly."""
 _EPSILON = 1e-9
-"""Added to a norm so that the division is defined for a zero vector."""
+"""Small number that is added to a norm, so that a division by the norm of a zero vector is defined."""
 
 MIN_RETRIEVAL_MATCHES = 4
-"""Matches below which two images are taken to share nothing. Evidence: docs/decisions/mapping.md."""
+"""Minimum number of matches of two similar images. Two images with fewer matches are treated as unrelated.
+Evidence: docs/decisions/mapping.md."""
 
 LIKELY_RETRIEVAL_MATCHES = 6
-"""Matches that nearly all pairs have which verification accepts. Evidence: docs/decisions/mapping.md."""
+"""Minimum number of matches of two images that probably pass verification. Nearly all verified pairs have at
+least this number of matches. Evidence: docs/decisions/mapping.md."""
 
 
 def largest_descriptors(
     descriptors: ByteDescriptors, keypoints: npt.NDArray[np.float32]
 ) -> npt.NDArray[np.float32]:
-    """Return the descriptors (128,128) of an image's largest features, padded with zeros.
+    """Return the descriptors (128,128) of an image's 128 largest features, padded with rows of zeros.
 
     Args:
-        descriptors: (N,128) root-normalised bytes.
-        keypoints: (N,4) as in `SiftFeatures`.
+        descriptors: (N,128) root-normalised descriptors as bytes.
+        keypoints: (N,4) keypoints of the same features (`SiftFeatures.keypoints`).
     """
     out = np.zeros((RETRIEVAL_FEATURES, 128), dtype=np.float32)
     picked = np.argsort(-keypoints[:, 2], kind="stable")[:RETRIEVAL_FEATURES]
@@ -61,16 +67,19 @@ def largest_descriptors(
 def count_preemptive_matches(
     images: npt.NDArray[np.float32], rows: Sequence[int], cameras: Sequence[str], context: StageContext
 ) -> npt.NDArray[np.int16]:
-    """Count the mutual matches among the largest features of some images and the images on their shortlists.
+    """Count the mutual matches of some images with the images on their shortlists.
+
+    Only the largest features of each image are matched.
 
     Args:
         images: (N,128,128) `largest_descriptors` of every image.
-        rows: R rows of `images`.
+        rows: Indices of the R images to compare with others.
         cameras: Camera name of each of the N images.
         context: Threads, progress, cancellation. The result does not depend on the number of threads.
 
     Returns:
-        (R,N) number of matches; 0 of an image with itself and with images that are not on its shortlist.
+        (R,N) number of matches of each of the R images with each of the N images. It is 0 for an image with
+        itself, and for two images that were not compared.
 
     Source: Wu, "Towards linear-time incremental structure from motion", 3DV 2013 (preemptive matching).
     """
@@ -96,7 +105,15 @@ def count_preemptive_matches(
 def _images_to_compare(
     shortlists: BoolArray, rows: Sequence[int], number_of_row: Mapping[int, int]
 ) -> list[IntArray]:
-    """Return the images to compare with each of the rows; a pair of two rows is compared once."""
+    """Return, for each of R images, the indices of the images to compare with it.
+
+    If two of the R images are on each other's shortlists, their pair is compared only once.
+
+    Args:
+        shortlists: (R,N) True if image n is on the shortlist.
+        rows: Indices of the R images.
+        number_of_row: Position of an image in `rows`, by image index.
+    """
     left = shortlists.copy()
     for number, row in enumerate(rows):
         listed = np.flatnonzero(left[number]).tolist()
@@ -107,11 +124,13 @@ def _images_to_compare(
 
 
 def count_ratio_test_matches(image: npt.NDArray[np.float32], others: npt.NDArray[np.float32]) -> IntArray:
-    """Count the mutual matches (K,) that pass the ratio test, of one image with each of K others.
+    """Return the number (K,) of matches of one image with each of K other images.
+
+    Two features match if each is the nearest feature of the other one and they pass the ratio test.
 
     Args:
         image: (128,128) `largest_descriptors` of the image.
-        others: (K,128,128) those of the other images.
+        others: (K,128,128) `largest_descriptors` of the other images.
     """
     parts = [np.zeros(0, dtype=np.int64)]
     for start in range(0, len(others), _BLOCK_SIZE):
@@ -127,10 +146,19 @@ def _vlad_shortlists(
     cameras: npt.NDArray[np.str_],
     context: StageContext,
 ) -> BoolArray:
-    """Return a mask (R,N): the most similar of all images and of each camera's images, for each of R rows."""
+    """Return the shortlists of R images as a mask (R,N), True if image n is on the shortlist.
+
+    A shortlist holds the most similar images of all cameras and the most similar images of each camera.
+
+    Args:
+        vlad: (N,D) VLAD descriptor of every image.
+        rows: Indices of the R images.
+        cameras: (N,) camera name of every image.
+        context: Cancellation.
+    """
     out = np.zeros((len(rows), len(vlad)), dtype=bool)
     groups = [np.flatnonzero(cameras == name) for name in np.unique(cameras)]
-    # Sums of whole numbers are exact. The last digits of a sum of other floats depend on the machine.
+    # Float sums of whole numbers are exact. The last digits of other float sums depend on the machine.
     whole = np.round(_QUANTISATION_STEPS * vlad)
     for start in range(0, len(rows), _BLOCK_SIZE):
         context.check_cancelled()
@@ -143,16 +171,16 @@ def _vlad_shortlists(
 
 
 def _vlad_descriptors(images: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Return a VLAD descriptor (N,D) of each image: a unit vector.
+    """Return the VLAD descriptors (N,D) of N images, unit vectors.
 
-    It adds up the differences of the features from their nearest visual words. The words are evenly spaced
-    among the features of the images themselves.
+    The VLAD descriptor of an image is the sum, for each visual word, of the differences between the word and
+    the features nearest to the word. The visual words are evenly spaced among the features of all images.
 
     Args:
         images: (N,128,128) `largest_descriptors` of every image.
 
     Source: Jégou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010, with
-        the normalisation of each word of Arandjelović, Zisserman, "All about VLAD", CVPR 2013.
+        the normalisation of each word's sum by Arandjelović, Zisserman, "All about VLAD", CVPR 2013.
     """
     flat = images.reshape(-1, 128)
     existing = np.flatnonzero(flat.any(axis=1))
@@ -170,9 +198,11 @@ def _vlad_descriptors(images: npt.NDArray[np.float32]) -> npt.NDArray[np.float32
 
 
 def _count_matches(products: npt.NDArray[np.float32]) -> IntArray:
-    """Count the matches (B,) in the scalar products (F,B,F) of one image's features with those of B images.
+    """Return the number (B,) of matches of one image with each of B images.
 
-    The products are changed.
+    Args:
+        products: (F,B,F) scalar products of the image's F descriptors with the F descriptors of each of the
+            B images; changed in place.
     """
     features = np.arange(RETRIEVAL_FEATURES)[:, None]
     others = np.arange(products.shape[1])[None, :]

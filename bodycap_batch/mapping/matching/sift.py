@@ -19,14 +19,15 @@ from bodycap_batch.mapping.matching.descriptors import DESCRIPTOR_NORM
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
 
 _DETECTION_SCALE = 0.6
-"""Size of the image that features are detected in, relative to the frame. OpenCV's detector doubles this
-image first. Detection takes half the time of full size, and the map is as accurate. Evidence:
-docs/decisions/mapping.md."""
+"""Ratio of the size of the image in which features are detected to the size of the frame. OpenCV's detector
+doubles the size of this image first. Detection takes half the time of a detection in the full frame, and the
+map has the same accuracy. Evidence: docs/decisions/mapping.md."""
 _MIN_LONG_SIDE_PX = 384
-"""Long side below which an image is not reduced further, px. Evidence: none."""
+"""Minimum long side (px) of the image in which features are detected. A frame is not reduced below this
+size. Evidence: none."""
 _CONTRAST_THRESHOLD = 0.02
-"""Contrast threshold of the detector: half of OpenCV's default, because blurred walls and ceilings have
-little contrast. Evidence: docs/decisions/mapping.md."""
+"""Contrast threshold of the detector. It is half of OpenCV's default, because blurred walls and ceilings
+have little contrast. Evidence: docs/decisions/mapping.md."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +35,9 @@ class SiftFeatures:
     """The features of one image.
 
     Attributes:
-        keypoints: (N,4) float32: x, y (px, COLMAP's origin), scale (px), orientation (rad).
-        descriptors: (N,128) uint8, root-normalised.
-        rgb: (N,3) uint8 colour of the image at each keypoint.
+        keypoints: (N,4) x and y (px, COLMAP's origin), scale (px) and orientation (rad) of each keypoint.
+        descriptors: (N,128) root-normalised descriptor of each keypoint.
+        rgb: (N,3) colour of the image at each keypoint, 0 to 255.
     """
 
     keypoints: npt.NDArray[np.float32]
@@ -50,9 +51,9 @@ def extract_features(
     """Yield the index and the features of each frame, in frame order.
 
     Args:
-        camera: Camera to read frames from; features outside its mask are dropped.
+        camera: Camera whose frames are read. Features outside the camera's mask are removed.
         frames: (K,) frame indices, increasing.
-        count: Largest number of features of a frame.
+        count: Maximum number of features of a frame.
         context: Threads and cancellation.
     """
     import cv2
@@ -90,7 +91,7 @@ def extract_features(
 
 
 def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
-    """Return the features of one image (H,W,3) that lie inside the camera's mask."""
+    """Return the features of one RGB image (H,W,3) that lie inside the camera's mask."""
     import cv2
 
     height, width = rgb.shape[:2]
@@ -116,7 +117,7 @@ def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.u
 
 
 def _root_sift(raw: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """Return the square roots of L1-normalised descriptors (N,128) as bytes.
+    """Normalise raw descriptors (N,128) to a sum of 1, and return their square roots as bytes.
 
     Source: Arandjelović, Zisserman, "Three things everyone should know to improve object
         retrieval", CVPR 2012.

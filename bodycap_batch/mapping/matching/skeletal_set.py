@@ -1,4 +1,7 @@
-"""Select the keyframes that a large map is built from: every other keyframe shows what some of them show."""
+"""Select skeletal keyframes (the reduced set of keyframes, Snavely's skeletal set) for a large map.
+
+Every keyframe that is not selected overlaps with several selected keyframes.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,15 @@ import numpy.typing as npt
 from bodycap_batch.core.arrays import IntArray
 
 SKELETAL_ABOVE = 1000
-"""Number of keyframes above which a map is built from a skeletal set and the other keyframes are resected.
-Adjusting that many keyframes together again and again would take hours.
-Evidence: docs/decisions/mapping.md."""
+"""Maximum number of keyframes of a map that is built from all keyframes at once. A larger map is built from
+skeletal keyframes, and the other keyframes are resected: repeated adjustments of all keyframes would take
+hours. Evidence: docs/decisions/mapping.md."""
 _MIN_MATCHES = 16
-"""Matches above which two keyframes surely show the same: four times `MIN_RETRIEVAL_MATCHES`.
-Evidence: docs/decisions/mapping.md."""
+"""Minimum number of matches of two keyframes that surely show the same part of the room: four times
+`MIN_RETRIEVAL_MATCHES`. Evidence: docs/decisions/mapping.md."""
 _MIN_SUPPORT = 6
-"""Selected keyframes that every other keyframe must match. Evidence: docs/decisions/mapping.md."""
+"""Minimum number of selected keyframes that every other keyframe must match.
+Evidence: docs/decisions/mapping.md."""
 
 
 def select_skeletal_keyframes(
@@ -27,20 +31,21 @@ def select_skeletal_keyframes(
     min_matches: int = _MIN_MATCHES,
     min_support: int = _MIN_SUPPORT,
 ) -> IntArray:
-    """Select keyframes that together show everything, so that the others can be resected against them.
+    """Select skeletal keyframes, against which all other keyframes can be resected.
 
     Keyframes are processed in time order. A keyframe is selected if it matches fewer than `min_support`
-    selected keyframes; this keeps the selection connected. Up to `min_support` keyframes that link the same
-    unconnected components are selected too.
+    selected keyframes. A keyframe is also selected if it matches keyframes of several components of the
+    selection. Components become one component once `min_support` keyframes link them.
 
     Args:
         matches: (N,N) number of matches of all pairs of keyframes, symmetric.
-        times: (N,) time of each keyframe, any unit.
-        min_matches: Matches above which two keyframes surely show the same.
-        min_support: Selected keyframes that each other keyframe must match, and links between components.
+        times: (N,) time of each keyframe, in any unit.
+        min_matches: Minimum number of matches of two keyframes that surely show the same part of the room.
+        min_support: Minimum number of selected keyframes that every other keyframe must match, and number of
+            keyframes that must link two components to join them.
 
     Returns:
-        Rows of the selected keyframes, increasing.
+        Indices of the selected keyframes, increasing.
 
     Source: Snavely et al., "Skeletal graphs for efficient structure from motion", CVPR 2008, for the idea.
     """

@@ -15,19 +15,21 @@ if TYPE_CHECKING:
     import pycolmap
 
 _ROBUST_TOLERANCE = 1e-4
-"""Relative change of the cost that ends an adjustment with a robust loss, which converges slowly.
-Evidence: docs/decisions/mapping.md."""
+"""Relative change of the cost at which an adjustment with a robust loss ends. Such an adjustment converges
+slowly. Evidence: docs/decisions/mapping.md."""
 
 _MAX_DIRECT_TRACK_LENGTH = 14.0
-"""Mean track length, in keyframes, above which the robust adjustment uses conjugate gradients. Eliminating
-the points costs the square of the track length; conjugate gradients cost the track length. Evidence:
-docs/decisions/mapping.md."""
+"""Maximum mean track length (keyframes) for which the robust adjustment uses a direct solver. For longer
+tracks it uses conjugate gradients. The time of the direct solver, which eliminates the points, grows with the
+square of the track length. The time of conjugate gradients grows linearly with the track length.
+Evidence: docs/decisions/mapping.md."""
 
 _STEP_ACCURACY = 1e-3
-"""Relative error at which conjugate gradients end; COLMAP: 0.1. Evidence: docs/decisions/mapping.md."""
+"""Relative error of a step at which conjugate gradients end. COLMAP's default is 0.1.
+Evidence: docs/decisions/mapping.md."""
 
 _MIN_LOSS_PX = 0.05
-"""Smallest width of the robust loss, px, for models without residuals. Evidence: none."""
+"""Minimum width (px) of the robust loss, for models whose residuals are almost zero. Evidence: none."""
 
 
 def adjust_and_filter(
@@ -36,7 +38,10 @@ def adjust_and_filter(
     calibrated_ids: Collection[int],
     only: Collection[int] | None = None,
 ) -> None:
-    """Adjust a model with a squared loss and remove outliers; arguments and errors as `bundle_adjust`."""
+    """Adjust a model with a squared loss and remove outliers, in place.
+
+    The arguments and errors are the same as in `bundle_adjust`.
+    """
     bundle_adjust(model, settings, calibrated_ids, only=only)
     _filter_points(model, settings)
 
@@ -47,18 +52,20 @@ def adjust_robustly(
     calibrated_ids: Collection[int],
     only: Collection[int] | None = None,
 ) -> None:
-    """Adjust a finished model with a robust loss and remove outliers; arguments as `bundle_adjust`.
+    """Adjust a finished model with a robust loss and remove outliers, in place.
 
-    Keypoints are accurate to a quarter of a pixel, but one in ten is off by four times that or more: large
-    and blurred ones above all. With a squared loss these bend the map. The loss is Cauchy's. Its width is the
-    median absolute residual along an axis, which is its most likely width given the residuals. If all noise
-    were Gaussian, it would cost 1.4 times the error. Evidence: docs/decisions/mapping.md.
+    The arguments are the same as in `bundle_adjust`. Most keypoints have an error of a quarter of a pixel,
+    but one keypoint in ten has an error of a pixel or more; most of these keypoints are large or blurred.
+    With a squared loss, these keypoints deform the map. So a Cauchy loss is used. Its width is the median
+    absolute residual along an image axis, which is the most likely width given the residuals. If all noise
+    were Gaussian, the error of the map would be 1.4 times as large as with a squared loss.
+    Evidence: docs/decisions/mapping.md.
 
     Raises:
         EstimationError: The adjustment failed.
 
     Source: Zhang, "Parameter estimation techniques: a tutorial with application to conic fitting", 1997, for
-        the loss; its width is the maximum-likelihood scale of a Cauchy distribution.
+        the loss. The width is the maximum-likelihood scale of a Cauchy distribution.
     """
     width_px = max(_MIN_LOSS_PX, median_residual_px(model))
     bundle_adjust(model, settings, calibrated_ids, loss_px=width_px, only=only)
@@ -66,13 +73,13 @@ def adjust_robustly(
 
 
 def _mean_track_length(model: Any) -> float:
-    """Return the length of a point's track, as the mean over all observations."""
+    """Return the mean track length over all observations: each track is weighted by its own length."""
     length = np.array([model.point3D(point).track.length() for point in model.point3D_ids()], dtype=float)
     return float((length**2).sum() / max(1.0, length.sum()))
 
 
 def _filter_points(model: Any, settings: pycolmap.IncrementalPipelineOptions) -> None:
-    """Remove observations with large residuals and points with small angles, in place."""
+    """Remove observations with large residuals and points with small triangulation angles, in place."""
     import pycolmap
 
     pycolmap.ObservationManager(model).filter_all_points3D(
@@ -82,7 +89,7 @@ def _filter_points(model: Any, settings: pycolmap.IncrementalPipelineOptions) ->
 
 
 def sub_model(model: Any, image_ids: Collection[int]) -> Any:
-    """Return a copy of a model with only some of its registered images."""
+    """Return a copy of a model in which only the images `image_ids` stay registered."""
     part = copy.deepcopy(model)
     for image_id in part.reg_image_ids():
         if image_id not in image_ids:
@@ -98,17 +105,18 @@ def bundle_adjust(
     loss_px: float | None = None,
     only: Collection[int] | None = None,
 ) -> None:
-    """Adjust a model once, with every pose free; the gauge moves.
+    """Adjust a model once.
 
-    If `only` is given, all intrinsics, all other poses and the points that other images observe are constant.
+    By default, all poses are adjusted and the model gets a new gauge. If `only` is given, only the poses of
+    these images and the points that no other image observes are adjusted. All intrinsics are constant then.
 
     Args:
         model: A reconstruction, changed in place.
         settings: The mapper's options.
-        calibrated_ids: Ids of the calibrated cameras.
-        iterations: Largest number of iterations; that of the options by default.
-        loss_px: Width of a Cauchy loss, px; a squared loss by default.
-        only: Ids of the images to adjust; all by default.
+        calibrated_ids: Database ids of the calibrated cameras. The intrinsics of these cameras are constant.
+        iterations: Maximum number of iterations; None: the number in the mapper's options.
+        loss_px: Width (px) of a Cauchy loss; None: a squared loss.
+        only: Ids of the images to adjust; None: all images.
 
     Raises:
         EstimationError: The adjustment failed.
@@ -128,7 +136,8 @@ def bundle_adjust(
         loss_px is not None and _mean_track_length(model) > _MAX_DIRECT_TRACK_LENGTH
     )
     if iterative:
-        # COLMAP uses conjugate gradients above these numbers of images; these are the least it accepts.
+        # For more images than these two numbers, COLMAP uses conjugate gradients. The numbers here are the
+        # smallest that COLMAP accepts.
         adjustment.ceres.max_num_images_direct_dense_cpu_solver = 1
         adjustment.ceres.max_num_images_direct_sparse_cpu_solver = 2
         adjustment.ceres.solver_options.eta = _STEP_ACCURACY
@@ -139,7 +148,8 @@ def bundle_adjust(
         if model.exists_camera(camera_id):
             config.set_constant_cam_intrinsics(camera_id)
     if not iterative:
-        # A fixed gauge makes blocks of different sizes, which slow conjugate gradients down.
+        # The gauge is not fixed for conjugate gradients. A fixed gauge gives blocks of different sizes, and
+        # these make conjugate gradients slow.
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     summary = pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
     if not summary.is_solution_usable():

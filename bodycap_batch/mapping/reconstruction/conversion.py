@@ -1,4 +1,4 @@
-"""Convert COLMAP's reconstruction and cameras into a `Map` and `Camera`."""
+"""Convert COLMAP's reconstructions and cameras into `Map` and `Camera`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def map_from_reconstruction(model: pycolmap.Reconstruction, workspace: Path) -> 
 
     Args:
         model: The reconstruction.
-        workspace: Folder of its database, for the colours of the keypoints.
+        workspace: Folder of the reconstruction's database, from which the keypoints' colours are read.
     """
     images = sorted(
         ((ImageRef.parse(model.image(image_id).name), image_id) for image_id in model.reg_image_ids()),
@@ -65,17 +65,17 @@ def map_from_reconstruction(model: pycolmap.Reconstruction, workspace: Path) -> 
 
 
 def _concatenate(parts: list[IntArray]) -> IntArray:
-    """Return all parts as one array; there may be none."""
+    """Concatenate arrays (possibly zero arrays) into one array."""
     return np.concatenate([np.zeros(0, dtype=np.int64), *parts])
 
 
 def _gauge_id(map_from_cam: FloatArray) -> str:
-    """Return the id of a gauge: a digest of the keyframe poses (K,4,4) that define it."""
+    """Return the id of a gauge: a digest of the keyframe poses (K,4,4) that define the gauge."""
     return hashlib.sha256(np.ascontiguousarray(map_from_cam).tobytes()).hexdigest()[:12]
 
 
 def camera_from_pycolmap(camera: Any) -> Camera:
-    """Convert a camera of a reconstruction into a `Camera`."""
+    """Convert a camera of a COLMAP reconstruction into a `Camera`."""
     return Camera(
         model=camera.model.name,
         width_px=int(camera.width),

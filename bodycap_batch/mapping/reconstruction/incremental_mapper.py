@@ -14,19 +14,20 @@ if TYPE_CHECKING:
     import pycolmap
 
 _INITIAL_PAIR_RELAXATIONS = 2
-"""How often the demands on the initial pair are relaxed before it is given up; COLMAP's number."""
+"""Number of times that the thresholds for an initial pair are relaxed before the pair is rejected. COLMAP's
+number."""
 
 
 def progress_counter(
     context: StageContext, total: int, stop: Callable[[], None], done: int = 0
 ) -> Callable[[], None]:
-    """Return a function that reports one more keyframe in the map on each call.
+    """Return a function that increases the reported number of keyframes in the map by one at each call.
 
     Args:
         context: Progress and cancellation.
-        total: Number of keyframes.
-        stop: Called once the work is cancelled.
-        done: Keyframes in the map at the start.
+        total: Number of all keyframes.
+        stop: Function that is called if the work is cancelled.
+        done: Number of keyframes in the map before the first call.
     """
 
     def count_one() -> None:
@@ -47,21 +48,24 @@ def register_images(
     *,
     adjust_globally: bool = True,
 ) -> bool:
-    """Register the database's images in a model, which may be empty, until none of the others fits.
+    """Register images of the database in a model, until no further image fits the model.
 
-    This is COLMAP's pipeline, except for its end. If no further image fits, COLMAP adjusts everything, tries
-    once more, and then adjusts everything again although nothing was added. This function leaves out the last
-    adjustment. Evidence: docs/decisions/mapping.md.
+    The model may be empty. The function follows COLMAP's pipeline except for the last step. If no further
+    image fits, COLMAP adjusts the whole model and tries once more. Then COLMAP adjusts the whole model again,
+    even if no image was added. This function omits the last adjustment.
+    Evidence: docs/decisions/mapping.md.
 
     Args:
         workspace: Folder of the database.
-        settings: The mapper's options; they name the initial pair of an empty model.
+        settings: The mapper's options. They name the initial pair for an empty model.
         model: The model so far, changed in place.
-        count_one: Called after each registered image. What it raises ends the run.
-        adjust_globally: False: only new images are adjusted, the model so far stays.
+        count_one: Function that is called after each registered image. If it raises an exception, the
+            registration ends.
+        adjust_globally: Whether the whole model is adjusted after it has grown; if False, a new image is
+            only adjusted together with the map around it.
 
     Returns:
-        False if the model was empty and there is no usable initial pair.
+        False if the model is empty and has no usable initial pair, else True.
 
     Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016, as implemented in COLMAP.
     """
@@ -87,15 +91,18 @@ def with_new_images(
     *,
     adjust_globally: bool,
 ) -> Any:
-    """Return a copy of a model with the database's new images registered; its existing poses stay.
+    """Return a copy of a model in which further images of the database are registered.
+
+    The poses of the images that are already registered do not change.
 
     Args:
         workspace: Folder of the database.
         model: A reconstruction; not changed.
-        settings: The mapper's options; changed.
+        settings: The mapper's options; changed in place.
         context: Progress and cancellation.
-        total: Number of keyframes, for the progress.
-        adjust_globally: False: only the new images are adjusted.
+        total: Number of all keyframes, for the progress.
+        adjust_globally: Whether global adjustments are made after the model has grown
+            (`register_images`).
     """
     settings.fix_existing_frames = True
     extended = copy.deepcopy(model)
@@ -111,17 +118,19 @@ def resect_images(
     image_ids: Collection[int],
     count_one: Callable[[], None],
 ) -> set[int]:
-    """Register images in a model that shows what they see; nothing is adjusted, existing poses stay.
+    """Register images in a model without any adjustment. The model must contain the places in the images.
 
     Args:
         workspace: Folder of the database.
         settings: The mapper's options.
-        model: The model so far, changed in place: poses, observations and new points are added.
-        image_ids: Ids of the images to register; images without matches are skipped.
-        count_one: Called after each registered image. What it raises ends the run.
+        model: The model so far, changed in place: poses, observations and new points are added, and existing
+            poses do not change.
+        image_ids: Ids of the images to register. Images without matches are skipped.
+        count_one: Function that is called after each registered image. If it raises an exception, the
+            registration ends.
 
     Returns:
-        Ids of the registered images.
+        Ids of the images that were registered.
     """
     mapper = _open_mapper(workspace, settings)
     mapper.begin_reconstruction(model)
@@ -140,7 +149,7 @@ def resect_images(
 def _open_mapper(
     workspace: Path, settings: pycolmap.IncrementalPipelineOptions
 ) -> pycolmap.IncrementalMapper:
-    """Return a mapper over the database of a workspace."""
+    """Return a COLMAP mapper for the database of a workspace."""
     import pycolmap
 
     options = pycolmap.DatabaseCacheOptions()
@@ -151,7 +160,10 @@ def _open_mapper(
 
 
 def _relaxed_options(options: Any) -> Iterator[Any]:
-    """Yield demands on the initial pair, relaxed as in COLMAP: half the inliers, half the angle, twice."""
+    """Yield mapper options with thresholds for the initial pair that become less strict, as in COLMAP.
+
+    The minimum number of inliers and the minimum angle are halved alternately.
+    """
     relaxed = copy.deepcopy(options)
     yield relaxed
     for _ in range(_INITIAL_PAIR_RELAXATIONS):
@@ -181,9 +193,9 @@ class _MapperRun:
         self._global = settings.get_global_bundle_adjustment()
 
     def initialise(self) -> bool:
-        """Start with the initial pair of the options; return False if there is none or it is unusable."""
+        """Start the model with the initial pair in the options; return False if no usable pair is given."""
         pair = (self._settings.init_image_id1, self._settings.init_image_id2)
-        if min(pair) < 0:  # COLMAP's mark for no pair
+        if min(pair) < 0:  # In COLMAP, a negative id means that no initial pair is given.
             return False
         for options in _relaxed_options(self._options):
             geometry = self._mapper.estimate_initial_two_view_geometry(options, *pair)
@@ -203,7 +215,7 @@ class _MapperRun:
         return bool(self._model.num_reg_frames() and self._model.num_points3D())
 
     def register_all(self, count_one: Callable[[], None]) -> None:
-        """Register images until no further one fits, not even after a global adjustment."""
+        """Register images until no further image fits, even after a global adjustment."""
         adjusted, last_try = self._size(), False
         while True:
             image_id = self._register_next()
@@ -221,7 +233,10 @@ class _MapperRun:
                 adjusted, last_try = self._size(), True
 
     def _register_next(self) -> int | None:
-        """Register the image that observes most of the map; return None if no image fits."""
+        """Register the image that fits and observes most of the map, and return its id.
+
+        Return None if no image fits.
+        """
         for image_id in self._mapper.find_next_images(self._options, structure_less=False):
             if self._mapper.register_next_image(self._options, image_id):
                 return int(image_id)
@@ -249,11 +264,15 @@ class _MapperRun:
             self._mapper.triangulate_image(options, item.id)
 
     def _size(self) -> tuple[int, int]:
-        """Return the number of registered frames and of points."""
+        """Return the model's number of registered frames and its number of points."""
         return self._model.num_reg_frames(), self._model.num_points3D()
 
     def _needs_global_adjustment(self, adjusted: tuple[int, int]) -> bool:
-        """Return whether the model grew much since its size was `adjusted`; the same test as COLMAP's."""
+        """Return whether the model has grown enough for a global adjustment, by COLMAP's test.
+
+        Args:
+            adjusted: Numbers of frames and points (`_size`) at the last global adjustment.
+        """
         frames, points = self._size()
         return bool(
             frames >= self._settings.ba_global_frames_ratio * adjusted[0]
@@ -263,7 +282,7 @@ class _MapperRun:
         )
 
     def _adjust_all(self) -> None:
-        """Adjust the whole model, unless the run was asked not to."""
+        """Adjust the whole model if global adjustments are permitted."""
         if not self._adjust_globally:
             return
         self._mapper.iterative_global_refinement(

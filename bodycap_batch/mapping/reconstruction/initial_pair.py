@@ -1,4 +1,4 @@
-"""Rank pairs of keyframes to start a reconstruction from."""
+"""Rank the pairs of keyframes from which a reconstruction can start."""
 
 from __future__ import annotations
 
@@ -20,34 +20,36 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MAX_CANDIDATES = 200
-"""Pairs that are measured at most. Evidence: none."""
+"""Maximum number of pairs whose parallax and coverage are measured. Evidence: none."""
 _CANDIDATE_MATCHES = 50
-"""Matches of a pair above which it is a candidate. The measured pairs are evenly spaced among the candidates,
-from most to fewest matches: the pairs with most matches are neighbours, which hardly moved apart.
-Evidence: none."""
+"""Minimum number of matches of a candidate pair. The candidates are sorted by their number of matches, and
+evenly spaced candidates are measured. The pairs with the most matches alone would be unsuitable: they are
+neighbours in time, and the camera hardly moved between them. Evidence: none."""
 _ENOUGH_MATCHES = 100
-"""Matches above which more do not improve a pair's score: COLMAP's demand on the initial pair."""
+"""Number of matches at which a pair gets the maximum score for matches. It is COLMAP's default minimum for
+the initial pair."""
 _ENOUGH_PARALLAX_RAD = float(np.radians(16.0))
-"""Parallax above which more does not improve a pair's score: COLMAP's demand on the initial pair.
-Evidence: docs/decisions/mapping.md."""
+"""Parallax (radians) at which a pair gets the maximum score for parallax. It is COLMAP's default minimum for
+the initial pair. Evidence: docs/decisions/mapping.md."""
 _GRID_CELLS = 4
-"""Cells of the coverage grid along each axis of the image."""
+"""Number of cells of the coverage grid along each axis of the image."""
 _MIN_PARALLAX_RAD = float(np.radians(1.5))
-"""Parallax below which a pair is not used. Evidence: none."""
+"""Minimum parallax (radians) of a usable initial pair. Evidence: none."""
 _MIN_COVERAGE = 0.3
-"""Coverage below which a pair is not used. Evidence: none."""
+"""Minimum coverage (fraction of the grid cells) of a usable initial pair. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
 class InitialPair:
-    """Two keyframes to start a reconstruction from.
+    """Two keyframes from which a reconstruction can start.
 
     Attributes:
-        ids: Database ids of the images.
-        names: Their image names.
+        ids: Database ids of the two images.
+        names: Image names of the two images.
         matches: Number of verified matches.
-        parallax_rad: Median angle between matched rays after the best rotation is removed.
-        coverage: Ratio of cells with matches in a 4 x 4 grid, mean of both images.
+        parallax_rad: Median angle (radians) between matched rays, after the rotation that fits best is
+            removed.
+        coverage: Fraction of the cells of a 4 x 4 grid that contain matches, mean of both images.
     """
 
     ids: tuple[int, int]
@@ -58,7 +60,7 @@ class InitialPair:
 
     @property
     def score(self) -> float:
-        """Larger is better; at most 1."""
+        """Score of the pair, from 0 to 1; a better pair has a larger score."""
         return (
             min(1.0, self.matches / _ENOUGH_MATCHES)
             * min(1.0, self.parallax_rad / _ENOUGH_PARALLAX_RAD)
@@ -67,12 +69,12 @@ class InitialPair:
 
     @property
     def is_usable(self) -> bool:
-        """Whether the cameras moved apart and the matches cover more than a small part of the images."""
+        """Whether the parallax and the coverage are large enough for an initial pair."""
         return self.parallax_rad >= _MIN_PARALLAX_RAD and self.coverage >= _MIN_COVERAGE
 
     @property
     def rejection_reason(self) -> str:
-        """The most likely reason why no model can be built from this pair, for the log."""
+        """The most likely reason why a reconstruction from this pair fails, for the log."""
         if self.parallax_rad < _MIN_PARALLAX_RAD:
             return f"the cameras hardly moved apart ({np.degrees(self.parallax_rad):.1f} degrees of parallax)"
         if self.coverage < _MIN_COVERAGE:
@@ -90,7 +92,7 @@ class InitialPair:
 
 
 def rank_initial_pairs(workspace: Path, intrinsics: Mapping[str, CameraIntrinsics]) -> list[InitialPair]:
-    """Return pairs of keyframes by parallax, number of matches and coverage, the best pair first.
+    """Return pairs of keyframes sorted by their score (`InitialPair.score`), the best pair first.
 
     Args:
         workspace: Folder of the database.
@@ -114,16 +116,19 @@ def find_user_pair(
     intrinsics: Mapping[str, CameraIntrinsics],
     frame_numbers: Mapping[str, IntArray],
 ) -> InitialPair | None:
-    """Return the pair that a user names: for each ``camera:frame``, the nearest keyframe of the camera.
+    """Return the initial pair that a user names by two frames.
+
+    For each frame ``camera:frame``, the nearest keyframe of the same camera is used.
 
     Args:
         workspace: Folder of the database.
-        names: Two frames by camera name and frame number in the camera's joined video.
+        names: Two frames, each as ``camera:frame`` with the frame number in the camera's joined video.
         intrinsics: Intrinsics by camera name.
-        frame_numbers: `CaptureCamera.frame_numbers` of each camera; the database knows frames by index.
+        frame_numbers: `CaptureCamera.frame_numbers` of each camera, by camera name. They are needed because
+            the database has frame indices, not frame numbers.
 
     Returns:
-        The pair, or None if the two keyframes share no verified matches.
+        The pair, or None if the two keyframes are not a verified pair.
 
     Raises:
         JobError: A camera has no keyframes, or both names lead to the same keyframe.
@@ -143,7 +148,7 @@ def find_user_pair(
 def _nearest_keyframe(
     name: str, keyframes: Collection[ImageRef], frame_numbers: Mapping[str, IntArray]
 ) -> ImageRef:
-    """Return the keyframe nearest to a frame ``camera:frame``."""
+    """Return the keyframe that is nearest in time to the frame ``camera:frame`` of the same camera."""
     camera, _, frame = name.rpartition(":")
     candidates = sorted(ref for ref in keyframes if ref.camera == camera)
     if not candidates:
@@ -158,7 +163,7 @@ def _nearest_keyframe(
 def _measure_pair(
     database: pycolmap.Database, ids: tuple[int, int], intrinsics: Mapping[str, CameraIntrinsics]
 ) -> InitialPair:
-    """Return two images with their number of matches, parallax and coverage."""
+    """Measure the number of matches, the parallax and the coverage of a pair of images."""
     matches = np.asarray(database.read_two_view_geometry(*ids).inlier_matches)
     names = (database.read_image(ids[0]).name, database.read_image(ids[1]).name)
     cameras = [intrinsics[ImageRef.parse(name).camera].camera for name in names]
@@ -180,7 +185,7 @@ def _measure_pair(
 
 
 def _grid_coverage(px: FloatArray, camera: Camera) -> float:
-    """Return the ratio of grid cells of the image that hold some of the pixels (N,2)."""
+    """Return the fraction of the image's grid cells that contain at least one of the pixels (N,2)."""
     size_px = (camera.width_px, camera.height_px)
     cells = np.clip((px / size_px * _GRID_CELLS).astype(int), 0, _GRID_CELLS - 1)
     return len(np.unique(cells @ (_GRID_CELLS, 1))) / _GRID_CELLS**2

@@ -1,4 +1,4 @@
-"""The options of COLMAP's incremental mapper."""
+"""Set the options of COLMAP's incremental mapper."""
 
 from __future__ import annotations
 
@@ -11,37 +11,39 @@ if TYPE_CHECKING:
     import pycolmap
 
 MIN_MODEL_KEYFRAMES = 3
-"""Keyframes of a model, at least. Evidence: none."""
+"""Minimum number of keyframes of a model. Evidence: none."""
 _ADJUSTMENT_TOLERANCE = 1e-5
-"""Relative change of the cost that ends a bundle adjustment. With COLMAP's 0, every adjustment runs to its
-last iteration. Evidence: docs/decisions/mapping.md."""
+"""Relative change of the cost at which a bundle adjustment ends. With COLMAP's default of 0, every adjustment
+uses the maximum number of iterations. Evidence: docs/decisions/mapping.md."""
 _GLOBAL_GROWTH = 1.4
-"""Growth factor of the map after which it is adjusted globally; COLMAP: 1.1.
-Evidence: docs/decisions/mapping.md."""
+"""Ratio of the number of frames or points of the map to their number at the last global adjustment. At this
+ratio the map is adjusted globally again. COLMAP's default is 1.1. Evidence: docs/decisions/mapping.md."""
 _GLOBAL_REFINEMENTS = 2
-"""Rounds of a global adjustment; COLMAP: 5. Evidence: docs/decisions/mapping.md."""
-_LOCAL_REFINEMENTS = 1
-"""Rounds of a local adjustment; COLMAP: 2. Evidence: docs/decisions/mapping.md."""
-_MIN_RESECTION_INLIERS = 20
-"""Map points that a keyframe must agree with to be registered; COLMAP: 30.
+"""Maximum number of rounds of a global adjustment. COLMAP's default is 5.
 Evidence: docs/decisions/mapping.md."""
+_LOCAL_REFINEMENTS = 1
+"""Maximum number of rounds of a local adjustment. COLMAP's default is 2.
+Evidence: docs/decisions/mapping.md."""
+_MIN_RESECTION_INLIERS = 20
+"""Minimum number of map points that must agree with the pose of a keyframe to register the keyframe. COLMAP's
+default is 30. Evidence: docs/decisions/mapping.md."""
 _MAX_EXTRA_PARAM = 1e3
-"""Largest distortion parameter that is accepted. A given calibration is trusted: COLMAP's 1 silently drops
-cameras with k3 > 1."""
+"""Maximum absolute value of an accepted distortion parameter. COLMAP's default of 1 rejects cameras with
+k3 > 1 without a message, but a given calibration must be accepted."""
 
 
 def make_mapper_options(
     options: MapOptions, calibrated_ids: Collection[int], scale: float
 ) -> pycolmap.IncrementalPipelineOptions:
-    """Return mapper options that are seeded and reproducible, with calibrated intrinsics held constant.
+    """Return mapper options that give reproducible maps and keep calibrated intrinsics constant.
 
-    The mapper gets one thread. Several threads add up residuals in an order that changes from run to run,
-    and the map would change with it.
+    The mapper uses one thread. Several threads would add up residuals in an order that differs from run to
+    run, so the map would differ too.
 
     Args:
         options: The stage's options.
         calibrated_ids: Database ids of the calibrated cameras.
-        scale: Factor on pixel thresholds.
+        scale: Factor that multiplies all pixel thresholds.
     """
     import pycolmap
 

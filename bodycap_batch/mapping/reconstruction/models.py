@@ -1,4 +1,4 @@
-"""The models of a workspace: their files, their order, the names of their keyframes."""
+"""Read, write and sort the models of a workspace, and list the registered images of a model."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 MODELS_FOLDER = "sparse"
-"""Folder of the models in a workspace, one numbered folder each; COLMAP's name for it."""
+"""Name of the folder with all models in a workspace, as COLMAP names it. Each model has a numbered folder."""
 
 
 def write_models(workspace: Path, models: Sequence[Any]) -> None:
-    """Write the models to ``sparse/<n>``, replacing earlier ones."""
+    """Write the models to the folders ``sparse/<n>`` of a workspace; delete earlier models there."""
     folder = workspace / MODELS_FOLDER
     shutil.rmtree(folder, ignore_errors=True)
     for number, model in enumerate(models):
@@ -21,7 +21,7 @@ def write_models(workspace: Path, models: Sequence[Any]) -> None:
 
 
 def read_model(workspace: Path, number: int) -> Any:
-    """Return one of the models in ``sparse/<n>``."""
+    """Read the model in the folder ``sparse/<number>`` of a workspace."""
     import pycolmap
 
     return pycolmap.Reconstruction(str(workspace / MODELS_FOLDER / str(number)))
@@ -38,5 +38,5 @@ def keyframe_names(model: Any) -> set[str]:
 
 
 def model_order(model: Any) -> tuple[int, int]:
-    """Return the sort key that puts the largest model first: by keyframes, then by points."""
+    """Return a sort key that puts the model with the most keyframes first, then with the most points."""
     return -model.num_reg_images(), -model.num_points3D()

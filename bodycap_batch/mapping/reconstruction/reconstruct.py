@@ -1,4 +1,4 @@
-"""Reconstruct models from nothing: try initial pairs, relax the demands on them, search further models."""
+"""Reconstruct models without a previous map, from several initial pairs and with relaxed thresholds."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ _RELAXATION_STEPS = (
     {"init_min_tri_angle": 6.0, "init_min_num_inliers": 50, "init_max_forward_motion": 0.99},
     {"init_min_tri_angle": 2.0, "init_min_num_inliers": 25, "init_max_forward_motion": 1.0},
 )
-"""Demands on the initial pair, relaxed step by step: degrees between rays, inliers, largest forward share of
-the motion. The first step is COLMAP's default. Evidence for the others: none."""
+"""Thresholds for the initial pair in each step: minimum angle (degrees) between rays, minimum number of
+inliers, maximum fraction of forward motion. The first step has COLMAP's defaults. Later steps are less
+strict; evidence for their values: none."""
 
 _MAX_SEARCH_TRIALS = 200
-"""Images that COLMAP's own search for an initial pair tries; its default."""
+"""Maximum number of images that COLMAP tries in its own search for an initial pair. COLMAP's default."""
 _MIN_REGISTERED_RATIO = 0.25
-"""Ratio of the keyframes that a model from a given initial pair must hold; else the next pair is tried.
-Evidence: none."""
+"""Minimum fraction of all keyframes in a model that starts from a given initial pair. If the model holds
+fewer, the next initial pair is tried. Evidence: none."""
 
 
 def reconstruct(
@@ -40,17 +41,21 @@ def reconstruct(
     total: int,
     initial_pairs: Sequence[InitialPair] = (),
 ) -> tuple[list[Any], list[dict[str, object]]]:
-    """Reconstruct models from nothing; relax the demands on the initial pair until one model is good enough.
+    """Reconstruct models without a previous map.
+
+    The given initial pairs are tried first. If no model from them is large enough, COLMAP's own search for an
+    initial pair follows. If the search finds no model, the thresholds for the initial pair are relaxed and
+    all attempts are repeated.
 
     Args:
         workspace: Folder of the database.
-        settings: The mapper's options; changed.
+        settings: The mapper's options; changed in place.
         context: Progress and cancellation.
-        total: Number of keyframes.
-        initial_pairs: Pairs to start from, the best first. COLMAP's own search follows if none succeeds.
+        total: Number of all keyframes.
+        initial_pairs: Initial pairs to try, the best first.
 
     Returns:
-        The models, largest first, and the result of each attempt for the log.
+        The models, largest first; the result of each attempt, for the log.
     """
     attempts: list[dict[str, object]] = []
     for demands in _RELAXATION_STEPS:
@@ -75,7 +80,7 @@ def reconstruct(
 def _reconstruct_from_search(
     workspace: Path, settings: pycolmap.IncrementalPipelineOptions, context: StageContext, total: int
 ) -> list[Any]:
-    """Return models from the initial pairs that COLMAP finds, largest first."""
+    """Return the models that start from initial pairs of COLMAP's own search, largest first."""
     settings.init_image_id1, settings.init_image_id2 = -1, -1
     settings.init_num_trials, settings.multiple_models = _MAX_SEARCH_TRIALS, True
     return _run_colmap(workspace, settings, context, total)
@@ -88,10 +93,10 @@ def _reconstruct_from_pair(
     context: StageContext,
     total: int,
 ) -> list[Any]:
-    """Return the model from a given pair and the models of the keyframes outside it, largest first.
+    """Return the model that starts from a given pair, and models of the remaining keyframes, largest first.
 
-    The largest further model also registers keyframes of the first one, as COLMAP's further models do: a part
-    of the room may be reachable from one side only.
+    Keyframes of the first model that fit the largest further model are also registered in the further model.
+    COLMAP does this too, because a part of the room may be connected to the rest on one side only.
     """
     import pycolmap
 
@@ -125,7 +130,7 @@ def _with_registered_images(
     context: StageContext,
     total: int,
 ) -> Any:
-    """Return a copy of a model with all images that fit it; the model itself if it is the larger one."""
+    """Register all images that fit in a copy of a model; return the copy or the model, the larger of both."""
     extended = copy.deepcopy(model)
     register_images(workspace, settings, extended, progress_counter(context, total, context.check_cancelled))
     return min([extended, model], key=model_order)
@@ -134,7 +139,7 @@ def _with_registered_images(
 def _run_colmap(
     workspace: Path, settings: pycolmap.IncrementalPipelineOptions, context: StageContext, total: int
 ) -> list[Any]:
-    """Run COLMAP's incremental mapping and return its models, largest first."""
+    """Run COLMAP's incremental mapping and return the models, largest first."""
     import pycolmap
 
     target = workspace / "mapper"

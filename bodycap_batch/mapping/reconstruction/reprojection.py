@@ -1,4 +1,4 @@
-"""Reprojection residuals of a model."""
+"""Compute the reprojection residuals of a model."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     import pycolmap
 
 _NO_PROJECTION_PX = 1e3
-"""Residual of a point that has no projection, px: far outside the image."""
+"""Residual (px) of a point that has no projection. It has the size of a point far outside the image."""
 
 
 def image_residuals_px(model: pycolmap.Reconstruction, image: Any, feature: IntArray) -> FloatArray:
-    """Return the residuals (N,2) of some features of an image: observed minus projected, px.
+    """Return the residuals (N,2) of some features of an image: observed minus projected position, px.
 
     Args:
         model: The reconstruction.
-        image: One of its images.
-        feature: (N,) indices of features of the image that observe a point.
+        image: A registered image of the reconstruction.
+        feature: (N,) indices of features of the image that observe a point of the reconstruction.
     """
     pose = np.asarray(image.cam_from_world().matrix())
     cam_from_map = make_transform(pose[:, :3], pose[:, 3])
@@ -37,7 +37,10 @@ def image_residuals_px(model: pycolmap.Reconstruction, image: Any, feature: IntA
 
 
 def median_residual_px(model: pycolmap.Reconstruction) -> float:
-    """Return the median absolute residual of all observations along an axis, px; 0 without observations."""
+    """Return the median absolute value of the x and y residuals (px) of all observations.
+
+    The result is 0 for a model without observations.
+    """
     parts = [np.zeros((0, 2))]
     for image_id in sorted(model.reg_image_ids()):
         image = model.image(image_id)

@@ -1,4 +1,7 @@
-"""Adjust a large map in two steps: first its skeletal keyframes, then all other keyframes against these."""
+"""Adjust a large map in two steps: first the skeletal keyframes, then all other keyframes.
+
+Skeletal keyframes are the reduced set of keyframes, Snavely's skeletal set.
+"""
 
 from __future__ import annotations
 
@@ -23,22 +26,23 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MIN_SHARED_POINTS = 60
-"""Common points above which two keyframes surely show the same. Evidence: none."""
+"""Minimum number of common points of two keyframes that surely show the same part of the room.
+Evidence: none."""
 
 
 def adjust_in_two_steps(
     model: Any, settings: pycolmap.IncrementalPipelineOptions, calibrated_ids: Collection[int]
 ) -> None:
-    """Adjust a large model in place, as `adjust_and_filter` and `adjust_robustly` would do.
+    """Adjust a large model in place; the result approximates `adjust_and_filter` and `adjust_robustly`.
 
-    One adjustment of all keyframes would take hours. So the skeletal keyframes are adjusted together, as a
-    map of their own. Then the others are adjusted against the points of that map, which stay constant. Points
-    that the skeletal keyframes do not observe are free in the second step.
+    One adjustment of all keyframes would take hours. So the skeletal keyframes are adjusted together first,
+    as a separate map. Then all other keyframes are adjusted, while the points of the separate map stay
+    constant. Points that no skeletal keyframe observes are free in the second step.
 
     Args:
-        model: A reconstruction; its gauge moves.
+        model: A reconstruction, changed in place. The adjustment gives it a new gauge.
         settings: The mapper's options.
-        calibrated_ids: Ids of the calibrated cameras.
+        calibrated_ids: Database ids of the calibrated cameras.
 
     Raises:
         EstimationError: An adjustment failed.
@@ -59,7 +63,7 @@ def adjust_in_two_steps(
 
 
 def _count_shared_points(model: Any, images: IntArray) -> npt.NDArray[np.int16]:
-    """Return the number (N,N) of points that two images both observe."""
+    """Return the number (N,N) of points that both images of each pair observe."""
     observed = [
         np.array([points[index].point3D_id for index in image.get_observation_point2D_idxs()], dtype=np.int64)
         for image in map(model.image, images.tolist())
@@ -72,17 +76,22 @@ def _count_shared_points(model: Any, images: IntArray) -> npt.NDArray[np.int16]:
 
 
 def _time_order(model: Any, images: IntArray) -> IntArray:
-    """Return numbers (N,) that sort the images by time, approximately: cameras may differ in their rates."""
+    """Return the frame index of each image (N,), a sort key that approximates the order in time.
+
+    The order is not exact, because cameras may have different frame rates.
+    """
     return np.array([ImageRef.parse(model.image(number).name).frame for number in images.tolist()])
 
 
 def _copy_back(model: Any, part: Any, image_ids: Collection[int]) -> None:
-    """Copy poses, intrinsics, points and removed observations of an adjusted part into the whole model.
+    """Copy poses, intrinsics and points of an adjusted part of a model into the whole model.
+
+    Observations that are removed in the part are also removed in the whole model.
 
     Args:
         model: The whole model, changed in place.
-        part: The adjusted part.
-        image_ids: Ids of the part's images.
+        part: The adjusted part of the model.
+        image_ids: Ids of the part's registered images.
     """
     for number, camera in part.cameras.items():
         model.camera(number).params = camera.params

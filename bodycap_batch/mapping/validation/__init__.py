@@ -1,1 +1,1 @@
-"""Checks of a finished map, and repairs."""
+"""Checks and repairs of a map."""

@@ -1,4 +1,7 @@
-"""Check that the distances between cameras stay within the body's reach, for a map without a metric scale."""
+"""Check that the distances between cameras in a map stay within the body's reach.
+
+The map has no metric scale, so the check also finds the scale that fits best.
+"""
 
 from __future__ import annotations
 
@@ -12,33 +15,36 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, runs
 from bodycap_batch.model.scene import Map
 
 Reach = Mapping[tuple[str, str], tuple[float, float]]
-"""Smallest and largest distance of two cameras, metres, by camera names in alphabetical order."""
+"""Minimum and maximum distance (metres) between two cameras, by their names in alphabetical order."""
 
 MIN_WITHIN_REACH = 0.8
-"""Ratio of distances that the provisional scale must put within reach; else the check is inconclusive.
-Evidence: none."""
+"""Minimum fraction of the distances that must be within reach at the provisional scale. With a smaller
+fraction, the check is inconclusive. Evidence: none."""
 _MIN_DISTANCES = 20
-"""Distances that the check needs. Evidence: none."""
+"""Minimum number of distances that the check needs. Evidence: none."""
 _MAX_GAP_NS = 1_000_000_000
-"""Largest time between two keyframes to interpolate between, nanoseconds: in more time, a limb can be
-anywhere."""
+"""Maximum time (nanoseconds) between two keyframes for an interpolation of the camera's position. In a longer
+time, a limb can move anywhere."""
 _SLACK_SIGMAS = 2.0
-"""Standard deviations by which a distance may leave the reach. Evidence: none."""
+"""Number of standard deviations by which a distance may be outside the reach. Evidence: none."""
 _MIN_RUN = 3
-"""Successive keyframes out of reach that make a violation; one or two are noise of their poses."""
+"""Minimum number of successive keyframes out of reach that are a violation. Shorter runs are treated as noise
+of the keyframes' poses."""
 _SMALLEST_UNIT = 1e-300
-"""Keeps a distance of zero positive for the logarithm, map units."""
+"""Smallest length (map units) of a lower limit of a distance. The limit stays positive, so its logarithm is
+defined."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DistanceCheck:
-    """The result of the check.
+    """The result of comparing the distances between cameras with the body's reach.
 
     Attributes:
-        distances: Number of distances (camera pair, instant).
-        within_reach: Ratio of these that the provisional scale puts within reach.
-        metres_per_unit: The provisional scale; None if there are too few distances.
-        violations: (K,) True for keyframes of the map that are out of reach in runs of several keyframes.
+        distances: Number of compared distances, one for each camera pair and instant.
+        within_reach: Fraction of the distances that are within reach at the provisional scale.
+        metres_per_unit: The provisional scale: metres per map unit; None if there are too few distances.
+        violations: (K,) True for each of the map's K keyframes that belongs to a run of at least `_MIN_RUN`
+            successive keyframes out of reach.
     """
 
     distances: int
@@ -48,11 +54,14 @@ class DistanceCheck:
 
     @property
     def is_conclusive(self) -> bool:
-        """False if no scale fits the body: the body or the map is wrong, and the check cannot know which."""
+        """Whether a scale was found at which most distances are within reach.
+
+        If there is no such scale, the given body or the map is wrong. The check cannot decide which of them.
+        """
         return self.metres_per_unit is not None and self.within_reach >= MIN_WITHIN_REACH
 
     def to_log(self) -> dict[str, object]:
-        """Return the entries for the log; they do not depend on the map's arbitrary scale."""
+        """Return the entries for the log. The entries do not depend on the map's arbitrary scale."""
         if self.metres_per_unit is None:
             return {"judged": False, "reason": f"{self.distances} distances between cameras are too few"}
         out: dict[str, object] = {
@@ -69,13 +78,14 @@ class DistanceCheck:
 def check_distances(scene: Map, common_ns: Mapping[str, IntArray], reach: Reach) -> DistanceCheck:
     """Compare the distances between cameras at the keyframes' instants with the body's reach.
 
-    The position of a camera between two of its keyframes is interpolated; its uncertainty grows with their
-    distance. All distances are related to one provisional scale, so the map's own scale does not matter.
+    The position of a camera between two of its keyframes is interpolated. The uncertainty of the position
+    grows with the distance between these two keyframes. All distances are converted to metres with one
+    provisional scale, so the map's own scale has no effect.
 
     Args:
-        scene: A map.
-        common_ns: Common time of every frame, by camera, nanoseconds.
-        reach: Smallest and largest distance of camera pairs.
+        scene: The map to check.
+        common_ns: Common time (nanoseconds) of every frame, by camera name.
+        reach: Minimum and maximum distance (metres) between the two cameras of each pair.
     """
     none = np.zeros(len(scene.keyframe_camera), dtype=bool)
     parts = [_distances_both_ways(scene, common_ns, pair) for pair in combinations(sorted(scene.cameras), 2)]
@@ -105,13 +115,13 @@ def check_distances(scene: Map, common_ns: Mapping[str, IntArray], reach: Reach)
 
 
 def find_best_scale(low: FloatArray, high: FloatArray) -> tuple[float, float]:
-    """Return the value that lies in most intervals, and the ratio of these intervals.
+    """Return the value that lies in the most intervals, and the fraction of the intervals that contain it.
 
-    If a whole range of values does, its middle is returned.
+    If several neighbouring values lie in the same intervals, the middle of their range is returned.
 
     Args:
         low: (N,) lower ends of the intervals.
-        high: (N,) upper ends.
+        high: (N,) upper ends of the intervals.
 
     Source: the maximum of a sweep over sorted end points.
     """
@@ -130,9 +140,9 @@ class _Distances:
 
     Attributes:
         pair: Camera names in alphabetical order.
-        keyframe: (N,) row in the map of the keyframe at whose instant the distance is taken.
-        distance: (N,) map units.
-        sigma: (N,) standard deviation from interpolation, map units.
+        keyframe: (N,) index in the map of the keyframe that defines the instant of each distance.
+        distance: (N,) distance between the two cameras, map units.
+        sigma: (N,) standard deviation of the distance because of interpolation, map units.
     """
 
     pair: tuple[str, str]
@@ -141,16 +151,16 @@ class _Distances:
     sigma: FloatArray
 
     def longest(self) -> FloatArray:
-        """Return the upper ends (N,) of the distances' confidence intervals."""
+        """Return the upper ends (N,) of the distances' confidence intervals, map units."""
         return self.distance + _SLACK_SIGMAS * self.sigma
 
     def shortest(self) -> FloatArray:
-        """Return the lower ends (N,), which are positive."""
+        """Return the lower ends (N,) of the distances' confidence intervals, map units, always positive."""
         return np.maximum(self.distance - _SLACK_SIGMAS * self.sigma, 1e-9 * self.distance + _SMALLEST_UNIT)
 
 
 def _distances_both_ways(scene: Map, common_ns: Mapping[str, IntArray], pair: tuple[str, str]) -> _Distances:
-    """Return the distances of two cameras at the instants of the keyframes of either."""
+    """Return the distances between two cameras at the instants of all keyframes of both cameras."""
     parts = [_distances_at_keyframes(scene, common_ns, a, b) for a, b in (pair, pair[::-1])]
     return _Distances(pair, *(np.concatenate(part) for part in zip(*parts, strict=True)))
 
@@ -158,7 +168,12 @@ def _distances_both_ways(scene: Map, common_ns: Mapping[str, IntArray], pair: tu
 def _distances_at_keyframes(
     scene: Map, common_ns: Mapping[str, IntArray], camera: str, other: str
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return keyframes of one camera, their distances to the other's path, and standard deviations."""
+    """Return the distances between two cameras at the instants of the first camera's keyframes.
+
+    Returns:
+        (N,) indices of the keyframes of `camera` at which the position of `other` can be interpolated; (N,)
+        distances between the two cameras, map units; (N,) standard deviations of the distances.
+    """
     own, others = scene.keyframes_of(camera), scene.keyframes_of(other)
     at = common_ns[camera][scene.keyframe_frame[own]]
     times = common_ns[other][scene.keyframe_frame[others]]
@@ -172,13 +187,14 @@ def _distances_at_keyframes(
     centres = scene.map_from_cam[:, :3, 3]
     step = centres[after] - centres[before]
     distance = np.linalg.norm(centres[before] + alpha[:, None] * step - centres[own[inside]], axis=1)
-    # A bent path leaves its chord by up to a fraction of the chord's length, most in the middle.
+    # A curved path deviates from its chord. The deviation grows with the chord's length and is largest in
+    # the middle.
     sigma = np.linalg.norm(step, axis=1) * alpha * (1.0 - alpha)
     return own[inside], distance, sigma
 
 
 def _keep_long_runs(scene: Map, mask: BoolArray) -> BoolArray:
-    """Return the mask (K,) without runs of fewer than `_MIN_RUN` successive keyframes of one camera."""
+    """Return the mask (K,) of keyframes; runs of fewer than `_MIN_RUN` keyframes of a camera become False."""
     out = np.zeros(len(mask), dtype=bool)
     for camera in sorted(scene.cameras):
         rows = scene.keyframes_of(camera)

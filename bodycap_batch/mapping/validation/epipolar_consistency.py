@@ -17,31 +17,32 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MAX_ERROR_PX = 8.0
-"""Largest epipolar error of a match under the map's poses, px: twice the error of verification, because a map
-bends a little."""
+"""Maximum epipolar error (px) of a match that the map's poses explain. It is twice the maximum error in
+verification, because a map is slightly deformed."""
 _MIN_PAIR_MATCHES = 30
-"""Pairs with fewer matches are not evaluated: some of them are wrong. Evidence: none."""
+"""Minimum number of matches of an evaluated pair. Some verified pairs with fewer matches are wrong.
+Evidence: none."""
 _MIN_INLIER_RATIO = 0.5
-"""Ratio of a pair's matches that the map's poses must explain; else the pair is inconsistent. Evidence:
-none."""
+"""Minimum fraction of a pair's matches that the map's poses must explain. A pair with a smaller fraction is
+inconsistent. Evidence: none."""
 _MAX_IMAGE_INCONSISTENT_RATIO = 0.25
-"""Ratio of an image's matches in inconsistent pairs above which the image is misregistered. Evidence:
-none."""
+"""Maximum fraction of an image's matches that may be in inconsistent pairs. An image with a larger fraction
+is misregistered. Evidence: none."""
 
 MAX_INCONSISTENT_RATIO = 0.1
-"""Ratio of a map's matches in inconsistent pairs above which the map is refused.
-Evidence: docs/decisions/mapping.md."""
+"""Maximum fraction of a map's matches that may be in inconsistent pairs. A map with a larger fraction is
+refused. Evidence: docs/decisions/mapping.md."""
 
 
 @dataclass(frozen=True, slots=True)
 class PairConsistency:
-    """A verified pair and how well the map's poses explain it.
+    """A verified pair, and the fraction of its matches that the map's poses explain.
 
     Attributes:
-        first: Image id.
-        second: Image id.
+        first: Id of the pair's first image.
+        second: Id of the pair's second image.
         matches: Number of verified matches.
-        inlier_ratio: Ratio of these matches that the map's poses explain.
+        inlier_ratio: Fraction of the verified matches that the map's poses explain.
     """
 
     first: int
@@ -51,12 +52,14 @@ class PairConsistency:
 
     @property
     def is_inconsistent(self) -> bool:
-        """Whether the map's poses explain too few of the matches."""
+        """Whether the map's poses explain too few of the pair's matches."""
         return self.inlier_ratio < _MIN_INLIER_RATIO
 
 
 def evaluate_pairs(workspace: Path, model: pycolmap.Reconstruction) -> list[PairConsistency]:
-    """Compare every verified pair of registered images with the epipolar geometry of the model's poses.
+    """Compare the matches of verified pairs with the epipolar geometry that the model's poses define.
+
+    Pairs are evaluated if both images are registered and the pair has at least `_MIN_PAIR_MATCHES` matches.
 
     Source: the Sampson distance of Hartley, Zisserman, "Multiple view geometry", 2004, 11.4.
     """
@@ -90,9 +93,10 @@ def evaluate_pairs(workspace: Path, model: pycolmap.Reconstruction) -> list[Pair
 def find_misregistered_images(pairs: Sequence[PairConsistency]) -> set[int]:
     """Return the ids of misregistered images: a small set that explains nearly all inconsistent pairs.
 
-    The image with the largest ratio of matches in inconsistent pairs is taken out first, then the next one. A
-    misregistered block is inconsistent with most of its partners; each partner is inconsistent with the
-    block only.
+    In each step, the image with the largest fraction of matches in inconsistent pairs is added to the set.
+    Its pairs no longer make other images inconsistent. So a misregistered block of images is found, but its
+    correct partners are not: the block is inconsistent with most of its partners, and each partner is
+    inconsistent only with the block.
     """
     total: dict[int, int] = {}
     wrong: dict[int, dict[int, int]] = {}
@@ -115,17 +119,19 @@ def find_misregistered_images(pairs: Sequence[PairConsistency]) -> set[int]:
 
 
 def inconsistent_match_ratio(pairs: Sequence[PairConsistency]) -> float:
-    """Return the ratio of all matches that belong to inconsistent pairs."""
+    """Return the fraction of all matches of the given pairs that belong to inconsistent pairs."""
     wrong = sum(pair.matches for pair in pairs if pair.is_inconsistent)
     return wrong / max(1, sum(pair.matches for pair in pairs))
 
 
 def check_consistency(ratio: float, reach: Mapping[str, object] | None) -> EstimationError | None:
-    """Return the error if a map contradicts many of its own pairs, as in rooms with parts that look the same.
+    """Return an error if a map contradicts many of its verified matches.
+
+    The usual cause is a room with several parts that look the same.
 
     Args:
         ratio: `inconsistent_match_ratio` of the map.
-        reach: Log of the distance check between cameras; None without a body.
+        reach: Log of the check of the distances between cameras; None if no body is given.
 
     Returns:
         The error; None if the map is consistent enough.
@@ -146,16 +152,17 @@ def check_consistency(ratio: float, reach: Mapping[str, object] | None) -> Estim
 def check_coverage(
     models: Sequence[Any], keyframes: int, attempts: object, options: MapOptions
 ) -> EstimationError | None:
-    """Return the error if the largest model holds too few keyframes.
+    """Return an error if the largest model holds too few keyframes.
 
     Args:
         models: The models, largest first.
-        keyframes: Number of keyframes.
+        keyframes: Number of keyframes of all cameras.
         attempts: The initial pairs that were tried, for the message.
-        options: The stage's options; ``min_coverage`` is the smallest ratio of keyframes.
+        options: The stage's options. ``min_coverage`` is the minimum fraction of the keyframes that the
+            largest model must hold.
 
     Returns:
-        The error; None if the model holds enough.
+        The error; None if the largest model holds enough keyframes.
     """
     registered = models[0].num_reg_images() if models else 0
     if registered >= max(2, options.min_coverage * keyframes):

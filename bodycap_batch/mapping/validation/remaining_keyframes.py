@@ -1,4 +1,7 @@
-"""Resect the keyframes of a long capture that are not among its skeletal keyframes."""
+"""Resect the keyframes of a long capture that are not skeletal keyframes.
+
+Skeletal keyframes are the reduced set of keyframes, Snavely's skeletal set.
+"""
 
 from __future__ import annotations
 
@@ -18,20 +21,21 @@ from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 def resect_remaining(
     models: list[Any], generator: PairGenerator, tried: Collection[Pair], context: MappingContext
 ) -> tuple[list[set[int]], dict[str, object]]:
-    """Adjust models robustly, then resect the keyframes that are in none of them; existing poses stay.
+    """Adjust models robustly, then resect the keyframes that no model contains.
 
-    To adjust all keyframes together would take hundreds of passes over millions of observations. So only the
-    resected keyframes are adjusted, against points that stay constant.
+    An adjustment of all keyframes together would need hundreds of passes over millions of observations. So
+    after resection only the resected keyframes are adjusted. The poses of the other keyframes and the points
+    that these observe stay constant. Misregistered keyframes are removed.
 
     Args:
         models: Reconstructions from some of the keyframes; changed in place and sorted, the largest first.
-        generator: Generates pairs among all keyframes.
-        tried: Pairs that were matched.
+        generator: Generator of pairs among all keyframes.
+        tried: Pairs that were already matched.
         context: Workspace, intrinsics, mapper options.
 
     Returns:
-        Ids of the images that were resected in each of the models, and entries for the log.
-        ``contradicted_share`` in the log is that of the largest model.
+        For each model, the ids of the images that were resected; entries for the log. The log entry
+        ``contradicted_share`` is the fraction of inconsistent matches of the largest model.
     """
     import pycolmap
 

@@ -1,4 +1,7 @@
-"""Find misregistered and missing keyframes, match and register them again, or remove them."""
+"""Repair a model: match misregistered and missing keyframes in further pairs, and register them again.
+
+Keyframes that are still misregistered are removed.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +24,10 @@ if TYPE_CHECKING:
     import pycolmap
 
 _ROUNDS = 2
-"""Rounds of a repair at most. Evidence: none."""
+"""Maximum number of rounds of a repair. Evidence: none."""
 _MIN_PAIR_BUDGET = 2000
-"""Pairs that a repair may match again even if fewer were matched before. Evidence: none."""
+"""Number of untried pairs that a round of a repair may match, even if fewer pairs were matched before. If
+there are more untried pairs, only the pairs of misregistered keyframes are matched. Evidence: none."""
 
 
 def repair_model(
@@ -32,16 +36,21 @@ def repair_model(
     context: MappingContext,
     keyframes: Collection[ImageRef] | None = None,
 ) -> tuple[Any, dict[str, object]]:
-    """Match misregistered and missing keyframes again, register them again, and remove what stays wrong.
+    """Match misregistered and missing keyframes in untried pairs, and register these keyframes again.
+
+    A round is accepted if it increases the number of correctly registered keyframes. If this number stays the
+    same, the round is accepted if it decreases the number of misregistered keyframes. At the end, all
+    keyframes that are still misregistered are removed.
 
     Args:
         model: The largest model; not changed.
-        tried: Pairs that were matched; the pairs matched here are added.
+        tried: Pairs that were already matched. The pairs that the repair matches are added to it.
         context: Workspace, intrinsics, mapper options.
-        keyframes: Keyframes that belong in the model; by default all of the database.
+        keyframes: Keyframes that the model should contain; by default all keyframes in the database.
 
     Returns:
-        The better one of the old and the new model, without misregistered keyframes, and entries for the log.
+        The given model, or the model of the last accepted round, without misregistered keyframes; entries
+        for the log.
     """
     import pycolmap
 
@@ -59,7 +68,8 @@ def repair_model(
             break
         untried = _untried_pairs(ids, wrong | missing, tried)
         if len(untried) > max(_MIN_PAIR_BUDGET, len(tried)):
-            # If many keyframes are missing, they show too little. To match them with all others costs most.
+            # Many missing keyframes usually show too little of the room to be registered. Matching them with
+            # all other keyframes would cost the most time, so only the misregistered keyframes are matched.
             untried = _untried_pairs(ids, wrong, tried)
         tried |= set(untried)
         verified = match_pairs(context.workspace, untried, context.intrinsics, context.stage)
@@ -89,7 +99,13 @@ def repair_model(
 
 
 def remove_misregistered(model: pycolmap.Reconstruction, context: MappingContext) -> tuple[Any, list[str]]:
-    """Return the model without misregistered keyframes, adjusted if any was removed, and their names."""
+    """Remove misregistered keyframes from a model; adjust the model if any keyframe was removed.
+
+    A large model is not adjusted.
+
+    Returns:
+        The model without misregistered keyframes; the image names of the removed keyframes.
+    """
     kept, removed, _ = remove_without_adjustment(model, context)
     if removed:
         _adjust_unless_large(kept, context)
@@ -99,10 +115,11 @@ def remove_misregistered(model: pycolmap.Reconstruction, context: MappingContext
 def remove_without_adjustment(
     model: pycolmap.Reconstruction, context: MappingContext
 ) -> tuple[Any, list[str], float]:
-    """Remove misregistered keyframes and leave all other poses as they are.
+    """Remove misregistered keyframes from a model and keep all other poses unchanged.
 
     Returns:
-        The model without these keyframes; their image names; the ratio of inconsistent matches before.
+        The model without misregistered keyframes; the image names of the removed keyframes; the fraction of
+        matches in inconsistent pairs before the removal.
     """
     pairs = evaluate_pairs(context.workspace, model)
     kept, removed = _remove_images(model, find_misregistered_images(pairs))
@@ -110,17 +127,23 @@ def remove_without_adjustment(
 
 
 def _remove_images(model: Any, image_ids: set[int]) -> tuple[Any, list[str]]:
-    """Return the model without some images, and their names.
+    """Return the model without some images, and the sorted names of the removed images.
 
-    Points that only these images observe go with them. Registration finds the poses of their frames from the
-    remaining points.
+    Points that only these images observe are removed too. Later, registration estimates the poses of the
+    removed frames from the remaining points.
     """
     removed = sorted(model.image(number).name for number in image_ids)
     return sub_model(model, registered_ids(model) - image_ids) if removed else model, removed
 
 
 def _untried_pairs(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pair]) -> list[Pair]:
-    """Return all pairs of some images with any other image that were not matched yet."""
+    """Return all pairs of the given images with any image that were not matched yet.
+
+    Args:
+        ids: Database ids of all keyframes.
+        images: Database ids of the images whose pairs are returned.
+        tried: Pairs that were already matched.
+    """
     refs: Sequence[ImageRef] = sorted(ids)
     chosen = [ref for ref in refs if ids[ref] in images]
     return sorted({(min(a, b), max(a, b)) for a in chosen for b in refs if a != b} - tried)
@@ -129,13 +152,17 @@ def _untried_pairs(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pai
 def re_register_images(
     model: pycolmap.Reconstruction, image_ids: Collection[int], context: MappingContext, total: int
 ) -> Any:
-    """Return the model after some of its images, and new ones, are registered against the rest.
+    """Remove some images from a model, then register these and all new images of the database.
 
     Args:
         model: A reconstruction; not changed.
         image_ids: Ids of the images to remove and to register again.
         context: Workspace, intrinsics, mapper options.
-        total: Number of keyframes, for the progress.
+        total: Number of all keyframes, for the progress.
+
+    Returns:
+        A copy of the model in which these images are registered, as far as they fit. All poses of the copy
+        are adjusted if the model is not large.
     """
     rest = sub_model(model, set(model.reg_image_ids()) - set(image_ids))
     extended = with_new_images(
@@ -151,6 +178,9 @@ def re_register_images(
 
 
 def _adjust_unless_large(model: pycolmap.Reconstruction, context: MappingContext) -> None:
-    """Adjust a model in place; in a large one, only new images are adjusted, at the end of the stage."""
+    """Adjust a model in place, unless the model is large.
+
+    At the end of the stage, the new images of a large model are adjusted (`finalise_models`).
+    """
     if not context.is_large(model.num_reg_images()):
         adjust_and_filter(model, context.mapper_options(), context.calibrated_ids)

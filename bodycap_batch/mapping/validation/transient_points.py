@@ -1,4 +1,4 @@
-"""Remove points that one camera observed for a moment only: they are often on the wearer's sleeve."""
+"""Remove points that only one camera observed, and only for a moment. Many are on the wearer's sleeve."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MIN_STATIC_POINTS = 20
-"""Static points that are enough for the pose of a keyframe. Evidence: docs/decisions/mapping.md."""
+"""Minimum number of static points that determine the pose of a keyframe without other points.
+Evidence: docs/decisions/mapping.md."""
 
 
 def remove_transient_points(model: pycolmap.Reconstruction, times_ns: Mapping[str, IntArray]) -> int:
-    """Remove points that neither another camera nor another time confirms, and return their number.
+    """Remove points that only one camera observed for a short time, and return the number of removed points.
 
-    What moves with a camera looks like static room to that camera for a moment, and it bends the map. Points
-    are kept if one of their keyframes observes too few static points. Evidence: docs/decisions/mapping.md.
+    An object that moves with a camera looks static to this camera for a moment. Points on such an object
+    deform the map. A point is kept if one of its keyframes observes fewer than `_MIN_STATIC_POINTS` static
+    points. Evidence: docs/decisions/mapping.md.
 
     Args:
-        model: A reconstruction, changed in place; to be adjusted afterwards.
-        times_ns: Time of every frame, by camera, nanoseconds.
+        model: A reconstruction, changed in place. The caller adjusts it afterwards.
+        times_ns: Time (nanoseconds) of every frame, by camera name.
     """
     refs = {int(i): ImageRef.parse(model.image(i).name) for i in model.reg_image_ids()}
     images_of = {
@@ -49,7 +51,15 @@ def remove_transient_points(model: pycolmap.Reconstruction, times_ns: Mapping[st
 
 
 def _is_static(images: list[int], refs: Mapping[int, Any], times_ns: Mapping[str, IntArray]) -> bool:
-    """Return whether two cameras observe a point, or one camera at two different times."""
+    """Return whether a point is static: several cameras observe it, or one camera observes it for long.
+
+    One camera must observe the point over a time of more than `MIN_STATIC_SPAN_NS`.
+
+    Args:
+        images: Ids of the images that observe the point.
+        refs: Keyframe of each registered image, by image id.
+        times_ns: Time (nanoseconds) of every frame, by camera name.
+    """
     if len({refs[image].camera for image in images}) > 1:
         return True
     times = [int(times_ns[refs[image].camera][refs[image].frame]) for image in images]
