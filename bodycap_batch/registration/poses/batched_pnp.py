@@ -154,8 +154,10 @@ def make_observations(
 
 
 def projection_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
-    """Return the derivative (N,2,2) of the pixel with respect to the ray (x/z, y/z), from central
-    differences."""
+    """Return the derivative (N,2,2) of the pixel with respect to the ray (x/z, y/z).
+
+    It is computed from central differences.
+    """
     out = np.empty((len(rays), 2, 2))
     for start in range(0, len(rays), _BATCH_ROWS):
         batch = rays[start : start + _BATCH_ROWS]
