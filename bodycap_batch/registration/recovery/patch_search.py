@@ -245,7 +245,7 @@ def match_patches(
     step = view.pyramid.step_px[level.pyramid_level]
     motion = _image_motion(view, points, px)
     images, is_inside = _render_patches(patches, rows, warp, _motion_blur(view, motion), level, step)
-    # During the readout a point moves little in the image. The row of its pixel px is therefore precise enough.
+    # During the readout a point moves little in the image, so its row hardly changes.
     expected_px = px_at_mid_row(lens, px, motion, -view.readout_ratio)
     found_px, score = np.full((len(rows), 2), np.nan), np.zeros(len(rows))
     target = view.pyramid.levels[level.pyramid_level].astype(np.float32)

@@ -134,8 +134,10 @@ def refine_points(scene_map: Map, paths: Sequence[Trajectory]) -> Map:
 
 
 def _mid_row_px(scene_map: Map, paths: Mapping[str, Trajectory]) -> FloatArray:
-    """Return the observed pixels (M,2) moved to the instant of the middle row. The poses refer to this
-    instant."""
+    """Return the observed pixels (M,2) moved to the instant of the middle row.
+
+    The poses refer to this instant.
+    """
     out = scene_map.obs_px.copy()
     for name, readout_s in sorted(scene_map.readout_s.items()):
         path = paths.get(name)
@@ -150,8 +152,10 @@ def _mid_row_px(scene_map: Map, paths: Mapping[str, Trajectory]) -> FloatArray:
 
 
 def _split_by_point(point: IntArray) -> list[slice]:
-    """Split observations (M,), ordered by point, into chunks. All observations of a point are in the same
-    chunk."""
+    """Split observations (M,), ordered by point, into chunks.
+
+    All observations of a point are in the same chunk.
+    """
     starts = np.flatnonzero(np.diff(point, prepend=-1))
     cuts = [0]
     for start in starts.tolist():

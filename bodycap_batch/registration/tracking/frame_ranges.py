@@ -75,9 +75,7 @@ def track_all(
     parts += _track_ranges(
         camera, points_by_keyframe, _split_by_thread(missing, frames, context.threads), context
     )
-    return Tracks.join_and_clear(
-        parts
-    )  # no other reference to the parts may exist, so that their memory is released
+    return Tracks.join_and_clear(parts)  # no other reference exists, so the memory is released
 
 
 def _track_ranges(
@@ -86,8 +84,10 @@ def _track_ranges(
     ranges: list[tuple[int, int]],
     context: StageContext,
 ) -> list[Tracks]:
-    """Track several ranges of frames in parallel, each on one thread. The result does not depend on the
-    threads."""
+    """Track several ranges of frames in parallel, each on one thread.
+
+    The result does not depend on the number of threads.
+    """
     stopped, lock = Event(), Lock()
     total = sum(stop - start for start, stop in ranges)
     position = [start for start, _ in ranges]

@@ -252,8 +252,7 @@ def track_range(
     stop: int,
     context: StageContext,
 ) -> Iterator[Tracks]:
-    """Track from every keyframe in [start, stop) forward to the next keyframe and back to the previous
-    keyframe.
+    """Track from every keyframe in [start, stop) forward to the next and backward to the previous keyframe.
 
     At most `_MAX_BUFFERED_FRAMES` frames are held in memory. The order of the yielded observations is not
     defined.
@@ -300,15 +299,14 @@ def _buffer(frame: _VideoFrame, motion: ImageMotion | None, active: _ActiveTrack
 def _close_tracks(
     active: _ActiveTracks, keyframe: int, keyframe_points: KeyframePoints, buffered: deque[_BufferedFrame]
 ) -> Generator[Tracks, None, BoolArray]:
-    """Use forward tracks as backward tracks of the next keyframe, if they arrive where it observes their
-    points.
+    """Use forward tracks that arrive at the next keyframe as backward tracks of this keyframe.
 
-    The pixels of such a track are shifted by a constant offset, so that the track ends exactly at the
-    keyframe's observation. The shifted track replaces a track backward from the keyframe, because that would
-    follow the same path.
+    A forward track is used if it arrives near the keyframe's own observation of the same point. Its pixels
+    are shifted by a constant offset, so that the track ends exactly at this observation. It replaces a track
+    backward from the keyframe, because that would follow the same path.
 
     Args:
-        active: Forward tracks in the next keyframe.
+        active: Forward tracks that have reached the next keyframe.
         keyframe: Frame index of the next keyframe.
         keyframe_points: (N) points of the next keyframe.
         buffered: Frames before the next keyframe.
@@ -337,8 +335,10 @@ def _close_tracks(
 def _estimate_motion(
     first: _VideoFrame, second: _VideoFrame, active: _ActiveTracks | None
 ) -> ImageMotion | None:
-    """Estimate the motion of the whole image from the active tracks, or from corners if too few are
-    active."""
+    """Estimate the motion of the whole image from the active tracks.
+
+    If too few tracks are active, corners are detected and used instead.
+    """
     if active is not None and len(active.px) >= _MIN_MOTION_POINTS:
         points = active.px
     else:
