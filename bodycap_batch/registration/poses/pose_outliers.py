@@ -18,7 +18,7 @@ Origin: halfway."""
 _SLOW_SPAN_NS, _MIN_NEIGHBOUR_RESPONSE_SLOW = 90_000_000, 0.8
 """_SLOW_SPAN_NS: maximum time in nanoseconds between the two neighbours for the threshold above.
 _MIN_NEIGHBOUR_RESPONSE_SLOW: minimum response of neighbours that are farther apart in time. A fast gesture
-then also bends the path at a single frame, but its neighbours respond less than those of an outlier.
+then also bends the path at a single frame, but the response of the neighbours is smaller than at an outlier.
 Evidence: docs/decisions/registration.md."""
 _GAP_MIN_SIGMAS = 4.0
 """Minimum deviation of an outlier next to a lost interval, in standard deviations. Evidence:

@@ -40,10 +40,10 @@ class RegisteredCamera:
 def estimate_relative_poses(own: RegisteredCamera, others: Sequence[RegisteredCamera]) -> list[RelativePose]:
     """Estimate the relative pose between one camera and each other camera of its rig.
 
-    The cameras of each pair are ordered by name.
+    In each relative pose the two cameras are ordered by name.
 
     Args:
-        own: The first camera of each pair, with its registration.
+        own: The camera that belongs to every pair, with its registration.
         others: The other cameras of the rig, with their registrations.
 
     Returns:

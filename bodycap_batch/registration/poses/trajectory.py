@@ -42,8 +42,9 @@ _REPEATS = 1
 """Number of repeated solutions without a rolling shutter. Each repetition weights the points by their
 agreement with the poses before."""
 _REPEATS_ROLLING = 2
-"""Number of repeated solutions with a rolling shutter. The correction of the pixels needs poses, for the
-velocities of the points in the image. Therefore pixels and poses are computed in turn, twice."""
+"""Number of repeated solutions with a rolling shutter. The correction of the pixels needs poses, because
+the velocities of points in the image follow from poses. Pixels and poses are therefore computed in turn,
+twice."""
 
 
 def acceptance_criteria(
@@ -88,8 +89,9 @@ def solve_rig(
     """Estimate the pose of every frame of a rig from the map points that its cameras observe at that instant.
 
     Wrongly matched points, and points that move with the wearer, disagree with the poses of most frames.
-    After a first solution each point is weighted by the fraction of its observations that agree. All frames
-    are then solved again. Observations of a rolling shutter are moved to the instant of the middle row.
+    After a first solution, all frames are solved again with new weights. The weight of each point is
+    multiplied by the squared fraction of its observations that agree with a pose. Observations of a rolling
+    shutter are moved to the instant of the middle row.
 
     Args:
         members: The cameras of the rig. The first camera is at the origin of the rig, and its frames are the

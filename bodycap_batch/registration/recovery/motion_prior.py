@@ -15,7 +15,7 @@ _PERCENTILE = 80.0
 intervals occur in the faster movements. Evidence: none."""
 _MAX_INTERVAL_DEVIATION = 0.1
 """Maximum deviation of a frame interval from the median interval, as a fraction of the median. Differences
-across other intervals are not used. Evidence: none."""
+across an interval with a larger deviation are not used. Evidence: none."""
 _ITERATIONS = 5
 """Number of iterations of reweighted least squares. Evidence: none."""
 _LOSS_WIDTH = 4.0

@@ -158,9 +158,7 @@ def find_lost_poses(
         localised = _localised_poses(path)
         for start, stop in intervals:
             context.check_cancelled()
-            position = max(
-                position, start
-            )  # the reported progress never decreases, although each pass starts again
+            position = max(position, start)  # a new pass does not reduce the progress
             context.progress(position, len(lost), "lost frames searched")
             poses |= interval_search.recover_interval(start, stop, localised)
         before, path = path.localised, _merge_into(path, poses, localiser.criteria)
