@@ -1,4 +1,4 @@
-"""The solved body and the map's points in each camera's images, and their drawing."""
+"""Project the solved body and the map points into each camera's images, and draw them."""
 
 from bodycap_batch.overlay.bone_motion import BoneMotion, Bones, bones_from_motion
 from bodycap_batch.overlay.bone_projection import BoneLine, project_bones

@@ -1,4 +1,4 @@
-"""A moving skeleton as straight bones at any time."""
+"""Describe a moving skeleton by straight bones at any time."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Bones:
     """All bones at one time.
 
     Attributes:
-        ends_in_world: (B,2,3) near and far end of each bone, metres.
-        observed: (B,) True if cameras measured the joint that turns the bone.
+        ends_in_world: (B,2,3) near and far end of each bone in the world, metres.
+        observed: (B,) True if cameras measured the joint that rotates the bone.
     """
 
     ends_in_world: FloatArray
@@ -29,11 +29,11 @@ class BoneMotion:
     """The bones of a motion at each tick.
 
     Attributes:
-        joints: (B,) index of the joint that turns each bone.
-        sides: (B,) "Left", "Right" or "" of each bone.
-        times_ns: (T,) common time of each tick.
-        ends_in_world: (T,B,2,3) near and far end of each bone, metres.
-        observed: (T,B) True if cameras measured the joint.
+        joints: (B,) index of the joint that rotates each bone.
+        sides: (B,) side of each bone: "Left", "Right" or "".
+        times_ns: (T,) common time of each tick, nanoseconds.
+        ends_in_world: (T,B,2,3) near and far end of each bone in the world, metres.
+        observed: (T,B) True if cameras measured the joint that rotates the bone.
     """
 
     joints: IntArray
@@ -50,9 +50,10 @@ class BoneMotion:
         set_array(self, "observed", (ticks, bones), np.bool_)
 
     def bones_at(self, common_ns: int) -> Bones | None:
-        """Return the bones at a common time, or None outside the motion.
+        """Return the bones at a common time, or None if this time is outside the motion.
 
-        Between two ticks the ends are interpolated. A bone is observed only if it is observed at both ticks.
+        The ends of a bone are interpolated between two ticks. A bone is observed only if it is observed at
+        both ticks.
         """
         ticks = len(self.times_ns)
         if not ticks or not self.times_ns[0] <= common_ns <= self.times_ns[-1]:
@@ -68,7 +69,7 @@ class BoneMotion:
 def bones_from_motion(motion: Motion) -> BoneMotion:
     """Return the bones of a motion.
 
-    There is one bone from a joint to each of its children, and one to the tip of a joint without children.
+    Each joint has one bone to each of its children. A joint with an end point also has a bone to this point.
     """
     skeleton = motion.skeleton
     world_from_joint = motion.world_from_joint()

@@ -1,4 +1,4 @@
-"""The projection of bones into an image."""
+"""Project bones into an image."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ from bodycap_batch.overlay.bone_motion import Bones
 from bodycap_batch.overlay.lens_field import field_margin, max_field_angle_rad
 
 _SAMPLES = 25
-"""Points on each bone; lens distortion bends the line through them. Evidence: none."""
+"""Number of points on each bone. They are projected separately, because lens distortion bends the bone's
+line. Evidence: none."""
 _MIN_DEPTH_M = 0.03
-"""Metres. A nearer part of a bone is inside the camera's own housing."""
+"""Metres: minimum depth of a visible part of a bone. A nearer part is inside the camera's own housing."""
 _MAX_OUTSIDE = 2.0
-"""Image widths or heights outside the image beyond which a part of a bone is omitted. Evidence: none."""
+"""Maximum distance from the image, in image widths or heights. Parts of a bone that are farther outside are
+omitted. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,9 +28,9 @@ class BoneLine:
 
     Attributes:
         bone: Index of the bone in `Bones`.
-        px: (S,2) pixels of the line's points at the lens's image size, COLMAP origin.
-        depth_m: (S,) depth along the optical axis.
-        observed: True if cameras measured the joint that turns the bone.
+        px: (S,2) pixels of the line's points at the image size of the lens, with COLMAP's origin.
+        depth_m: (S,) depth of these points along the optical axis, metres.
+        observed: True if cameras measured the joint that rotates the bone.
     """
 
     bone: int
@@ -40,15 +42,16 @@ class BoneLine:
 def project_bones(lens: Camera, cam_from_world: FloatArray, bones: Bones) -> list[BoneLine]:
     """Project bones into an image.
 
-    Parts behind the camera, outside the lens's field of view or far outside the image are omitted.
+    Three kinds of parts are omitted: parts behind the camera, parts outside the field of view of the lens,
+    and parts far outside the image.
 
     Args:
-        lens: Intrinsics; distortion bends the lines.
-        cam_from_world: (4,4) the frame's pose.
-        bones: The bones at the frame's time.
+        lens: Intrinsics of the camera. The lines are bent by the lens distortion.
+        cam_from_world: (4,4) pose of the frame.
+        bones: The bones at the time of the frame.
 
     Returns:
-        Lines with at least one point in the image, the farthest first.
+        Lines with at least one point in the image, the farthest line first.
     """
     share = np.linspace(0.0, 1.0, _SAMPLES)[None, :, None]
     near_end, far_end = bones.ends_in_world[:, None, 0], bones.ends_in_world[:, None, 1]

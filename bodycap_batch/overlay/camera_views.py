@@ -1,4 +1,4 @@
-"""The poses of each camera and the map points that each of its frames observed."""
+"""Collect the poses of each camera and the map points that each of its frames observed."""
 
 from __future__ import annotations
 
@@ -14,22 +14,21 @@ from bodycap_batch.model.merge_data import CameraClock, MergeResult
 from bodycap_batch.model.scene import FrameStatus, Map, Registration
 
 _MAX_INLIER_ERROR_PX = 4.0
-"""Largest reprojection error of an inlier, pixels at an image width of 640.
+"""Pixels at 640 px image width: maximum reprojection error of an inlier.
 
-Registration's threshold is four times the noise of a track, and that noise is 0.3 to 1 px.
-"""
+Origin: about the inlier limit of registration for tracks with a noise of 0.5 px."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObservedPoints:
-    """Map points that one frame observed. Pixels have the lens's image size and COLMAP's origin.
+    """Map points that one frame observed. Pixels refer to the image size of the lens, with COLMAP's origin.
 
     Attributes:
         point: (K,) index of the point in its map.
         px: (K,2) projection of the point with the solved pose.
         observed_px: (K,2) observed pixel.
-        depth: (K,) depth along the optical axis.
-        error_px: (K,) distance between projection and observation.
+        depth: (K,) depth of the point along the optical axis, in the unit of the frame of reference.
+        error_px: (K,) distance between projection and observed pixel.
     """
 
     point: IntArray
@@ -45,16 +44,16 @@ class CameraView:
 
     Attributes:
         camera: Camera name.
-        reference_frame: "world" (metres, Z up), or the gauge of a map that is not in the world.
-        lens: Intrinsics at the work size, as the map has them.
-        times_ns: (N,) common time of each frame.
+        reference_frame: "world" (metres, Z up), or the gauge of a map that is not placed in the world.
+        lens: Intrinsics from the map, at the work size (the image size that all stages work at).
+        times_ns: (N,) common time of each frame, nanoseconds.
         frame_from_cam: (N,4,4) poses in the frame of reference; NaN for a lost frame.
         status: (N,) status of each frame.
-        points: (P,3) all points of the map in which the camera was registered.
-        observation_start: (N+1,) index of the first observation of each frame in the arrays below. The last
+        points: (P,3) all points of the camera's map, in the frame of reference.
+        observation_start: (N+1,) index of each frame's first observation in the two arrays below. The last
             value is the number of observations.
         observed_point: (M,) point index of each observation.
-        observed_px: (M,2) pixel of each observation, COLMAP origin.
+        observed_px: (M,2) pixel of each observation, with COLMAP's origin.
     """
 
     camera: str
@@ -78,15 +77,15 @@ class CameraView:
         set_array(self, "observed_px", (observations, 2))
 
     def cam_from_frame(self, index: int) -> FloatArray | None:
-        """Return the pose (4,4) from the frame of reference into the camera, or None for a lost frame."""
+        """Return the pose (4,4) from the frame of reference into the camera; None for a lost frame."""
         pose = self.frame_from_cam[index]
         return invert(pose) if np.isfinite(pose).all() else None
 
     def inliers_at(self, index: int) -> ObservedPoints:
-        """Return the inlier map points of a frame; a lost frame has none.
+        """Return the observed map points of a frame that are inliers; no points for a lost frame.
 
-        With a rolling shutter the pose is that of the middle row. Points in other rows have an error that
-        comes from the delay of their row.
+        With a rolling shutter, the pose refers to the exposure of the middle row. Points in other rows
+        therefore have an error that grows with the delay of their row.
         """
         cam_from_frame = self.cam_from_frame(index)
         first, stop = self.observation_start[index : index + 2].tolist()
@@ -114,16 +113,17 @@ def make_camera_views(
 ) -> tuple[CameraView, ...]:
     """Make one view for each camera.
 
-    It is in the world if merging placed the camera there. Otherwise it is in the gauge of the camera's map.
+    If merging placed the camera in the world, its view is in the world. Otherwise the view is in the gauge of
+    the camera's map.
 
     Args:
-        registrations: One for each camera.
+        registrations: Registrations of all cameras.
         maps: The maps in which the cameras were registered.
-        clocks: By camera name.
-        merge: The body in the world, if there is one.
+        clocks: Clocks of the cameras, by camera name.
+        merge: Result of merging; None if there is none.
 
     Returns:
-        Views in the order of `registrations`. A camera that is in no map has no view.
+        Views in the order of `registrations`. A camera without a map has no view.
     """
     map_by_gauge = {scene.gauge: scene for scene in maps}
     merged_paths = {} if merge is None else {path.camera: path for path in merge.trajectories}
@@ -155,9 +155,12 @@ def make_camera_views(
 
 
 def _observations(registration: Registration, scene: Map) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return frame, point and pixel of a camera's observations, sorted by frame.
+    """Return the frame, point and pixel of each observation of a camera, sorted by frame.
 
-    They are the tracked observations and those of the camera's own keyframes.
+    These are the tracked observations and the observations of the camera's own keyframes.
+
+    Returns:
+        Frame indices (M,), point indices (M,) and pixels (M,2).
     """
     camera = registration.trajectory.camera
     tracked = scene.points_of(camera, registration.obs_keyframe, registration.obs_feature)

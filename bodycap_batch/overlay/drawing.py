@@ -1,4 +1,4 @@
-"""Overlays drawn into RGB images."""
+"""Draw overlays into RGB images."""
 
 from __future__ import annotations
 
@@ -16,25 +16,29 @@ RgbImage = npt.NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
 LEFT_COLOUR, RIGHT_COLOUR, MIDDLE_COLOUR = (86, 180, 233), (240, 150, 20), (250, 250, 250)
-"""RGB: sky blue, orange and white.
+"""RGB colours of bones on the left, on the right and in the middle: sky blue, orange and white.
 
-Colour-blind people can tell them apart.
-Source: M. Okabe, K. Ito, Color Universal Design.
-"""
+Colour-blind people can distinguish them.
+Source: M. Okabe, K. Ito, Color Universal Design."""
 _OUTLINE_COLOUR = (20, 20, 20)
-"""RGB of the dark border around bones."""
+"""RGB colour of the dark border around bones."""
 _SMALL_ERROR_COLOUR, _LARGE_ERROR_COLOUR = np.array([60.0, 220.0, 120.0]), np.array([235.0, 60.0, 60.0])
-"""RGB of points with no error and with an error of at least `_LARGE_ERROR_PX`: green and red."""
+"""RGB colours of points without an error and of points with an error of at least `_LARGE_ERROR_PX`: green and
+red."""
 _LARGE_ERROR_PX = 3.0
-"""Reprojection error that is drawn fully red, pixels at an image width of 640. Evidence: none."""
+"""Pixels at 640 px image width: minimum reprojection error that is drawn fully red. Evidence: none."""
 _COLOUR_STEPS = 6
-"""Different colours from green to red. OpenCV is called once for each."""
+"""Number of colours from green to red. OpenCV is called separately for each colour."""
 SUBPIXEL_BITS = 4
-"""Fractional bits of OpenCV's fixed-point coordinates: sixteenths of a pixel."""
+"""Number of fractional bits in OpenCV's fixed-point coordinates: sixteenths of a pixel."""
 
 
 def side_colour(side: str) -> Colour:
-    """Return the colour of a bone on the left side, the right side or in the middle of the body."""
+    """Return the colour of a bone from its side of the body.
+
+    Args:
+        side: "Left", "Right", or any other text for the middle.
+    """
     return {"Left": LEFT_COLOUR, "Right": RIGHT_COLOUR}.get(side, MIDDLE_COLOUR)
 
 
@@ -47,16 +51,19 @@ def draw_overlay(
 ) -> RgbImage:
     """Draw points and bones into a copy of an image.
 
-    A dot marks where the solved pose projects a point. It is green if the error is small and red if the error
-    is large. A thin line leads from it to the observed pixel. Measured bones are solid; inferred bones are
-    thinner and dashed.
+    A dot marks the pixel to which the solved pose projects a point. It is green if the error is small and red
+    if the error is large. A thin line connects the dot with the observed pixel. Measured bones are solid.
+    Inferred bones are thinner and dashed.
 
     Args:
-        image: (H,W,3) RGB, any size.
-        width_px: Width of the images to which the pixels of `points` and `lines` belong (the lens's width).
-        points: From `CameraView.inliers_at`.
-        lines: From `project_bones`.
-        sides: Side of each bone, as `BoneMotion.sides`.
+        image: (H,W,3) RGB image of any size.
+        width_px: Image width of the lens, to which the pixels of `points` and `lines` refer.
+        points: Observed points from `CameraView.inliers_at`; None for no points.
+        lines: Visible parts of bones from `project_bones`.
+        sides: Side of each bone, from `BoneMotion.sides`.
+
+    Returns:
+        (H,W,3) the new image.
     """
     drawn = np.ascontiguousarray(image).copy()
     scale = image.shape[1] / width_px
@@ -71,7 +78,7 @@ def draw_overlay(
 
 
 def _draw_points(image: RgbImage, points: ObservedPoints, scale: float, large_error_px: float) -> None:
-    """Draw all points of one colour with one call.
+    """Draw points, with one pair of OpenCV calls for all points of a colour.
 
     A dot is a line of length zero. The line to the observed pixel is omitted if the dot covers that pixel.
     """

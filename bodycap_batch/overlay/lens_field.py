@@ -1,4 +1,4 @@
-"""The field of view in which a lens model is valid."""
+"""Determine the field of view in which a lens model is valid."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.camera import Camera
 
 _ANGLE_COUNT, _AZIMUTH_COUNT = 178, 16
-"""Sampled angles off the axis, one in half a degree, and directions around the axis. Evidence: none."""
+"""Number of sampled angles off the optical axis (two per degree), and number of sampled directions around the
+axis. Evidence: none."""
 _MAX_ANGLE_RAD = float(np.deg2rad(89.0))
-"""Largest sampled angle off the axis, radians: the tangent is infinite at 90 degrees."""
+"""Radians: maximum sampled angle off the optical axis. The tangent is infinite at 90 degrees."""
 
 
 def max_field_angle_rad(lens: Camera) -> float:
-    """Return the largest angle off the optical axis up to which the image radius grows, in radians.
+    """Return the maximum angle off the optical axis, in radians, at which the lens model is valid.
 
-    A polynomial lens model is not monotonic outside the image to which it was fitted. Beyond that angle it
-    would project a point into the image, on the wrong side.
+    Up to this angle the distance from the principal point grows with the angle. A polynomial lens model is
+    not monotonic outside the image to which it was fitted. It would project a point at a larger angle into
+    the image, to a wrong pixel.
     """
     return _max_angle_rad(lens.model, lens.width_px, lens.height_px, tuple(lens.params.tolist()))
 
@@ -43,7 +45,8 @@ def _max_angle_rad(model: str, width_px: int, height_px: int, params: tuple[floa
 def field_margin(x_in_cam: FloatArray, max_angle_rad: float, near: float) -> FloatArray:
     """Return a measure (N,) of how far points (N,3) are inside the field of view.
 
-    It is negative if the depth is less than `near` or the angle off the axis is greater than `max_angle_rad`.
+    The measure is negative if the depth is less than `near`, or if the angle off the optical axis exceeds
+    `max_angle_rad`.
     """
     angle = np.arctan2(np.linalg.norm(x_in_cam[:, :2], axis=1), x_in_cam[:, 2])
     return np.asarray(np.minimum(x_in_cam[:, 2] - near, max_angle_rad - angle))

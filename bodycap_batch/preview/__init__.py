@@ -1,4 +1,4 @@
-"""``preview.mp4``: the body in its room next to the source videos, with the results drawn into them."""
+"""Render ``preview.mp4``: the body in its room, next to the source videos with overlays of the results."""
 
 from bodycap_batch.preview.preview_film import PreviewInputs, render_preview
 

@@ -1,4 +1,4 @@
-"""The positions of the room and the videos in the film's image."""
+"""Compute the positions of the room and the videos in the preview's image."""
 
 from __future__ import annotations
 
@@ -8,20 +8,29 @@ from itertools import combinations
 from math import sqrt
 
 WIDTH, HEIGHT = 1280, 720
-"""Size of the film, pixels: 720p, which every player supports."""
+"""Pixels: width and height of the preview (720p). Every player supports this size."""
 ROOM_WIDTH = 660
-"""Width of the room's view at the left of the image, pixels: about half of it. Evidence: none."""
+"""Pixels: width of the room's view at the left of the image. It is about half of the image. Evidence:
+none."""
 _LABEL_HEIGHT = 22
-"""Height of the line of text below a video, pixels."""
+"""Pixels: height of the line of text below a video."""
 _MARGIN = 4
-"""Space between two videos, pixels."""
+"""Pixels: space between two videos."""
 _MAX_SEARCHED = 10
-"""Number of videos up to which all partitions into rows are tried (2^9 for ten videos)."""
+"""Maximum number of videos for which all partitions into rows are tried. For ten videos these are 2^9
+partitions."""
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A rectangle in the image, pixels: left, top, width, height."""
+    """A rectangle in the image, in pixels.
+
+    Attributes:
+        x: Left column.
+        y: Top row.
+        width: Width.
+        height: Height.
+    """
 
     x: int
     y: int
@@ -30,26 +39,30 @@ class Box:
 
 
 def lay_out_videos(aspects: Sequence[float]) -> list[tuple[Box, Box]]:
-    """Arrange videos in rows next to the room so that they are as large as possible.
+    """Arrange videos in rows next to the room, so that the videos are as large as possible.
 
     Args:
-        aspects: Width over height of each video. The first video is never smaller than another.
+        aspects: Ratio of width to height of each video.
 
     Returns:
-        One box for each video and one for the line of text below it.
+        For each video, a box for the video and a box for the line of text below it. For up to ten videos, no
+        row has fewer videos than the row above it.
     """
     layouts = [_place_rows(aspects, ends) for ends in _partitions(len(aspects))]
-    # Lengths are summed, not areas: one large video does not compensate for many that are too small to read.
+    # Lengths are summed instead of areas: a large video must not compensate for many unreadably small videos.
     return max(layouts, key=lambda boxes: sum(sqrt(box.width * box.height) for box, _ in boxes), default=[])
 
 
 def _partitions(count: int) -> list[tuple[int, ...]]:
-    """Return the ends of the rows of each partition of the videos; for many videos, only even partitions."""
+    """Return partitions of the videos into rows, each as the ends of its rows.
+
+    For many videos, only partitions into rows of equal length are returned. Their last row may be shorter.
+    """
     if count > _MAX_SEARCHED:
         return [tuple(sorted({*range(row, count, row), count})) for row in range(2, count + 1)]
     inner = range(1, count)
     partitions = [(*cuts, count) for size in range(count) for cuts in combinations(inner, size)]
-    # No row has fewer videos than the row above it, so the first video is never smaller than another.
+    # No row may have fewer videos than the row above it: the first videos are then the largest.
     return [ends for ends in partitions if _row_lengths(ends) == sorted(_row_lengths(ends))]
 
 
@@ -58,7 +71,15 @@ def _row_lengths(ends: tuple[int, ...]) -> list[int]:
 
 
 def _place_rows(aspects: Sequence[float], ends: tuple[int, ...]) -> list[tuple[Box, Box]]:
-    """Place rows that fill the width; if their total height is too large, shrink all of them."""
+    """Place rows that fill the width. If their total height is too large, all rows are shrunk.
+
+    Args:
+        aspects: Ratio of width to height of each video.
+        ends: For each row, the number of videos up to its end.
+
+    Returns:
+        For each video, a box for the video and a box for the line of text below it.
+    """
     area_width = WIDTH - ROOM_WIDTH
     starts = (0, *ends[:-1])
     full_heights = [

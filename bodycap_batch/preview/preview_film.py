@@ -1,4 +1,4 @@
-"""The preview film, rendered image by image."""
+"""Render the preview film, image by image."""
 
 from __future__ import annotations
 
@@ -35,11 +35,14 @@ from bodycap_batch.preview.tiles import WORLD, VideoTile, draw_tile, nearest_fra
 from bodycap_batch.preview.viewpoint import Viewpoint, follow_target
 
 _BODY_RADIUS_M = 1.05
-"""Metres from the hips to what must be visible: the head, and a hand of a stretched arm."""
+"""Metres: radius around the middle of the body that must be visible. It includes the head, and a hand of a
+stretched arm."""
 _PATH_PIECES = 1500
-"""A path is drawn in at most about twice as many pieces, however long the video is. Evidence: none."""
+"""Number of pieces in a drawn camera path. A long path has at least this number and at most about twice this
+number. Evidence: none."""
 _MAX_CLOCK_S = 1e8
-"""Seconds; a larger time comes from a clock that counts from 1970 and is shown relative to the start."""
+"""Seconds: maximum time that is shown unchanged. A larger time comes from a clock that counts from 1970, and
+is shown relative to the start."""
 _STROKE_LEGEND = "solid: measured · dashed: inferred"
 _DOT_LEGEND = "dots: map points, green where they fit, red where not"
 
@@ -54,9 +57,9 @@ class PreviewInputs:
         views: Poses and observations of each camera.
         reference_frame: Frame of reference of the room: "world", or the gauge of a map.
         points: (P,3) points of the room in that frame of reference.
-        colours: (P,3) uint8 RGB.
+        colours: (P,3) uint8 RGB colours of the points.
         bone_motion: The solved motion; None if there is none.
-        note: Why the body that the job asks for is missing, or "".
+        note: Reason why there is no body although the job requires one; "" otherwise.
     """
 
     path: Path
@@ -70,9 +73,10 @@ class PreviewInputs:
 
 
 def render_preview(inputs: PreviewInputs, context: StageContext) -> Path:
-    """Write the preview, 1280×720 and at most a minute long, and return its path.
+    """Write the preview, 1280×720, and return its path.
 
-    A capture longer than a minute is shown faster, with evenly spaced images.
+    The preview has at most `MAX_FRAMES` frames. A long capture is shown with evenly spaced frames, and faster
+    if necessary.
 
     Raises:
         CaptureError: A frame cannot be decoded.
@@ -106,12 +110,12 @@ def render_preview(inputs: PreviewInputs, context: StageContext) -> Path:
 def _encoder(video: VideoWriter, threads: int) -> Iterator[Callable[[RgbImage], None]]:
     """Yield the function that encodes an image.
 
-    With more than one thread an image is encoded while the next one is drawn.
+    With more than one thread, an image is encoded while the next image is drawn.
     """
     if threads == 1:
         yield video.add
         return
-    # The encoder releases the interpreter's lock, so a thread is enough.
+    # The encoder releases the interpreter's lock, so a thread is sufficient; no process is needed.
     with ThreadPoolExecutor(max_workers=1) as pool:
         encoding: Future[None] | None = None
 
@@ -127,7 +131,7 @@ def _encoder(video: VideoWriter, threads: int) -> Iterator[Callable[[RgbImage], 
 
 
 def _choose_timeline(inputs: PreviewInputs) -> PreviewTimeline:
-    """Return the timeline of the motion, or that of the videos if there is no motion."""
+    """Return the timeline of the motion, or the timeline of the videos if there is no motion."""
     if inputs.bone_motion is not None and len(inputs.bone_motion.times_ns) > 1:
         times = inputs.bone_motion.times_ns
         fps = 1e9 * (len(times) - 1) / float(times[-1] - times[0])
@@ -161,7 +165,7 @@ def make_tiles(inputs: PreviewInputs, timeline: PreviewTimeline) -> list[VideoTi
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _RoomView:
-    """The constant content of the room's view and its viewpoint at each time."""
+    """The constant content of the room's view, and the viewpoint in each frame of the preview."""
 
     cloud: ColouredPoints
     grid: FloatArray | None
@@ -200,7 +204,7 @@ class _RoomView:
         )
 
     def draw(self, image: RgbImage, index: int, now_ns: int) -> None:
-        """Draw the room at one common time into an image of the background."""
+        """Draw the room at one common time into the left part of the preview's image."""
         view = self.viewpoints[index]
         if self.grid is not None:
             draw_lines(image, view, self.grid, GRID_COLOUR)
@@ -217,7 +221,11 @@ class _RoomView:
 
 
 def _rotation_to_z_up(poses: FloatArray) -> FloatArray:
-    """Return the rotation (3,3) that makes the mean upward direction of camera images (poses (N,4,4)) Z."""
+    """Return the rotation (3,3) that makes the mean upward direction of the images the Z axis.
+
+    Args:
+        poses: (N,4,4) camera poses.
+    """
     up = -poses[:, :3, 1].sum(axis=0)
     length = np.linalg.norm(up)
     if length < 1e-9:
@@ -231,12 +239,12 @@ def _rotation_to_z_up(poses: FloatArray) -> FloatArray:
 def _find_target(
     bone_motion: BoneMotion | None, timeline: PreviewTimeline, centres: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Return the position to look at in each frame (F,3) and the radius that must be visible around it.
+    """Return the position (F,3) to look at in each frame, and the radius around it that must be visible.
 
     Args:
-        bone_motion: The body; None if there is none.
+        bone_motion: The solved motion; None if there is none.
         timeline: Times of the preview's frames.
-        centres: (N,3) camera centres, which are shown if there is no body.
+        centres: (N,3) camera centres. They determine the result if there is no motion.
     """
     if bone_motion is not None and len(bone_motion.times_ns):
         ends = bone_motion.ends_in_world
@@ -251,7 +259,7 @@ def _find_target(
 
 
 def _draw_captions(image: RgbImage, inputs: PreviewInputs, timeline: PreviewTimeline, index: int) -> None:
-    """Draw time, speed and note above the room, and the legend below it."""
+    """Draw the time, the speed and the note above the room, and the legend below it."""
     seconds = timeline.times_ns[index] * 1e-9
     since_start = seconds - timeline.times_ns[0] * 1e-9
     clock = f"+{since_start:.2f} s" if seconds > _MAX_CLOCK_S else f"{seconds:.2f} s"

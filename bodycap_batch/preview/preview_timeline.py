@@ -1,4 +1,4 @@
-"""The times that the preview shows, and the preview's frame rate."""
+"""Choose the times that the preview shows, and the preview's frame rate."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ import numpy as np
 from bodycap_batch.core.arrays import IntArray, set_array
 
 MAX_FRAMES = 720
-"""Frames of the preview: 48 seconds at 15 frames per second, a minute at 12.
+"""Maximum number of frames in the preview: 48 seconds at 15 frames per second, a minute at 12.
 
-A person has the patience for that, and rendering takes little time compared with mapping.
-"""
+A person has the patience for that time, and rendering takes little time compared with mapping."""
 MIN_FPS = 12
-"""Lowest frame rate at which the preview is played, frames per second. Evidence: none."""
+"""Minimum frame rate at which the preview is played, frames per second. If the motion or the videos have a
+lower rate, the preview is played at their rate. Evidence: none."""
 _TARGET_FPS = 15.0
-"""Frames per second that are enough to follow a body. Evidence: docs/decisions/report.md."""
+"""Preferred frame rate of the preview, frames per second. It is sufficient to follow a body. Evidence:
+docs/decisions/report.md."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreviewTimeline:
-    """The times to show.
+    """The times that the preview shows.
 
     Attributes:
-        times_ns: (F,) common time of each frame of the preview, evenly spaced.
+        times_ns: (F,) common time of each frame of the preview in nanoseconds, evenly spaced.
         fps: Frames per second of the preview.
-        speed: Seconds of the capture in one second of the preview; at least 1.
+        speed: Number of seconds of the capture that one second of the preview shows; at least 1.
     """
 
     times_ns: IntArray
@@ -39,15 +40,16 @@ class PreviewTimeline:
 
 
 def make_timeline(start_ns: int, stop_ns: int, fps: float) -> PreviewTimeline:
-    """Spread at most `MAX_FRAMES` frames evenly over an interval.
+    """Return a timeline of at most `MAX_FRAMES` frames that are evenly spaced in an interval of time.
 
     Args:
-        start_ns: First time, common time.
-        stop_ns: Last time, common time.
-        fps: Rate of the motion or of the videos. Above 22 only every second, third ... frame is shown.
+        start_ns: Start of the interval in common time, nanoseconds.
+        stop_ns: End of the interval in common time, nanoseconds.
+        fps: Frame rate of the motion or of the videos. At 22.5 or more, or in a long interval, only every
+            second, third ... frame is shown.
     """
     rate = Fraction(fps).limit_denominator(1001)
-    # The rate may come from rounded times. A hundredth of a frame more ensures that the last one is included.
+    # The rate may come from rounded times. Adding a hundredth of a frame ensures that the last frame is used.
     available = int(Fraction(stop_ns - start_ns, 10**9) * rate + Fraction(1, 100)) + 1
     stride = max(1, round(fps / _TARGET_FPS), -(-available // MAX_FRAMES))
     shown_rate = rate / stride

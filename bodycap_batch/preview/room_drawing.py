@@ -1,4 +1,4 @@
-"""Drawing of the room from outside: points, floor, cameras and the body, in the order of depth."""
+"""Draw the room from outside: points, floor, cameras and the body, from far to near."""
 
 from __future__ import annotations
 
@@ -14,33 +14,37 @@ from bodycap_batch.overlay.drawing import SUBPIXEL_BITS, side_colour
 from bodycap_batch.preview.viewpoint import Viewpoint
 
 BACKGROUND = np.array([26, 28, 34], dtype=np.uint8)
-"""RGB of the dark ground; the colours of cameras and limbs are chosen for it."""
+"""RGB colour of the dark background. The colours of cameras and limbs are chosen for this background."""
 GRID_COLOUR, _SHADOW_COLOUR = (70, 76, 90), (12, 13, 16)
-"""RGB of the floor's grid and of the body's shadow on it."""
+"""RGB colours of the floor's grid and of the body's shadow on the floor."""
 _OUTLINE_COLOUR = (15, 16, 19)
-"""RGB of the dark border around measured bones."""
+"""RGB colour of the dark border around measured bones."""
 _MAX_POINTS = 40_000
-"""Points drawn in each image; that many take a few milliseconds."""
+"""Maximum number of points drawn in each image. This number takes a few milliseconds."""
 _BONE_RADIUS_M = 0.022
-"""Radius of a drawn bone, metres. Evidence: none."""
+"""Metres: radius of a drawn bone. Evidence: none."""
 _MIN_POINT_DEPTH, _MIN_LINE_DEPTH = 0.35, 0.05
-"""Depths, relative to the target's distance, below which points and lines are omitted.
+"""Minimum depth of points and minimum depth of lines, as a fraction of the target's distance.
 
-Near points would cover the body. A line to a point behind the viewer has no meaningful projection.
-"""
+Nearer points would cover the body. A line to a point behind the viewer has no meaningful projection."""
 _MAX_LINE_PX = 8192
-"""Largest coordinate of a drawn line, pixels. OpenCV's fixed-point coordinates overflow at 2^15 or more."""
+"""Pixels: maximum coordinate of a drawn line. OpenCV's fixed-point coordinates overflow at 2^15 or more."""
 _DASH_PX = 9.0
-"""Length of a dash and a gap of an inferred bone, pixels. Evidence: none."""
+"""Pixels: length of a dash of an inferred bone together with the gap after it. Evidence: none."""
 _FRUSTUM = np.array([[0, 0, 0], [-0.6, -0.45, 1], [0.6, -0.45, 1], [0.6, 0.45, 1], [-0.6, 0.45, 1.0]])
-"""Corners of a camera's symbol: its centre and an image of 4:3 at depth 1."""
+"""Corners (5,3) of a camera's symbol: the camera centre and the corners of a 4:3 image at depth 1."""
 _FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
-"""Pairs of corners that a line connects."""
+"""Pairs of corners that are connected by a line."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColouredPoints:
-    """Points of the room: positions (P,3) and RGB colours (P,3)."""
+    """Points of the room.
+
+    Attributes:
+        points: (P,3) positions in the room.
+        colours: (P,3) RGB colours.
+    """
 
     points: FloatArray
     colours: RgbImage
@@ -52,12 +56,15 @@ class ColouredPoints:
 
 
 def blank_image(size: tuple[int, int]) -> RgbImage:
-    """Return an image of the background; `size` is its width and height."""
+    """Return an image of the background. The argument `size` is its width and height."""
     return np.full((size[1], size[0], 3), BACKGROUND, dtype=np.uint8)
 
 
 def draw_points(image: RgbImage, view: Viewpoint, cloud: ColouredPoints) -> None:
-    """Draw points from far to near. They fade with distance; points close to the viewer are omitted."""
+    """Draw points from far to near.
+
+    The points fade with distance. Points close to the viewer are omitted.
+    """
     px, depth = view.project(cloud.points)
     pixel = np.round(px).astype(np.int64)
     height, width = image.shape[:2]
@@ -74,7 +81,12 @@ def draw_points(image: RgbImage, view: Viewpoint, cloud: ColouredPoints) -> None
 
 
 def floor_grid(positions: FloatArray, spacing: float = 1.0) -> FloatArray:
-    """Return short lines (L,2,3) of a grid on the floor z = 0, at least two cells beyond positions (N,3)."""
+    """Return short lines (L,2,3) of a grid on the floor z = 0.
+
+    Args:
+        positions: (N,3) positions. The grid extends at least two cells beyond them.
+        spacing: Side of a cell.
+    """
     low = np.floor(positions[:, :2].min(axis=0) / spacing - 2).astype(int)
     high = np.ceil(positions[:, :2].max(axis=0) / spacing + 2).astype(int)
     lines = []
@@ -90,7 +102,7 @@ def floor_grid(positions: FloatArray, spacing: float = 1.0) -> FloatArray:
 def draw_lines(
     image: RgbImage, view: Viewpoint, lines: FloatArray, colour: Colour, thickness: int = 1
 ) -> None:
-    """Draw straight lines (L,2,3); a line with an end behind the viewer is omitted."""
+    """Draw straight lines (L,2,3). A line is omitted if one of its ends is behind the viewer."""
     import cv2
 
     px, depth = view.project(lines)
@@ -110,15 +122,15 @@ def draw_camera(
 
 
 def draw_path(image: RgbImage, view: Viewpoint, centres: FloatArray, colour: Colour) -> None:
-    """Draw a line through centres (N,3); it is interrupted at unknown centres (NaN)."""
+    """Draw a line through camera centres (N,3). The line is interrupted at unknown centres (NaN)."""
     pieces = np.stack([centres[:-1], centres[1:]], axis=1)
     draw_lines(image, view, pieces[np.isfinite(pieces).all(axis=(1, 2))], colour)
 
 
 def draw_body(image: RgbImage, view: Viewpoint, bones: Bones, sides: Sequence[str]) -> None:
-    """Draw the bones' shadow and then the bones from far to near.
+    """Draw the shadow of the bones, and then the bones from far to near.
 
-    Measured bones are solid; inferred bones are thin and dashed.
+    Measured bones are solid. Inferred bones are thin and dashed.
     """
     shadow = bones.ends_in_world.copy()
     shadow[..., 2] = 0.0

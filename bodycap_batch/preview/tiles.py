@@ -1,4 +1,4 @@
-"""One camera's video in the preview, with overlays and a line of text about each frame's pose."""
+"""Draw one camera's video into the preview, with overlays and a line of text about each frame's pose."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ class VideoTile:
 
     Attributes:
         camera: The camera with its videos.
-        view: Its poses and observations; None if it is in no map.
-        frames: (F,) index of the video frame in each frame of the preview, −1 if the video has none.
-        video_box: Position of the video.
-        label_box: Position of the line of text.
+        view: Poses and observations of the camera; None if no map contains the camera.
+        frames: (F,) index of the video frame that each frame of the preview shows; −1 if there is none.
+        video_box: Position of the video in the preview's image.
+        label_box: Position of the line of text in the preview's image.
         colour: Colour of the camera's path in the room.
     """
 
@@ -58,11 +58,14 @@ class VideoTile:
     colour: Colour
 
     def poses(self) -> FloatArray:
-        """Return the camera's poses (N,4,4), NaN for lost frames; N is zero if the camera is in no map."""
+        """Return the camera's poses (N,4,4), NaN for lost frames; N is zero if no map contains the camera."""
         return np.zeros((0, 4, 4)) if self.view is None else self.view.frame_from_cam
 
     def images(self) -> Generator[RgbImage | None, None, None]:
-        """Yield the video's image (H,W,3) at the tile's size for each frame of the preview, or None."""
+        """Yield an image for each frame of the preview.
+
+        It is the video's image (H,W,3) at the size of the tile, or None if there is no video frame.
+        """
         size = (self.video_box.width, self.video_box.height)
         shown = np.unique(self.frames[self.frames >= 0])
         index, image = -1, None
@@ -75,10 +78,11 @@ class VideoTile:
 
 
 def resize_image(image: RgbImage, size: tuple[int, int]) -> RgbImage:
-    """Return an image (H,W,3) at (width, height).
+    """Return an image (H,W,3) resized to the width and height in `size`.
 
-    It is halved while it is at least twice too large, and then interpolated. Averaging directly to the size
-    has hardly less aliasing and takes five times as long: 3 ms for 640×480.
+    The image is halved while it is at least twice too large. It is then interpolated to its final size.
+    Averaging directly to the final size has hardly less aliasing, and takes five times as long: 3 ms for
+    640×480.
     """
     import cv2
 
@@ -90,7 +94,10 @@ def resize_image(image: RgbImage, size: tuple[int, int]) -> RgbImage:
 
 
 def nearest_frames(camera: CaptureCamera, times_ns: IntArray) -> IntArray:
-    """Return the frame (F,) nearest to each common time, −1 before the video starts and after it ends."""
+    """Return the index (F,) of the frame nearest to each common time.
+
+    It is −1 before the video starts and after it ends.
+    """
     frame_times = camera.common_times_ns()
     if not len(frame_times):
         return np.full(len(times_ns), -1, dtype=np.int64)
@@ -115,11 +122,11 @@ def draw_tile(
     """Draw a camera's video frame and its line of text into the preview's image.
 
     Args:
-        image: The preview's image; it is changed.
-        tile: The camera.
-        video_image: The video frame at the tile's size; None if the video has none at this time.
-        frame: Index of the video frame, −1 if there is none.
-        bone_motion: The body; None if there is none.
+        image: (H,W,3) image of the preview, changed in place.
+        tile: The camera's video and its position.
+        video_image: The video frame at the size of the tile; None if there is none at this time.
+        frame: Index of the video frame; −1 if there is none.
+        bone_motion: The solved motion; None if there is none.
     """
     status = FrameStatus.NO_MAP if tile.view is None or frame < 0 else tile.view.status[frame]
     points = None if tile.view is None or frame < 0 else tile.view.inliers_at(frame)
@@ -168,7 +175,7 @@ def _with_overlay(
 
 
 def describe_status(status: FrameStatus, points: ObservedPoints | None) -> tuple[str, Colour]:
-    """Return the text about a frame's pose and its colour."""
+    """Return the text about a frame's pose, and the colour of this text."""
     if not status.localised or points is None:
         return f"lost: {_LOSS_REASONS.get(status, status.value)}", RED
     name = {FrameStatus.KEYFRAME: "keyframe", FrameStatus.RIG: "carried by the rig"}.get(status, "")

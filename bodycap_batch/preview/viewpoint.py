@@ -1,4 +1,4 @@
-"""The virtual camera that shows the body in its room."""
+"""Place the virtual camera that shows the body in its room."""
 
 from __future__ import annotations
 
@@ -10,37 +10,40 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import transform_points
 
 _FIELD_RAD = float(np.deg2rad(42.0))
-"""Field of view over the shorter side of the image, radians. Evidence: none."""
+"""Radians: field of view over the shorter side of the image. Evidence: none."""
 _ELEVATION_RAD = float(np.deg2rad(17.0))
-"""Angle by which the camera looks down, radians. Evidence: none."""
+"""Radians: angle between the horizontal plane and the direction in which the camera looks down. Evidence:
+none."""
 _AZIMUTHS_RAD = tuple(float(np.deg2rad(side)) for side in (35, -35, 75, -75, 110, -110, 145, -145))
-"""Candidate azimuths, radians, the preferred ones first.
+"""Radians: candidate azimuths of the camera, the preferred azimuths first.
 
-Zero is in front of a body that faces -Y, the direction in which it starts to walk.
-"""
+At azimuth zero the camera is in front of a body that faces -Y. A body starts to walk in this direction."""
 _MIN_SHARE_OF_BEST = 0.6
-"""Share of the best azimuth's visible points from which an earlier azimuth is preferred. Evidence: none."""
+"""Minimum number of visible points of the selected azimuth, as a fraction of the maximum over all azimuths.
+The first candidate with this number is selected. Evidence: none."""
 _SWAY_RAD = float(np.deg2rad(22.0))
-"""Amplitude of the camera's slow rotation about the body, radians; it shows depth. Evidence: none."""
+"""Radians: amplitude of the camera's slow rotation about the body. The rotation makes depth visible.
+Evidence: none."""
 _SWAY_PERIOD_S = 24.0
-"""Period of that rotation, seconds of the preview. Evidence: none."""
+"""Seconds of the preview: period of the camera's slow rotation. Evidence: none."""
 _SMOOTHING_SIGMA_S = 1.0
-"""Sigma of the Gaussian that smooths the target's path, seconds. Steps are shorter and do not shake it."""
+"""Seconds: sigma of the Gaussian that smooths the target's path. The steps of a walking body are shorter, so
+they do not shake the camera."""
 _SAMPLED_TARGETS = 8
-"""Target positions for which an azimuth's visible points are counted. Evidence: none."""
+"""Approximate number of target positions at which an azimuth's visible points are counted. Evidence: none."""
 _MARGIN = 1.1
-"""Factor on the distance; it leaves free space around the body. Evidence: none."""
+"""Factor on the distance of the camera. It leaves free space around the body. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Viewpoint:
-    """A pinhole camera.
+    """A virtual pinhole camera.
 
     Attributes:
-        size: Width and height of its image, pixels.
+        size: Width and height of the image, pixels.
         focal_px: Focal length, pixels.
-        cam_from_room: (4,4), x right, y down, z forward.
-        distance: Distance from the camera to its target, in the room's unit.
+        cam_from_room: (4,4) pose with x right, y down, z forward.
+        distance: Distance between the camera and the target, in the room's unit.
     """
 
     size: tuple[int, int]
@@ -49,7 +52,7 @@ class Viewpoint:
     distance: float
 
     def project(self, x_in_room: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return pixels (...,2) with OpenCV's origin, and depths (...).
+        """Return pixels (...,2) with OpenCV's origin, and depths (...), of points in the room.
 
         The pixels of points behind the camera are meaningless.
         """
@@ -65,19 +68,21 @@ def follow_target(
 ) -> list[Viewpoint]:
     """Return a smoothly moving viewpoint for each frame of the preview.
 
-    Its distance to the target is constant and shows the whole target. It rotates slowly to show depth.
+    The distance between camera and target is constant, and the whole target is visible. The camera rotates
+    slowly about the target to show depth.
 
     Args:
         target: (F,3) position to look at in each frame, Z up.
-        seconds: (F,) time of each frame in the preview.
+        seconds: (F,) time of each frame in the preview, seconds.
         size: Width and height of the image, pixels.
-        reach: Radius around the target that must be visible.
-        points: (P,3) points of the room; the camera stands where it sees them behind the target.
+        reach: Radius around the target that must be visible, in the room's unit.
+        points: (P,3) points of the room. The azimuth is chosen so that many of them are visible behind the
+            target.
     """
     smooth_target = _smooth_path(target, seconds)
     focal_px = 0.5 * min(size) / np.tan(0.5 * _FIELD_RAD)
     deviation = float(np.linalg.norm(target - smooth_target, axis=1).max(initial=0.0))
-    # A body is higher than wide. It may deviate sideways by 0.4 of its reach and still be wholly visible.
+    # A body is taller than wide. It is wholly visible even if it deviates sideways by 0.4 of its reach.
     distance = _MARGIN * max(reach, 0.6 * reach + deviation) / np.tan(0.5 * _FIELD_RAD)
     phase = 2.0 * np.pi * seconds / _SWAY_PERIOD_S
 
@@ -109,7 +114,15 @@ def _count_points_behind_target(view: Viewpoint, points: FloatArray) -> int:
 
 
 def _look_at(position: FloatArray, azimuth_rad: float, distance: float) -> FloatArray:
-    """Return cam_from_room (4,4) of a camera that looks down at a position, at azimuth zero from -Y."""
+    """Return cam_from_room (4,4) of a camera that looks down at a position.
+
+    At azimuth zero the camera is displaced from the position towards -Y.
+
+    Args:
+        position: (3,) position to look at.
+        azimuth_rad: Azimuth of the camera, radians.
+        distance: Distance between the camera and the position.
+    """
     level, lift = np.cos(_ELEVATION_RAD), np.sin(_ELEVATION_RAD)
     to_camera = np.array([np.sin(azimuth_rad) * level, -np.cos(azimuth_rad) * level, lift])
     forward = -to_camera

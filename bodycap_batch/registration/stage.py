@@ -46,20 +46,21 @@ def register_frames(
 ) -> Registration:
     """Estimate the pose of every frame of one camera against the map.
 
-    Map points are tracked from both neighbouring keyframes, into these keyframes too. All observations are
-    used: two tracks of one point start from the independent errors of two keyframes. No map points are added.
+    Map points are tracked from each keyframe into the frames up to both neighbouring keyframes, including
+    these. A frame may have two tracks of one point, from two keyframes. Both are used, because their errors
+    are independent. No map points are added.
 
     Args:
         camera: The camera.
-        maps: Maps of the room. The one with the most keyframes of this camera is used.
+        maps: Maps of the room. The map with the most keyframes of this camera is used.
         selection: The keyframes of the camera, the sharpness of its frames and the noise of its tracks.
-        options: Acceptance limits.
+        options: Minimum number of inliers and maximum relative sigma of a pose.
         context: Threads, progress and cancellation.
-        previous: An earlier registration against a smaller map. Observations between unchanged neighbouring
-            keyframes are reused. Every pose is estimated again.
+        previous: An earlier registration against a smaller map. Its observations between unchanged
+            neighbouring keyframes are used again. Every pose is estimated again.
 
     Returns:
-        A pose or a reason for every frame, and the frames that should become keyframes.
+        The registration: a pose or a reason for every frame, and the frames that should become keyframes.
     """
     offered = _offered_keyframes(selection, previous)
     scene_map = _map_of_camera(maps, camera.name)
@@ -96,19 +97,19 @@ def register_in_rig(
 ) -> tuple[Registration, list[RelativePose]]:
     """Estimate the pose of every frame of one camera with the observations of all cameras of its rig.
 
-    The relative pose of two cameras is the robust mean over all frames in which each was localised by itself.
-    A camera is left out if its relative pose has too few samples or scatters too much.
+    The relative pose of two cameras is the robust mean over all frames that both cameras localised
+    separately. A camera is excluded if its relative pose has too few samples or scatters too much.
 
     Args:
         own: The camera with its registration.
         others: The other cameras on its segment, exposed at the same instants.
         maps: The maps that the camera was registered against.
         selection: The keyframes of the camera.
-        options: Acceptance limits.
-        threads: Threads that solve frames. The result does not depend on them.
+        options: Minimum number of inliers and maximum relative sigma of a pose.
+        threads: Number of threads that solve frames. The result does not depend on it.
 
     Returns:
-        The registration with poses that all cameras support, and the relative pose of each other camera.
+        The registration with poses from all cameras of the rig, and the relative pose of each other camera.
 
     Source: generalised cameras, Pless, "Using many cameras as one", CVPR 2003.
     """
@@ -135,10 +136,11 @@ def _track_without_misplaced(
     criteria: AcceptanceCriteria,
     context: StageContext,
 ) -> tuple[Map, Tracks, IntArray]:
-    """Remove misplaced keyframes and track the frames around them from the remaining keyframes.
+    """Remove misregistered keyframes, and track the frames around them from the remaining keyframes.
 
     Returns:
-        The map without these keyframes, the tracks, and the frame indices of the removed keyframes.
+        The map without the misregistered keyframes, the tracks, and the frame indices of the removed
+        keyframes.
     """
     nothing = np.zeros(0, np.int64)
     misplaced = find_misplaced_keyframes(camera.name, scene_map, tracks, criteria)
@@ -151,14 +153,14 @@ def _track_without_misplaced(
 
 
 def _offered_keyframes(selection: KeyframeSelection, previous: Registration | None) -> IntArray:
-    """Return the frames that were offered to the mapper so far."""
+    """Return the indices of the frames that were offered to the mapper so far."""
     if previous is None:
         return np.asarray(selection.frames)
     return np.union1d(previous.tried_keyframes, previous.wanted_keyframes)
 
 
 def _map_of_camera(maps: Sequence[Map], camera: str) -> Map | None:
-    """Return the map with the most keyframes of a camera, or None if no map has one."""
+    """Return the map with the most keyframes of a camera; None if no map has a keyframe of the camera."""
     counts = [len(item.keyframes_of(camera)) for item in maps]
     return maps[int(np.argmax(counts))] if counts and max(counts) > 0 else None
 

@@ -1,1 +1,1 @@
-"""Poses of single frames from their observations, and the test of each pose."""
+"""Estimate the poses of single frames from their observations, and test each pose."""

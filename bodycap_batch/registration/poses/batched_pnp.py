@@ -16,49 +16,54 @@ _RAY_STEP = 1e-4
 """Step of the central differences, in units of the ray (x/z, y/z). Origin: about the cube root of the float64
 precision, rounded up. Evidence: none."""
 _CHUNK_FRAMES = 48
-"""Frames solved together: enough to hide numpy's overhead, few enough to stay in the processor's cache."""
+"""Number of frames solved together. More frames hide numpy's overhead; fewer frames stay in the processor's
+cache."""
 _BATCH_ROWS = 1 << 14
-"""Observations undistorted at a time. The camera model needs ten times the memory of its result."""
+"""Maximum number of observations undistorted at a time. The camera model needs ten times the memory of its
+result."""
 _MAX_ITERATIONS = 20
-"""Iterations of Gauss–Newton. Evidence: none."""
+"""Maximum number of Gauss–Newton iterations. Evidence: none."""
 _CONVERGED_PX = 1e-2
-"""Pixels: an iteration that moves the observations by less is the last one. Origin: a third of the standard
-error of 200 points with 0.5 px of noise. Evidence: docs/decisions/registration.md."""
+"""Pixels: threshold of convergence. An iteration that moves the projected points by less is the last
+iteration. Origin: a third of the standard error of 200 points with 0.5 px of noise. Evidence:
+docs/decisions/registration.md."""
 _MAX_STEP_RAD = 0.5
-"""Radians: largest rotation of one iteration. Origin: beyond it the linearisation does not hold. Evidence:
-none."""
-_CUTOFF_MEDIANS = 3.0
-"""Median residuals beyond which an observation gets no weight while the start is still bad. Evidence:
-none."""
-MIN_COUNTED_WEIGHT = 0.05
-"""Observations with less weight are ignored in the noise estimate and in RANSAC if there are others.
+"""Radians: maximum rotation in one iteration. Origin: the linearisation is not valid for larger rotations.
 Evidence: none."""
+_CUTOFF_MEDIANS = 3.0
+"""Cut-off of a residual, as a multiple of the frame's median residual. It is used while it is larger than the
+inlier limit, that is, while the pose is still bad. Evidence: none."""
+MIN_COUNTED_WEIGHT = 0.05
+"""Minimum weight of an observation for the noise estimate and for RANSAC. RANSAC uses all observations if too
+few have this weight. Evidence: none."""
 _LOSS_SCALE = 0.25
 """Scale of the Cauchy loss, as a fraction of the cut-off. Evidence: docs/decisions/registration.md."""
 _DAMPING = 1e-10
 """Damping, as a fraction of the trace of the normal equations. It only prevents a singular matrix."""
 _TINY = 1e-300
-"""Smallest divisor; it prevents a division by zero."""
+"""Smallest divisor. It prevents a division by zero."""
 _UNUSABLE = 1e5
-"""Residual in px, or depth, that stands for "no usable value". It exceeds every limit."""
+"""Residual in pixels, or depth, that stands for "no usable value". It exceeds every limit."""
 _MIN_OBSERVATIONS = 3
-"""Observations that a pose with six unknowns needs, two residuals each."""
+"""Minimum number of observations for a pose. Each observation gives two residuals, and a pose has six
+unknowns."""
 _UPPER_TRIANGLE = tuple((i, j) for i in range(6) for j in range(i, 6))
 """Index pairs of the upper triangle of a 6×6 matrix."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observations:
-    """Map points observed in frames, ordered by frame.
+    """Map points observed in F frames, ordered by frame.
 
     Attributes:
-        bounds: (F+1,) the rows of frame f are [bounds[f], bounds[f+1]).
-        points: (M,3) in the gauge.
-        rays: (M,2) undistorted observations at depth 1: x/z, y/z.
+        bounds: (F+1,) row bounds: the rows of frame f are [bounds[f], bounds[f+1]).
+        points: (M,3) observed points in the gauge.
+        rays: (M,2) undistorted observed pixels at depth 1: x/z, y/z.
         px_from_ray: (M,2,2) derivative of the pixel with respect to the ray.
-        weight: (M,) inverse variance, relative to that of the best observation.
-        member: (M,) index of the observing camera of a rig; None if the poses are those of a single camera.
-        cam_from_rig: (C,4,4) poses of the rig's cameras; the estimated poses are then those of the rig.
+        weight: (M,) inverse variance of each observation, relative to the best observations.
+        member: (M,) index of the observing camera of a rig; None for a single camera.
+        cam_from_rig: (C,4,4) poses of the cameras in the rig; None for a single camera. If they are given,
+            the estimated poses are the poses of the rig.
     """
 
     bounds: IntArray
@@ -70,7 +75,7 @@ class Observations:
     cam_from_rig: FloatArray | None = None
 
     def rows(self, frame: int) -> slice:
-        """Return the rows of one frame."""
+        """Return the range of rows of one frame."""
         return slice(int(self.bounds[frame]), int(self.bounds[frame + 1]))
 
     def select_frame(self, frame: int) -> Observations:
@@ -87,14 +92,14 @@ class Observations:
         )
 
     def camera_poses(self, rows: IntArray, poses: FloatArray) -> FloatArray:
-        """Return the poses of the observing cameras, given the poses of their frames.
+        """Return the poses of the observing cameras, given the poses of the frames.
 
         Args:
-            rows: (N,) rows of observations.
-            poses: (N,4,4) cam_from_gauge, or rig_from_gauge, of their frames.
+            rows: (N,) row indices of observations.
+            poses: (N,4,4) cam_from_gauge, or rig_from_gauge, of the frame of each observation.
 
         Returns:
-            (N,4,4) cam_from_gauge.
+            Poses cam_from_gauge (N,4,4) of the observing cameras.
         """
         if self.member is None or self.cam_from_rig is None:
             return poses
@@ -106,12 +111,12 @@ class PoseQuality:
     """How well each pose explains the observations of its frame.
 
     Attributes:
-        inliers: (F,) number of observations within the limit.
-        error_px: (F,) mean residual of the inliers.
-        inlier_weight_ratio: (F,) weight of the inliers over the weight of all observations.
-        noise_px: (F,) median absolute residual along one axis, scaled by the root of the weight, over inliers
-            that are not almost without weight.
-        depth: (F,) median depth of the inliers.
+        inliers: (F,) number of observations whose residual is below the inlier limit.
+        error_px: (F,) mean residual of the inliers, pixels.
+        inlier_weight_ratio: (F,) ratio of the inliers' weight to the weight of all observations.
+        noise_px: (F,) median absolute residual along one image axis, multiplied by the root of the weight.
+            Only inliers with a weight of at least `MIN_COUNTED_WEIGHT` are used.
+        depth: (F,) median depth of the inliers, in the unit of the gauge.
         information: (F,6,6) Gauss–Newton information of a left perturbation of cam_from_gauge, for 1 px of
             noise.
     """
@@ -127,7 +132,15 @@ class PoseQuality:
 def make_observations(
     camera: Camera, bounds: IntArray, points: FloatArray, px: FloatArray, weight: FloatArray | None = None
 ) -> Observations:
-    """Undistort pixels (M,2) once, so that each iteration needs no camera model."""
+    """Return observations with undistorted pixels, so that the iterations need no camera model.
+
+    Args:
+        camera: The camera model.
+        bounds: (F+1,) row bounds of the frames, as in `Observations`.
+        points: (M,3) observed points in the gauge.
+        px: (M,2) observed pixels.
+        weight: (M,) weights of the observations; 1 by default.
+    """
     rays = np.empty((len(px), 2))
     for start in range(0, len(px), _BATCH_ROWS):
         rays[start : start + _BATCH_ROWS] = camera.unproject(px[start : start + _BATCH_ROWS])
@@ -141,7 +154,10 @@ def make_observations(
 
 
 def projection_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
-    """Return the derivative (N,2,2) of the pixel by the ray (x/z, y/z), from central differences."""
+    """Return the derivative (N,2,2) of the pixel with respect to the ray (x/z, y/z).
+
+    It is computed from central differences.
+    """
     out = np.empty((len(rays), 2, 2))
     for start in range(0, len(rays), _BATCH_ROWS):
         batch = rays[start : start + _BATCH_ROWS]
@@ -157,17 +173,17 @@ def refine_poses(
 ) -> FloatArray:
     """Minimise the reprojection error of each frame under a Cauchy loss, cut off at `limit_px`.
 
-    The loss starts as wide as the residuals and narrows with them. A start beyond the limit therefore still
-    converges. Frames are independent of each other.
+    The loss is as wide as the residuals at first, and narrows as they shrink. The poses therefore converge
+    even if the first residuals exceed the limit. Frames are independent of each other.
 
     Args:
         observations: Observations of F frames.
         cam_from_gauge: (F,4,4) poses to start from.
-        limit_px: Inlier limit.
-        threads: Threads that solve chunks of frames. The result does not depend on them.
+        limit_px: Inlier limit, pixels.
+        threads: Number of threads that solve chunks of frames. The result does not depend on it.
 
     Returns:
-        (F,4,4) cam_from_gauge.
+        Refined poses cam_from_gauge (F,4,4).
 
     Source: Holland, Welsch, "Robust regression using iteratively reweighted least-squares", 1977.
     """
@@ -227,7 +243,10 @@ def evaluate_poses(
 def find_inliers(
     observations: Observations, cam_from_gauge: FloatArray, limit_px: float, threads: int
 ) -> BoolArray:
-    """Return which observations (M,) agree with poses (F,4,4) within a limit; none does if a pose is NaN."""
+    """Return a mask (M,) of the observations that agree with poses (F,4,4) within a limit.
+
+    It is False for all observations of a frame whose pose is NaN.
+    """
     out = np.zeros(len(observations.rays), dtype=bool)
 
     def mark_chunk(chosen: IntArray) -> None:
@@ -252,7 +271,7 @@ def _for_each_chunk(observations: Observations, work: Callable[[IntArray], None]
 
 
 def _chunks(observations: Observations) -> Iterator[IntArray]:
-    """Yield chunks of the frames that have enough observations for a pose."""
+    """Yield chunks of frame indices. Frames with too few observations for a pose are omitted."""
     counts = np.diff(observations.bounds)
     usable = np.flatnonzero(counts >= _MIN_OBSERVATIONS)
     for start in range(0, len(usable), _CHUNK_FRAMES):
@@ -262,10 +281,10 @@ def _chunks(observations: Observations) -> Iterator[IntArray]:
 def _gauss_newton_step(
     observations: Observations, frames: IntArray, poses: FloatArray, limit_px: float
 ) -> tuple[FloatArray, BoolArray]:
-    """Do one iteration.
+    """Perform one Gauss–Newton iteration.
 
     Returns:
-        The new poses, and which of them have converged.
+        The new poses (N,4,4), and a mask (N,) of the poses that have converged.
     """
     rows, starts, owner = _rows_of_frames(observations, frames)
     residual, jacobian, _ = linearise(observations, rows, poses[owner])
@@ -285,9 +304,16 @@ def _gauss_newton_step(
 
 
 def _segment_medians(value: FloatArray, owner: IntArray, starts: IntArray, counts: IntArray) -> FloatArray:
-    """Return the lower median of the `counts` smallest values of each owner.
+    """Return the lower median of the `counts` smallest values of each frame.
 
-    One sort does it for all owners: the owner is added as the leading digits of each value.
+    The values of all frames are sorted together. A multiple of the frame's number is added to each value
+    before, so that the frames stay separate.
+
+    Args:
+        value: (M,) values, ordered by frame.
+        owner: (M,) number of the frame of each value.
+        starts: (F,) position of each frame's first value.
+        counts: (F,) number of smallest values to use in each frame.
     """
     capped = np.minimum(value, _UNUSABLE)
     base = owner * (2.0 * _UNUSABLE)
@@ -296,7 +322,12 @@ def _segment_medians(value: FloatArray, owner: IntArray, starts: IntArray, count
 
 
 def _rows_of_frames(observations: Observations, frames: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the rows of some frames, the position of each frame's first row, and the frame of each row."""
+    """Return the rows of the selected frames.
+
+    Returns:
+        Row indices (M,), the position (F,) of each frame's first row among them, and the number (M,) of each
+        row's frame.
+    """
     counts = observations.bounds[frames + 1] - observations.bounds[frames]
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     owner = np.repeat(np.arange(len(frames)), counts)
@@ -307,17 +338,18 @@ def _rows_of_frames(observations: Observations, frames: IntArray) -> tuple[IntAr
 def linearise(
     observations: Observations, rows: IntArray, cam_from_gauge: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return residuals, their derivatives by a left perturbation of cam_from_gauge, and depths.
+    """Return residuals, their derivatives with respect to a left perturbation of cam_from_gauge, and depths.
 
-    A point behind the camera gets a residual beyond any limit and no derivative.
+    A point behind the camera gets a residual beyond any limit. Its derivatives are zero.
 
     Args:
         observations: The observations.
-        rows: (N,) rows of them.
-        cam_from_gauge: (N,4,4) one pose for each row.
+        rows: (N,) row indices of the observations to use.
+        cam_from_gauge: (N,4,4) pose of the frame of each row; rig_from_gauge if `observations` are from a
+            rig.
 
     Returns:
-        Residuals (2,N) px, derivatives (2,6,N), rotation first, and depths (N,).
+        Residuals (2,N) in pixels; derivatives (2,6,N), rotation first; depths (N,).
     """
     residual, (a, b, inverse, z), px_from_ray = _residuals(observations, rows, cam_from_gauge)
     jacobian = np.empty((2, 6, len(a)))
@@ -335,7 +367,12 @@ def linearise(
 
 
 def _camera_to_rig_jacobian(jacobian: FloatArray, member: IntArray, cam_from_rig: FloatArray) -> None:
-    """Change derivatives (2,6,N) by a camera's perturbation, in place, into derivatives by its rig's.
+    """Replace derivatives with respect to a camera's perturbation by derivatives with respect to its rig's.
+
+    Args:
+        jacobian: (2,6,N) derivatives, changed in place; rotation first.
+        member: (N,) index of the observing camera.
+        cam_from_rig: (C,4,4) poses of the cameras in the rig.
 
     Source: the adjoint map of SE(3), as in Sola, Deray, Atchuthan, "A micro Lie theory for state estimation
         in robotics", 2018; rotation first.
@@ -348,11 +385,11 @@ def _camera_to_rig_jacobian(jacobian: FloatArray, member: IntArray, cam_from_rig
 def _residuals(
     observations: Observations, rows: IntArray, cam_from_gauge: FloatArray
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]:
-    """Return residuals (2,N), the projection and the derivative of the pixel.
+    """Return the residuals, the projected points and the derivative of the pixel with respect to the ray.
 
     Returns:
-        Residuals (2,N) as in `linearise`; x/z, y/z, 1/z and z (N,) each; px_from_ray (2,2,N), which is 0 for
-        unusable observations.
+        Residuals (2,N) as in `linearise`; a tuple of x/z, y/z and 1/z (N,) each, and z (N,); px_from_ray
+        (2,2,N). For unusable observations px_from_ray is 0.
     """
     x, y, z = transform_points(observations.camera_poses(rows, cam_from_gauge), observations.points[rows]).T
     in_front = z > 1e-9
@@ -385,7 +422,7 @@ def _normal_equations(
 def _retract(cam_from_gauge: FloatArray, step: FloatArray) -> FloatArray:
     """Apply left perturbations (N,6), rotation first, to poses (N,4,4).
 
-    A perturbation with a large rotation is shortened.
+    A perturbation with a rotation above `_MAX_STEP_RAD` is shortened.
     """
     rotvec = step[:, :3]
     angle = np.linalg.norm(rotvec, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Select lost frames that should become keyframes, so that the map grows where tracking failed."""
+"""Select lost frames as new keyframes, so that the map grows where tracking failed."""
 
 from __future__ import annotations
 
@@ -7,34 +7,37 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced, runs
 
 _WINDOW_FRAMES = 3
-"""Frames of which the sharpest one is requested. Evidence: none."""
+"""Number of successive lost frames in a window. Only the sharpest frame of each window is requested.
+Evidence: none."""
 _END_OFFSET_FRAMES = 1
-"""Distance in frames from a lost interval to the frame with a pose that is requested with it: the adjacent
-one."""
+"""Distance in frames between a lost interval and the frame with a pose that is requested on either side. With
+1 it is the adjacent frame."""
 _MIN_BUDGET = 20
-"""Frames that may always be requested at a time. Evidence: none."""
+"""Number of frames that may be requested in every round. Evidence: none."""
 _BUDGET_RATIO = 0.5
-"""Most frames requested at a time, as a fraction of those offered before. Origin: it bounds the growth of the
-map in one round. Evidence: none."""
+"""Maximum number of frames requested in one round, as a fraction of the number of frames offered before.
+Origin: it bounds the growth of the map in one round. Evidence: none."""
 
 
 def lost_intervals(localised: BoolArray) -> list[tuple[int, int]]:
-    """Return the maximal intervals [start, stop) of frames without a pose."""
+    """Return the lost intervals [start, stop): the longest possible runs of frames without a pose."""
     return runs(~localised)
 
 
 def request_keyframes(localised: BoolArray, sharpness: FloatArray, tried: IntArray) -> IntArray:
-    """Select lost frames to offer to the mapper, and the frames with poses next to them.
+    """Select lost frames that the mapper should try as keyframes, and the frames with poses next to them.
 
-    The sharpest of every few lost frames is taken.
+    Lost intervals are divided into windows of three frames. The sharpest frame of each window is selected,
+    unless a frame of the window was offered before.
 
     Args:
-        localised: (N,) frames with a pose.
-        sharpness: (N,) image sharpness.
-        tried: Frames that were offered before.
+        localised: (N,) True for frames with a pose.
+        sharpness: (N,) image sharpness of each frame.
+        tried: Indices of the frames that were offered to the mapper before.
 
     Returns:
-        Frame indices, increasing; at most half as many as were offered before, but up to 20 in any case.
+        Indices of the selected frames, increasing. Their number is at most 20, or half the number of frames
+        offered before if that is larger.
 
     Source: Algorithm 1 of Vo, Kim, Choudhary, "Motion capture using body mounted cameras in an unknown
         environment".

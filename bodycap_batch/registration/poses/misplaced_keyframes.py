@@ -1,4 +1,4 @@
-"""Find keyframes whose pose contradicts the video: tracks continue where the map makes the camera jump."""
+"""Find misregistered keyframes: their poses in the map contradict the tracks between keyframes."""
 
 from __future__ import annotations
 
@@ -14,27 +14,32 @@ from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, ransac_pose
 from bodycap_batch.registration.tracking.klt import Tracks
 
 _MIN_TRACKS = 15
-"""Tracks between two keyframes that a decision needs. Origin: about the least number of inliers of a pose.
-Evidence: none."""
+"""Minimum number of tracks between two keyframes for a decision. Origin: about the minimum number of inliers
+of a pose. Evidence: none."""
 _MAX_MEDIAN_ERROR = 4.0
-"""Largest median distance of tracks from their expected pixels between correct keyframes, in inlier limits.
-Evidence: docs/decisions/registration.md."""
+"""Maximum median distance between tracked and predicted pixels, as a multiple of the inlier limit. If the
+median between two keyframes is larger, the tracks may contradict the poses. Evidence:
+docs/decisions/registration.md."""
 _UNSEEN_ERROR_PX = 1e5
-"""Pixels: error of a point that the keyframe cannot see. It exceeds every limit."""
+"""Pixels: error assigned to a point that the keyframe cannot see. It exceeds every limit."""
 
 
 _MIN_OTHER_POSE_RATIO = 0.5
-"""Least ratio of the tracks into a keyframe that agree on one other pose, if the keyframe is misplaced.
-Tracks that merely slipped do not agree. Evidence: docs/decisions/registration.md."""
+"""Minimum fraction of the tracks into a keyframe that must agree on another pose of this keyframe. Only then
+do the tracks contradict the map. Tracks that have slipped do not agree on any pose. Evidence:
+docs/decisions/registration.md."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Interval:
-    """Two successive keyframes of a camera.
+    """The interval between two successive keyframes of a camera.
+
+    Both attributes are False in two cases: there are too few tracks, or the tracks disagree with the poses
+    but no other pose explains them.
 
     Attributes:
-        consistent: The tracks between them agree with their poses.
-        inconsistent: The tracks contradict their poses. Neither is true if there are too few tracks.
+        consistent: True if the tracks between the keyframes agree with their poses.
+        inconsistent: True if the tracks contradict the poses and agree on another pose of one keyframe.
     """
 
     consistent: bool
@@ -43,14 +48,14 @@ class _Interval:
 
 @dataclass(frozen=True, slots=True)
 class _ArrivingTracks:
-    """Tracks that arrive in another keyframe.
+    """Tracks that start in one keyframe and arrive in another.
 
     Attributes:
-        target: (N,) index of the keyframe they arrive in, among the camera's keyframes.
-        source: (N,) index of the keyframe they come from.
-        point: (N,) map points.
-        px: (N,2) pixel of arrival.
-        error_px: (N,) distance from the pixel that the map predicts.
+        target: (N,) index of the keyframe that the track arrives in, among the camera's keyframes.
+        source: (N,) index of the keyframe that the track starts from, among the camera's keyframes.
+        point: (N,) index of the tracked map point.
+        px: (N,2) pixel at which the track arrives.
+        error_px: (N,) distance between this pixel and the pixel that the map predicts.
     """
 
     target: IntArray
@@ -63,11 +68,11 @@ class _ArrivingTracks:
 def find_misplaced_keyframes(
     camera: str, scene_map: Map, tracks: Tracks, criteria: AcceptanceCriteria
 ) -> IntArray:
-    """Find keyframes whose pose contradicts the tracks from their neighbours.
+    """Find misregistered keyframes: keyframes whose pose contradicts the tracks from their neighbours.
 
-    Points tracked from one keyframe to the next must arrive at the pixels that the map predicts. If they do
-    not, one side of the interval is misplaced: the side with fewer points that are shared with other
-    keyframes. A side extends as far as consistent intervals connect its keyframes.
+    Points tracked from one keyframe to the next must arrive at the pixels that the map predicts. If they
+    arrive elsewhere, the keyframes on one side of the interval are misregistered. It is the side with fewer
+    points that other keyframes share. A side consists of all keyframes that consistent intervals connect.
 
     Args:
         camera: Camera name.
@@ -76,10 +81,10 @@ def find_misplaced_keyframes(
         criteria: The inlier limit of an observation.
 
     Returns:
-        Rows of the misplaced keyframes in the map.
+        Row indices of the misregistered keyframes in the map.
 
-    Source: the loop of tracking and map as a check is Zach, Klopschitz, Pollefeys, "Disambiguating visual
-        relations using loop constraints", CVPR 2010, in its simplest form.
+    Source: Zach, Klopschitz, Pollefeys, "Disambiguating visual relations using loop constraints", CVPR 2010.
+        Tracking and the map form a loop here, which is the simplest loop constraint.
     """
     rows = scene_map.keyframes_of(camera)
     arriving = _arriving_tracks(camera, scene_map, rows, tracks)
@@ -101,7 +106,7 @@ def find_misplaced_keyframes(
 
 
 def _arriving_tracks(camera: str, scene_map: Map, rows: IntArray, tracks: Tracks) -> _ArrivingTracks:
-    """Select the tracks that end in a keyframe, with their distance from the predicted pixel."""
+    """Select the tracks that arrive in a keyframe, with their distance from the predicted pixel."""
     frames = scene_map.keyframe_frame[rows]
     arrived = np.flatnonzero(np.isin(tracks.frame, frames))
     point = scene_map.points_of(camera, tracks.keyframe[arrived], tracks.feature[arrived])
@@ -118,7 +123,17 @@ def _arriving_tracks(camera: str, scene_map: Map, rows: IntArray, tracks: Tracks
 def _check_interval(
     lens: Camera, scene_map: Map, arriving: _ArrivingTracks, number: int, criteria: AcceptanceCriteria
 ) -> _Interval:
-    """Compare the tracks between a keyframe and the next one, both ways, with the keyframes' poses."""
+    """Compare the tracks between a keyframe and the next keyframe with the poses of both.
+
+    Tracks in both directions are compared.
+
+    Args:
+        lens: The camera model.
+        scene_map: The map.
+        arriving: Tracks that arrive in a keyframe.
+        number: Index of the first of the two keyframes, among the camera's keyframes.
+        criteria: The inlier limit of an observation.
+    """
     directions = [
         np.flatnonzero((arriving.source == source) & (arriving.target == target))
         for source, target in ((number, number + 1), (number + 1, number))
@@ -145,7 +160,15 @@ def _check_interval(
 def _arrival_errors(
     scene_map: Map, camera: str, row: IntArray, point: IntArray, px: FloatArray
 ) -> FloatArray:
-    """Return the distances (N,) of pixels from where keyframes (rows) project points."""
+    """Return the distances (N,) in pixels between observed and predicted pixels.
+
+    Args:
+        scene_map: The map.
+        camera: Camera name.
+        row: (N,) row index of a keyframe in the map.
+        point: (N,) index of the point that the keyframe observes.
+        px: (N,2) observed pixel.
+    """
     if len(row) == 0:
         return np.zeros(0)
     x_in_cam = transform_points(invert(scene_map.map_from_cam[row]), scene_map.points[point])
@@ -155,7 +178,7 @@ def _arrival_errors(
 
 
 def _count_shared_points(scene_map: Map) -> IntArray:
-    """Count the points (K,) of each keyframe that at least three observations of the map share."""
+    """Return the number (K,) of points that each keyframe shares with at least two other keyframes."""
     keyframe_count = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
     return np.bincount(
         scene_map.obs_keyframe[keyframe_count[scene_map.obs_point] > 2],
@@ -164,7 +187,7 @@ def _count_shared_points(scene_map: Map) -> IntArray:
 
 
 def map_without_keyframes(scene_map: Map, rows: IntArray) -> Map:
-    """Return the map without some keyframes and their observations, in the same gauge."""
+    """Return the map without the keyframes `rows` and their observations, in the same gauge."""
     keep = np.ones(len(scene_map.keyframe_camera), dtype=bool)
     keep[rows] = False
     obs_kept: BoolArray = keep[scene_map.obs_keyframe]

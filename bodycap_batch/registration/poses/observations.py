@@ -1,4 +1,4 @@
-"""Collect the observations of map points by the cameras of a rig, block by block."""
+"""Collect the observations of map points by the cameras of a rig, one block of frames after another."""
 
 from __future__ import annotations
 
@@ -18,22 +18,26 @@ from bodycap_batch.registration.poses.static_points import static_points
 from bodycap_batch.registration.tracking.klt import Tracks
 
 _POINT_VARIANCE_RATIO = 6.0
-"""Variance that the position error of a point adds to its observations, for a point seen by one keyframe,
-relative to the variance of a track. It falls with the number of keyframes. Evidence:
-docs/decisions/registration.md."""
+"""Ratio of two variances: the variance that the position error of a point adds to its observations, over the
+variance of a track. It holds for a point that one keyframe sees. The added variance is inversely proportional
+to the number of keyframes. Evidence: docs/decisions/registration.md."""
 _TRANSIENT_WEIGHT = 0.01
-"""Weight factor of points that are not known to be static. Evidence: docs/decisions/registration.md."""
+"""Weight factor of observations whose point is not static. Evidence: docs/decisions/registration.md."""
 BLOCK_FRAMES = 1200
-"""Frames whose observations are held at a time. It bounds the memory; the poses do not depend on it.
-Evidence: docs/decisions/registration.md."""
+"""Maximum number of frames in a block. Only the observations of one block are held in memory at a time. The
+poses do not depend on this number. Evidence: docs/decisions/registration.md."""
 _MIN_OBSERVED = 4
-"""Observations of a point below which its reliability counts as full. Evidence: none."""
+"""Minimum number of observations of a point for an estimate of its reliability. A point with fewer
+observations is treated as fully reliable. Evidence: none."""
 
 
 def point_weights(keyframe_count: IntArray) -> FloatArray:
-    """Return the weights of observations of points that `keyframe_count` (N,) keyframes see, relative to 1.
+    """Return the weights (N,) of observations, from the number of keyframes that see each observed point.
 
-    More keyframes determine a point better.
+    More keyframes determine a point better. The weight approaches 1 as the number grows.
+
+    Args:
+        keyframe_count: (N,) number of keyframes that see each point.
     """
     return np.asarray(keyframe_count / (keyframe_count + _POINT_VARIANCE_RATIO))
 
@@ -44,9 +48,10 @@ class RigMember:
 
     Attributes:
         camera: The camera.
-        tracks: Observations in its frames, ordered by frame.
-        cam_from_rig: (4,4) its pose in the rig; the poses of frames are those of the rig.
-        rig_frame: (N,) frame of the rig at the instant of each frame of this camera; -1 if there is none.
+        tracks: Tracked observations in the frames of this camera, ordered by frame.
+        cam_from_rig: (4,4) pose of the camera in the rig. The estimated poses of frames are poses of the rig.
+        rig_frame: (N,) index of the rig's frame at the instant of each frame of this camera; -1 if the rig
+            has no frame then.
     """
 
     camera: CaptureCamera
@@ -59,9 +64,11 @@ class RigMember:
 class PointReliability:
     """How often each point was observed in frames with a pose, and how often it agreed with the pose.
 
+    C is the number of cameras, P the number of points.
+
     Attributes:
-        observed: (C*P,) by camera and point.
-        agreed: (C*P,) likewise.
+        observed: (C*P,) number of observations of each point by each camera, in frames with a pose.
+        agreed: (C*P,) number of these observations that agree with the pose of their frame.
     """
 
     observed: IntArray
@@ -69,28 +76,42 @@ class PointReliability:
 
     @staticmethod
     def zero(count: int) -> PointReliability:
-        """Return empty counts for `count` points."""
+        """Return a reliability in which all `count` numbers of observations are zero."""
         return PointReliability(np.zeros(count, np.int64), np.zeros(count, np.int64))
 
     def add(self, keys: IntArray, has_pose: BoolArray, agrees: BoolArray) -> None:
-        """Count observations (M,) of points `keys`, in frames with a pose only."""
+        """Add observations to the numbers; observations in frames without a pose are ignored.
+
+        Args:
+            keys: (M,) index by camera and point of each observation.
+            has_pose: (M,) True if the frame of the observation has a pose.
+            agrees: (M,) True if the observation agrees with that pose.
+        """
         self.observed[:] += np.bincount(keys[has_pose], minlength=len(self.observed))
         self.agreed[:] += np.bincount(keys[has_pose & agrees], minlength=len(self.observed))
 
     def agreement(self, keys: IntArray) -> FloatArray:
-        """Return the ratio (M,) of a point's observations that agree; 1 for fewer than `_MIN_OBSERVED`."""
+        """Return the fraction (M,) of each point's observations that agree with a pose.
+
+        It is 1 for a point with fewer than `_MIN_OBSERVED` observations.
+
+        Args:
+            keys: (M,) index by camera and point of each requested fraction.
+        """
         ratio = self.agreed / np.maximum(self.observed, 1)
         return np.asarray(np.where(self.observed < _MIN_OBSERVED, 1.0, ratio)[keys])
 
 
 @dataclass(slots=True)
 class RigObservations:
-    """The cameras of a rig and the map, with the observations of the last block if it is the only one.
+    """The cameras of a rig and the map. If all frames fit into one block, its observations are cached.
+
+    C is the number of cameras, P the number of points.
 
     Attributes:
-        members: The cameras. The frames of the first one are those of the rig.
+        members: The cameras of the rig. The frames of the first camera are the frames of the rig.
         scene_map: The map.
-        static: (C,P) static points, by camera.
+        static: (C,P) True if the point is static for the camera; see `static_points`.
     """
 
     members: Sequence[RigMember]
@@ -100,12 +121,12 @@ class RigObservations:
 
     @staticmethod
     def create(members: Sequence[RigMember], scene_map: Map) -> RigObservations:
-        """Find the static points of each camera."""
+        """Return the cameras and the map with the static points of each camera."""
         static = np.array([static_points(member.camera, scene_map) for member in members])
         return RigObservations(members, scene_map, static)
 
     def blocks(self) -> Iterator[FrameBlock]:
-        """Yield the observations of successive blocks of frames. A single block is cached."""
+        """Yield the observations of successive blocks of frames. If there is only one block, it is cached."""
         count = len(self.members[0].camera.times_ns)
         if count > BLOCK_FRAMES:
             for first in range(0, count, BLOCK_FRAMES):
@@ -116,7 +137,7 @@ class RigObservations:
         yield self._only_block
 
     def _make_block(self, frames: slice) -> FrameBlock:
-        """Collect the observations of all cameras in some frames, ordered by frame."""
+        """Collect the observations of all cameras in the rig's frames `frames`, ordered by frame."""
         parts = [_observations_of(member, self.scene_map, frames) for member in self.members]
         frame, point, px = (np.concatenate(each) for each in zip(*parts, strict=True))
         member = np.repeat(np.arange(len(self.members)), [len(part[0]) for part in parts])
@@ -125,25 +146,30 @@ class RigObservations:
 
     @property
     def lenses(self) -> list[Camera]:
-        """The camera models of the map, one for each member."""
+        """The camera models of the map, one for each camera of the rig."""
         return [self.scene_map.cameras[member.camera.name] for member in self.members]
 
     @property
     def rolling(self) -> bool:
-        """True if observations must be moved to the instant of the middle row."""
+        """True if a camera has a rolling shutter.
+
+        Its observations must then be moved to the instant of the middle row.
+        """
         return any(self.scene_map.readout_s.get(member.camera.name, 0.0) for member in self.members)
 
 
 @dataclass(slots=True)
 class FrameBlock:
-    """Observations of the map by a rig in a block of frames: tracked points, and observations of keyframes.
+    """Observations of map points by the cameras of a rig in a block of frames.
+
+    They are the tracked observations and the observations of the keyframes.
 
     Attributes:
-        rig: The rig.
-        frames: The frames of the block.
-        frame: (M,) frame index, increasing.
-        point: (M,) point index.
-        px: (M,2) pixel.
+        rig: The cameras of the rig and the map.
+        frames: Range of the rig's frames in the block.
+        frame: (M,) index of the rig's frame of each observation, increasing.
+        point: (M,) index of the observed point.
+        px: (M,2) observed pixel.
         member: (M,) index of the observing camera.
     """
 
@@ -156,12 +182,13 @@ class FrameBlock:
     _observations: Observations | None = field(default=None, init=False, repr=False)
 
     def observations(self, px: FloatArray | None, reliability: PointReliability | None) -> Observations:
-        """Return the weighted observations, at pixels (M,2) if these differ from the block's own.
+        """Return the weighted observations.
 
         Args:
-            px: (M,2) corrected pixels, or None for the block's own; the latter are undistorted once and
-                cached.
-            reliability: Agreement of the points with the poses of an earlier solution, if there is one.
+            px: (M,2) corrected pixels, or None for the pixels of the block. The pixels of the block are
+                undistorted once and cached.
+            reliability: Reliability of the points according to an earlier solution; None if there is no
+                earlier solution.
         """
         if px is not None:
             observations = self._make_observations(px)
@@ -175,7 +202,7 @@ class FrameBlock:
         return replace(observations, weight=weight)
 
     def _make_observations(self, px: FloatArray) -> Observations:
-        """Undistort pixels (M,2) and weight them by the certainty of their points."""
+        """Undistort pixels (M,2), and weight each observation by the certainty of its point."""
         scene_map, lenses = self.rig.scene_map, self.rig.lenses
         count = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))[self.point]
         weight = point_weights(count) * np.where(self.static, 1.0, _TRANSIENT_WEIGHT)
@@ -200,16 +227,20 @@ class FrameBlock:
 
     @property
     def static(self) -> BoolArray:
-        """(M,) whether the observed point is static."""
+        """(M,) True if the observed point is static for the observing camera."""
         return np.asarray(self.rig.static[self.member, self.point])
 
     @property
     def point_keys(self) -> IntArray:
-        """(M,) index by camera and point, as in `PointReliability`."""
+        """(M,) index by camera and point, as `PointReliability` uses it."""
         return self.member * len(self.rig.scene_map.points) + self.point
 
     def px_at_mid_row(self, path: FloatArray) -> FloatArray:
-        """Return pixels (M,2) at the instant of the middle row, given the rig's poses of all frames."""
+        """Return the pixels (M,2) moved to the instant of the middle row.
+
+        Args:
+            path: (F,4,4) poses map_from_rig of all frames; NaN if there is none.
+        """
         out = self.px.copy()
         scene_map, times_ns = self.rig.scene_map, self.rig.members[0].camera.times_ns
         for number, (member, lens) in enumerate(zip(self.rig.members, self.rig.lenses, strict=True)):
@@ -222,7 +253,11 @@ class FrameBlock:
         return out
 
     def count_by_frame(self, selected: BoolArray) -> IntArray:
-        """Count the selected rows of each frame of the block."""
+        """Return the number (F,) of selected observations in each frame of the block.
+
+        Args:
+            selected: (M,) True for the observations to count.
+        """
         return np.bincount(
             self.frame[selected] - self.frames.start, minlength=self.frames.stop - self.frames.start
         )
@@ -231,7 +266,11 @@ class FrameBlock:
 def _observations_of(
     member: RigMember, scene_map: Map, frames: slice
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return rig frames, points and pixels of the observations of one camera in a block of frames."""
+    """Return the observations of one camera in a block of the rig's frames.
+
+    Returns:
+        Index of the rig's frame (M,), point index (M,) and pixel (M,2) of each observation.
+    """
     name = member.camera.name
     inside = np.flatnonzero((member.rig_frame >= frames.start) & (member.rig_frame < frames.stop))
     first, stop = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)

@@ -1,4 +1,4 @@
-"""Estimate the poses of frames from observed map points, and their covariance."""
+"""Estimate the poses of frames and their covariances from observed map points."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ from bodycap_batch.registration.poses.batched_pnp import (
 )
 
 _MIN_INLIER_WEIGHT_RATIO = 0.3
-"""Least weight of the inliers over the weight of all observations. Evidence: none."""
+"""Minimum ratio of the inliers' weight to the weight of all observations, for an accepted pose. Evidence:
+none."""
 _MIN_NOISE_PX = 0.3
-"""Pixels: smallest noise of an observation that is assumed, however small the residuals are. Evidence:
+"""Pixels: smallest assumed noise of an observation. It is used if the residuals are smaller. Evidence:
 none."""
 MAP_COVARIANCE_SCALE = 5.0
-"""Variance of a pose over the variance that its residuals suggest.
+"""Ratio of the variance of a pose to the variance that its residuals suggest.
 
-The map points around a frame are displaced together, which the residuals of one frame cannot show. Evidence:
-docs/decisions/registration.md."""
+The map points around a frame are displaced together. The residuals of one frame cannot show this error.
+Evidence: docs/decisions/registration.md."""
 _UNCONSTRAINED_VARIANCE = 1e12
-"""Variance of a pose without a solution; it exceeds every limit."""
+"""Variance assumed for a pose that the observations do not determine. It exceeds every limit."""
 _WEIGHT_RATIO_FLOOR = 1e-3
-"""Smallest inlier weight ratio by which sigmas are divided; it prevents a division by zero."""
+"""Smallest inlier weight ratio that sigmas are divided by. It prevents a division by zero."""
 _MAX_TRIALS = 2000
-"""RANSAC iterations. Evidence: none."""
+"""Maximum number of RANSAC iterations. Evidence: none."""
 TRUSTED_WEIGHT_RATIO = 0.6
-"""Inlier weight ratio from which on a start is accepted without RANSAC. Above it RANSAC never found a better
-pose."""
+"""Minimum inlier weight ratio of a pose that is accepted without RANSAC. RANSAC never found a better pose
+than such a pose."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,10 +46,10 @@ class AcceptanceCriteria:
     """The conditions that a pose must meet.
 
     Attributes:
-        max_error_px: Inlier limit.
-        min_inliers: Fewest inliers.
-        max_sigma_depth: Largest sigma of the camera centre, as a fraction of the median depth.
-        min_noise_px: Smallest noise of an observation that is assumed.
+        max_error_px: Maximum reprojection error of an inlier, pixels.
+        min_inliers: Minimum number of inliers.
+        max_sigma_depth: Maximum sigma of the camera centre, as a fraction of the median depth.
+        min_noise_px: Smallest assumed noise of an observation, pixels.
         seed: Seed of RANSAC.
     """
 
@@ -61,15 +62,16 @@ class AcceptanceCriteria:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FramePose:
-    """The result for one frame.
+    """The estimated pose of one frame, or the reason why it has none.
 
     Attributes:
-        status: REGISTERED, or the reason why there is no pose.
-        gauge_from_cam: (4,4), None unless registered.
-        covariance: (6,6) as in `Trajectory`.
+        status: Status of the frame. `REGISTERED`, `KEYFRAME` and `RIG` have a pose; any other status is the
+            reason why there is none.
+        gauge_from_cam: (4,4) pose; None if there is none.
+        covariance: (6,6) covariance as in `Trajectory`; None if there is no pose.
         inliers: Number of inliers.
-        inlier_weight_ratio: Weight of the inliers over the weight of all observations.
-        error_px: Mean reprojection error of the inliers.
+        inlier_weight_ratio: Ratio of the inliers' weight to the weight of all observations.
+        error_px: Mean reprojection error of the inliers, pixels.
     """
 
     status: FrameStatus
@@ -90,15 +92,19 @@ def solve_poses(
 ) -> list[FramePose]:
     """Estimate the poses of all frames of a camera or a rig from the observed map points.
 
-    A frame whose start leads to few inliers, or that has no start, is solved again from a RANSAC pose.
+    Each pose is refined from its start. A frame without a start, or with a low inlier weight ratio, is solved
+    again from a RANSAC pose. The result with the higher inlier weight ratio is kept.
 
     Args:
-        lenses: The camera model, or those of the rig's cameras.
-        observations: Observations (M rows), by frame.
-        px: (M,2) the same observations as pixels.
-        start: (F,4,4) cam_from_gauge to start from; NaN if there is none.
+        lenses: The camera model, or the models of all cameras of the rig.
+        observations: (M) observations, ordered by frame.
+        px: (M,2) observed pixels of these observations.
+        start: (F,4,4) cam_from_gauge to start from; NaN for a frame without a start.
         criteria: The conditions that a pose must meet.
-        threads: Threads that solve chunks of frames. The result does not depend on them.
+        threads: Number of threads that solve chunks of frames. The result does not depend on it.
+
+    Returns:
+        The pose of each frame, or the reason why there is none.
     """
     has_start = np.asarray(np.isfinite(start).all(axis=(1, 2)))
     initial = np.where(has_start[:, None, None], start, np.eye(4))
@@ -130,9 +136,10 @@ def _ransac(
     px: FloatArray,
     criteria: AcceptanceCriteria,
 ) -> FloatArray | None:
-    """Return the RANSAC pose (4,4) of one frame from some of its observations.
+    """Return the RANSAC pose (4,4) of one frame from the chosen observations; None if RANSAC fails.
 
-    If several cameras of a rig observe them, it is the pose of the rig from all of them.
+    If several cameras of a rig observe the chosen points, the pose of the rig is estimated from all these
+    cameras.
     """
     points, px = observations.points[chosen], px[chosen]
     if observations.member is None or observations.cam_from_rig is None:
@@ -156,11 +163,14 @@ def _ransac_rig_pose(
 
     Args:
         lenses: (C) camera models.
-        cam_from_rig: (C,4,4) their poses in the rig.
-        member: (N,) camera that sees each point.
-        points: (N,3) map points.
-        px: (N,2) pixels.
+        cam_from_rig: (C,4,4) poses of the cameras in the rig.
+        member: (N,) index of the camera that sees each point.
+        points: (N,3) map points in the gauge.
+        px: (N,2) observed pixels.
         criteria: The inlier limit and the seed.
+
+    Returns:
+        The pose, or None if RANSAC fails.
 
     Source: Hee Lee et al., "Minimal solutions for pose estimation of a multi-camera system", ISRR 2013, as in
         COLMAP.
@@ -185,7 +195,13 @@ def _ransac_rig_pose(
 def ransac_pose(
     camera: Camera, points: FloatArray, px: FloatArray, criteria: AcceptanceCriteria
 ) -> FloatArray | None:
-    """Return the pose cam_from_gauge (4,4) of a calibrated camera from map points (N,3) at pixels (N,2).
+    """Return the pose cam_from_gauge (4,4) of a calibrated camera; None if RANSAC fails.
+
+    Args:
+        camera: The camera model.
+        points: (N,3) map points in the gauge.
+        px: (N,2) observed pixels of the points.
+        criteria: The inlier limit and the seed.
 
     Source: Lebeda, Matas, Chum, "Fixing the locally optimized RANSAC", BMVC 2012, as in COLMAP.
     """
@@ -208,7 +224,17 @@ def accept_poses(
     criteria: AcceptanceCriteria,
     threads: int = 1,
 ) -> list[FramePose]:
-    """Count the inliers of poses (F,4,4), estimate their covariance, and accept or reject them."""
+    """Count the inliers of poses, estimate their covariances, and accept or reject each pose.
+
+    Args:
+        observations: Observations of F frames.
+        cam_from_gauge: (F,4,4) poses of the frames, or poses rig_from_gauge of a rig.
+        criteria: The conditions that a pose must meet.
+        threads: Number of threads. The result does not depend on it.
+
+    Returns:
+        The accepted pose of each frame, or the reason why the pose was rejected.
+    """
     quality = evaluate_poses(observations, cam_from_gauge, criteria.max_error_px, threads)
     covariance = _covariance(quality, criteria.min_noise_px)
     sigma = np.sqrt(np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1])
@@ -242,11 +268,12 @@ def accept_poses(
 def _covariance(quality: PoseQuality, min_noise_px: float) -> FloatArray:
     """Return covariances (F,6,6) from the information and the noise of the inliers.
 
-    Without an inverse the variances are huge. Observations that disagree with a pose are evidence against it:
-    the sigmas grow as the inlier weight ratio falls. Evidence: docs/decisions/registration.md.
+    If the information matrix is singular, the variances are huge. Observations that disagree with a pose are
+    evidence against it. The sigmas therefore grow as the inlier weight ratio falls. Evidence:
+    docs/decisions/registration.md.
 
     A left perturbation of cam_from_gauge is a right perturbation of gauge_from_cam with the opposite sign.
-    The covariance is therefore the same.
+    Both perturbations therefore have the same covariance.
     """
     noise_px = np.maximum(1.4826 * np.nan_to_num(quality.noise_px), min_noise_px)
     solvable = np.linalg.matrix_rank(quality.information) == 6

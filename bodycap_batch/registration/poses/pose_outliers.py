@@ -1,4 +1,4 @@
-"""Find poses that deviate from their neighbours, and isolated poses."""
+"""Find poses that deviate from the poses around them, and isolated poses."""
 
 from __future__ import annotations
 
@@ -7,70 +7,78 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, runs
 
 _MIN_SIGMAS = 8.0
-"""Least deviation of an outlier, in standard deviations of the centres. Evidence: none."""
+"""Minimum deviation of an outlier, in standard deviations of the camera centres. Evidence: none."""
 _MIN_SCALE_RATIO = 10.0
-"""Least deviation of an outlier, as a multiple of the typical second difference around it. It is independent
-of the map's scale and of the speed. Evidence: none."""
+"""Minimum deviation of an outlier, as a multiple of the typical second difference around it. This ratio does
+not depend on the map's scale or on the speed. Evidence: none."""
 _MIN_NEIGHBOUR_RESPONSE = 0.5
-"""Least ratio of a frame's second difference that the second differences of its neighbours undo. It is 1 at a
-single outlier and 0 at a jerk of the camera. Origin: halfway."""
+"""Minimum response of the neighbours of an outlier: the fraction of the frame's second difference that the
+second differences of both neighbours cancel. It is 1 at a single outlier and 0 at a jerk of the camera.
+Origin: halfway."""
 _SLOW_SPAN_NS, _MIN_NEIGHBOUR_RESPONSE_SLOW = 90_000_000, 0.8
-"""The same for neighbours that are farther apart in time than _SLOW_SPAN_NS. A fast gesture then bends as few
-frames as an outlier does, but its neighbours less. Evidence: docs/decisions/registration.md."""
+"""_SLOW_SPAN_NS: maximum time in nanoseconds between the two neighbours for the threshold above.
+_MIN_NEIGHBOUR_RESPONSE_SLOW: minimum response of neighbours that are farther apart in time. A fast gesture
+then also bends the path at a single frame, but the response of the neighbours is smaller than at an outlier.
+Evidence: docs/decisions/registration.md."""
 _GAP_MIN_SIGMAS = 4.0
-"""Least deviation of an outlier next to a lost interval, in standard deviations. Evidence:
+"""Minimum deviation of an outlier next to a lost interval, in standard deviations. Evidence:
 docs/decisions/registration.md."""
 _GAP_MIN_SCALE_RATIO = 5.0
-"""Least deviation of an outlier next to a lost interval, as a multiple of the typical second difference.
+"""Minimum deviation of an outlier next to a lost interval, as a multiple of the typical second difference.
 Evidence: docs/decisions/registration.md."""
 _RUN_LENGTHS = (2, 3)
-"""Numbers of successive outliers that are tested. Longer runs may be motion."""
+"""Tested numbers of successive outliers. A longer run may be motion."""
 _MAX_RUN_SPAN_NS = 140_000_000
-"""Nanoseconds from the frame before a run to the frame after it. Origin: three poses at 30 Hz; in a longer
-time a body can move there and back."""
+"""Nanoseconds: maximum time from the frame before a run to the frame after it. Origin: three poses at 30 Hz.
+In a longer time a body can move there and back."""
 _MIN_KINK_RATIO = 2.0
-"""Least deviation of a run, as a multiple of the deviation that a sudden stop of the body explains. Evidence:
-none."""
+"""Minimum deviation of a run, as a multiple of the deviation that a sudden stop of the body explains.
+Evidence: none."""
 _MAX_EXTRAPOLATION_RATIO = 0.5
-"""Largest extrapolation error at the pose after the run, as a fraction of the deviation. If the path moves
-permanently aside, the test does not apply. Evidence: none."""
+"""Maximum extrapolation error at the pose after the run, as a fraction of the deviation. The error is larger
+if the path moves aside and stays there; such a run is not an outlier. Evidence: none."""
 _SECOND_MIN_RESPONSE, _FIRST_MAX_RESPONSE, _SECOND_MAX_RESPONSE = 0.25, 0.45, 1.0
-"""Response of the third pose's second difference to that of the second. Above it the second pose after a lost
-interval may be wrong; above _SECOND_MAX_RESPONSE it is right; below _FIRST_MAX_RESPONSE the first pose may be
-wrong. Origin: a wrong first pose gives 0, a wrong second pose 0.5, a wrong third pose 2. Evidence: none for
-the limits between them."""
+"""Thresholds of the response after a lost interval. The response is the fraction of the second pose's second
+difference that the third pose's second difference cancels. The first pose may be wrong if the response is
+below _FIRST_MAX_RESPONSE. The second pose may be wrong if the response is between _SECOND_MIN_RESPONSE and
+_SECOND_MAX_RESPONSE. Origin: a wrong first pose gives 0, a wrong second pose 0.5, a wrong third pose 2.
+Evidence for the thresholds between these values: none."""
 _SCALE_WINDOW = 12
-"""Frames on either side that determine the typical second difference. Evidence: none."""
+"""Number of frames on either side that determine the typical second difference. Evidence: none."""
 ISOLATED_INLIER_FACTOR = 4
-"""An isolated pose needs this multiple of the usual least number of inliers. Evidence: none."""
+"""Minimum number of inliers of an isolated pose, as a multiple of the usual minimum number. Evidence:
+none."""
 _MAX_ISOLATED_RUN = 2
-"""Most successive frames of an isolated pose. Evidence: none."""
+"""Maximum number of successive poses that are treated as isolated. Evidence: none."""
 _MIN_ISOLATING_GAP = 3
-"""Lost frames on either side that make a pose isolated. Evidence: none."""
+"""Minimum number of lost frames on either side of isolated poses. Evidence: none."""
 
 
 def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArray) -> BoolArray:
-    """Find up to three successive frames whose centre leaves the line between its neighbours by far.
+    """Find up to three successive frames whose camera centre is far from the path of the other frames.
 
-    The test uses second differences: the offset of a centre from the midpoint of the centres before and after
-    it. A single outlier changes its own second difference by its full height, and those of both neighbours by
-    half of it with the opposite sign. A body that stops suddenly changes mainly one second difference. Next
-    to a lost interval only one side can be tested; the limits are lower there, because more poses are wrong.
-    A deviation of several frames that lasts longer than `_MAX_RUN_SPAN_NS` counts as motion.
+    The test uses second differences. The second difference of a frame is the offset of its centre from the
+    midpoint of the centres before and after it. A single outlier changes its own second difference by its
+    full deviation. It changes the second differences of both neighbours by half of that, with the opposite
+    sign. A body that stops suddenly changes mainly one second difference.
+
+    Next to a lost interval only one side can be tested. The limits are lower there, because more poses are
+    wrong. A deviation of several frames that lasts longer than `_MAX_RUN_SPAN_NS` is treated as motion.
 
     Args:
-        centres: (N,3) camera centres; NaN where there is no pose.
-        sigma: (N,) standard deviation of each centre relative to its neighbours, same unit; NaN likewise.
-        times_ns: (N,) times of the frames, increasing.
+        centres: (N,3) camera centres in the map's gauge; NaN for frames without a pose.
+        sigma: (N,) standard deviation of each centre relative to its neighbours, in the unit of the centres;
+            NaN for frames without a pose.
+        times_ns: (N,) times of the frames in nanoseconds, increasing.
 
     Returns:
-        (N,) True if the pose is an outlier. The scale of the map has no influence.
+        Mask (N,) of the frames whose pose is an outlier. It does not depend on the scale of the map.
     """
     size = np.linalg.norm(_second_differences(centres, sigma)[0], axis=1)
     in_run = np.zeros(len(centres), dtype=bool)
     for length in _RUN_LENGTHS:
         in_run |= _outlier_runs(centres, sigma, times_ns, size, length)
-    # Next to a run of outliers a correct pose would look like an outlier.
+    # Runs are removed first, because a correct pose next to a run would look like an outlier.
     centres = np.where(in_run[:, None], np.nan, centres)
     backwards = _outliers_after_gaps(centres[::-1], sigma[::-1])[::-1]
     ends = _outliers_after_gaps(centres, sigma) | backwards
@@ -78,11 +86,11 @@ def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArra
 
 
 def _single_outliers(centres: FloatArray, sigma: FloatArray, times_ns: IntArray) -> BoolArray:
-    """Return the frames (N,) that leave the line between their neighbours by themselves."""
+    """Return a mask (N,) of single outliers: frames that deviate from both neighbours."""
     offset, noise = _second_differences(centres, sigma)
     size = np.linalg.norm(offset, axis=1)
     out = np.zeros(len(centres), dtype=bool)
-    # Without the second differences of both neighbours, the wrong frame of the three could be selected.
+    # Both neighbours need a second difference. Otherwise the wrong one of the three frames could be selected.
     frames = 1 + _run_starts(np.isfinite(size), 3)
     highest = np.maximum(size[frames - 1], size[frames + 1])
     frames = frames[(size[frames] > _MIN_SIGMAS * noise[frames]) & (size[frames] >= highest)]
@@ -99,14 +107,14 @@ def _single_outliers(centres: FloatArray, sigma: FloatArray, times_ns: IntArray)
 def _outlier_runs(
     centres: FloatArray, sigma: FloatArray, times_ns: IntArray, size: FloatArray, length: int
 ) -> BoolArray:
-    """Return the frames (N,) of runs of outliers of a given length.
+    """Return a mask (N,) of the frames in runs of outliers of a given length.
 
     A run is tested against the straight line from the pose before it to the pose after it.
 
     Args:
         centres: (N,3) camera centres.
         sigma: (N,) standard deviation of each centre.
-        times_ns: (N,) times of the frames.
+        times_ns: (N,) times of the frames in nanoseconds.
         size: (N,) length of each frame's second difference.
         length: Number of poses in a run.
     """
@@ -127,23 +135,24 @@ def _outlier_runs(
         smallest > np.maximum(_MIN_KINK_RATIO * kink, extrapolation_error / _MAX_EXTRAPOLATION_RATIO)
     )
     for row in np.flatnonzero(candidate).tolist():
-        # The deviation that a constant second difference adds up to over the run.
+        # The deviation from the line if every frame of the run had the typical second difference.
         local = _local_scale(size, before[row], behind[row] + 1, _SCALE_WINDOW) * 0.25 * steps**2
         out[run[row]] |= smallest[row] > _MIN_SCALE_RATIO * local
     return out
 
 
 def _local_scale(size: FloatArray, start: int, stop: int, window: int) -> float:
-    """Return the median size of `window` second differences on either side of start:stop.
+    """Return the typical second difference: the median length of `window` second differences on either side.
 
-    It is infinite if too few are known.
+    The frames from `start` to `stop` are not used. The result is infinite if too few second differences are
+    known.
     """
     nearby = np.concatenate([size[max(0, start - window) : start], size[stop : stop + window]])
     return float(np.nanmedian(nearby)) if np.isfinite(nearby).sum() >= _SCALE_WINDOW // 2 else np.inf
 
 
 def _run_starts(known: BoolArray, length: int) -> IntArray:
-    """Return the first frames of all runs of `length` known frames."""
+    """Return the first frames of all runs of `length` successive known frames; runs may overlap."""
     if len(known) < length:
         return np.zeros(0, dtype=np.int64)
     rows = np.lib.stride_tricks.sliding_window_view(known, length)
@@ -160,13 +169,15 @@ def _second_differences(centres: FloatArray, sigma: FloatArray) -> tuple[FloatAr
 
 
 def _outliers_after_gaps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
-    """Return the wrong poses (N,) among the first two after each lost interval.
+    """Return a mask (N,) of the wrong poses among the first two poses after each lost interval.
 
-    A wrong first pose changes the second difference of the second pose by half of its height, and that of the
-    third pose not at all. A wrong second pose changes its own by its full height, and that of the third pose
-    by half of it with the opposite sign. If the response does not tell these cases apart, both poses are
-    rejected. A wrong third pose changes its own second difference by twice as much as that of the second
-    pose; it has both neighbours and is tested like any other frame.
+    A wrong first pose changes the second difference of the second pose by half of its deviation. It does not
+    change the second difference of the third pose. A wrong second pose changes its own second difference by
+    its full deviation. It changes the second difference of the third pose by half of that, with the opposite
+    sign. If the response does not distinguish these two cases, both poses are rejected.
+
+    A wrong third pose changes its own second difference twice as much as the second difference of the second
+    pose. The third pose has both neighbours and is tested like any other frame.
     """
     offset, noise = _second_differences(centres, sigma)
     size = np.linalg.norm(offset, axis=1)
@@ -188,12 +199,13 @@ def isolated_poses(localised: BoolArray, inliers: IntArray, min_inliers: int) ->
     """Return the frames whose pose has few inliers and no support from neighbouring frames.
 
     Args:
-        localised: (N,) frames with a pose.
-        inliers: (N,) inliers of each pose.
-        min_inliers: Inliers with which a pose needs no support.
+        localised: (N,) True for frames with a pose.
+        inliers: (N,) number of inliers of each pose.
+        min_inliers: Minimum number of inliers of an isolated pose that is kept.
 
     Returns:
-        (N,) True in runs of one or two poses between at least three lost frames on either side.
+        Mask (N,) of runs of one or two poses with too few inliers and at least three lost frames on either
+        side.
     """
     out = np.zeros(len(localised), dtype=bool)
     for start, stop in runs(localised):

@@ -1,4 +1,4 @@
-"""Relate the cameras of a rig by what their own frames gave."""
+"""Relate the cameras of a rig to each other by the registrations of the single cameras."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class RegisteredCamera:
 
     Attributes:
         camera: The camera.
-        registration: Its registration.
+        registration: The registration of this camera.
     """
 
     camera: CaptureCamera
@@ -30,7 +30,7 @@ class RegisteredCamera:
 
     @property
     def tracks(self) -> Tracks:
-        """The tracked observations in its frames."""
+        """The tracked observations in the frames of this camera."""
         registration = self.registration
         return Tracks(
             registration.obs_frame, registration.obs_keyframe, registration.obs_feature, registration.obs_px
@@ -38,7 +38,17 @@ class RegisteredCamera:
 
 
 def estimate_relative_poses(own: RegisteredCamera, others: Sequence[RegisteredCamera]) -> list[RelativePose]:
-    """Estimate the relative pose of a camera and each other one; the pair is ordered by name."""
+    """Estimate the relative pose between one camera and each other camera of its rig.
+
+    In each relative pose the two cameras are ordered by name.
+
+    Args:
+        own: The camera that belongs to every pair, with its registration.
+        others: The other cameras of the rig, with their registrations.
+
+    Returns:
+        Relative poses in the order of `others`.
+    """
     out = []
     for other in others:
         first, second = sorted((own, other), key=lambda each: each.camera.name)
@@ -52,7 +62,14 @@ def estimate_relative_poses(own: RegisteredCamera, others: Sequence[RegisteredCa
 def rig_members(
     own: RegisteredCamera, others: Sequence[RegisteredCamera], relative: Sequence[RelativePose]
 ) -> list[RigMember]:
-    """Return the camera, at the origin of the rig, and the other cameras with a well-known relative pose."""
+    """Return the cameras of a rig: the camera at its origin, and the cameras with a well-known relative pose.
+
+    Args:
+        own: The camera at the origin of the rig.
+        others: The other cameras on the segment.
+        relative: Relative pose between `own` and each other camera. Cameras whose relative pose is not rigid
+            are excluded.
+    """
     count = len(own.camera.times_ns)
     out = [
         RigMember(camera=own.camera, tracks=own.tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
@@ -76,9 +93,14 @@ def rig_members(
 def initial_rig_poses(
     own: RegisteredCamera, others: Sequence[RegisteredCamera], members: Sequence[RigMember]
 ) -> FloatArray:
-    """Return poses rig_from_map (F,4,4) to start from; NaN if no camera has one.
+    """Return poses rig_from_map (F,4,4) to start from; NaN for frames in which no camera has a pose.
 
-    The camera's own pose is preferred to one that is derived from another camera.
+    The pose of the first camera is used if it is known. Otherwise the pose is derived from another camera.
+
+    Args:
+        own: The camera at the origin of the rig, with its registration.
+        others: The other cameras on the segment, with their registrations.
+        members: The cameras of the rig, from `rig_members`.
     """
     out = np.full((len(own.camera.times_ns), 4, 4), np.nan)
     by_name = {item.camera.name: item.registration.trajectory for item in (own, *others)}

@@ -1,4 +1,4 @@
-"""Find the static points of a map: those that one camera did not see only for a moment."""
+"""Find the static points of a map: points that another camera saw too, or one camera for a longer time."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from bodycap_batch.model.scene import Map
 from bodycap_batch.model.static_span import MIN_STATIC_SPAN_NS
 
 _MIN_KEYFRAME_RATIO = 0.5
-"""Least ratio of a camera's keyframes that must see enough static points. Evidence: none."""
+"""Minimum fraction of a camera's keyframes that must see enough static points. If the fraction is smaller,
+the test is not applied. Evidence: none."""
 _MIN_STATIC_POINTS = 12
-"""Static points that a keyframe must see to support the test. A single camera that always moves on sees
-fewer; the test is then not applied. Evidence: none."""
+"""Minimum number of static points that a keyframe must see, to be in that fraction. The keyframes of a single
+camera that always moves on see fewer. The test is not applied to such a camera. Evidence: none."""
 
 
 def static_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
-    """Return which points (P,) another camera saw too, or this camera over more than MIN_STATIC_SPAN_NS.
+    """Return a mask (P,) of the map's static points for a camera.
 
-    Things that move with a camera, above all the wearer's own arm, look static to that camera for a while but
-    to no other camera. All points count as static if few of the camera's keyframes see static ones.
+    A point is static if another camera saw it too, or if this camera saw it for longer than
+    MIN_STATIC_SPAN_NS. Things that move with a camera, above all the wearer's own arm, look static to that
+    camera for a while. They do not look static to other cameras. If few of the camera's keyframes see static
+    points, all points are treated as static.
     """
     count = len(scene_map.points)
     rows = scene_map.keyframes_of(camera.name)
@@ -35,9 +38,7 @@ def static_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
     static_seen = np.bincount(
         scene_map.obs_keyframe[is_own], weights=static[point], minlength=len(scene_map.keyframe_camera)
     )
-    observing = np.intersect1d(
-        rows, scene_map.obs_keyframe
-    )  # A keyframe without observations does not count.
+    observing = np.intersect1d(rows, scene_map.obs_keyframe)  # A keyframe without observations is not used.
     is_usable = len(observing) > 0 and bool(
         (static_seen[observing] >= _MIN_STATIC_POINTS).mean() >= _MIN_KEYFRAME_RATIO
     )

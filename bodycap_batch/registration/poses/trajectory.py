@@ -1,4 +1,4 @@
-"""Solve all frames of a camera or a rig against the map, repeatedly with what the solution before showed."""
+"""Estimate the poses of all frames against the map, and repeat this with weights from the solution before."""
 
 from __future__ import annotations
 
@@ -29,26 +29,34 @@ from bodycap_batch.registration.poses.pose_outliers import (
 from bodycap_batch.registration.tracking.klt import Tracks, camera_pixel_scale
 
 _MIN_STATIC_INLIERS = 6
-"""Inliers on static points below which a pose is taken for one relative to the wearer's sleeve. Evidence:
-none."""
+"""Minimum number of inliers on static points. A pose with fewer is probably a pose relative to the wearer's
+sleeve, and is rejected. Evidence: none."""
 _MAP_NOISE_PX = 0.6
 """Pixels at 640 px image width: standard deviation of a map point's projection. Evidence: none."""
 _INLIER_SIGMAS = 3.5
-"""Inlier limit in standard deviations of an observation. Origin: it covers 99.8 % of a 2D normal
-distribution."""
+"""Maximum reprojection error of an inlier, in standard deviations of an observation. Origin: it covers 99.8 %
+of a 2D normal distribution."""
 _BLUR_WINDOW_FRAMES = 15
-"""Frames on either side with which the sharpness of a frame is compared. Evidence: none."""
+"""Number of frames before and after a frame with which its sharpness is compared. Evidence: none."""
 _REPEATS = 1
-"""Repetitions with weights from the agreement of each point."""
+"""Number of repeated solutions without a rolling shutter. Each repetition weights the points by their
+agreement with the poses before."""
 _REPEATS_ROLLING = 2
-"""The same with a rolling shutter. Its correction needs poses for the image velocities, so poses and
-corrected pixels are solved alternately, twice."""
+"""Number of repeated solutions with a rolling shutter. The correction of the pixels needs poses, because
+the velocities of points in the image follow from poses. Pixels and poses are therefore computed in turn,
+twice."""
 
 
 def acceptance_criteria(
     camera: CaptureCamera, selection: KeyframeSelection, options: RegistrationOptions
 ) -> AcceptanceCriteria:
-    """Return the conditions for poses of a camera, from the noise of its tracks and the options."""
+    """Return the conditions for poses of a camera, from the noise of its tracks and the options.
+
+    Args:
+        camera: The camera.
+        selection: The keyframes of the camera. Only the noise of its tracks is used.
+        options: Minimum number of inliers and maximum relative sigma.
+    """
     noise_px = np.hypot(_MAP_NOISE_PX * camera_pixel_scale(camera), 2.0 * selection.noise_px)
     return AcceptanceCriteria(
         max_error_px=float(_INLIER_SIGMAS * noise_px),
@@ -60,7 +68,10 @@ def acceptance_criteria(
 def solve_camera(
     camera: CaptureCamera, scene_map: Map, tracks: Tracks, criteria: AcceptanceCriteria, threads: int = 1
 ) -> list[FramePose]:
-    """Estimate the pose of every frame of a camera from the observed map points; see `solve_rig`."""
+    """Estimate the pose of every frame of a camera from the observed map points; see `solve_rig`.
+
+    The solution starts from poses that are interpolated between the keyframes.
+    """
     count = len(camera.times_ns)
     member = RigMember(camera=camera, tracks=tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
     rows = scene_map.keyframes_of(camera.name)
@@ -77,19 +88,22 @@ def solve_rig(
 ) -> list[FramePose]:
     """Estimate the pose of every frame of a rig from the map points that its cameras observe at that instant.
 
-    Points that move with the wearer and wrongly matched points disagree with the poses of most frames. After
-    a first solution each point is weighted by the ratio of frames that agree with it, and all frames are
-    solved again. Observations of a rolling shutter are moved to the instant of the middle row.
+    Wrongly matched points, and points that move with the wearer, disagree with the poses of most frames.
+    After a first solution, all frames are solved again with new weights. The weight of each point is
+    multiplied by the squared fraction of its observations that agree with a pose. Observations of a rolling
+    shutter are moved to the instant of the middle row.
 
     Args:
-        members: The cameras. The first one is at the origin of the rig, and its frames are those of the rig.
+        members: The cameras of the rig. The first camera is at the origin of the rig, and its frames are the
+            frames of the rig.
         scene_map: The map.
-        start: (F,4,4) rig_from_map to start from; NaN if there is none.
+        start: (F,4,4) rig_from_map to start from; NaN for a frame without a start.
         criteria: The conditions that a pose must meet.
-        threads: Threads that solve chunks of frames. The result does not depend on them.
+        threads: Number of threads that solve chunks of frames. The result does not depend on it.
 
     Returns:
-        Poses of the first camera; their status is `FrameStatus.RIG` if it alone has too few inliers.
+        The poses of the first camera. A pose has the status `FrameStatus.RIG` if the first camera alone has
+        too few inliers.
     """
     rig = RigObservations.create(members, scene_map)
     solution = _solve(rig, start, criteria, threads)
@@ -105,11 +119,11 @@ def solve_rig(
 
 @dataclass(slots=True)
 class _Solution:
-    """Poses of all frames, and what agrees with them.
+    """Poses of all frames, and the observations that agree with them.
 
     Attributes:
-        poses: One for each frame.
-        reliability: How often each point agreed.
+        poses: Pose of each frame.
+        reliability: How often each point agreed with a pose.
         static: (F,) number of inliers on static points.
         own_inliers: (F,) number of inliers of the first camera.
     """
@@ -128,17 +142,17 @@ def _solve(
     reliability: PointReliability | None = None,
     path: FloatArray | None = None,
 ) -> _Solution:
-    """Estimate the poses of all frames, one block after another.
+    """Estimate the poses of all frames, block by block.
 
-    All observations of a long video would fill the memory.
+    The observations of a long video do not fit into memory together.
 
     Args:
-        rig: Cameras and map.
-        start: (F,4,4) rig_from_map to start from.
+        rig: The cameras of the rig and the map.
+        start: (F,4,4) rig_from_map to start from; NaN for a frame without a start.
         criteria: The conditions that a pose must meet.
-        threads: Threads that solve chunks of frames.
-        reliability: Agreement of each point in the solution before.
-        path: (F,4,4) map_from_rig that corrects the rolling shutter; None for a global shutter.
+        threads: Number of threads that solve chunks of frames.
+        reliability: Reliability of each point in the solution before; None in the first solution.
+        path: (F,4,4) poses map_from_rig for the correction of the rolling shutter; None for a global shutter.
     """
     count = len(start)
     out = _Solution(
@@ -162,13 +176,13 @@ def _solve(
 def _assign_status(
     poses: list[FramePose], rig: RigObservations, own_inliers: IntArray, criteria: AcceptanceCriteria
 ) -> list[FramePose]:
-    """Set the status of keyframes, and of frames that only other cameras of the rig support.
+    """Set the status of keyframes, and of frames whose pose depends on other cameras of the rig.
 
     Args:
-        poses: One for each frame.
-        rig: The rig.
-        own_inliers: (F,) inliers of the first camera.
-        criteria: The least number of inliers.
+        poses: Pose of each frame.
+        rig: The cameras of the rig and the map.
+        own_inliers: (F,) number of inliers of the first camera.
+        criteria: The conditions of a pose. Only the minimum number of inliers is used.
     """
     rows = rig.scene_map.keyframes_of(rig.members[0].camera.name)
     status = dict.fromkeys(rig.scene_map.keyframe_frame[rows].tolist(), FrameStatus.KEYFRAME)
@@ -183,7 +197,7 @@ def _assign_status(
 
 
 def pose_array(poses: Sequence[FramePose]) -> FloatArray:
-    """Return the poses gauge_from_cam (N,4,4); NaN if there is none."""
+    """Return the poses gauge_from_cam (N,4,4); NaN for frames without a pose."""
     missing = np.full((4, 4), np.nan)
     matrices = [missing if pose.gauge_from_cam is None else pose.gauge_from_cam for pose in poses]
     return np.array(matrices).reshape(-1, 4, 4)
@@ -196,9 +210,9 @@ def build_trajectory(
 
     Args:
         camera: The camera.
-        gauge: Gauge of the poses.
-        poses: One for each frame.
-        sharpness: (F,) sharpness of the frames.
+        gauge: Identifier of the gauge of the poses.
+        poses: Pose of each frame.
+        sharpness: (F,) image sharpness of each frame.
     """
     missing = np.full((6, 6), np.nan)
     return Trajectory(
@@ -217,9 +231,9 @@ def build_trajectory(
 
 
 def _frame_statuses(poses: Sequence[FramePose], sharpness: FloatArray) -> list[FrameStatus]:
-    """Return the statuses of the frames.
+    """Return the status of each frame.
 
-    A frame without tracks that is much less sharp than the frames around it gets the status BLUR.
+    A frame with too few tracks that is much less sharp than the frames around it gets the status BLUR.
     """
     statuses = []
     for index, pose in enumerate(poses):
@@ -233,9 +247,9 @@ def _frame_statuses(poses: Sequence[FramePose], sharpness: FloatArray) -> list[F
 
 
 def _interpolated_keyframe_poses(keyframes: IntArray, map_from_cam: FloatArray, count: int) -> FloatArray:
-    """Return cam_from_map (count,4,4), interpolated between keyframes.
+    """Return poses cam_from_map (count,4,4) of all frames, interpolated between keyframes.
 
-    Frames outside all keyframes get the pose of the nearest one.
+    Frames before the first and after the last keyframe get the pose of the nearest keyframe.
     """
     frames = np.arange(count)
     after = np.clip(np.searchsorted(keyframes, frames), 1, max(1, len(keyframes) - 1))
@@ -250,8 +264,8 @@ def _require_static_inliers(poses: list[FramePose], static_inliers: IntArray) ->
     """Reject the poses with few inliers on static points.
 
     Args:
-        poses: One for each frame.
-        static_inliers: (F,) inliers on static points.
+        poses: Pose of each frame.
+        static_inliers: (F,) number of inliers on static points.
     """
     has_pose = np.array([pose.gauge_from_cam is not None for pose in poses], dtype=bool)
     return _reject(poses, has_pose & (static_inliers < _MIN_STATIC_INLIERS), FrameStatus.UNCONFIRMED)
@@ -260,13 +274,13 @@ def _require_static_inliers(poses: list[FramePose], static_inliers: IntArray) ->
 def _reject_outliers(
     poses: list[FramePose], times_ns: IntArray, criteria: AcceptanceCriteria
 ) -> list[FramePose]:
-    """Reject poses that deviate from their neighbours, and isolated poses with few inliers."""
+    """Reject poses that deviate from the poses around them, and isolated poses with few inliers."""
     centres = np.full((len(poses), 3), np.nan)
     sigma = np.full(len(poses), np.nan)
     for frame, pose in enumerate(poses):
         if pose.gauge_from_cam is not None and pose.covariance is not None:
             centres[frame] = pose.gauge_from_cam[:3, 3]
-            # Neighbouring frames share the error of the map.
+            # Neighbouring frames share the error of the map. It is therefore removed from the sigma.
             sigma[frame] = np.sqrt(np.trace(pose.covariance[3:, 3:]) / MAP_COVARIANCE_SCALE)
     accepted = _reject(poses, find_outlier_poses(centres, sigma, times_ns), FrameStatus.POSE_JUMP)
     localised = np.array([pose.gauge_from_cam is not None for pose in accepted], dtype=bool)
@@ -276,7 +290,7 @@ def _reject_outliers(
 
 
 def _reject(poses: list[FramePose], rejected: BoolArray, status: FrameStatus) -> list[FramePose]:
-    """Replace the poses selected by `rejected` (F,) by the status."""
+    """Return the poses, with each pose selected by `rejected` (F,) replaced by a status."""
     return [
         FramePose(status=status, inliers=pose.inliers, error_px=pose.error_px) if rejected[frame] else pose
         for frame, pose in enumerate(poses)

@@ -1,1 +1,1 @@
-"""Find the poses of lost frames."""
+"""Recover the poses of lost frames."""

@@ -1,4 +1,4 @@
-"""Localise single frames by searching map points where an expected pose predicts them."""
+"""Localise single frames: search map points at the pixels that an expected pose predicts."""
 
 from __future__ import annotations
 
@@ -35,20 +35,22 @@ _LEVELS = (
     SearchLevel(pyramid_level=1, patch_side=21, search_radius=8, min_score=0.7, limit_px=6.0),
     SearchLevel(pyramid_level=0, patch_side=31, search_radius=8, min_score=0.75, limit_px=4.0),
 )
-"""Searches from coarse to fine. The last one is at full size, because its errors are a quarter smaller than
-at half size. Evidence for that: docs/decisions/registration.md; for the other values: none."""
+"""Searches from coarse to fine. The last search uses the largest image of the pyramid. Its errors are a
+quarter smaller than in the image of half that size. Evidence for this: docs/decisions/registration.md; for
+the other values: none."""
 _CELL_SIDE_PX = 40.0
-"""Pixels at 640 px image width: side of a cell, about the side of a patch."""
+"""Pixels at 640 px image width: side of a cell of the image grid. It is about the side of a patch."""
 _FULL_WEIGHT_PER_CELL = 2.0
-"""Matches of one cell that have their full weight together; overlapping patches have common errors. Evidence:
-docs/decisions/registration.md."""
+"""Maximum number of matches in one cell that have their full weight. More matches share this weight, because
+overlapping patches have common errors. Evidence: docs/decisions/registration.md."""
 _MIN_NOISE_PX = 1.0
-"""Pixels at 640 px image width: smallest noise of a patch match that is assumed. Few matches in a blurred
-frame may agree better by chance. Evidence: none."""
+"""Pixels at 640 px image width: smallest assumed noise of a patch match. The residuals of few matches in a
+blurred frame may be smaller by chance. Evidence: none."""
 _MIN_MATCHES = 8
-"""Least matches for a pose. Evidence: none."""
+"""Minimum number of matches for a pose. Evidence: none."""
 _SUFFICIENT_INLIERS, _SUFFICIENT_WEIGHT_RATIO = 25, 0.6
-"""Inliers, and inlier weight ratio, with which no further expected pose is tried. Evidence: none."""
+"""Minimum number of inliers and minimum inlier weight ratio of a sufficient pose. After a sufficient pose no
+further expected pose is tried. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,12 +58,12 @@ class PoseEstimate:
     """A pose from patch matches or from tracking.
 
     Attributes:
-        cam_from_map: (4,4).
-        covariance: (6,6) as in `Trajectory`.
+        cam_from_map: (4,4) pose.
+        covariance: (6,6) covariance as in `Trajectory`.
         inliers: Number of inliers.
-        inlier_weight_ratio: Weight of the inliers over the weight of all matches.
-        error_px: Mean residual of the inliers.
-        depth: Median depth of the matched points.
+        inlier_weight_ratio: Ratio of the inliers' weight to the weight of all matches.
+        error_px: Mean residual of the inliers, pixels.
+        depth: Median depth of the matched points, in map units.
     """
 
     cam_from_map: FloatArray
@@ -73,9 +75,10 @@ class PoseEstimate:
 
     @staticmethod
     def from_trajectory(path: Trajectory, frame: int) -> PoseEstimate:
-        """Return the pose of a frame from tracking.
+        """Return the pose of a localised frame of a trajectory.
 
-        The depth of its points is not stored; it is set to infinity.
+        The trajectory does not contain the depth of the points, so the depth is set to infinity. It does not
+        contain the inlier weight ratio either, so this ratio is set to 1.
         """
         return PoseEstimate(
             cam_from_map=invert(path.gauge_from_cam[frame]),
@@ -103,12 +106,15 @@ class PoseEstimate:
         return self.inliers >= min_inliers and self.inlier_weight_ratio >= min_inlier_weight_ratio
 
     def conditioned_on_centre(self, position: PositionEstimate) -> tuple[FloatArray, FloatArray]:
-        """Return the pose and its covariance, given another position of the centre.
+        """Return the pose and its covariance for another position of the camera centre.
 
         The rotation changes as far as it is correlated with the centre.
 
+        Args:
+            position: The other position, with its uncertainty.
+
         Returns:
-            cam_from_map (4,4) and its covariance (6,6).
+            Pose cam_from_map (4,4) and its covariance (6,6).
         """
         rotation, centre = self.cam_from_map[:3, :3], invert(self.cam_from_map)[:3, 3]
         gain = self.covariance[:3, 3:] @ np.linalg.inv(self.covariance[3:, 3:])
@@ -125,7 +131,11 @@ class PoseEstimate:
 
 
 def fuse(first: PositionEstimate, second: PositionEstimate) -> tuple[PositionEstimate, float]:
-    """Combine two independent positions; return the weighted mean and their squared Mahalanobis distance."""
+    """Combine two independent positions.
+
+    Returns:
+        The weighted mean, and the squared Mahalanobis distance between the two positions.
+    """
     information = np.linalg.inv(first.covariance + second.covariance)
     difference = second.centre - first.centre
     centre = first.centre + first.covariance @ information @ difference
@@ -138,8 +148,8 @@ class SearchFrame:
     """A frame to be searched.
 
     Attributes:
-        pyramid: Its image.
-        keyframe_row: Its own row among the map's keyframes, or -1.
+        pyramid: Image pyramid of the frame.
+        keyframe_row: Row index of the frame among the map's keyframes, or -1 if it is no keyframe.
     """
 
     pyramid: Pyramid
@@ -148,11 +158,11 @@ class SearchFrame:
 
 @dataclass(frozen=True, slots=True)
 class NeighbourPose:
-    """Pose of the camera one frame away.
+    """Pose of the camera in the frame before or after.
 
     Attributes:
         pose: (4,4) cam_from_map.
-        direction: 1 if it is one frame earlier, −1 if it is one frame later.
+        direction: 1 for the pose of the frame before, −1 for the pose of the frame after.
     """
 
     pose: FloatArray
@@ -161,7 +171,7 @@ class NeighbourPose:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuidedLocaliser:
-    """Localises frames of a camera near an expected pose.
+    """Estimates the poses of a camera's frames near expected poses.
 
     Attributes:
         lens: The camera model.
@@ -169,7 +179,8 @@ class GuidedLocaliser:
         criteria: The conditions that a pose must meet.
         exposure_ratio: Exposure time as a fraction of the frame interval.
         readout_ratio: Readout time as a fraction of the frame interval.
-        is_unmasked: Returns which pixels (N,2) the mask of the camera leaves visible.
+        is_unmasked: Function from pixels (N,2) to a mask (N,) of the pixels that the camera's mask leaves
+            visible.
     """
 
     lens: Camera
@@ -186,13 +197,16 @@ class GuidedLocaliser:
         neighbour: NeighbourPose,
         predicted: PositionEstimate,
     ) -> PoseEstimate | None:
-        """Estimate the pose of a frame.
+        """Estimate the pose of a frame, searching from coarse to fine.
 
         Args:
             search_frame: The frame.
-            priors: Expected poses cam_from_map (4,4), the most likely first.
+            priors: Expected poses cam_from_map (4,4), the most likely pose first.
             neighbour: Pose of the frame before or after.
-            predicted: Position predicted by the motion.
+            predicted: Camera position that the motion predicts.
+
+        Returns:
+            The pose, or None if a search fails.
         """
         best: PoseEstimate | None = None
         for prior in priors:
@@ -215,8 +229,11 @@ class GuidedLocaliser:
 
         Args:
             search_frame: The frame.
-            pose: (4,4) cam_from_map.
+            pose: (4,4) good pose cam_from_map.
             neighbour: Pose of the frame before or after.
+
+        Returns:
+            The pose, or None if the search fails.
         """
         return self._search(self._view(search_frame, pose, neighbour), _LEVELS[-1])
 
@@ -233,7 +250,7 @@ class GuidedLocaliser:
         )
 
     def _search(self, view: PredictedView, level: SearchLevel) -> PoseEstimate | None:
-        """Search the points that a view should show, and estimate the pose from them."""
+        """Search the points that should be visible in a view, and estimate the pose from the matches."""
         rows = select_patches(self.patches, view)
         if len(rows) < _MIN_MATCHES:
             return None
@@ -244,7 +261,8 @@ class GuidedLocaliser:
     def _solve(self, view: PredictedView, matches: PatchMatches, level: SearchLevel) -> PoseEstimate | None:
         """Estimate a pose from matches.
 
-        It starts from the expected pose, and from RANSAC if few matches agree with that one.
+        The expected pose is refined. If few matches agree with the result, a RANSAC pose is refined too, and
+        the pose with more inliers is returned.
         """
         scale = view.pyramid.step_px[0]
         criteria = replace(
@@ -272,7 +290,7 @@ class GuidedLocaliser:
     def _refined(
         self, observations: Observations, start: FloatArray, criteria: AcceptanceCriteria
     ) -> PoseEstimate | None:
-        """Refine a pose; return None if it is not acceptable."""
+        """Return the refined pose; None if it is not acceptable."""
         pose = refine_poses(observations, start[None], criteria.max_error_px)
         accepted = accept_poses(observations, pose, criteria)[0]
         if accepted.covariance is None:
@@ -288,11 +306,11 @@ class GuidedLocaliser:
 
 
 def _match_weights(cell: FloatArray, keyframe_count: IntArray) -> FloatArray:
-    """Return the weights (N,) of matches.
+    """Return the weights (N,) of matches. Matches in a crowded cell have lower weights.
 
     Args:
-        cell: (N,2) position in units of a cell; the matches of a crowded cell share its weight.
-        keyframe_count: (N,) keyframes that see each point.
+        cell: (N,2) pixel of each match, in units of the cell's side.
+        keyframe_count: (N,) number of keyframes that see each matched point.
     """
     _, group, count = np.unique(np.floor(cell).astype(int), axis=0, return_inverse=True, return_counts=True)
     crowding = np.maximum(1.0, count[np.ravel(group)] / _FULL_WEIGHT_PER_CELL)

@@ -11,32 +11,32 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 
 _PERCENTILE = 80.0
-"""Percentile of a camera's third and fourth differences. It is high because lost intervals belong to the
-faster movements. Evidence: none."""
+"""Percentile of a camera's third and fourth differences that is used as their sigma. It is high, because lost
+intervals occur in the faster movements. Evidence: none."""
 _MAX_INTERVAL_DEVIATION = 0.1
-"""Largest deviation of a frame interval from the median, as a fraction of it, for differences across it.
-Evidence: none."""
+"""Maximum deviation of a frame interval from the median interval, as a fraction of the median. Differences
+across an interval with a larger deviation are not used. Evidence: none."""
 _ITERATIONS = 5
-"""Iterations of reweighted least squares. Evidence: none."""
+"""Number of iterations of reweighted least squares. Evidence: none."""
 _LOSS_WIDTH = 4.0
 """Squared Mahalanobis distance at which a position, or a residual of the motion, has half of its weight.
 Evidence: none."""
 _VELOCITY_SIGMA_JERKS, _ACCELERATION_SIGMA_JERKS = 30.0, 4.0
-"""Sigmas of an unknown velocity and of an unknown acceleration, in units of the camera's jerk sigma.
+"""Sigma of an unknown velocity and sigma of an unknown acceleration, in units of the camera's jerk sigma.
 Evidence: none."""
 MAX_DISAGREEMENT = 11.3
-"""Largest squared Mahalanobis distance between a found centre and its smoothed position. Origin: 99 % of a
-chi-squared variable with three degrees of freedom. Beyond it one of the two is wrong, and it is unknown
-which."""
+"""Maximum squared Mahalanobis distance between a found centre and its smoothed position. If the distance is
+larger, one of the two is wrong, and it is unknown which. Origin: 99 % of a chi-squared variable with three
+degrees of freedom."""
 _NEIGHBOURS = 4
-"""Neighbouring frames that a cubic is drawn through: two before and two after."""
+"""Number of neighbouring frames that determine a cubic: two frames before and two frames after."""
 _PRIOR = 1e-9
-"""Information of a weak prior on every centre, as a fraction of the mean. It only prevents a singular
-matrix."""
+"""Information of a weak prior on every centre, as a fraction of the mean information. It only prevents a
+singular matrix."""
 
 
 def times_in_intervals(times_ns: IntArray) -> FloatArray:
-    """Return the times (N,) of frames since the first one, in median frame intervals."""
+    """Return the times (N,) of frames since the first frame, in units of the median frame interval."""
     times = (times_ns - times_ns[0]).astype(np.float64)
     return np.asarray(times / np.median(np.diff(times)))
 
@@ -46,8 +46,8 @@ class PositionEstimate:
     """Position of a camera, with its uncertainty.
 
     Attributes:
-        centre: (3,) in the map.
-        covariance: (3,3).
+        centre: (3,) camera centre in the map.
+        covariance: (3,3) covariance of the centre in the axes of the map.
     """
 
     centre: FloatArray
@@ -56,12 +56,12 @@ class PositionEstimate:
 
 @dataclass(frozen=True, slots=True)
 class MotionStatistics:
-    """How smoothly a camera moves, in map units along one axis, for frames one interval apart.
+    """How smoothly a camera moves. All values are in map units along one axis, for frames one interval apart.
 
     Attributes:
-        jerk_sigma: Third difference of the centre from frame to frame.
-        cubic_residual_sigma: Distance of a centre from the cubic through the two centres before it and the
-            two after it.
+        jerk_sigma: Sigma of the third difference of the centre over successive frames.
+        cubic_residual_sigma: Sigma of the distance of a centre from the cubic through the two centres before
+            and the two centres after it.
     """
 
     jerk_sigma: float
@@ -72,11 +72,11 @@ class MotionStatistics:
         """Estimate the statistics of a path.
 
         Args:
-            times: (N,) in frame intervals.
-            centres: (N,3) camera centres; NaN where unknown.
+            times: (N,) times of the frames, in units of the frame interval.
+            centres: (N,3) camera centres in the map; NaN for frames without a pose.
 
         Returns:
-            None if too few centres are known.
+            The statistics; None if too few successive centres are known, or if the camera does not move.
         """
         sizes = []
         for order in (3, 4):
@@ -87,7 +87,7 @@ class MotionStatistics:
             if len(differences) < _NEIGHBOURS:
                 return None
             sizes.append(float(np.percentile(np.sqrt((differences**2).mean(axis=1)), _PERCENTILE)))
-        # The fourth difference is six times the distance from the cubic.
+        # The fourth difference is six times the distance of the middle centre from the cubic.
         return (
             MotionStatistics(jerk_sigma=sizes[0], cubic_residual_sigma=sizes[1] / 6.0)
             if min(sizes) > 0.0
@@ -96,10 +96,10 @@ class MotionStatistics:
 
 
 class CentreKalmanFilter:
-    """Kalman filter of a camera's centre, velocity and acceleration, run forwards or backwards in time.
+    """Kalman filter of a camera's centre, velocity and acceleration, run forward or backward in time.
 
     Source: Tang, Yoon, Barfoot, "A white-noise-on-jerk motion prior for continuous-time trajectory estimation
-        on SE(3)", RA-L 2019, applied to the centre alone, because a hand rotates freely.
+        on SE(3)", RA-L 2019. It is applied to the centre alone, because a hand rotates freely.
     """
 
     def __init__(self, statistics: MotionStatistics, start: PositionEstimate) -> None:
@@ -112,7 +112,7 @@ class CentreKalmanFilter:
         self._covariance[6:, 6:] = np.eye(3) * (_ACCELERATION_SIGMA_JERKS * jerk) ** 2
 
     def predict(self, interval: float) -> PositionEstimate:
-        """Advance by `interval` (> 0) frame intervals and return the predicted position."""
+        """Advance the state by `interval` (> 0) frame intervals, and return the predicted position."""
         powers = np.array([[1.0, interval, interval**2 / 2.0], [0.0, 1.0, interval], [0.0, 0.0, 1.0]])
         transition = np.kron(powers, np.eye(3))
         noise = np.array([interval**3 / 6.0, interval**2 / 2.0, interval]) * self._jerk
@@ -135,8 +135,8 @@ class SmoothedCentres:
     """Smoothed positions of successive frames.
 
     Attributes:
-        positions: By frame.
-        disagreement: By observed frame: squared Mahalanobis distance from the smoothed position.
+        positions: Smoothed position of each frame, by frame.
+        disagreement: Squared Mahalanobis distance between observed and smoothed position, by observed frame.
     """
 
     positions: Mapping[int, PositionEstimate]
@@ -152,14 +152,14 @@ def smooth_centres(
 ) -> SmoothedCentres:
     """Smooth the centres of successive frames, given observed positions and the statistics of the motion.
 
-    Positions and motion residuals are weighted by a Cauchy loss: a position may be wrong, and a hand may stop
-    suddenly.
+    A Cauchy loss weights the positions and the residuals of the motion. A position may be wrong, and a hand
+    may stop suddenly.
 
     Args:
-        frames: (N,) frame indices.
-        times: (N,) in frame intervals.
+        frames: (N,) indices of successive frames.
+        times: (N,) times of these frames, in units of the frame interval.
         observed: Observed positions, by frame.
-        trusted: Frames whose positions always have their full weight.
+        trusted: Indices of the frames whose positions always have their full weight.
         statistics: How smoothly the camera moves.
     """
     at = {frame: index for index, frame in enumerate(frames.tolist())}
@@ -191,16 +191,17 @@ def smooth_centres(
 def _solve_block_tridiagonal(
     rows: FloatArray, weight: FloatArray, information: FloatArray, weighted: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Solve the least-squares problem of motion residuals and positions.
+    """Solve the least-squares problem of motion residuals and observed positions.
 
-    A motion residual connects five frames. Blocks of four frames are therefore connected to the next block
-    only, and time and memory grow linearly with the number of frames.
+    A motion residual connects five frames. Frames are therefore grouped into blocks of four. Each block is
+    connected only to the blocks before and after it. Time and memory then grow linearly with the number of
+    frames.
 
     Args:
-        rows: (N−4,5) as returned by `_cubic_residual_rows`.
-        weight: (N−4,) their information.
+        rows: (N−4,5) linear maps from `_cubic_residual_rows`.
+        weight: (N−4,) information of each motion residual.
         information: (N,3,3) information of the positions.
-        weighted: (N,3) the information times the positions.
+        weighted: (N,3) product of the information and the position.
 
     Returns:
         Centres (N,3) and their covariances (N,3,3).
@@ -225,10 +226,10 @@ def _solve_block_tridiagonal(
 
 
 def _information_blocks(rows: FloatArray, weight: FloatArray, groups: int) -> tuple[FloatArray, FloatArray]:
-    """Return the information of motion residuals, in blocks of four frames.
+    """Return the information of the motion residuals, in G blocks of four frames.
 
     Returns:
-        (G,4,4) within each block, and (G,4,4) between each block and the next one.
+        Information (G,4,4) within each block, and information (G,4,4) between each block and the next block.
     """
     pairs = np.zeros((groups + 1, 2 * _NEIGHBOURS, 2 * _NEIGHBOURS))
     for number, row in enumerate(rows):
@@ -241,12 +242,16 @@ def _information_blocks(rows: FloatArray, weight: FloatArray, groups: int) -> tu
 
 
 def _cubic_residual_rows(times: FloatArray, bend: float) -> tuple[FloatArray, FloatArray]:
-    """Return the linear map from five successive centres to the distance from their cubic.
+    """Return the linear map from five successive centres to the distance of the middle centre from a cubic.
 
-    Row n concerns the frames n to n+4.
+    The cubic passes through the other four centres. Row n refers to the frames n to n+4.
+
+    Args:
+        times: (N,) times of the frames, in units of the frame interval.
+        bend: Sigma of the distance for frames one interval apart.
 
     Returns:
-        Rows (N−4,5), and the sigma (N−4,) of each distance.
+        Coefficients (N−4,5), and the sigma (N−4,) of each distance.
     """
     count = max(0, len(times) - _NEIGHBOURS)
     rows, sigma = np.zeros((count, _NEIGHBOURS + 1)), np.full(count, bend)

@@ -1,4 +1,4 @@
-"""Find map points in a frame by the patches that keyframes show of them, near an expected pose."""
+"""Find map points in a frame near an expected pose, by image patches around the points in keyframes."""
 
 from __future__ import annotations
 
@@ -17,45 +17,50 @@ from bodycap_batch.model.scene import Map
 from bodycap_batch.registration.tracking.klt import grid_sample
 
 _MAX_POINTS = 300
-"""Points searched in a frame. Evidence: none."""
+"""Maximum number of points searched in a frame. Evidence: none."""
 _GRID_CELLS = 8
-"""Cells along each side of the image over which these points are spread. Evidence: none."""
+"""Number of grid cells along each side of the image. The searched points are spread over these cells.
+Evidence: none."""
 _MARGIN_PX = 4.0
-"""Pixels: least distance of a searched point from the border of the image. Evidence: none."""
+"""Pixels: minimum distance of a searched point from the border of the image. Evidence: none."""
 _MIN_COSINE = 0.6
-"""Least cosine of the angle between both lines of sight. A patch is assumed to face the camera, which holds
-for similar directions only. Evidence: none."""
+"""Minimum cosine of the angle between the lines of sight of the frame and of the keyframe. The surface of a
+patch is assumed to face the camera. This holds only for similar directions. Evidence: none."""
 _MAX_LOG_SCALE = 0.8
-"""Largest absolute logarithm of the ratio of both distances. Evidence: none."""
+"""Maximum absolute logarithm of the distance ratio: the distance of the point from the keyframe over its
+distance from the frame. Evidence: none."""
 _SCALE_PENALTY, _SHARPNESS_REWARD = 0.3, 0.1
-"""Factors of the logarithm of the distance ratio and of the sharpness in the score of a keyframe, relative to
-the cosine. Evidence: none."""
+"""Factors in the score of a keyframe, relative to the cosine: of the absolute logarithm of the distance
+ratio, and of the sharpness. Evidence: none."""
 _MAX_BLUR_PX = 40.0
-"""Pixels at 640 px image width: longest blur that is rendered. Evidence: none."""
+"""Pixels at 640 px image width: maximum length of rendered motion blur. Evidence: none."""
 _MAX_BLUR_SAMPLES = 5
-"""Most samples along a blur. It bounds the time."""
+"""Maximum number of samples along the motion blur. It bounds the computing time."""
 _BLUR_STEP_PX = 3.0
-"""Pixels of the pyramid level between two samples; a longer blur is sampled less densely. Evidence: none."""
+"""Pixels of the pyramid level: maximum distance between two samples along the motion blur. If the number of
+samples is limited, the distance is larger. Evidence: none."""
 _WARP_STEP_PX = 4.0
-"""Pixels: step of the differences that give the warp of a patch. Evidence: none."""
+"""Pixels: step of the finite differences that determine the warp of a patch. Evidence: none."""
 _MIN_DEPTH_RATIO = 0.25
-"""Least depth of a point, as a fraction of the median depth. A nearer point is usually wrong, and it would
-dominate the pose. Evidence: none."""
+"""Minimum depth of a point, as a fraction of the median depth. A nearer point is usually wrong, and would
+have the largest influence on the pose. Evidence: none."""
 _MIN_CONTRAST = 3.0
-"""Least standard deviation of the grey values of a patch. Evidence: none."""
+"""Minimum standard deviation of the grey values of a patch. Evidence: none."""
 _LEVELS = 3
-"""Levels of an image pyramid."""
+"""Number of levels of an image pyramid."""
 
 Patches = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
 class Pyramid:
-    """A frame at a width of at most 640 pixels, and at half and a quarter of that.
+    """A frame at three sizes. The longer side of the first image has at most 640 pixels.
+
+    Each further image has half the size of the image before.
 
     Attributes:
-        levels: The images.
-        step_px: (3,) pixels of the frame per pixel of each level.
+        levels: The three images, the largest first.
+        step_px: (3,) number of pixels of the frame per pixel of each image.
     """
 
     levels: tuple[GreyImage, ...]
@@ -63,7 +68,7 @@ class Pyramid:
 
     @staticmethod
     def build(grey: GreyImage) -> Pyramid:
-        """Reduce a frame (H,W)."""
+        """Return the image pyramid of a frame (H,W)."""
         import cv2
 
         height, width = grey.shape
@@ -84,9 +89,9 @@ class KeyframePatches:
 
     Attributes:
         scene_map: The map.
-        pyramids: Images of keyframes, by their row in the map.
-        sharpness: (K,) sharpness of the keyframes, relative to the median of their camera.
-        usable: (P,) points that may be searched.
+        pyramids: Image pyramids of keyframes, by row index in the map.
+        sharpness: (K,) sharpness of the keyframes, relative to the median sharpness of their camera.
+        usable: (P,) True for points that may be searched.
         keyframe_count: (P,) number of keyframes that see each point.
     """
 
@@ -103,13 +108,14 @@ class PredictedView:
 
     Attributes:
         lens: The camera model.
-        pyramid: The image.
-        cam_from_map: (4,4) the expected pose.
-        neighbour_pose: (4,4) the pose one frame earlier, or one frame later if `readout_ratio` is negative.
+        pyramid: Image pyramid of the frame.
+        cam_from_map: (4,4) expected pose of the frame.
+        neighbour_pose: (4,4) pose cam_from_map of the frame before, or of the frame after.
         exposure_ratio: Exposure time as a fraction of the frame interval.
-        readout_ratio: Readout time as a fraction of the frame interval, if the map was refined for it.
-        keyframe_row: The frame's own row among the map's keyframes, or -1. Its own patches are not used,
-            because they are found wherever the map puts the frame.
+        readout_ratio: Readout time as a fraction of the frame interval; 0 if the map was not adjusted for a
+            rolling shutter. It is negative if `neighbour_pose` is the pose of the frame after.
+        keyframe_row: Row index of this frame among the map's keyframes, or -1. Patches of this keyframe are
+            not used, because they would match even if its pose in the map is wrong.
     """
 
     lens: Camera
@@ -123,13 +129,13 @@ class PredictedView:
 
 @dataclass(frozen=True, slots=True)
 class SearchLevel:
-    """How points are searched.
+    """Size and range of a search.
 
     Attributes:
-        pyramid_level: Level of the pyramid.
+        pyramid_level: Index of the pyramid level.
         patch_side: Side of a patch in pixels of the level; odd.
-        search_radius: Largest distance from the expected pixel, in pixels of the level.
-        min_score: Least correlation.
+        search_radius: Maximum distance from the expected pixel, in pixels of the level.
+        min_score: Minimum normalised correlation.
         limit_px: Inlier limit of the pose from the matches, in pixels at 640 px image width.
     """
 
@@ -146,8 +152,9 @@ class PatchMatches:
 
     Attributes:
         point: (N,) index of the map point.
-        px: (N,2) pixel.
-        mid_row_px: (N,2) pixel at the instant of the middle row, to which the poses of the map belong.
+        px: (N,2) pixel at which the point was found.
+        mid_row_px: (N,2) this pixel moved to the instant of the middle row. The poses of the map refer to
+            this instant.
         score: (N,) normalised correlation.
     """
 
@@ -157,17 +164,20 @@ class PatchMatches:
     score: FloatArray
 
     def select(self, selected: BoolArray) -> PatchMatches:
-        """Return the matches under a mask."""
+        """Return the matches that a mask selects."""
         return PatchMatches(
             self.point[selected], self.px[selected], self.mid_row_px[selected], self.score[selected]
         )
 
 
 def select_patches(patches: KeyframePatches, view: PredictedView) -> IntArray:
-    """Select the observations of the map that provide the patches: one for each of some well-spread points.
+    """Select map points to search in a frame, and the keyframe that provides the patch of each point.
+
+    The points are spread over the image. The selected keyframe sees its point from a similar direction and
+    distance.
 
     Returns:
-        Rows of the map's observations, increasing.
+        Row indices of the map's observations that provide the patches, increasing.
     """
     scene, lens = patches.scene_map, view.lens
     x_in_cam = transform_points(view.cam_from_map, scene.points)
@@ -208,20 +218,21 @@ def match_patches(
 ) -> PatchMatches:
     """Search points around their expected pixels by normalised correlation.
 
-    A patch of a keyframe is warped to the expected view, as if its surface faced the camera at the depth of
-    the point. It is blurred along the path of the point in the image while the shutter is open.
+    A patch of a keyframe is warped to the expected view. Its surface is assumed to be at the depth of the
+    point and to face the camera. The patch is blurred along the path of the point in the image during the
+    exposure.
 
     Args:
         patches: The map and the images of its keyframes.
         view: The expected view of the frame.
-        rows: Observations of the map that provide the patches, from `select_patches`.
+        rows: Row indices of the map's observations that provide the patches, from `select_patches`.
         level: Size and range of the search.
 
     Returns:
         The points found, with subpixel precision.
 
-    Source: Klein, Murray, "Improving the agility of keyframe-based SLAM", ECCV 2008, for the search in
-        blurred frames; the warp is Klein, Murray, "Parallel tracking and mapping", ISMAR 2007.
+    Source: the search in blurred frames is from Klein, Murray, "Improving the agility of keyframe-based
+        SLAM", ECCV 2008. The warp is from Klein, Murray, "Parallel tracking and mapping", ISMAR 2007.
     """
     scene, lens = patches.scene_map, view.lens
     points = scene.points[scene.obs_point[rows]]
@@ -234,7 +245,7 @@ def match_patches(
     step = view.pyramid.step_px[level.pyramid_level]
     motion = _image_motion(view, points, px)
     images, is_inside = _render_patches(patches, rows, warp, _motion_blur(view, motion), level, step)
-    # During the readout a point moves by a small part of the image, so its row hardly changes.
+    # During the readout a point moves little in the image, so its row hardly changes.
     expected_px = px_at_mid_row(lens, px, motion, -view.readout_ratio)
     found_px, score = np.full((len(rows), 2), np.nan), np.zeros(len(rows))
     target = view.pyramid.levels[level.pyramid_level].astype(np.float32)
@@ -253,14 +264,14 @@ def match_patches(
 def _patch_warps(
     scene: Map, lens: Camera, cam_from_map: FloatArray, rows: IntArray, px: FloatArray
 ) -> FloatArray:
-    """Return the derivatives (N,2,2) of the keyframes' pixels by this camera's pixels.
+    """Return the derivatives (N,2,2) of the keyframe's pixel with respect to the frame's pixel.
 
     Args:
         scene: The map.
-        lens: This camera's model.
-        cam_from_map: (4,4) its pose.
-        rows: (N,) observations of the map that provide the patches.
-        px: (N,2) pixels at which this camera sees the points.
+        lens: The camera model of the frame.
+        cam_from_map: (4,4) pose of the frame.
+        rows: (N,) row indices of the map's observations that provide the patches.
+        px: (N,2) pixels of the points in the frame.
     """
     keyframe = scene.obs_keyframe[rows]
     depth = transform_points(cam_from_map, scene.points[scene.obs_point[rows]])[:, 2]
@@ -281,12 +292,18 @@ def _patch_warps(
 
 
 def _image_motion(view: PredictedView, points: FloatArray, px: FloatArray) -> FloatArray:
-    """Return how far points seen at `px` (N,2) moved since the neighbouring frame, in px (N,2)."""
+    """Return the motion (N,2) of points in the image since the neighbouring frame, in pixels.
+
+    Args:
+        view: The expected view of the frame.
+        points: (N,3) points in the map.
+        px: (N,2) expected pixels of the points in the frame.
+    """
     return np.asarray(np.nan_to_num(px - view.lens.project(transform_points(view.neighbour_pose, points))))
 
 
 def _motion_blur(view: PredictedView, motion_px: FloatArray) -> FloatArray:
-    """Return how far points move while the shutter is open, in px (N,2), limited to `_MAX_BLUR_PX`."""
+    """Return the motion (N,2) of points during the exposure in pixels, limited to `_MAX_BLUR_PX`."""
     blur = motion_px * view.exposure_ratio
     longest = _MAX_BLUR_PX * max(1.0, view.pyramid.step_px[0])
     return np.asarray(
@@ -306,14 +323,15 @@ def _render_patches(
 
     Args:
         patches: The map and the images of its keyframes.
-        rows: (N,) observations of the map that provide the patches.
-        warp: (N,2,2) derivative of the keyframe's pixel by the frame's pixel.
-        blur_px: (N,2) motion in the frame while the shutter is open.
+        rows: (N,) row indices of the map's observations that provide the patches.
+        warp: (N,2,2) derivative of the keyframe's pixel with respect to the frame's pixel.
+        blur_px: (N,2) motion in the frame during the exposure, in pixels of the frame.
         level: Size of the patches.
-        step_px: Pixels of the frame per pixel of a patch.
+        step_px: Number of pixels of the frame per pixel of a patch.
 
     Returns:
-        Patches (N,side,side), and which of them (N,) lie inside their keyframes and have contrast.
+        Patches (N,side,side), and a mask (N,) of the patches that lie inside their keyframes and have
+        contrast.
     """
     import cv2
 
@@ -357,7 +375,16 @@ def _render_patches(
 def _best_match(
     target: Patches, patch: Patches, expected: FloatArray, radius: int
 ) -> tuple[float, float, float] | None:
-    """Return column, row and correlation of the best match near an expected pixel; None at the border."""
+    """Return column, row and correlation of the best match near an expected pixel.
+
+    Returns None if the best match lies at the border of the searched area, or if this area is too small.
+
+    Args:
+        target: (H,W) image of the frame.
+        patch: (side,side) patch to search.
+        expected: (2,) expected column and row of the patch's centre.
+        radius: Maximum distance from the expected pixel along each axis.
+    """
     import cv2
 
     half = patch.shape[0] // 2
@@ -377,6 +404,6 @@ def _best_match(
 
 
 def _subpixel_peak(before: float, middle: float, after: float) -> float:
-    """Return the offset of the peak of a parabola through three values from the middle one."""
+    """Return the position of the peak of a parabola through three values, relative to the middle value."""
     curvature = float(before) - 2.0 * float(middle) + float(after)
     return 0.5 * (float(before) - float(after)) / curvature if curvature < 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""Smooth the camera centres that the observations determine less exactly than the camera's motion does."""
+"""Smooth the camera centres whose observations are less exact than a prediction from the camera's motion."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from bodycap_batch.registration.recovery.motion_prior import (
 
 
 def smooth_weak_centres(path: Trajectory, adjustable: BoolArray | None = None) -> Trajectory:
-    """Move the centres of weakly observed frames towards their neighbours.
+    """Move the centres of weakly observed frames towards the path of the frames around them.
 
     Few points remain in a fast movement. A centre may then be less certain than its prediction from the
-    neighbouring frames. Such a centre becomes the weighted mean of both, and the rotation follows as far as
-    it is correlated with the centre.
+    neighbouring frames. Such a centre is replaced by the weighted mean of the centre and its prediction. The
+    rotation changes as far as it is correlated with the centre.
 
-    At the end of a lost interval the path is known from one side only. Recovery therefore comes before
-    smoothing. Evidence: docs/decisions/registration.md.
+    At the end of a lost interval the path is known on one side only. Lost frames are therefore recovered
+    before the path is smoothed. Evidence: docs/decisions/registration.md.
 
     Args:
-        path: Poses of one camera, estimated frame by frame.
-        adjustable: (N,) frames whose centres may move; all by default.
+        path: Trajectory of one camera, whose poses were estimated frame by frame.
+        adjustable: (N,) True for frames whose centres may move; all frames by default.
 
     Returns:
-        The trajectory with moved centres. The covariances stay: neighbouring frames share the error of the
-        map, which smoothing does not reduce. `error_px` and `inliers` stay, because they describe the
-        measured pose.
+        The trajectory with moved centres. The covariances are unchanged: neighbouring frames share the error
+        of the map, which smoothing does not reduce. `error_px` and `inliers` are unchanged too, because they
+        describe the measured pose.
 
-    Source: as for `smooth_centres`.
+    Source: see `smooth_centres`.
     """
     frames_with_pose = np.flatnonzero(path.localised)
     if len(frames_with_pose) < LEAST_POSED:
@@ -63,5 +63,5 @@ def smooth_weak_centres(path: Trajectory, adjustable: BoolArray | None = None) -
 
 
 def smooth_if_final(path: Trajectory) -> Trajectory:
-    """Smooth the weak centres of a trajectory, unless recovery follows: recovery needs poses as measured."""
+    """Smooth the weak centres of a trajectory if no recovery follows; recovery needs the measured poses."""
     return smooth_weak_centres(path) if (~path.localised).sum() < LEAST_LOST else path

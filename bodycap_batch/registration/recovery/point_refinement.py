@@ -1,4 +1,4 @@
-"""Remove weakly supported poses next to lost intervals, and refine points from the remaining poses."""
+"""Remove weakly supported poses next to lost intervals, and refine map points from the remaining poses."""
 
 from __future__ import annotations
 
@@ -17,41 +17,42 @@ from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
 from bodycap_batch.registration.poses.pnp import MAP_COVARIANCE_SCALE
 
 _WELL_SUPPORTED_FACTOR = 4
-"""Multiple of the usual least number of inliers with which a pose next to a lost interval is kept. Evidence:
-docs/decisions/registration.md."""
+"""Minimum number of inliers of a well-supported pose, as a multiple of the usual minimum number. A
+well-supported pose next to a lost interval is kept. Evidence: docs/decisions/registration.md."""
 _MAX_BOUNDARY_FRAMES = 8
-"""Frames next to a lost interval that may be removed. It keeps poses of a camera that always sees little.
-Evidence: none."""
+"""Maximum number of frames removed at each end of a lost interval. It preserves the poses of a camera that
+always sees few points. Evidence: none."""
 _NOISE_PX = 0.8
 """Pixels at 640 px image width: standard deviation of an observation. Evidence: none."""
 _LOSS_SIGMAS, _MAX_SIGMAS = 2.0, 5.0
-"""Sigmas: an observation has half of its weight at _LOSS_SIGMAS, and is removed in the end beyond
-_MAX_SIGMAS. Evidence: none."""
+"""Standard deviations of a residual. At _LOSS_SIGMAS an observation has half of its weight. Beyond
+_MAX_SIGMAS an observation is removed after the refinement. Evidence: none."""
 _ITERATIONS, _COARSE_ITERATIONS = 10, 4
-"""Iterations of Gauss–Newton, and how many of them have strong damping. Evidence: none."""
-_COARSE_DAMPING, _FINE_DAMPING = 1e-3, 1e-6
-"""Damping of the first and of the other iterations, as a fraction of a point's mean information. Evidence:
+"""Number of Gauss–Newton iterations, and number of the first iterations, which have strong damping. Evidence:
 none."""
+_COARSE_DAMPING, _FINE_DAMPING = 1e-3, 1e-6
+"""Damping of the first iterations and damping of the later iterations, as a fraction of a point's mean
+information. Evidence: none."""
 _MIN_OBSERVATIONS = 2
-"""Observations that a point needs: two lines of sight determine it."""
+"""Minimum number of observations of a point: two lines of sight determine it."""
 _CHUNK_ROWS = 1 << 15
-"""Observations held at a time. It bounds the memory."""
+"""Approximate number of observations in a chunk. Only one chunk is held in memory at a time."""
 
 
 def remove_weak_boundary_poses(path: Trajectory, min_inliers: int) -> Trajectory:
     """Remove poses next to lost intervals that too few points support.
 
-    A keyframe there depends on points that it helped to triangulate, and on few others. Its own points agree
-    with it wherever it is. The removed frames are searched again like any lost frame. Evidence:
-    docs/decisions/registration.md.
+    A keyframe next to a lost interval sees mainly points that it helped to triangulate. These points agree
+    with its pose even if the pose is wrong. The removed frames are searched again like any lost frame.
+    Evidence: docs/decisions/registration.md.
 
     Args:
-        path: The trajectory, as tracking left it.
-        min_inliers: Fewest inliers of any pose.
+        path: The trajectory, from tracking.
+        min_inliers: Minimum number of inliers of any pose.
 
     Returns:
-        The trajectory with those frames `UNCONFIRMED`, or `path` itself if there are none. Frames that are
-        supported by a rig stay.
+        The trajectory in which the removed frames have the status `UNCONFIRMED`, or `path` itself if no pose
+        is removed. Poses with the status `RIG` are kept.
     """
     weak = path.inliers < _WELL_SUPPORTED_FACTOR * min_inliers
     weak &= np.array([status is not FrameStatus.RIG for status in path.status], dtype=bool)
@@ -75,9 +76,9 @@ def remove_weak_boundary_poses(path: Trajectory, min_inliers: int) -> Trajectory
 
 
 def _first_supported(weak: BoolArray, frame: int, step: int) -> int:
-    """Return the first frame that is not weak, in steps from a given frame.
+    """Return the first frame with a pose that is not weak, from `frame` in steps of `step`.
 
-    At most `_MAX_BOUNDARY_FRAMES` frames are passed over.
+    The search ends after `_MAX_BOUNDARY_FRAMES` frames.
     """
     last = frame + step * _MAX_BOUNDARY_FRAMES
     while frame != last and 0 <= frame < len(weak) and weak[frame]:
@@ -88,17 +89,18 @@ def _first_supported(weak: BoolArray, frame: int, step: int) -> int:
 def refine_points(scene_map: Map, paths: Sequence[Trajectory]) -> Map:
     """Refine the points of a map from the poses of the frames.
 
-    The mapper may leave keyframes at the ends of lost intervals, and with them their points, far from the
-    poses that tracking gives. Evidence: docs/decisions/registration.md.
+    Keyframes at the ends of lost intervals may have poses in the map that are far from the poses of tracking.
+    The points that these keyframes see are then displaced too. Evidence: docs/decisions/registration.md.
 
     Args:
         scene_map: The map.
-        paths: Trajectories of all cameras. Keyframes of cameras in another gauge keep the poses of the map.
+        paths: Trajectories of all cameras. Keyframes of cameras in another gauge keep their poses in the map.
 
     Returns:
-        The map with keyframes at the poses of the trajectories, refined points, and the same gauge. Keyframes
-        of lost frames keep their pose and lose their observations. Observations that do not agree are
-        removed; so are all observations of points with fewer than two left.
+        The map in the same gauge, with refined points and with keyframes at the poses of the trajectories.
+        Keyframes of lost frames keep their poses but lose their observations. Observations that disagree with
+        the refined points are removed. Observations of points with fewer than two remaining observations are
+        removed too.
     """
     poses, covariance = scene_map.map_from_cam.copy(), np.zeros((len(scene_map.keyframe_frame), 6, 6))
     has_pose = np.ones(len(poses), dtype=bool)
@@ -132,7 +134,10 @@ def refine_points(scene_map: Map, paths: Sequence[Trajectory]) -> Map:
 
 
 def _mid_row_px(scene_map: Map, paths: Mapping[str, Trajectory]) -> FloatArray:
-    """Return the observed pixels (M,2) at the instant of the middle row, to which the poses belong."""
+    """Return the observed pixels (M,2) moved to the instant of the middle row.
+
+    The poses refer to this instant.
+    """
     out = scene_map.obs_px.copy()
     for name, readout_s in sorted(scene_map.readout_s.items()):
         path = paths.get(name)
@@ -147,7 +152,10 @@ def _mid_row_px(scene_map: Map, paths: Mapping[str, Trajectory]) -> FloatArray:
 
 
 def _split_by_point(point: IntArray) -> list[slice]:
-    """Split observations (M,), ordered by point, into chunks of whole points."""
+    """Split observations (M,), ordered by point, into chunks.
+
+    All observations of a point are in the same chunk.
+    """
     starts = np.flatnonzero(np.diff(point, prepend=-1))
     cuts = [0]
     for start in starts.tolist():
@@ -159,20 +167,20 @@ def _split_by_point(point: IntArray) -> list[slice]:
 def _refine_points_gauss_newton(
     scene_map: Map, points: FloatArray, rows: IntArray, px: FloatArray, covariance: FloatArray
 ) -> BoolArray:
-    """Refine the points (P,3) that some observations see, in place.
+    """Refine, in place, the points (P,3) that the given observations see.
 
     Args:
         scene_map: The map.
         points: (P,3) points of the map, changed in place.
-        rows: (M,) observations, ordered by point.
-        px: (M,2) their pixels.
+        rows: (M,) row indices of observations in the map, ordered by point.
+        px: (M,2) pixels of these observations.
         covariance: (K,6,6) covariance of the keyframes' poses.
 
     Returns:
-        (M,) which observations agree with the refined points.
+        Mask (M,) of the observations that agree with the refined points.
 
-    Source: Gauss–Newton under a Cauchy loss. Each observation is weighted by the noise of its pixel and of
-        its keyframe's pose.
+    Source: Gauss–Newton under a Cauchy loss. The weight of an observation depends on the noise of its pixel
+        and on the covariance of its keyframe's pose.
     """
     keyframe = scene_map.obs_keyframe[rows]
     point_index, starts, number = np.unique(scene_map.obs_point[rows], return_index=True, return_inverse=True)
@@ -204,15 +212,15 @@ def _refine_points_gauss_newton(
 def _single_observations(
     scene_map: Map, keyframe: IntArray, px: FloatArray
 ) -> tuple[Observations, FloatArray]:
-    """Undistort pixels of keyframes, as observations in a frame of their own each.
+    """Undistort pixels of keyframes. Each pixel becomes an observation in a separate frame.
 
     Args:
         scene_map: The map.
-        keyframe: (M,) keyframe of each pixel.
-        px: (M,2) pixels.
+        keyframe: (M,) row index of the keyframe that observes each pixel.
+        px: (M,2) observed pixels.
 
     Returns:
-        The observations, and the noise (M,) of each in pixels.
+        The observations, whose points are zero, and the noise (M,) of each observation in pixels.
     """
     count = len(px)
     out = Observations(

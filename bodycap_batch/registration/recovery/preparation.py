@@ -1,4 +1,4 @@
-"""Prepare the recovery of lost frames: remove wrong keyframes and weak poses, and refine the map points."""
+"""Prepare the recovery: remove misregistered keyframes and weak poses, and refine the map points."""
 
 from __future__ import annotations
 
@@ -31,13 +31,14 @@ def remove_misplaced_keyframes(
     selection: KeyframeSelection,
     options: RegistrationOptions,
 ) -> Map:
-    """Remove the keyframes that contradict the tracks of their camera.
+    """Return the map without misregistered keyframes: keyframes that contradict the tracks of their camera.
 
     Args:
         scene_map: The map.
-        cameras: Cameras with their registrations. Those registered against another map are skipped.
+        cameras: Cameras with their registrations. Cameras that were registered against another map are
+            ignored.
         selection: The keyframes of one camera. Only the noise of its tracks is used.
-        options: Acceptance limits.
+        options: Minimum number of inliers and maximum relative sigma of a pose.
     """
     misplaced: list[IntArray] = []
     for camera in cameras:
@@ -60,16 +61,16 @@ def prepare_recovery(
     Weak poses are removed from all cameras. The map points are refined with the remaining poses.
 
     Args:
-        own: The camera with its own registration, not with that of its rig.
-        others: The trajectories of the other cameras.
+        own: The camera with its own registration, not with the registration of its rig.
+        others: Trajectories of the other cameras.
         scene_map: The map.
         selection: The keyframes of the camera.
-        options: Acceptance limits.
-        threads: Threads that solve frames. The result does not depend on them.
+        options: Minimum number of inliers and maximum relative sigma of a pose.
+        threads: Number of threads that solve frames. The result does not depend on it.
 
     Returns:
-        The map in the same gauge, and the registration. Both are unchanged if no pose is removed, because
-        refined points then bring no gain, or if too few poses remain for a search. Evidence:
+        The map in the same gauge, and the registration. Both are unchanged in two cases: no pose is removed,
+        so that refined points bring no gain; or the remaining poses do not permit a recovery. Evidence:
         docs/decisions/registration.md.
     """
     before = [own.registration.trajectory, *(path for path in others if path.gauge == scene_map.gauge)]
@@ -91,7 +92,8 @@ def motion_statistics(path: Trajectory) -> MotionStatistics | None:
     """Estimate how smoothly a camera moves.
 
     Returns:
-        None if no frame is lost or too few frames have a pose: recovery is then not possible.
+        The statistics; None if recovery is not possible. This is the case if no frame is lost, if too few
+        frames have a pose, or if the motion cannot be estimated from them.
     """
     has_pose = path.localised
     if has_pose.all() or has_pose.sum() < LEAST_POSED:

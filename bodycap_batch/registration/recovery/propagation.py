@@ -33,24 +33,26 @@ from bodycap_batch.registration.recovery.motion_prior import (
 from bodycap_batch.registration.recovery.patch_search import Pyramid
 
 _MIN_INLIERS, _MIN_INLIER_WEIGHT_RATIO = 10, 0.45
-"""Least inliers, and least inlier weight ratio, of a pose that the propagation continues from. Evidence:
-none."""
+"""Minimum number of inliers and minimum inlier weight ratio of a pose that is found in a lost frame.
+Evidence: none."""
 _SEED_MIN_INLIERS, _SEED_MIN_INLIER_WEIGHT_RATIO = 15, 0.5
-"""Least inliers, and least inlier weight ratio, of a pose at a seed. No motion supports it. Evidence:
-none."""
+"""Minimum number of inliers and minimum inlier weight ratio of the pose of a seed (a keyframe inside the lost
+interval). They are higher, because no predicted motion supports this pose. Evidence: none."""
 _MAX_PREDICTION_DISTANCE = 16.0
-"""Squared Mahalanobis distance between the found and the predicted centre. Origin: 99.9 % of a chi-squared
-variable with three degrees of freedom."""
+"""Maximum squared Mahalanobis distance between the found and the predicted centre. Origin: 99.9 % of a
+chi-squared variable with three degrees of freedom."""
 _MAX_MISSES = 3
-"""Successive frames without a pose after which a propagation ends. The prediction is then off by more than
-the search range. Evidence: none."""
+"""Maximum number of successive frames without a pose that a propagation skips. It ends at the next frame
+without a pose, because the error of the prediction then exceeds the search range. Evidence: none."""
 _SEED_SIGMA_JERKS = 40.0
 """Sigma of a seed's centre along each axis, in units of the camera's jerk sigma. Evidence: none."""
 _INITIAL_FRAMES = 6
-"""Most frames before an interval that initialise the motion filter. Evidence: none."""
+"""Maximum number of frames with poses before an interval that initialise the motion filter. Evidence:
+none."""
 _MAX_CORNERS, _CORNER_SPACING_PX, _GRID_SIDE = 48, 12.0, 4
-"""Corners for the image motion, their least distance in pixels of the reduced image, and points along each
-side of the grid to which the camera's rotation is fitted. Evidence: none."""
+"""_MAX_CORNERS: maximum number of corners for the image motion. _CORNER_SPACING_PX: minimum distance between
+two corners, in pixels of the reduced image. _GRID_SIDE: number of points along each side of a grid; the
+camera's rotation is fitted to the motion of these points. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,12 +62,13 @@ class LostInterval:
     Attributes:
         start: First lost frame.
         stop: One past the last lost frame.
-        times: (N,) times of all frames of the camera, in frame intervals.
-        pyramids: Images by frame, including the frames on either side.
-        poses: Poses around the interval, by frame.
-        tracked_frames: Frames with a pose from tracking.
-        seed_poses: Poses cam_from_map (4,4) of keyframes in the interval that were not accepted, by frame.
-        keyframe_rows: Rows of these keyframes in the map, by frame.
+        times: (N,) times of all frames of the camera, in units of the frame interval.
+        pyramids: Image pyramids of the frames to search, and of the frame on either side, by frame.
+        poses: Poses of the camera's localised frames, by frame.
+        tracked_frames: Indices of the frames with a pose from tracking.
+        seed_poses: Poses cam_from_map (4,4) of the seeds, by frame. A seed is a keyframe in the interval
+            whose pose was not accepted.
+        keyframe_rows: Row indices of the seeds in the map, by frame.
         statistics: How smoothly the camera moves.
     """
 
@@ -80,19 +83,19 @@ class LostInterval:
     statistics: MotionStatistics
 
     def search_frame(self, frame: int) -> SearchFrame:
-        """Return a frame with its image."""
+        """Return a frame with its image pyramid, ready to be searched."""
         return SearchFrame(self.pyramids[frame], self.keyframe_rows.get(frame, -1))
 
 
 @dataclass(slots=True)
 class _PropagationState:
-    """State of a propagation.
+    """State of a propagation after its last frame.
 
     Attributes:
-        frame: The last frame.
-        pose: (4,4) its pose cam_from_map.
-        rotation_step: (3,3) its rotation from the frame before.
-        motion_filter: Filter of the centre.
+        frame: Index of the last frame.
+        pose: (4,4) pose cam_from_map of the last frame.
+        rotation_step: (3,3) rotation between the frame before and the last frame.
+        motion_filter: Filter of the camera centre.
     """
 
     frame: int
@@ -103,12 +106,12 @@ class _PropagationState:
 
 @dataclass(slots=True)
 class Propagation:
-    """Propagation of poses through a lost interval from all sides.
+    """Propagation of poses through a lost interval, from both ends and from the seeds in it.
 
     Attributes:
-        localiser: Estimates the pose of a frame near an expected one.
-        interval: The interval.
-        estimates: Poses found, by direction and frame.
+        localiser: Estimates the pose of a frame near an expected pose.
+        interval: The lost interval.
+        estimates: Found poses, by direction (1 forward, −1 backward) and frame.
     """
 
     localiser: GuidedLocaliser
@@ -116,9 +119,10 @@ class Propagation:
     estimates: dict[tuple[int, int], PoseEstimate] = field(default_factory=dict)
 
     def run(self) -> dict[int, PoseEstimate]:
-        """Return the best pose of each frame.
+        """Return the best pose found for each frame.
 
-        Poses are propagated inwards from both ends and outwards from the seeds.
+        Poses are propagated inward from both ends of the interval and outward from the seeds. The best pose
+        is the pose with the highest support.
         """
         interval = self.interval
         for direction, end in ((1, interval.start - 1), (-1, interval.stop)):
@@ -154,11 +158,16 @@ class Propagation:
     def second_pass(
         self, estimates: Mapping[int, PoseEstimate], positions: Mapping[int, PositionEstimate]
     ) -> dict[int, PoseEstimate]:
-        """Search again from the smoothed positions, also in a single frame missed between two others.
+        """Search the frames again from the smoothed positions.
+
+        A frame without a pose is also searched if both adjacent frames have a pose.
 
         Args:
             estimates: The result of `run`.
-            positions: Smoothed positions of these frames and of those around them.
+            positions: Smoothed positions of the interval's frames.
+
+        Returns:
+            Poses with enough support, by frame.
         """
         accepted = {}
         poses = {
@@ -189,7 +198,10 @@ class Propagation:
         return accepted
 
     def _initialised(self, end: int, direction: int) -> _PropagationState:
-        """Return a state at the end of the interval, filtered over the frames with poses before it."""
+        """Return the state from which a propagation starts at one end of the interval.
+
+        The motion filter runs over the frames with poses before this end, in the given direction.
+        """
         poses = self.interval.poses
         candidates = [end - direction * number for number in range(_INITIAL_FRAMES)]
         gap = next((number for number, frame in enumerate(candidates) if frame not in poses), _INITIAL_FRAMES)
@@ -233,9 +245,10 @@ class Propagation:
             state.rotation_step, state.pose, misses = pose[:3, :3] @ state.pose[:3, :3].T, pose, 0
 
     def _candidate_rotations(self, state: _PropagationState, frame: int) -> list[FloatArray]:
-        """Return rotations (3,3) that the next frame may have.
+        """Return possible rotations cam_from_map (3,3) of the next frame, the most likely first.
 
-        They are the one from the image motion, if that is known, and the one of a constant angular velocity.
+        The first candidate follows from the image motion, if this motion is known. The last candidate assumes
+        a constant angular velocity.
         """
         rotation, lens = state.pose[:3, :3], self.localiser.lens
         previous_pyramid, pyramid = self.interval.pyramids.get(state.frame), self.interval.pyramids[frame]
@@ -259,9 +272,14 @@ class Propagation:
 
 
 def _neighbour_pose(before: FloatArray | None, after: FloatArray | None, pose: FloatArray) -> NeighbourPose:
-    """Return the pose before, else the pose after, else the frame's own pose.
+    """Return the pose of the frame before, or the pose of the frame after if there is none before.
 
-    The frame's own pose stands for a camera that does not move.
+    If both are missing, the frame's own pose is returned. The camera is then treated as stationary.
+
+    Args:
+        before: (4,4) pose cam_from_map of the frame before, or None.
+        after: (4,4) pose cam_from_map of the frame after, or None.
+        pose: (4,4) pose cam_from_map of the frame.
     """
     if before is not None:
         return NeighbourPose(before)

@@ -39,12 +39,12 @@ from bodycap_batch.registration.recovery.search_images import (
 )
 
 _SMOOTHING_MARGIN = 8
-"""Frames on either side of an interval that are smoothed together with it. Evidence: none."""
+"""Number of frames on either side of an interval that are smoothed together with it. Evidence: none."""
 _MIN_INLIER_WEIGHT_RATIO = 0.5
-"""Least ratio of the inliers' weight to that of all matches for an accepted pose. Evidence: none."""
+"""Minimum ratio of the inliers' weight to the weight of all matches, for an accepted pose. Evidence: none."""
 _MAX_PASSES = 5
-"""Passes over the lost intervals. Each pass starts from the poses of the pass before and reaches farther.
-Evidence: docs/decisions/registration.md."""
+"""Maximum number of passes over the lost intervals. Each pass starts from the poses of the pass before, and
+reaches frames farther inside. Evidence: docs/decisions/registration.md."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,13 +52,13 @@ class RecoveryInputs:
     """What `recover_lost_frames` needs besides the registration of the camera.
 
     Attributes:
-        capture: All cameras; the camera to recover is the first one.
-        registrations: Cameras with their registrations, in the same order. They may be loaded one by one:
-            only one is held at a time.
+        capture: All cameras. The first camera is the camera to recover.
+        registrations: All cameras with their registrations, in the order of `capture`. They may be loaded one
+            after another: only one registration is held at a time.
         maps: The maps that the cameras were registered against.
         selection: The keyframes of the camera to recover.
-        in_rig: The poses were estimated from all cameras of a rig. The preparation is then skipped, because
-            it would estimate them from one camera alone.
+        in_rig: True if the poses were estimated from all cameras of a rig. The preparation is then skipped,
+            because it would estimate the poses again from one camera alone.
     """
 
     capture: Capture
@@ -73,18 +73,19 @@ def recover_lost_frames(
 ) -> Registration:
     """Recover the poses of one camera's lost frames.
 
-    The steps are: remove misplaced keyframes of all cameras from the map; remove weak poses next to lost
-    intervals and refine the map points, unless the poses are those of a rig; search the lost frames.
+    First, misregistered keyframes of all cameras are removed from the map. Second, weak poses next to lost
+    intervals are removed and the map points are refined. The second step is skipped for poses of a rig.
+    Third, the lost frames are searched.
 
     Args:
-        registration: The frames of the camera, as tracking left them.
+        registration: Registration of the camera, from tracking.
         inputs: All cameras, their registrations and the maps.
-        options: Acceptance limits.
+        options: Minimum number of inliers and maximum relative sigma of a pose.
         context: Threads, progress and cancellation.
 
     Returns:
-        The registration with more poses and a smoothed trajectory. Observations of recovered frames are not
-        kept.
+        The registration with more poses and a smoothed trajectory. It contains no observations of the
+        recovered frames.
     """
     gauge = registration.trajectory.gauge
     scene_map = next(scene for scene in inputs.maps if scene.gauge == gauge)
@@ -111,25 +112,27 @@ def find_lost_poses(
     options: RegistrationOptions,
     context: StageContext,
 ) -> Registration:
-    """Search the lost frames of a camera and give them the poses that are well supported.
+    """Search the lost frames of a camera, and accept the poses that are well supported.
 
-    Frames are searched one after another, from both ends of a lost interval and from keyframes in it whose
-    poses were not accepted. In each frame the map points are searched where the motion so far predicts them,
-    by their appearance in keyframes of any camera. The centres found are smoothed together with those around
-    the interval, because the acceleration of a body-worn camera changes little from frame to frame. A pose is
-    accepted if enough points agree, if its centre is near the smoothed one, and if its sigma is small. Frames
-    still lost next to accepted poses are searched again, until nothing more is found.
+    Frames are searched one after another, from both ends of a lost interval and from the seeds in it. A seed
+    is a keyframe whose pose was not accepted. In each frame the map points are searched at the pixels that
+    the predicted motion gives. They are recognised by their appearance in keyframes of any camera.
+
+    The centres found are smoothed together with the centres around the interval, because the acceleration of
+    a body-worn camera changes little from frame to frame. A pose is accepted if enough points agree, if its
+    centre is near the smoothed centre, and if its sigma is small. Frames that are still lost next to accepted
+    poses are searched again, until no more poses are found.
 
     Args:
-        registration: The frames of the camera, as tracking left them.
-        scene_map: The map of its poses.
+        registration: Registration of the camera, from tracking.
+        scene_map: The map that the poses refer to.
         capture: All cameras.
-        options: Acceptance limits.
+        options: Minimum number of inliers and maximum relative sigma of a pose.
         context: Progress and cancellation.
 
     Returns:
-        The registration with more poses and a smoothed trajectory. Observations of recovered frames are not
-        kept.
+        The registration with more poses and a smoothed trajectory. It contains no observations of the
+        recovered frames.
     """
     path = registration.trajectory
     camera = capture.camera(path.camera)
@@ -155,7 +158,7 @@ def find_lost_poses(
         localised = _localised_poses(path)
         for start, stop in intervals:
             context.check_cancelled()
-            position = max(position, start)  # a further pass starts at the first interval again
+            position = max(position, start)  # a new pass does not reduce the progress
             context.progress(position, len(lost), "lost frames searched")
             poses |= interval_search.recover_interval(start, stop, localised)
         before, path = path.localised, _merge_into(path, poses, localiser.criteria)
@@ -170,7 +173,7 @@ def _make_localiser(
     options: RegistrationOptions,
     context: StageContext,
 ) -> GuidedLocaliser:
-    """Collect what a localiser needs: the keyframes of all cameras and the exposure time."""
+    """Return a localiser with the keyframes of all cameras and the camera's exposure time."""
     camera = capture.camera(path.camera)
     criteria = AcceptanceCriteria(
         max_error_px=1.0, min_inliers=options.min_inliers, max_sigma_depth=options.max_sigma_depth
@@ -194,11 +197,11 @@ class _IntervalSearch:
     Attributes:
         camera: The camera.
         scene_map: The map.
-        localiser: Estimates the pose of a frame near an expected one.
-        times: (N,) times of the frames, in frame intervals.
+        localiser: Estimates the pose of a frame near an expected pose.
+        times: (N,) times of the frames, in units of the frame interval.
         statistics: How smoothly the camera moves.
-        seed_rows: Rows of the map's keyframes among the lost frames, by frame.
-        tracked_frames: Frames with a pose from tracking.
+        seed_rows: Row indices in the map of the keyframes that are lost frames, by frame.
+        tracked_frames: Indices of the frames with a pose from tracking.
     """
 
     camera: CaptureCamera
@@ -212,7 +215,13 @@ class _IntervalSearch:
     def recover_interval(
         self, start: int, stop: int, poses: Mapping[int, PoseEstimate]
     ) -> dict[int, PoseEstimate]:
-        """Return accepted poses of the lost frames [start, stop), given the poses around them."""
+        """Return the accepted poses of the lost frames [start, stop), by frame.
+
+        Args:
+            start: First lost frame.
+            stop: One past the last lost frame.
+            poses: Poses of the camera's localised frames, by frame.
+        """
         seed_rows = {frame: row for frame, row in self.seed_rows.items() if start <= frame < stop}
         interval = LostInterval(
             start=start,
@@ -229,13 +238,18 @@ class _IntervalSearch:
 
 
 def _extended_intervals(has_pose: BoolArray, before: BoolArray) -> list[tuple[int, int]]:
-    """Return the intervals that are still lost next to a new pose."""
+    """Return the intervals [start, stop) that are still lost and adjacent to a new pose.
+
+    Args:
+        has_pose: (N,) True for frames that have a pose now.
+        before: (N,) True for frames that had a pose before the last pass.
+    """
     is_new = np.concatenate([[False], has_pose & ~before, [False]])
     return [(start, stop) for start, stop in lost_intervals(has_pose) if is_new[start] or is_new[stop + 1]]
 
 
 def _smooth(estimates: Mapping[int, PoseEstimate], interval: LostInterval) -> SmoothedCentres:
-    """Smooth the centres of an interval together with those of the frames around it."""
+    """Smooth the centres of an interval together with the centres of the frames around it."""
     first = max(0, interval.start - _SMOOTHING_MARGIN)
     frames = np.arange(first, min(len(interval.times), interval.stop + _SMOOTHING_MARGIN))
     neighbours = {
@@ -247,7 +261,7 @@ def _smooth(estimates: Mapping[int, PoseEstimate], interval: LostInterval) -> Sm
 
 
 def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> dict[int, PoseEstimate]:
-    """Return the smoothed poses of an interval that have enough support."""
+    """Return the smoothed poses of an interval that have enough support, by frame."""
     estimates = propagation.run()
     if not estimates:
         return {}
@@ -269,7 +283,7 @@ def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> d
 def _merge_into(
     path: Trajectory, poses: Mapping[int, PoseEstimate], criteria: AcceptanceCriteria
 ) -> Trajectory:
-    """Add poses to a trajectory, except isolated ones."""
+    """Return the trajectory with additional poses. Isolated poses are not added."""
     has_pose: BoolArray = path.localised.copy()
     inliers = path.inliers.copy()
     for frame, estimate in poses.items():
@@ -295,7 +309,7 @@ def _merge_into(
 
 
 def _single_poses(has_pose: BoolArray) -> BoolArray:
-    """Return the frames (N,) with a pose of which neither neighbour has one."""
+    """Return a mask (N,) of the frames with a pose between two frames without a pose."""
     padded = np.concatenate([[False], has_pose, [False]])
     return np.asarray(has_pose & ~padded[:-2] & ~padded[2:])
 
@@ -308,7 +322,7 @@ def _localised_poses(path: Trajectory) -> dict[int, PoseEstimate]:
 
 
 def _seed_keyframes(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, int]:
-    """Return the rows of the map's keyframes among the lost frames of a camera, by frame."""
+    """Return the row indices in the map of a camera's keyframes that are lost frames, by frame."""
     rows = scene_map.keyframes_of(camera)
     frames = scene_map.keyframe_frame[rows]
     return {int(frame): int(row) for row, frame in zip(rows, frames, strict=True) if lost[frame]}

@@ -1,4 +1,4 @@
-"""Decode the images that recovery searches in, and estimate how long the shutter was open."""
+"""Decode the images that recovery needs, and estimate the exposure time of the frames."""
 
 from __future__ import annotations
 
@@ -24,32 +24,38 @@ from bodycap_batch.registration.recovery.patch_search import (
 )
 
 _MAX_KEYFRAMES = 600
-"""Keyframes held in memory, half a megabyte each. Origin: the memory limit of the task."""
+"""Maximum number of keyframes held in memory. Each needs half a megabyte. Origin: the memory limit of the
+task."""
 _MAX_DISTANCE_FRAMES = 90
-"""Frames: farthest distance of a searched frame from an end of its interval or from a seed. Evidence:
+"""Maximum distance in frames between a searched frame and the nearest end of its interval or seed. Evidence:
 none."""
 _MAX_FRAMES = 400
-"""Frames of one interval held in memory; the nearest to an end or a seed are kept. Origin: the memory limit
-of the task."""
+"""Maximum number of frames of one interval held in memory. The frames nearest to an end or a seed are
+selected. Origin: the memory limit of the task."""
 _EXPOSURE_CANDIDATES = (0.0, 0.3, 0.6)
-"""Exposure times tried, as a fraction of the frame interval. Evidence: none."""
+"""Candidates for the exposure time, as fractions of the frame interval. Evidence: none."""
 _EXPOSURE_FRAMES = 4
-"""Fastest frames with a pose that are compared for each exposure time. Evidence: none."""
+"""Number of frames in which the candidates for the exposure time are compared. They are the frames with the
+largest rotation since the frame before. Evidence: none."""
 _EXPOSURE_LEVEL = SearchLevel(pyramid_level=1, patch_side=21, search_radius=4, min_score=-1.0, limit_px=6.0)
-"""Search for the comparison of exposure times; a least correlation of -1 accepts every match. Evidence:
-none."""
+"""Size and range of the search for the comparison of exposure times. With a minimum correlation of -1 every
+match is accepted. Evidence: none."""
 
 
 def read_keyframe_patches(
     scene_map: Map, capture: Capture, camera: CaptureCamera, context: StageContext
 ) -> KeyframePatches:
-    """Decode the keyframes of all cameras; at most `_MAX_KEYFRAMES` of them, evenly spaced.
+    """Decode the keyframes of all cameras. At most `_MAX_KEYFRAMES` evenly spaced keyframes are decoded.
 
     Args:
         scene_map: The map.
         capture: All cameras.
-        camera: The camera to be searched. Its static points are used.
+        camera: The camera whose frames are searched. Only points that are static for this camera are
+            searched.
         context: Progress and cancellation.
+
+    Returns:
+        The map with the images and the sharpness of its keyframes.
     """
     count = len(scene_map.keyframe_camera)
     chosen = evenly_spaced(count, _MAX_KEYFRAMES)
@@ -79,17 +85,17 @@ def read_keyframe_patches(
 def read_pyramids(
     camera: CaptureCamera, start: int, stop: int, seed_frames: list[int], max_frames: int = _MAX_FRAMES
 ) -> dict[int, Pyramid]:
-    """Decode the frames of a lost interval that are near its ends or a seed, and one frame on either side.
+    """Decode the frames of a lost interval that are near its ends or a seed, and the frame on either side.
 
     Args:
         camera: The camera.
         start: First lost frame.
         stop: One past the last lost frame.
-        seed_frames: Keyframes inside the interval whose poses were not accepted.
-        max_frames: Most frames to hold; the nearest ones are kept.
+        seed_frames: Indices of the seeds: keyframes inside the interval whose poses were not accepted.
+        max_frames: Maximum number of frames. The frames nearest to an end or a seed are selected.
 
     Returns:
-        Image pyramids by frame index.
+        Image pyramids, by frame index.
     """
     frames = np.arange(max(0, start - 1), min(len(camera.times_ns), stop + 1))
     reference_frames = np.array([start, stop - 1, *seed_frames])
@@ -100,16 +106,16 @@ def read_pyramids(
 
 
 def estimate_exposure(camera: CaptureCamera, localiser: GuidedLocaliser, path: Trajectory) -> float:
-    """Estimate the exposure time from blurred frames that have a pose.
+    """Estimate the exposure time from frames that have a pose and fast motion.
 
-    The map points are searched in the fastest frames, blurred for each candidate time. The time with the
-    highest sum of correlations is selected. Masked pixels do not count: the wearer's sleeve, still in front
-    of the camera, looks like a short exposure.
+    The map points are searched in the frames with the fastest rotation. Their patches are blurred for each
+    candidate exposure time. The candidate with the highest sum of correlations is selected. Masked pixels are
+    ignored: the wearer's sleeve does not move in the image, and would suggest a short exposure.
 
     Args:
         camera: The camera.
-        localiser: Its localiser, with any exposure time.
-        path: Its poses.
+        localiser: Localiser of this camera. Its exposure time is ignored.
+        path: Trajectory of this camera.
 
     Returns:
         Exposure time as a fraction of the frame interval.

@@ -1,4 +1,4 @@
-"""Decide which intervals of a video are tracked, and reuse the tracks of an earlier round."""
+"""Decide which frame ranges of a video are tracked, and use the tracks of an earlier round again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from bodycap_batch.model.scene import FrameStatus, Registration
 from bodycap_batch.registration.tracking.klt import KeyframePoints, Tracks, track_range
 
 _MIN_RANGE_FRAMES = 15
-"""Frames: a shorter rest is not worth a decoder of its own. Evidence: none."""
+"""Minimum number of frames in the last part of a split range. A shorter part does not justify a separate
+video decoder. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +24,9 @@ class TrackCache:
     """The tracks of an earlier round.
 
     Attributes:
-        tracks: The observations.
-        keyframes: Frame indices of the keyframes they were tracked from and between, increasing.
+        tracks: The tracked observations.
+        keyframes: Frame indices of the keyframes of that round, increasing. The tracks start in these
+            keyframes.
     """
 
     tracks: Tracks
@@ -32,7 +34,7 @@ class TrackCache:
 
     @staticmethod
     def from_registration(previous: Registration | None) -> TrackCache | None:
-        """Return the tracks of an earlier registration; None if there is none."""
+        """Return the tracks of an earlier registration; None if there is no earlier registration."""
         if previous is None:
             return None
         status = previous.trajectory.status
@@ -47,13 +49,17 @@ def track_all(
     cache: TrackCache | None,
     context: StageContext,
 ) -> Tracks:
-    """Track every interval between successive keyframes, or reuse the tracks of an earlier round.
+    """Track map points in every interval between successive keyframes, or use the tracks of an earlier round.
 
     Args:
         camera: The camera.
         points_by_keyframe: Map points of the keyframes, by frame index.
-        cache: Tracks of an earlier round, reused in intervals between the same two keyframes.
+        cache: Tracks of an earlier round. They are used in intervals that have the same two keyframes as
+            before.
         context: Threads, progress and cancellation.
+
+    Returns:
+        All tracks of the camera, ordered by frame, keyframe and feature.
     """
     count = len(camera.times_ns)
     frames = sorted(points_by_keyframe)
@@ -69,7 +75,7 @@ def track_all(
     parts += _track_ranges(
         camera, points_by_keyframe, _split_by_thread(missing, frames, context.threads), context
     )
-    return Tracks.join_and_clear(parts)  # nothing else may hold the parts: it releases them one by one
+    return Tracks.join_and_clear(parts)  # no other reference exists, so the memory is released
 
 
 def _track_ranges(
@@ -78,7 +84,10 @@ def _track_ranges(
     ranges: list[tuple[int, int]],
     context: StageContext,
 ) -> list[Tracks]:
-    """Track ranges of frames, one on each thread at a time. The result does not depend on the threads."""
+    """Track several ranges of frames in parallel, each on one thread.
+
+    The result does not depend on the number of threads.
+    """
     stopped, lock = Event(), Lock()
     total = sum(stop - start for start, stop in ranges)
     position = [start for start, _ in ranges]
@@ -109,7 +118,7 @@ def _track_ranges(
 def _split_by_thread(
     ranges: list[tuple[int, int]], keyframes: list[int], threads: int
 ) -> list[tuple[int, int]]:
-    """Split ranges at keyframes if they are longer than an even share of the threads."""
+    """Split ranges at keyframes if they are longer than an equal part for each thread."""
     total = sum(stop - start for start, stop in ranges)
     thread_frames = -(-total // max(1, threads))
     out = []
@@ -124,7 +133,7 @@ def _split_by_thread(
 
 
 def _merge_ranges(intervals: list[tuple[int | None, int | None]], count: int) -> list[tuple[int, int]]:
-    """Merge intervals that touch into ranges [start, stop) of frames, keyframes included."""
+    """Merge intervals that share a keyframe into ranges [start, stop) of frames, keyframes included."""
     ranges: list[tuple[int, int]] = []
     for first, last in intervals:
         start, stop = first or 0, count if last is None else last + 1
@@ -136,14 +145,14 @@ def _merge_ranges(intervals: list[tuple[int | None, int | None]], count: int) ->
 
 
 def _reusable(tracks: Tracks, intervals: list[tuple[int | None, int | None]], count: int) -> Tracks:
-    """Select the tracks from the keyframes at the ends of some intervals that lie inside these intervals.
+    """Select the tracks that lie inside some intervals and start from the keyframes at their ends.
 
-    A keyframe belongs to two intervals. Tracks from it into an interval that is tracked again are left out,
-    because they would count twice.
+    A keyframe belongs to two intervals. Its tracks into an interval that is tracked again are removed.
+    Otherwise these tracks would be used twice.
     """
     kept_frames = np.zeros(
         (count, 2), dtype=np.int64
-    )  # frames before and after a keyframe in which its tracks are kept
+    )  # number of frames before and after each keyframe in which its tracks are kept
     for first, last in intervals:
         if first is not None:
             kept_frames[first, 1] = (count if last is None else last) - first

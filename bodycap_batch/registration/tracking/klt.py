@@ -1,4 +1,4 @@
-"""Track map points from keyframes into the frames between them, from both sides, with the KLT tracker."""
+"""Track map points from keyframes forward and backward into the frames between them, with the KLT tracker."""
 
 from __future__ import annotations
 
@@ -27,22 +27,25 @@ from bodycap_batch.model.optical_flow import (
 from bodycap_batch.model.scene import Map
 
 _MAX_TRACKS = 250
-"""Map points tracked from a keyframe. Evidence: none."""
+"""Maximum number of map points tracked from a keyframe. Evidence: none."""
 _GRID_CELLS = 8
-"""Cells along each side of the image over which these points are spread. Evidence: none."""
-_MAX_BUFFERED_FRAMES = 90
-"""Frames held in memory for tracking back from a keyframe. It bounds the memory if keyframes are far
-apart."""
-_MIN_TRACKS = 6
-"""Fewer tracks are not continued. Origin: too few for a pose."""
-_MAX_CLOSURE_PX = 2.0
-"""Pixels at 640 px image width: largest distance at which a track has arrived at a keyframe's own
-observation. Evidence: none."""
-_MIN_MOTION_POINTS = 48
-"""Points from which the motion of the whole image is estimated; corners are detected if fewer are tracked.
+"""Number of grid cells along each side of the image. The tracked points are spread over these cells.
 Evidence: none."""
+_MAX_BUFFERED_FRAMES = 90
+"""Maximum number of frames held in memory for tracking backward from a keyframe. It bounds the memory if
+keyframes are far apart."""
+_MIN_TRACKS = 6
+"""Minimum number of tracks from one keyframe that are continued. Origin: fewer tracks are too few for a
+pose."""
+_MAX_CLOSURE_PX = 2.0
+"""Pixels at 640 px image width: maximum distance between a track that arrives at the next keyframe and the
+keyframe's own observation of the same point. A track within this distance is treated as correct. Evidence:
+none."""
+_MIN_MOTION_POINTS = 48
+"""Minimum number of tracked points for an estimate of the motion of the whole image. If fewer points are
+tracked, corners are detected and used instead. Evidence: none."""
 _CORNER_SPACING_PX = 12.0
-"""Least distance of these corners, in pixels of the reduced image. Evidence: none."""
+"""Minimum distance between two detected corners, in pixels of the reduced image. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,19 +63,19 @@ class KeyframePoints:
     px: Pixels
 
     def select(self, mask: npt.NDArray[Any]) -> KeyframePoints:
-        """Return the points under a mask."""
+        """Return the points that a mask selects."""
         return KeyframePoints(self.feature[mask], self.point[mask], self.px[mask])
 
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """Observations of map points in frames, named by the keyframe feature they start from.
+    """Tracked observations of map points. The keyframe feature that a track starts from identifies its point.
 
     Attributes:
-        frame: (M,) frame index.
-        keyframe: (M,) frame index of the keyframe.
-        feature: (M,) feature index in the keyframe.
-        px: (M,2) float32 pixel.
+        frame: (M,) index of the observing frame.
+        keyframe: (M,) frame index of the keyframe that the track starts from.
+        feature: (M,) feature index in this keyframe.
+        px: (M,2) float32 observed pixel.
     """
 
     frame: IntArray
@@ -84,8 +87,8 @@ class Tracks:
     def join_and_clear(parts: list[Tracks]) -> Tracks:
         """Concatenate tracks, ordered by frame, keyframe and feature, and clear the list.
 
-        The memory of the parts is released field by field, because a long video has many observations.
-        Evidence: docs/decisions/registration.md.
+        The memory of the list's tracks is released field by field, because a long video has many
+        observations. Evidence: docs/decisions/registration.md.
         """
         if not parts:
             none = np.zeros(0, np.int64)
@@ -108,19 +111,22 @@ class Tracks:
         return Tracks(frame, keyframe, feature, px)
 
     def in_frames(self, first: int, stop: int) -> Tracks:
-        """Return the observations in frames first <= frame < stop; the tracks must be ordered by frame."""
+        """Return the observations in frames first <= frame < stop. The tracks must be ordered by frame."""
         low, high = np.searchsorted(self.frame, [first, stop]).tolist()
         return self.select(slice(low, high))
 
     def select(self, mask: npt.NDArray[Any] | slice) -> Tracks:
-        """Return the observations under a mask."""
+        """Return the observations that a mask or a slice selects."""
         return Tracks(self.frame[mask], self.keyframe[mask], self.feature[mask], self.px[mask])
 
 
 def select_keyframe_points(scene_map: Map, camera: str) -> dict[int, KeyframePoints]:
-    """Select map points of each keyframe of a camera, spread over the image, by frame index.
+    """Select map points of each keyframe of a camera, spread over the image.
 
     Points that many keyframes observe are preferred.
+
+    Returns:
+        Selected points of each keyframe, by frame index.
     """
     keyframe_count = np.bincount(scene_map.obs_point, minlength=len(scene_map.points))
     lens = scene_map.cameras[camera]
@@ -145,7 +151,15 @@ def select_keyframe_points(scene_map: Map, camera: str) -> dict[int, KeyframePoi
 
 
 def grid_sample(cell: IntArray, score: IntArray, count: int) -> IntArray:
-    """Return the rows of up to `count` items, taken from the cells in turn, highest score first."""
+    """Return the rows of up to `count` items, spread evenly over grid cells.
+
+    Each round takes the item with the highest remaining score from every cell.
+
+    Args:
+        cell: (N,) index of each item's cell.
+        score: (N,) score of each item.
+        count: Maximum number of items to select.
+    """
     order = np.lexsort((-score, cell))
     sorted_cells = cell[order]
     cell_start = np.searchsorted(sorted_cells, sorted_cells)
@@ -156,7 +170,7 @@ def grid_sample(cell: IntArray, score: IntArray, count: int) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class _VideoFrame:
-    """A frame at full size and reduced."""
+    """A video frame at full size and at reduced size."""
 
     camera: CaptureCamera
     index: int
@@ -165,19 +179,19 @@ class _VideoFrame:
 
     @property
     def scale(self) -> float:
-        """Factor on pixel thresholds."""
+        """Factor on pixel thresholds for the size of this image."""
         return pixel_scale(self.grey.shape[1], self.grey.shape[0])
 
 
 @dataclass(slots=True)
 class _ActiveTracks:
-    """Tracks alive in the newest frame.
+    """Tracks from one keyframe that have reached the newest frame.
 
     Attributes:
-        keyframe: Frame index of the keyframe they start from.
-        start: The points they started from.
-        rows: (N,) their rows among these points, increasing.
-        px: (N,2) current pixel.
+        keyframe: Frame index of the keyframe that the tracks start from.
+        start: Points of this keyframe that were tracked at the start.
+        rows: (N,) rows in `start` of the points that are still tracked, increasing.
+        px: (N,2) current pixel of these points.
     """
 
     keyframe: int
@@ -193,10 +207,10 @@ class _ActiveTracks:
         )
 
     def advance(self, first: _VideoFrame, second: _VideoFrame, motion: ImageMotion | None) -> bool:
-        """Follow the tracks into a frame; return False if too few are left."""
+        """Follow the tracks from the first frame into the second; return False if too few remain."""
         guess = None if motion is None else apply_homography(self.px, motion.homography)
-        # A slipped track is rejected by the pose later. Tracking back is only worth its cost if many would
-        # slip.
+        # A slipped track is rejected by the pose later. The slow check by tracking back is only done if many
+        # tracks may slip.
         with_check = motion is None or not motion.is_reliable
         tracked = track_points(first.grey, second.grey, self.px, guess, with_check=with_check)
         keep = tracked.ok & second.camera.is_unmasked(tracked.px)
@@ -204,19 +218,19 @@ class _ActiveTracks:
         return len(self.rows) >= _MIN_TRACKS
 
     def observe(self, frame: int) -> Tracks:
-        """Return the observations in the current frame."""
+        """Return the current pixels as observations in a frame."""
         return _make_tracks(frame, self.keyframe, self.start.feature[self.rows], self.px)
 
 
 @dataclass(frozen=True, slots=True)
 class _BufferedFrame:
-    """A frame on the way to the next keyframe.
+    """A frame between two keyframes, held in memory for tracking backward.
 
     Attributes:
         frame: The frame.
-        motion: Image motion from the next frame to this one.
-        rows: (N,) rows of the forward tracks alive in it.
-        px: (N,2) their pixels.
+        motion: Image motion from the next frame to this frame; None if it is unknown.
+        rows: (N,) rows of the forward tracks that reach this frame, in the points of their keyframe.
+        px: (N,2) pixels of these tracks in this frame.
     """
 
     frame: _VideoFrame
@@ -226,7 +240,7 @@ class _BufferedFrame:
 
 
 def _make_tracks(frame: int, keyframe: int, feature: IntArray, px: Pixels) -> Tracks:
-    """Return the observations of one frame."""
+    """Return the observations of one frame, from tracks that start in one keyframe."""
     count = len(feature)
     return Tracks(np.full(count, frame, np.int64), np.full(count, keyframe, np.int64), feature, px)
 
@@ -238,14 +252,15 @@ def track_range(
     stop: int,
     context: StageContext,
 ) -> Iterator[Tracks]:
-    """Track from every keyframe in [start, stop) forward to the next one and back to the one before.
+    """Track from every keyframe in [start, stop) forward to the next and backward to the previous keyframe.
 
-    At most `_MAX_BUFFERED_FRAMES` frames are held in memory. The observations are yielded in no fixed order.
+    At most `_MAX_BUFFERED_FRAMES` frames are held in memory. The order of the yielded observations is not
+    defined.
 
     Args:
         camera: The camera.
         points_by_keyframe: Map points of the keyframes, by frame index.
-        start: First frame. Forward tracking starts at the first keyframe at or after it.
+        start: First frame. Forward tracking starts at the first keyframe at or after this frame.
         stop: One past the last frame.
         context: Cancellation.
     """
@@ -274,7 +289,7 @@ def track_range(
 
 
 def _buffer(frame: _VideoFrame, motion: ImageMotion | None, active: _ActiveTracks | None) -> _BufferedFrame:
-    """Keep a frame for tracking back from the next keyframe."""
+    """Return a frame with its forward tracks, for tracking backward from the next keyframe."""
     backward = None if motion is None else motion.inverse()
     if active is None:
         return _BufferedFrame(frame, backward, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
@@ -284,12 +299,20 @@ def _buffer(frame: _VideoFrame, motion: ImageMotion | None, active: _ActiveTrack
 def _close_tracks(
     active: _ActiveTracks, keyframe: int, keyframe_points: KeyframePoints, buffered: deque[_BufferedFrame]
 ) -> Generator[Tracks, None, BoolArray]:
-    """Shift tracks that arrive at the next keyframe's observation of the same point, so that they end in it.
+    """Use forward tracks that arrive at the next keyframe as backward tracks of this keyframe.
 
-    Tracking such a point back from the keyframe would only retrace the same path.
+    A forward track is used if it arrives near the keyframe's own observation of the same point. Its pixels
+    are shifted by a constant offset, so that the track ends exactly at this observation. It replaces a track
+    backward from the keyframe, because that would follow the same path.
+
+    Args:
+        active: Forward tracks that have reached the next keyframe.
+        keyframe: Frame index of the next keyframe.
+        keyframe_points: (N) points of the next keyframe.
+        buffered: Frames before the next keyframe.
 
     Returns:
-        (N,) True for the keyframe's points that need no tracking back.
+        Mask (N,) of the keyframe's points that need no tracking backward.
     """
     _, active_rows, point_rows = np.intersect1d(
         active.start.point[active.rows], keyframe_points.point, return_indices=True
@@ -312,7 +335,10 @@ def _close_tracks(
 def _estimate_motion(
     first: _VideoFrame, second: _VideoFrame, active: _ActiveTracks | None
 ) -> ImageMotion | None:
-    """Estimate the motion of the whole image from the active tracks, or from corners if these are few."""
+    """Estimate the motion of the whole image from the active tracks.
+
+    If too few tracks are active, corners are detected and used instead.
+    """
     if active is not None and len(active.px) >= _MIN_MOTION_POINTS:
         points = active.px
     else:
@@ -324,7 +350,7 @@ def _estimate_motion(
 def _track_back(
     frame: _VideoFrame, keyframe_points: KeyframePoints, buffered: deque[_BufferedFrame]
 ) -> Iterator[Tracks]:
-    """Track points of a keyframe back through the buffered frames."""
+    """Track points of a keyframe backward through the buffered frames."""
     active = _ActiveTracks.start_at(frame.index, keyframe_points)
     later = frame
     for item in reversed(buffered):
@@ -335,5 +361,5 @@ def _track_back(
 
 
 def camera_pixel_scale(camera: CaptureCamera) -> float:
-    """Return the factor on pixel thresholds for a camera."""
+    """Return the factor on pixel thresholds for the image size of a camera."""
     return pixel_scale(camera.camera.width_px, camera.camera.height_px)
