@@ -1,7 +1,7 @@
 """Error modes of a skeleton whose bone lengths were not measured but scaled from the stature.
 
-People of one stature differ in bone lengths. Rigs (the skeletons of animation programs) differ in where they
-place the joints of one body.
+People of one stature differ in bone lengths. The skeletons of different motion capture systems differ in where
+they place the joints of one body.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _JOINT_PLACEMENT_SIGMA = {
     "ForeArm": (0.025, 0.0, 0.0),
     "Hand": (0.03, 0.0, 0.0),
 }
-"""By joint, sigma of its position between rigs, as a fraction of the stature.
+"""By joint, sigma of its position between the skeletons of motion capture systems.
 
-The three values are for the directions [outwards, back, up] of the body in a T-pose.
+The three values are fractions of the stature, for the directions [outwards, back, up] in a T-pose.
 
-Derived from the rigs of three makers, see docs/decisions/body_calibration.md.
+Derived from the skeletons of three makers, see docs/decisions/body_calibration.md.
 """
 
 
@@ -44,7 +44,7 @@ class SkeletonErrorModes:
 
     Attributes:
         bone_lengths: Variation of bone lengths between people of one stature.
-        joint_placement: Variation of joint centres between rigs for a body of one stature.
+        joint_placement: Variation of joint centres between the skeletons of motion capture systems.
     """
 
     bone_lengths: ErrorModes
@@ -92,7 +92,9 @@ def bone_length_modes(bones: Sequence[Bone], cameras: Sequence[str]) -> ErrorMod
 
 
 def joint_placement_modes(bones: Sequence[Bone], cameras: Sequence[str], stature_m: float) -> ErrorModes:
-    """Return the error modes in which rigs place the joints of one body differently, left and right alike.
+    """Return the error modes of joint placement.
+
+    In such a mode, another maker's skeleton places a joint elsewhere in the body, left and right alike.
 
     If ``Spine1`` moves, its child joints keep their places. If a joint of an arm moves, its descendants move
     with it, because the offset of each arm bone varies independently.

@@ -120,8 +120,8 @@ class ReferenceCameraRoll(NamedTuple):
 
     Attributes:
         roll_deg: Roll about the optical axis, degrees.
-        vertical: The vertical in the gauge of the tracks' map. None if neither the job nor the map nor the
-            walk gives a vertical.
+        vertical: The vertical in the gauge of the tracks' map. None if job, map and walk do not determine it,
+            or if the reference camera is on a limb.
     """
 
     roll_deg: float

@@ -98,7 +98,7 @@ def error_modes(
         alignment: By camera whose map was aligned through the body, uncertainty of the pose of this map.
         skeleton: Error modes of the bones; None if the bones were measured. The modes of joint placement are
             transient. They do not increase the uncertainty of the mounts, because the mounts refer to the
-            joints as they are placed.
+            same placement of the joints.
 
     Returns:
         The constant and the transient modes.

@@ -1,9 +1,9 @@
 """Test whether the motion obeys the hinges of the skeleton, and loosen the violated hinges.
 
 A hinge can be violated for three reasons. No elbow is a perfect hinge. The joint may not be a hinge in the
-rig of the skeleton. A sliding strap looks like sideways bending. If the graph enforces a violated hinge to a
-centimetre, errors of mounts and scale absorb the violation and hide it. The violation can be measured only if
-the hinge is free.
+system that the skeleton comes from. A sliding strap looks like sideways bending. If the graph
+enforces a violated hinge to a centimetre, errors of mounts and scale absorb the violation and hide it. The
+violation can be measured only if the hinge is free.
 
 Source: estimation of variance components from redundancies, W. Foerstner, "Ein Verfahren zur Schaetzung von
 Varianz- und Kovarianzkomponenten", AVN 1979. Each hinge has one variance component.

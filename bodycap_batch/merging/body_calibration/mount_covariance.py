@@ -3,7 +3,8 @@
 The calibration weighs its residuals with pessimistic sigmas. The residuals at the solution are therefore used
 to estimate the actual uncertainty, in two steps:
 
-1. For each type of residual rows, the rows and their redundancies give the actual variance of the rows.
+1. For each type of residual rows, the rows and their redundancies give the actual variance of the rows. The
+   redundancy of a row is its contribution to the degrees of freedom, 0 to 1.
 2. The solution is a linear function of the noise in the rows. Noise with these variances therefore gives the
    covariance of the mounts. This covariance has the sandwich form.
 
