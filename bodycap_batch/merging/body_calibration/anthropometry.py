@@ -1,7 +1,7 @@
 """Error modes of a skeleton whose bone lengths were not measured but scaled from the stature.
 
-People of one stature differ in bone lengths. The skeletons of different motion capture systems differ in where
-they place the joints of one body.
+People of one stature differ in bone lengths. The skeletons of different motion capture systems differ in
+where they place the joints of one body.
 """
 
 from __future__ import annotations
