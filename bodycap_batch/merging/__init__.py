@@ -1,4 +1,7 @@
-"""Stage 4: fit a skeleton to the cameras' trajectories, in metres, z up. Only this package imports gtsam."""
+"""Stage 4, merging: fit a skeleton to the cameras' trajectories. The result is in the world: metres, z up.
+
+Only this package imports gtsam.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +17,15 @@ def merge_trajectories(inputs: MergeInputs, options: MergeOptions, context: Stag
 
     Args:
         inputs: Trajectories in the gauges of their maps, clocks, skeleton and mount priors.
-        options: Options of the stage, among them the rate of the timeline.
-        context: Progress and cancellation, both used between the optimiser's iterations.
+        options: Options of the stage, among them the number of ticks per second.
+        context: Receiver of the progress and source of cancellation. Both are used between the optimiser's
+            iterations.
+
+    Returns:
+        The motion of the body, the mounts, the trajectories in the world, and the report.
 
     Raises:
-        EstimationError: Too few frames were localised, or nothing determines the scale.
+        EstimationError: Too few frames were localised, or no source determines the scale.
         JobError: The job names a camera or frame that does not exist.
         Cancelled: The work was stopped.
 

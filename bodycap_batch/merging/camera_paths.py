@@ -1,4 +1,4 @@
-"""The cameras' paths in the world: as measured, or with centres solved together with the body."""
+"""The cameras' paths in the world, with measured centres or with centres solved together with the body."""
 
 from __future__ import annotations
 
@@ -18,9 +18,12 @@ def trajectory_in_world(trajectory: Trajectory, world_from_map: Similarity, drop
     """Return the trajectory in the world, without the poses that are gross errors.
 
     Args:
-        trajectory: The trajectory in the main map's gauge.
+        trajectory: Trajectory of one camera in the gauge of the main map.
         world_from_map: Similarity from the main map to the world.
-        dropped: (N,) frames with gross errors. Their status becomes POSE_JUMP.
+        dropped: (N,) numbers of the frames with gross errors.
+
+    Returns:
+        The trajectory in metres. Frames with gross errors have no pose and the status POSE_JUMP.
     """
     in_world = transform_trajectory(trajectory, world_from_map, "world")
     poses, covariance = np.array(in_world.gauge_from_cam), np.array(in_world.covariance)
@@ -40,20 +43,24 @@ def with_solved_centres(
 ) -> Trajectory:
     """Return the trajectory with the camera centres of the solved motion.
 
-    The motion graph has all frames of all cameras and the skeleton as unknowns. The joints that cameras share
-    reduce the local errors of the map, and the motion prior reduces noise. Evidence:
+    The motion graph combines the measured poses of all cameras with the skeleton. Joints between the bones of
+    two cameras reduce the local errors of the map, and the motion prior reduces noise. Evidence:
     docs/decisions/body_calibration.md.
 
-    A centre moves by its robust weight in the solution. If measurement and solution differ by centimetres,
-    either may be wrong. Orientations stay as measured, because joints do not determine them to a tenth of a
-    degree. A camera with an uncalibrated mount keeps its measured path.
+    Each centre moves towards the solved centre by a fraction: the robust weight of its measurement in the
+    solution. If measurement and solution differ by centimetres, this weight is small, because either of them
+    may be wrong. The measured orientations remain unchanged, because joints do not determine orientations to
+    a tenth of a degree. A camera with an uncalibrated mount keeps its measured path.
 
     Args:
-        trajectory: The trajectory in the world, as measured.
-        track: The measurements that the solution rests on.
-        mount: The camera's solved mount.
+        trajectory: The measured trajectory of the camera in the world.
+        track: The measured poses of the camera in the motion graph.
+        mount: The solved mount of the camera.
         solution: The solved motion.
-        world_from_solved: Rigid transform from the frame of the solution to the world.
+        world_from_solved: Rigid transform from the solved frame of reference to the world.
+
+    Returns:
+        The trajectory with moved centres.
     """
     if is_uncalibrated(mount):
         return trajectory
@@ -64,7 +71,16 @@ def with_solved_centres(
 
 
 def _blend_centres(measured: FloatArray, solved: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return measured poses (N,4,4) with centres moved towards the solved ones by a weight (N,)."""
+    """Return measured poses (N,4,4) with each centre moved towards the solved centre by a weight.
+
+    Args:
+        measured: (N,4,4) measured camera poses.
+        solved: (N,4,4) solved camera poses.
+        weight: (N,) fraction of the way to the solved centre.
+
+    Returns:
+        (N,4,4) poses with moved centres.
+    """
     out = measured.copy()
     out[:, :3, 3] += weight[:, None] * (solved[:, :3, 3] - measured[:, :3, 3])
     return out

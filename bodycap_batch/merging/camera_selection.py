@@ -1,4 +1,4 @@
-"""Select the main map, the reference camera and the cameras that can be used with them."""
+"""Select the main map, the reference camera, and all other cameras that can be used."""
 
 from __future__ import annotations
 
@@ -23,17 +23,23 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 MIN_LOCALISED_FRAMES = 15
 """Minimum number of localised frames of a camera: half a second at 30 fps. Evidence: none."""
 REFERENCE_ROLES = ("Spine1", "Spine", "Hips", "Neck", "Head")
-"""Bones whose camera can be the reference camera, the best first. Limbs move relative to them."""
+"""Preferred bones for the reference camera, the best bone first: trunk, then neck and head.
+
+Cameras on limbs are considered after the cameras on these bones, because limbs move relative to the trunk.
+"""
 _MIN_TIME_RATIO = 0.25
-"""Minimum localised time of the reference camera, as a part of that of the longest one. Evidence: none."""
+"""Minimum ratio of the reference camera's localised time to the longest localised time of all cameras.
+
+A camera below this ratio is considered as the reference camera only after all other cameras. Evidence: none.
+"""
 
 
 class SelectedCameras(NamedTuple):
-    """The cameras that the body is solved from.
+    """The cameras that are used to solve the motion of the body.
 
     Attributes:
-        inputs: The inputs with correlated mount priors.
-        aligned: The usable cameras in the main map's gauge.
+        inputs: The inputs, with correlated mount priors (see `correlate_mount_priors`).
+        aligned: The usable cameras, with trajectories in the gauge of the main map.
     """
 
     inputs: MergeInputs
@@ -41,11 +47,11 @@ class SelectedCameras(NamedTuple):
 
 
 class MainMapCandidate(NamedTuple):
-    """A map that may become the main one.
+    """A map that may become the main map.
 
     Attributes:
-        cameras: Its cameras' trajectories, that of the reference camera first.
-        further: The trajectories in other maps.
+        cameras: Trajectories in this map. The trajectory of the reference camera is the first.
+        further: Trajectories in all other maps.
     """
 
     cameras: list[Trajectory]
@@ -53,15 +59,18 @@ class MainMapCandidate(NamedTuple):
 
 
 def select_cameras(inputs: MergeInputs, step: Callable[[], None], options: MergeOptions) -> SelectedCameras:
-    """Select the cameras to solve the body from, and correlate the mount priors at equal positions.
+    """Select the cameras that are used to solve the body, and correlate mount priors at equal positions.
 
     Args:
         inputs: Trajectories, skeleton, mounts and clocks.
-        step: Called after each iteration; may raise to stop.
-        options: What the job states of the scale.
+        step: Function that is called after each iteration. It may raise an exception to stop the work.
+        options: Options of the stage, with the known distance and the marker board of the job.
+
+    Returns:
+        The selected cameras.
 
     Raises:
-        EstimationError: No map has two cameras at a distance that the body determines.
+        EstimationError: In no map does the body determine the distance between two cameras.
     """
     excluded = excluded_cameras(inputs)
     correlated = correlate_mount_priors(inputs, excluded)
@@ -74,16 +83,19 @@ def align_usable_cameras(
     options: MergeOptions | None = None,
     excluded: Mapping[str, str] | None = None,
 ) -> UsableCameras:
-    """Align the usable cameras to the first main map with which they determine the scale.
+    """Align the usable cameras to the best main map with which the cameras determine the scale.
 
     Args:
         inputs: Trajectories, skeleton, mounts and clocks.
-        step: Called after each iteration; may raise to stop.
-        options: What the job states of the scale.
-        excluded: The result of `excluded_cameras`, if it is known.
+        step: Function that is called after each iteration. It may raise an exception to stop the work.
+        options: Options of the stage, with the known distance and the marker board of the job.
+        excluded: The result of `excluded_cameras`; None to compute it.
+
+    Returns:
+        The usable cameras, with trajectories in the gauge of the main map.
 
     Raises:
-        EstimationError: No map has two cameras at a distance that the body determines.
+        EstimationError: In no map does the body determine the distance between two cameras.
     """
     excluded = excluded_cameras(inputs) if excluded is None else excluded
     unused: dict[str, str] = {}
@@ -108,12 +120,16 @@ def correlate_mount_priors(inputs: MergeInputs, excluded: Mapping[str, str] | No
     """Return the inputs with wider mount priors for cameras that share one nominal position.
 
     Cameras with the same nominal position form a rig and share one error. With independent priors, n such
-    cameras would pull the body to the nominal position n times as strongly as one. The sigmas of each are
-    therefore multiplied by √n.
+    cameras would pull the body to the nominal position n times as strongly as one camera. The sigmas of each
+    of these mount priors are therefore multiplied by √n. This function changes only mounts that are assumed
+    from the cameras' names.
 
     Args:
         inputs: Trajectories and mounts.
-        excluded: The result of `excluded_cameras`, if it is known.
+        excluded: The result of `excluded_cameras`; None to compute it.
+
+    Returns:
+        The inputs with the wider mount priors.
     """
     excluded = excluded_cameras(inputs) if excluded is None else excluded
     used = [inputs.mount_of(each.camera) for each in inputs.trajectories if each.camera not in excluded]
@@ -137,7 +153,14 @@ def _at_same_position(first: Mount, second: Mount) -> bool:
 
 
 def excluded_cameras(inputs: MergeInputs) -> dict[str, str]:
-    """Return the cameras that carry no information about the body's motion, with the reason."""
+    """Find the cameras that contain no information about the body's motion.
+
+    Args:
+        inputs: Trajectories, mounts and clocks.
+
+    Returns:
+        By name of an excluded camera, the reason.
+    """
     rare = rarely_localised(inputs.trajectories)
     still = stationary_cameras(inputs, [each for each in inputs.trajectories if each.camera not in rare])
     reason = "it stands still while the others move: nobody wears it, or it is frozen"
@@ -145,7 +168,14 @@ def excluded_cameras(inputs: MergeInputs) -> dict[str, str]:
 
 
 def rarely_localised(trajectories: Sequence[Trajectory]) -> dict[str, str]:
-    """Return the cameras with fewer than `MIN_LOCALISED_FRAMES`, with the reason."""
+    """Find the cameras with fewer localised frames than `MIN_LOCALISED_FRAMES`.
+
+    Args:
+        trajectories: The trajectories of all cameras.
+
+    Returns:
+        By name of such a camera, the reason why it is excluded.
+    """
     counts = {each.camera: int(each.localised.sum()) for each in trajectories}
     needed = f"{MIN_LOCALISED_FRAMES} needed"
     return {
@@ -158,14 +188,18 @@ def rarely_localised(trajectories: Sequence[Trajectory]) -> dict[str, str]:
 def candidate_main_maps(
     inputs: MergeInputs, excluded: Mapping[str, str] | None = None
 ) -> list[MainMapCandidate]:
-    """Return each map as the main one, the best first.
+    """Return all maps as candidates for the main map, the best candidate first.
 
-    Reference cameras are ranked by their bone: trunk, head, limb. A camera that was localised for a short
-    time comes after all others.
+    The rank of a map is the rank of its best reference camera. Cameras are ranked by their bone: first trunk,
+    then head, then limbs. The number of localised frames decides between cameras with equally good bones.
+    Cameras that were localised for a short time come after all other cameras.
 
     Args:
         inputs: Trajectories, mounts and clocks.
-        excluded: The result of `excluded_cameras`, if it is known.
+        excluded: The result of `excluded_cameras`; None to compute it.
+
+    Returns:
+        One candidate per map.
     """
     counts = {each.camera: int(each.localised.sum()) for each in inputs.trajectories}
     seconds = {camera: count / inputs.clocks[camera].nominal_fps for camera, count in counts.items()}
@@ -187,7 +221,7 @@ def candidate_main_maps(
 
 
 def _can_determine_scale(skeleton: SkeletonModel, roles: Sequence[str]) -> bool:
-    """Return True if the distance of any two cameras on these bones follows from the body."""
+    """Return True if the body bounds the distance between at least two cameras on these bones."""
     if len(roles) < 2:
         return False
     bones = kinematic_chain(skeleton, set(roles))

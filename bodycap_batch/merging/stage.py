@@ -52,9 +52,9 @@ from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import SkeletonModel
 
 _EXPECTED_ITERATIONS = 80
-"""Iterations of a whole stage from which the progress starts to count; it grows if there are more.
+"""Expected number of optimiser iterations in the whole stage, as the initial total of the progress.
 
-Evidence: none.
+The total grows if more iterations are needed. Evidence: none.
 """
 
 
@@ -62,7 +62,7 @@ class _Progress:
     """Count the optimiser's iterations, report them, and stop the work if it is cancelled.
 
     Attributes:
-        what: Name of the running step.
+        what: Name of the current step, for the progress display.
     """
 
     def __init__(self, context: StageContext) -> None:
@@ -84,7 +84,7 @@ class _Progress:
 
 
 def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> MergeResult:
-    """Run the stage. See `bodycap_batch.merging.merge_trajectories`."""
+    """Run the merging stage. `bodycap_batch.merging.merge_trajectories` describes arguments and result."""
     step = _Progress(context)
     inputs, aligned = select_cameras(inputs, step, options)
     used = aligned.trajectories
@@ -131,7 +131,8 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         window_ticks=max_window_ticks(len(bones), tracks, tick_times),
         error_modes=calibration.error_modes,
     )
-    # The first mount is that of the reference camera, which the first window of a long capture may lack.
+    # The first mount belongs to the reference camera. The solution does not identify the reference camera,
+    # because the first window of a long capture may not contain this camera.
     points = map_points_of(inputs, calibration.mounts[0].camera)
     placed = _place_in_world(inputs.skeleton, bones, solution, calibration, scale * points, fps)
     to_world = placed.world_from_solved
@@ -198,12 +199,15 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
 
 
 def timeline(clocks: Mapping[str, CameraClock], used: Sequence[Trajectory], fps: float) -> IntArray:
-    """Return the common times (T,) of the ticks, from the first timestamp of the used cameras to the last.
+    """Return the ticks of the motion, from the first to the last timestamp of all used cameras.
 
     Args:
-        clocks: By camera.
+        clocks: By camera, the clock that converts its timestamps to common time.
         used: Trajectories of the used cameras.
-        fps: Rate of the timeline.
+        fps: Number of ticks per second.
+
+    Returns:
+        (T,) common time of each tick, nanoseconds.
     """
     times = [clocks[each.camera].common_times_ns(each.times_ns) for each in used]
     start, end = min(int(each.min()) for each in times), max(int(each.max()) for each in times)
@@ -216,9 +220,9 @@ class _PreparedTracks:
     """Tracks without gross errors.
 
     Attributes:
-        tracks: One per camera.
+        tracks: The cleaned tracks, one per camera. The track of the reference camera is the first.
         provisional: Provisional scale, metres per map unit.
-        dropped: By camera, (N,) frames with gross errors.
+        dropped: By camera, (N,) numbers of the frames with gross errors.
     """
 
     tracks: list[CameraTrack]
@@ -229,7 +233,7 @@ class _PreparedTracks:
 def _prepare_tracks(
     inputs: MergeInputs, used: Sequence[Trajectory], bones: Sequence[Bone]
 ) -> _PreparedTracks:
-    """Put the trajectories onto the common clock, drop gross errors, and estimate a provisional scale."""
+    """Convert the trajectories to common time, remove gross errors, and estimate a provisional scale."""
     index = {bone.role: number for number, bone in enumerate(bones)}
     mounts = inputs.mount_by_camera()
     tracks = [make_track(inputs, each, index[mounts[each.camera].role]) for each in used]
@@ -247,9 +251,9 @@ class _PlacedBody:
     """The whole body in the world.
 
     Attributes:
-        world_from_solved: Rigid transform from the frame of the solution.
-        world_from_joint: (T,J,4,4) pose of every joint.
-        solved: (J,) True if the joint was a variable of the graph.
+        world_from_solved: Rigid transform from the solved frame of reference to the world, metres.
+        world_from_joint: (T,J,4,4) pose of every joint of the skeleton in the world, metres.
+        solved: (J,) True if the motion graph solved the joint.
         floor: The floor.
     """
 
@@ -270,12 +274,15 @@ def _place_in_world(
     """Complete the body, find the floor, and transform the body to the world.
 
     Args:
-        skeleton: The body.
-        bones: The graph's bones.
+        skeleton: The skeleton of the body.
+        bones: Bones of the graph.
         solution: The solved motion.
         calibration: The calibration of the body.
-        points_m: (P,3) points of the map of the reference camera, metres, in the frame of the solution.
-        fps: Rate of the timeline.
+        points_m: (P,3) points of the reference camera's map in the solved frame of reference, metres.
+        fps: Number of ticks per second.
+
+    Returns:
+        The body in the world, and the floor.
     """
     up = calibration.vertical
     rotation = rotation_to_z_up(up.up)

@@ -1,4 +1,8 @@
-"""Error modes of a skeleton that is scaled from the stature: variation between people and between rigs."""
+"""Error modes of a skeleton whose bone lengths were not measured but scaled from the stature.
+
+People of one stature differ in bone lengths. The skeletons of different motion capture systems differ in
+where they place the joints of one body.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +17,11 @@ from bodycap_batch.merging.graph.error_modes import ErrorModes
 from bodycap_batch.model.skeleton_presets import split_side
 
 PROPORTION_SIGMA = 0.04
-"""Relative sigma of a bone's length at a given stature, and of a scale that rests on the bones.
+"""Relative sigma of a bone's length at a given stature, and of a scale that is derived from bone lengths.
 
-Standard deviations of segment lengths over stature are 3 to 5 % between people. Winter's table gives means
-only. Source: C. C. Gordon et al., "2012 Anthropometric Survey of U.S. Army Personnel", Natick 2014.
+Between people, the ratio of a segment's length to the stature has a standard deviation of 3 to 5 %.
+Winter's table gives only mean ratios. Source: C. C. Gordon et al., "2012 Anthropometric Survey of U.S. Army
+Personnel", Natick 2014.
 """
 
 _JOINT_PLACEMENT_SIGMA = {
@@ -25,19 +30,21 @@ _JOINT_PLACEMENT_SIGMA = {
     "ForeArm": (0.025, 0.0, 0.0),
     "Hand": (0.03, 0.0, 0.0),
 }
-"""Sigma of a joint's place between rigs, [outwards, back, up] in a T-pose, as a part of the stature.
+"""By joint, sigma of its position between the skeletons of motion capture systems.
 
-Derived from the rigs of three makers, see docs/decisions/body_calibration.md.
+The three values are fractions of the stature, for the directions [outwards, back, up] in a T-pose.
+
+Derived from the skeletons of three makers, see docs/decisions/body_calibration.md.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class SkeletonErrorModes:
-    """Error modes of a skeleton that was not measured.
+    """Error modes of a skeleton whose bones were not measured.
 
     Attributes:
         bone_lengths: Variation of bone lengths between people of one stature.
-        joint_placement: Variation of joint centres between rigs for one stature.
+        joint_placement: Variation of joint centres between the skeletons of motion capture systems.
     """
 
     bone_lengths: ErrorModes
@@ -50,9 +57,12 @@ def skeleton_error_modes(
     """Return the error modes of a skeleton that is scaled from a stature.
 
     Args:
-        bones: The graph's bones.
-        cameras: Names of the cameras. The modes do not move their mounts.
-        stature_m: Stature in metres.
+        bones: Bones of the graph.
+        cameras: Names of the cameras. The modes do not change the mounts of these cameras.
+        stature_m: Stature of the subject, metres.
+
+    Returns:
+        The error modes of bone lengths and of joint placement.
     """
     return SkeletonErrorModes(
         bone_length_modes(bones, cameras), joint_placement_modes(bones, cameras, stature_m)
@@ -60,11 +70,17 @@ def skeleton_error_modes(
 
 
 def bone_length_modes(bones: Sequence[Bone], cameras: Sequence[str]) -> ErrorModes:
-    """Return one mode per kind of bone, in which it is longer by `PROPORTION_SIGMA` on both sides.
+    """Return one error mode for each kind of bone, for example both forearms.
+
+    In such a mode, the bones of this kind are longer by the fraction `PROPORTION_SIGMA`, left and right
+    alike.
 
     Args:
-        bones: The graph's bones.
-        cameras: Names of the cameras. The modes do not move their mounts.
+        bones: Bones of the graph.
+        cameras: Names of the cameras. The modes do not change the mounts of these cameras.
+
+    Returns:
+        The error modes, one for each kind of bone.
     """
     parts = _part_names(bones)
     names = sorted({part for part, bone in zip(parts, bones, strict=True) if bone.parent >= 0})
@@ -76,15 +92,20 @@ def bone_length_modes(bones: Sequence[Bone], cameras: Sequence[str]) -> ErrorMod
 
 
 def joint_placement_modes(bones: Sequence[Bone], cameras: Sequence[str], stature_m: float) -> ErrorModes:
-    """Return the modes in which rigs place the joints of one body differently, on both sides alike.
+    """Return the error modes of joint placement.
 
-    Moving a joint leaves its descendants in place, except in the arms, where each bone's length varies
-    independently.
+    In such a mode, another maker's skeleton places a joint elsewhere in the body, left and right alike.
+
+    If ``Spine1`` moves, its child joints keep their places. If a joint of an arm moves, its descendants move
+    with it, because the offset of each arm bone varies independently.
 
     Args:
-        bones: The graph's bones.
-        cameras: Names of the cameras. The modes do not move their mounts.
-        stature_m: Stature in metres.
+        bones: Bones of the graph.
+        cameras: Names of the cameras. The modes do not change the mounts of these cameras.
+        stature_m: Stature of the subject, metres.
+
+    Returns:
+        The error modes, one for each joint and direction.
     """
     parts = _part_names(bones)
     moves = [
@@ -106,12 +127,12 @@ def joint_placement_modes(bones: Sequence[Bone], cameras: Sequence[str], stature
 
 
 def _part_names(bones: Sequence[Bone]) -> list[str]:
-    """Return the bones' roles without their side."""
+    """Return the role of each bone without its side: ``Arm`` for ``LeftArm``."""
     return [split_side(bone.role)[1] for bone in bones]
 
 
 def _modes_from_offsets(offsets_m: FloatArray, cameras: Sequence[str]) -> ErrorModes:
-    """Return modes that change nothing but the bones' offsets (B,3,M)."""
+    """Return M error modes that change only the offsets of the bones, by `offsets_m` (B,3,M)."""
     count = offsets_m.shape[2]
     return ErrorModes(
         mounts={camera: np.zeros((6, count)) for camera in cameras},

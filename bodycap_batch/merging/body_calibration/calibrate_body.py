@@ -51,9 +51,15 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import MEAN_HEIGHT_M, split_side
 
 _SAMPLES = 80
-"""Samples of the calibration of the whole body. Evidence: none."""
+"""Maximum number of sampled times in the calibration of the whole body. Evidence: none.
+
+Times of a T-pose and times for rarely measured cameras are added to these.
+"""
 MIN_WALKING_SAMPLES = 10
-"""Minimum number of walking samples, to take the height over the floor from these alone. Evidence: none."""
+"""Minimum number of walking samples for a height over the floor from walking samples only. Evidence: none.
+
+With fewer walking samples, the height comes from all samples.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +67,12 @@ class CalibrationInput:
     """Camera tracks that are ready for the calibration.
 
     Attributes:
-        tracks: Cleaned tracks in the main map's gauge, that of the reference camera first.
+        tracks: Tracks without gross errors, in the gauge of the main map. The track of the reference camera
+            is the first.
         provisional: Approximate scale, metres per map unit.
-        alignment: By camera of an aligned map, uncertainty of its map's pose.
-        main_from_gauge: By gauge, similarity from each used map to the main one. None if all cameras are in
-            one map.
+        alignment: By camera whose map was aligned to the main map, uncertainty of the pose of this map.
+        main_from_gauge: By gauge of each used map, similarity from this map to the main map. None if all
+            cameras are in one map.
     """
 
     tracks: Sequence[CameraTrack]
@@ -76,20 +83,23 @@ class CalibrationInput:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BodyCalibration:
-    """What is constant over a capture.
+    """The quantities that are constant over a capture.
 
     Attributes:
-        scale: The metric scale.
-        bones_alone: The scale at which the calibration graph has the lowest cost.
-        limbs: The scale of each limb alone, a diagnostic.
-        mounts: The solved mounts with their sigmas, that of the reference camera first.
-        reference_prior: Mount prior of the reference camera, with its roll.
-        error_modes: Error modes of scale, mounts and body, the constant and the transient ones.
-        vertical: The vertical.
-        height_over_floor_m: Height of the reference camera's joint over the floor; None if none was found.
-        t_pose_ns: First and last common time of a T-pose; None without one.
-        rolls: The search for the roll of each limb's camera.
-        off_hinge_m: By role, sigma by which a bone's far end leaves its hinge's plane; violated hinges only.
+        scale: The metric scale, combined from all of its sources.
+        bones_alone: The scale from the bones alone, at which the calibration graph has the lowest cost.
+        limbs: The scale that each limb gives alone; a diagnostic.
+        mounts: The solved mounts with their sigmas. The mount of the reference camera is the first.
+        reference_prior: Mount prior of the reference camera, rotated by the roll that was found.
+        error_modes: Error modes of scale, mounts and body, both constant and transient modes.
+        vertical: The vertical in the gauge of the main map.
+        height_over_floor_m: Height of the reference camera's joint over the floor, metres. None if no floor
+            was found, or if the reference camera is on a limb.
+        t_pose_ns: First and last common time of the T-pose; None if the capture has no T-pose.
+        rolls: For each camera whose roll was searched, the costs of all rolls. The reference camera is not
+            among these cameras.
+        off_hinge_m: By role of the bone below a violated hinge, sigma (metres) of the distance of the bone's
+            far end from the hinge's plane.
     """
 
     scale: MetricScale
@@ -109,8 +119,9 @@ class ReferenceCameraRoll(NamedTuple):
     """The roll of the reference camera, and the vertical.
 
     Attributes:
-        roll_deg: The roll.
-        vertical: The vertical; None if nothing but the body itself would give it.
+        roll_deg: Roll about the optical axis, degrees.
+        vertical: The vertical in the gauge of the tracks' map. None if job, map and walk do not determine it,
+            or if the reference camera is on a limb.
     """
 
     roll_deg: float
@@ -126,18 +137,21 @@ def calibrate_body(
 ) -> BodyCalibration:
     """Estimate mounts, metric scale and vertical.
 
-    Mounts and scale come from the free motion of the body. The scale is combined with its other sources, see
-    ``scale.py``.
+    The free motion of the body determines the mounts and a first scale. This scale is then combined with the
+    other sources of scale, see ``scale.py``.
 
     Args:
         inputs: Skeleton, mount priors, trajectories and map points.
-        options: T-pose, known distance and marker board of the job.
-        bones: The graph's bones.
-        data: Cleaned tracks.
-        step: Called after each iteration; may raise to stop.
+        options: T-pose, known distance and marker board that the job gives.
+        bones: Bones of the graph.
+        data: Camera tracks without gross errors, and their alignment.
+        step: Function that is called after each iteration. It may raise an exception to stop the work.
+
+    Returns:
+        The calibration of the body.
 
     Raises:
-        JobError: The known distance does not exist.
+        JobError: A frame of the known distance does not exist, or its two cameras share no map.
         EstimationError: The data do not determine the calibration.
     """
     tracks, provisional = data.tracks, data.provisional
@@ -164,7 +178,7 @@ def calibrate_body(
         trunk_orientation(inputs.skeleton, bones, poses), scene, np.random.default_rng(0), verticals
     )
     walking = samples.posture.walking
-    # Bending down or sitting lowers the trunk, so that only walking gives its height.
+    # A person who bends or sits lowers the trunk. Only walking gives the trunk's height over the floor.
     upright = poses[walking] if walking.sum() >= MIN_WALKING_SAMPLES else poses
     height_m = _height_over_floor(bones[0], upright, up, scene)
     distance = known_distance(inputs.trajectories, options.known_distance, data.main_from_gauge)
@@ -202,7 +216,7 @@ def calibrate_body(
 
 
 class _ResolvedRolls(NamedTuple):
-    """The inputs with the rolls of all cameras, the known facts of the posture, and the roll searches."""
+    """The inputs with the rolls of all cameras applied, facts about the posture, and the roll searches."""
 
     inputs: MergeInputs
     hints: PostureHints
@@ -217,7 +231,7 @@ def _resolve_camera_rolls(
     stated: Sequence[VerticalHypothesis],
     step: Callable[[], None],
 ) -> _ResolvedRolls:
-    """Find the roll of each camera, that of the reference camera first."""
+    """Find the roll of the reference camera, then the rolls of the other cameras."""
     roll_deg, found = reference_camera_roll(inputs, bones, data.tracks, data.provisional, stated)
     hints = PostureHints(vertical=None if found is None else found.up, t_pose_ns=t_pose_ns)
     inputs = with_rolls(inputs, {data.tracks[0].camera: roll_deg})
@@ -236,14 +250,17 @@ def reference_camera_roll(
     provisional: float,
     stated: Sequence[VerticalHypothesis],
 ) -> ReferenceCameraRoll:
-    """Find the roll of the reference camera, and the vertical if something else than the body gives it.
+    """Find the roll of the reference camera, and the vertical if the job, the map or the walk gives it.
 
     Args:
         inputs: Skeleton, mount priors and map points.
-        bones: The graph's bones.
-        tracks: Cleaned tracks of one map, that of the reference camera first.
+        bones: Bones of the graph.
+        tracks: Cleaned tracks in one map. The track of the reference camera is the first.
         provisional: Approximate scale, metres per map unit.
-        stated: Verticals that the job states.
+        stated: Possible verticals from the marker board of the job.
+
+    Returns:
+        The roll and the vertical.
     """
     reference = tracks[0].scaled(provisional)
     points_m = provisional * map_points_of(inputs, reference.camera)
@@ -279,16 +296,16 @@ def preliminary_vertical(
     """Estimate the vertical before the calibration, from the job, the planes of the map, or the walk.
 
     Args:
-        skeleton: The body.
-        bones: The graph's bones.
+        skeleton: The skeleton of the body.
+        bones: Bones of the graph.
         reference: Track of the reference camera, metres.
         mount: Mount prior of the reference camera.
-        points_m: (P,3) points of its map, metres.
-        stated: Verticals that the job states.
+        points_m: (P,3) points of the reference camera's map, metres.
+        stated: Possible verticals from the marker board of the job.
 
     Returns:
-        The vertical. None if it is ambiguous, or if the reference camera is on a limb: a swinging arm gives
-        neither the vertical nor the direction that the body faces.
+        The vertical. None if the vertical is ambiguous or only the body gives it. None also if the reference
+        camera is on a limb: a swinging arm gives neither the vertical nor the direction that the body faces.
     """
     if split_side(bones[reference.bone].role)[0]:
         return None
@@ -304,23 +321,42 @@ def preliminary_vertical(
 
 
 def stated_verticals(asked: MarkerBoard | None, board: LocatedBoard | None) -> tuple[VerticalHypothesis, ...]:
-    """Return the verticals that the job states by the marker board.
+    """Return the possible verticals that follow from the marker board of the job.
 
     Args:
-        asked: The board that the job describes.
-        board: The board in the map.
+        asked: The marker board that the job describes; None if the job describes none.
+        board: The marker board as located in the map; None if the job describes none.
+
+    Returns:
+        The possible verticals. Empty without a board, or if the job does not say how the board is placed.
     """
     return () if board is None or asked is None else board.verticals(asked.placed)
 
 
 def with_rolls(inputs: MergeInputs, rolls_deg: Mapping[str, float]) -> MergeInputs:
-    """Return the inputs with the mount priors of these cameras rotated about their optical axes."""
+    """Return the inputs with mount priors rotated about the optical axes.
+
+    Args:
+        inputs: The inputs of the stage.
+        rolls_deg: By camera, roll about the optical axis, degrees. Other mount priors remain unchanged.
+
+    Returns:
+        The inputs with the rotated mount priors.
+    """
     mounts = tuple(with_roll(mount, rolls_deg.get(mount.camera, 0.0)) for mount in inputs.mounts)
     return replace(inputs, mounts=mounts)
 
 
 def map_points_of(inputs: MergeInputs, camera: str) -> FloatArray:
-    """Return the points (P,3) of a camera's map, in its gauge; P is 0 if they are unknown."""
+    """Return the points (P,3) of a camera's map in the gauge of this map.
+
+    Args:
+        inputs: Trajectories and map points.
+        camera: Camera name.
+
+    Returns:
+        (P,3) points in map units. P is 0 if the points of the map are unknown.
+    """
     gauge = next(each.gauge for each in inputs.trajectories if each.camera == camera)
     return inputs.map_points.get(gauge, np.zeros((0, 3)))
 
@@ -328,7 +364,13 @@ def map_points_of(inputs: MergeInputs, camera: str) -> FloatArray:
 def _t_pose_interval(
     skeleton: SkeletonModel, stated_s: float | None, bones: Sequence[Bone], data: CalibrationInput
 ) -> tuple[int, int] | None:
-    """Return the first and last time of the T-pose that the job states, or else of one that is detected."""
+    """Return the first and last common time of the T-pose.
+
+    The T-pose is the one that the job gives. If the job says nothing about a T-pose, it is detected.
+
+    Returns:
+        The two times. None if the job excludes a T-pose or none is detected.
+    """
     if stated_s is not None:
         start = min(int(track.times_ns[0]) for track in data.tracks)
         return (start, start + round(stated_s * 1e9)) if stated_s > 0.0 else None
@@ -336,16 +378,17 @@ def _t_pose_interval(
 
 
 def _height_over_floor(first: Bone, poses: FloatArray, up: Vertical, scene: SceneContext) -> float | None:
-    """Return the median height (m) of the first bone's joint over the floor that the person walks on.
+    """Return the median height of the first bone's joint over the floor that the person walks on.
 
     Args:
-        first: The first bone, that of the reference camera.
-        poses: (K,B,4,4) bone poses while the person walks.
+        first: The first bone, on which the reference camera is mounted.
+        poses: (K,B,4,4) bone poses in metres, at walking samples if there are enough of them, else at all
+            samples.
         up: The vertical.
-        scene: Map points and path.
+        scene: Map points and path of the reference camera.
 
     Returns:
-        The height; None if no floor was found, or if the reference camera is on a limb.
+        The height in metres. None if no floor was found, or if the reference camera is on a limb.
     """
     if split_side(first.role)[0]:
         return None

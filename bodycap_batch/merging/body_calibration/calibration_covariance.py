@@ -33,15 +33,19 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_RAD
 
 _TRANSIENT_SHARE = float(np.sqrt(1.0 - POSTURE_BIAS_SHARE**2))
-"""Part of a joint's everyday sigma that varies within a capture; `POSTURE_BIAS_SHARE` is constant."""
+"""Fraction of a joint's everyday sigma that varies within a capture.
+
+The everyday sigma is the sigma of the joint's rotation prior. The fraction `POSTURE_BIAS_SHARE` of this sigma
+is constant over a capture. The squares of the two fractions add up to 1.
+"""
 
 
 class PoseSigma(NamedTuple):
     """One-sigma uncertainty of a pose, per axis.
 
     Attributes:
-        rotation_rad: Of the rotation.
-        position_m: Of the position.
+        rotation_rad: Sigma of the rotation, radians.
+        position_m: Sigma of the position, metres.
     """
 
     rotation_rad: float
@@ -68,7 +72,7 @@ class CalibrationErrorModes:
     Attributes:
         constant: Modes that are constant over the capture: noise of the calibration, bias of the posture,
             scale, bone lengths.
-        transient: Modes that act on single intervals of the motion only: bends of the map, varying posture,
+        transient: Modes that act only on single intervals of the motion: bends of the map, varying posture,
             placement of the joints.
     """
 
@@ -76,7 +80,7 @@ class CalibrationErrorModes:
     transient: ErrorModes
 
     def stacked(self) -> ErrorModes:
-        """Return all modes."""
+        """Return the constant modes, then the transient modes."""
         return stack_modes([self.constant, self.transient])
 
 
@@ -89,11 +93,15 @@ def error_modes(
     """Return the error modes of the last solution of a calibration graph.
 
     Args:
-        graph: The solved graph.
+        graph: The solved calibration graph.
         scale: Uncertainty of the scale.
-        alignment: By camera of a map that was aligned by the body, uncertainty of its map's pose.
+        alignment: By camera whose map was aligned through the body, uncertainty of the pose of this map.
         skeleton: Error modes of the bones; None if the bones were measured. The modes of joint placement are
-            transient: they do not add to the uncertainty of the mounts, which refer to the same placement.
+            transient. They do not increase the uncertainty of the mounts, because the mounts refer to the
+            same placement of the joints.
+
+    Returns:
+        The constant and the transient modes.
     """
     samples, cameras = graph.samples, graph.samples.cameras
     linearised = graph.linearised()
@@ -123,8 +131,11 @@ def mounts_with_sigmas(graph: CalibrationGraph, modes: ErrorModes) -> tuple[Moun
     """Return the mounts of the last solution with their sigmas.
 
     Args:
-        graph: The solved graph.
+        graph: The solved calibration graph.
         modes: Error modes that are constant over the capture.
+
+    Returns:
+        One mount per camera, in the order of the graph's cameras.
     """
     out = []
     for name in graph.samples.cameras:
@@ -144,18 +155,30 @@ def mounts_with_sigmas(graph: CalibrationGraph, modes: ErrorModes) -> tuple[Moun
 def variance_factors(
     samples: CalibrationSamples, linearised: LinearisedCalibration, reduced: ReducedSystem
 ) -> FloatArray:
-    """Estimate the variance factor (5,) of each `RowType` from the residuals."""
+    """Estimate the variance factor of each `RowType` from the residuals.
+
+    The variance factor is the ratio of the actual variance of the residuals to the assumed variance.
+
+    Args:
+        samples: The camera poses of the calibration graph.
+        linearised: The calibration graph, linearised at its solution.
+        reduced: The reduced system of `linearised`.
+
+    Returns:
+        (5,) variance factors.
+    """
     correlated = samples.correlated_samples
     map_error = _map_error_variance(samples, linearised, reduced)
-    # Remaining gaps may be correlated in the same way as the errors of the map.
+    # The gaps of joints at different samples may be correlated in the same way as the errors of the map.
     gap = correlated * linearised.variance_factor(reduced, RowType.JOINT_GAP, 1.0 / correlated)
     factors = {
         RowType.PRIOR: 1.0,
         RowType.MEASUREMENT: samples.white_noise_share + correlated * map_error,
         RowType.JOINT_GAP: gap,
-        # Joint rotations are weighed at widened sigmas. Their transient part differs between samples.
+        # The graph weighs joint rotations with widened sigmas. Only the transient part of the rotations
+        # differs between samples.
         RowType.JOINT_ROTATION: (_TRANSIENT_SHARE / JOINT_PRIOR_SCALE) ** 2,
-        # Mounts by name are weighed at a larger sigma than they have.
+        # The graph weighs mounts that are known by name only with a larger sigma than their expected error.
         RowType.NAMED_MOUNT: (NOMINAL_ERROR_RAD / NOMINAL_SIGMA_RAD) ** 2,
     }
     return np.array([factors[row_type] for row_type in RowType])
@@ -164,14 +187,15 @@ def variance_factors(
 def rescale_sigmas(
     graph: CalibrationGraph, linearised: LinearisedCalibration, reduced: ReducedSystem
 ) -> None:
-    """Reduce the sigmas of measurements and gaps to those estimated from the residuals.
+    """Reduce the sigmas of camera poses and joint gaps to the sigmas estimated from the residuals.
 
-    Residuals below the usual error of a map mean that this map is better. Sigmas never grow.
+    If the residuals are below the usual error of a map, this map is better than usual. This function never
+    increases a sigma.
 
     Args:
-        graph: The solved graph; its sigmas are changed.
-        linearised: Its linearisation.
-        reduced: The reduced system of that.
+        graph: The solved calibration graph. Its sigmas are changed.
+        linearised: The graph, linearised at its solution.
+        reduced: The reduced system of `linearised`.
     """
     factors = variance_factors(graph.samples, linearised, reduced)
     graph.rescale_sigmas(
@@ -182,12 +206,16 @@ def rescale_sigmas(
 def measurement_jacobian(
     graph: CalibrationGraph, linear: LinearisedGraph, directions: FloatArray
 ) -> FloatArray:
-    """Return the change of the residuals (R,P) if the measured camera poses move along P directions.
+    """Return the derivative of the residuals with respect to movements of the measured camera poses.
 
     Args:
-        graph: The solved graph.
+        graph: The solved calibration graph.
         linear: The Jacobian at the last solution.
-        directions: (C,K,P,6) rotation (rad), then translation (m), of each camera in the axes of the map.
+        directions: (C,K,P,6) movement of C cameras at K ticks along P directions: rotation (rad), then
+            translation (m), in the axes of the map.
+
+    Returns:
+        (R,P) change of the whitened residuals per unit of movement along each direction.
     """
     samples = graph.samples
     poses, all_points = graph.poses(), samples.mount_points(graph.scale)
@@ -210,14 +238,18 @@ def measurement_jacobian(
 
 
 def scale_jacobian(graph: CalibrationGraph, linearised: LinearisedCalibration) -> FloatArray:
-    """Return the change of the residuals (R,) per unit of log scale because their sigmas change.
+    """Return the derivative of the residuals with respect to log scale that is due to their sigmas.
 
-    Centres and gaps are uncertain in map units, so their whitened residuals shrink as the map grows. Without
-    this term the smallest scale would have the lowest cost. Rotations do not depend on the scale.
+    The sigmas of camera centres and joint gaps are constant in map units. In metres they grow with the scale,
+    so their whitened residuals shrink. Without this term the smallest scale would have the lowest cost.
+    Rotations do not depend on the scale.
 
     Args:
-        graph: The solved graph.
-        linearised: Its linearisation.
+        graph: The solved calibration graph.
+        linearised: The graph, linearised at its solution.
+
+    Returns:
+        (R,) change of the whitened residuals per unit of log scale.
     """
     linear = linearised.linear
     out = np.where(linearised.row_types == RowType.JOINT_GAP, -linear.rhs, 0.0)
@@ -231,7 +263,7 @@ def scale_jacobian(graph: CalibrationGraph, linearised: LinearisedCalibration) -
 def _transient_shares(
     samples: CalibrationSamples, linearised: LinearisedCalibration, reduced: ReducedSystem
 ) -> FloatArray:
-    """Return the part (B,) of each joint's everyday sigma that varies within the capture."""
+    """Return the fraction (B,) of each joint's everyday sigma that varies within the capture."""
     usual = np.flatnonzero(~samples.posture.t_pose)
     shares = transient_variance_shares(linearised, reduced, usual, samples.times_ns[usual], JOINT_PRIOR_SCALE)
     return np.sqrt(shares)
@@ -240,9 +272,12 @@ def _transient_shares(
 def _map_error_variance(
     samples: CalibrationSamples, linearised: LinearisedCalibration, reduced: ReducedSystem
 ) -> float:
-    """Return the variance of the measurements beyond their own noise, relative to their assumed variance."""
+    """Return the variance of the camera poses that is error of the map, relative to their assumed variance.
+
+    It is the variance estimated from the residuals minus the variance of the independent noise.
+    """
     white, correlated = samples.white_noise_share, samples.correlated_samples
-    # The assumed variance of the map's error was multiplied by the number of samples that share it.
-    # The residuals of single samples show it without this factor.
+    # In the assumed variance, the error of the map is multiplied by the number of samples that share this
+    # error. The residuals of single samples do not contain this factor.
     prior = white + (1.0 - white) / correlated
     return max(linearised.variance_factor(reduced, RowType.MEASUREMENT, prior) - white, 0.0)

@@ -1,6 +1,6 @@
 """Find the roll of cameras about their optical axes: 0, 90, 180 or 270 degrees.
 
-The roll is searched only if the job does not state how the camera sits on the body.
+The roll is searched only if the job does not give the camera's orientation on the body.
 """
 
 from __future__ import annotations
@@ -25,20 +25,24 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
 
 ROLLS_DEG = (0.0, 90.0, 180.0, 270.0)
-"""The rolls that are tried, degrees: the ways in which a box is strapped on."""
+"""The rolls that are tried, degrees: the four ways to strap a box-shaped camera on. The usual roll is 0."""
 MIN_COST_DIFFERENCE = 8.0
-"""Minimum reduction of the cost by another roll than the usual one: half the square of 4 sigma.
+"""Minimum reduction of the cost for the selection of a roll other than the usual roll. Evidence: none.
 
-That people wear cameras the usual way up is known no better than this. Evidence: none.
+The value is half the square of 4 sigma. It expresses how certain it is that people wear cameras the usual way
+up.
 """
 _MIN_DOWN_COSINE = 0.3
-"""Mean cosine between down and the way to the limbs' cameras, above which the usual roll is accepted.
+"""Minimum mean cosine between down and the direction to the limbs' cameras, to accept the usual roll.
 
-Hands that hang are 45° and more below a camera on the chest, a cosine of 0.7. If the roll is wrong, they are
-beside it, and the mean is 0.
+Seen from a camera on the chest, hanging hands are 45° or more below the horizontal: a cosine of 0.7. If the
+roll is wrong by 90°, the hands seem to be beside the camera, and the mean cosine is 0.
 """
 _MIN_COSINE_GAIN = 0.4
-"""Minimum gain of this mean cosine for another roll than the usual one. Derived as `_MIN_DOWN_COSINE`."""
+"""Minimum increase of the mean cosine of `_MIN_DOWN_COSINE`, to select a roll other than the usual roll.
+
+The derivation is as for `_MIN_DOWN_COSINE`.
+"""
 _LEGS = frozenset({"UpLeg", "Leg", "Foot", "ToeBase"})
 _PARTS_BELOW = {
     "Hips": _LEGS,
@@ -47,22 +51,24 @@ _PARTS_BELOW = {
     "Neck": _LEGS | {"Arm", "ForeArm", "Hand"},
     "Head": _LEGS | {"Shoulder", "Arm", "ForeArm", "Hand"},
 }
-"""By bone of the reference camera, the bones that are below it even if elbows are bent.
+"""By bone of the reference camera, the bones that are below this camera even if the elbows are bent.
 
-Hands at work are above the belt. Shoulders are always above a camera on the chest.
+Working hands are above the belt, so a camera on the hips or the lower spine has only the legs below it.
+Shoulders are always above a camera on the chest.
 """
 _SAMPLES = 30
-"""Samples of the calibration of one roll. Evidence: none."""
+"""Maximum number of sampled times in the calibration of one roll. Evidence: none."""
 _ITERATIONS = 12
-"""Maximum number of iterations of the calibration of one roll. Evidence: none."""
+"""Maximum number of optimiser iterations in the calibration of one roll. Evidence: none."""
 
 
 class RollCost(NamedTuple):
     """A roll, and its cost relative to the selected roll.
 
     Attributes:
-        roll_deg: The roll.
-        extra_cost: Half the sum of squares beyond that of the selected roll; negative if it is lower.
+        roll_deg: Roll about the optical axis, degrees.
+        extra_cost: Cost of this roll minus the cost of the selected roll. The cost is half the sum of the
+            squared residuals.
     """
 
     roll_deg: float
@@ -73,8 +79,9 @@ class ReferenceRoll(NamedTuple):
     """The roll of the reference camera, and the vertical.
 
     Attributes:
-        roll_deg: The roll.
-        vertical: (3,) the vertical that the surroundings give for this roll; None if they give none.
+        roll_deg: Roll about the optical axis, degrees.
+        vertical: (3,) the vertical for this roll from the job, the map or the walk; None if none of these
+            gives a vertical.
     """
 
     roll_deg: float
@@ -83,12 +90,13 @@ class ReferenceRoll(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RollSearch:
-    """How well each roll of a camera explains its motion relative to the reference camera.
+    """How well each roll of a camera explains the camera's motion relative to the reference camera.
 
     Attributes:
         camera: Camera name.
-        costs: Half the sum of squares for each of `ROLLS_DEG`, minus that for the usual roll.
-        chosen_deg: The selected roll.
+        costs: For each roll of `ROLLS_DEG`, its cost minus the cost of the usual roll. The cost is half the
+            sum of the squared residuals.
+        chosen_deg: The selected roll, degrees.
     """
 
     camera: str
@@ -96,7 +104,7 @@ class RollSearch:
     chosen_deg: float
 
     def runner_up(self) -> RollCost:
-        """Return the best roll that was not selected."""
+        """Return the roll with the lowest cost among the rolls that were not selected."""
         chosen = self.costs[ROLLS_DEG.index(self.chosen_deg)]
         rest = [(cost - chosen, roll) for roll, cost in zip(ROLLS_DEG, self.costs, strict=True)]
         cost, roll = min(pair for pair in rest if pair[1] != self.chosen_deg)
@@ -104,15 +112,15 @@ class RollSearch:
 
 
 def with_roll(mount: Mount, degrees: float) -> Mount:
-    """Return the mount with its camera rotated about the optical axis."""
+    """Return the mount with its camera rotated about the optical axis by an angle in degrees."""
     turn = make_transform(so3_exp([0.0, 0.0, np.radians(degrees)]), np.zeros(3))
     return replace(mount, joint_from_cam=mount.joint_from_cam @ turn)
 
 
 def has_unknown_roll(mount: Mount) -> bool:
-    """Return True if the mount's orientation rests on the camera's name alone.
+    """Return True if the mount's orientation is assumed from the camera's name only.
 
-    If the job states a sigma, it also states the orientation.
+    If the job gives a sigma for the mount, the job also gives the orientation.
     """
     return mount.by_name
 
@@ -125,18 +133,19 @@ def search_rolls(
     hints: PostureHints,
     step: Callable[[], None],
 ) -> tuple[RollSearch, ...]:
-    """Try all rolls of each camera on another bone than the reference camera.
+    """Try all rolls of each camera that is mounted on another bone than the reference camera.
 
     Args:
-        skeleton: The body.
+        skeleton: The skeleton of the body.
         mounts: By camera, its mount prior.
-        tracks: Cleaned tracks, that of the reference camera first.
+        tracks: Cleaned tracks. The track of the reference camera is the first.
         scale: Approximate scale, metres per map unit.
-        hints: What is known of the posture.
-        step: Called after each iteration; may raise to stop.
+        hints: Facts about the posture that are known before the calibration.
+        step: Function that is called after each iteration. It may raise an exception to stop the work.
 
     Returns:
-        One search per camera. Cameras with a stated orientation or with few common frames are left out.
+        One search per camera. The result does not contain cameras whose orientation the job gives, or cameras
+        that share too few frames with the reference camera.
     """
     reference = tracks[0]
     out = []
@@ -158,7 +167,15 @@ def search_rolls(
 
 
 def _select_roll(camera: str, costs: FloatArray) -> RollSearch:
-    """Select the roll with the lowest cost (4,), if it is clearly lower than that of the usual roll."""
+    """Select the roll with the lowest cost, if this cost is clearly lower than the cost of the usual roll.
+
+    Args:
+        camera: Camera name.
+        costs: (4,) cost of each roll of `ROLLS_DEG`.
+
+    Returns:
+        The search result. It selects the usual roll if no other roll is clearly better.
+    """
     relative = costs - costs[0]
     best = int(np.argmin(relative))
     chosen = ROLLS_DEG[best] if relative[best] < -MIN_COST_DIFFERENCE else 0.0
@@ -175,11 +192,16 @@ def reference_roll(
 
     Args:
         mounts: By camera, its mount prior.
-        tracks: Cleaned tracks, that of the reference camera first.
-        vertical_of: Returns for a roll in degrees the vertical (3,) of the walk or the planes that is nearest
-            to the camera's own up direction with that roll, or None.
-        trunk_up_of: Returns for a roll in degrees the direction (3,) in which the trunk points, or None. It
-            decides on the roll if the surroundings do not, but is not used as the vertical.
+        tracks: Cleaned tracks. The track of the reference camera is the first.
+        vertical_of: Function from a roll in degrees to the vertical (3,), or to None. The vertical comes from
+            the job, the map or the walk. If several directions are possible, the up direction of the camera
+            with this roll decides between them.
+        trunk_up_of: Function from a roll in degrees to the up direction of the trunk (3,), or to None. It is
+            used only if `vertical_of` returns None for all rolls. It is never returned as the vertical.
+
+    Returns:
+        The roll and the vertical. The roll is 0 if the job gives the orientation of the reference camera, if
+        no limbs hang below the camera, or if no other roll is clearly better.
     """
     reference, limbs, usual = tracks[0], _hanging_tracks(mounts, tracks), vertical_of(0.0)
     usual_cosine = 0.0 if usual is None else mean_down_cosine(reference, limbs, usual)
@@ -200,15 +222,15 @@ def reference_roll(
 
 
 def mean_down_cosine(reference: CameraTrack, limbs: Sequence[CameraTrack], vertical: FloatArray) -> float:
-    """Return the mean cosine between down and the way from the reference camera to the limbs' cameras.
+    """Return the mean cosine between down and the direction from the reference camera to the limbs' cameras.
 
     Args:
         reference: Track of the reference camera.
         limbs: Tracks of the limbs' cameras.
-        vertical: (3,) unit vector.
+        vertical: (3,) unit vector upwards, in the gauge of the tracks.
 
     Returns:
-        The mean; 0 if the cameras were never measured together.
+        The mean cosine; 0 if the reference camera and the limbs' cameras were never measured together.
     """
     cosines = [np.zeros(0)]
     for track in limbs:
@@ -221,9 +243,10 @@ def mean_down_cosine(reference: CameraTrack, limbs: Sequence[CameraTrack], verti
 
 
 def _hanging_tracks(mounts: Mapping[str, Mount], tracks: Sequence[CameraTrack]) -> list[CameraTrack]:
-    """Return the tracks of cameras on limbs below the reference camera, if both sides have one.
+    """Return the tracks of the cameras on limbs that hang below the reference camera.
 
-    One hand alone is beside the chest rather than below it.
+    The list is empty if the left or the right side has no such camera: one hand alone is beside the chest
+    rather than below it.
     """
     below = _PARTS_BELOW.get(mounts[tracks[0].camera].role, frozenset())
     sides = [split_side(mounts[track.camera].role) for track in tracks]
@@ -234,7 +257,10 @@ def _hanging_tracks(mounts: Mapping[str, Mount], tracks: Sequence[CameraTrack]) 
 def _roll_from_trunk(
     reference: CameraTrack, limbs: Sequence[CameraTrack], trunk_up_of: Callable[[float], FloatArray | None]
 ) -> float:
-    """Return the roll (degrees) at which limbs hang below the trunk's up direction; 0 if it is unclear."""
+    """Return the roll (degrees) with which the limbs hang opposite to the up direction of the trunk.
+
+    The roll is 0 if no other roll is clearly better.
+    """
     cosines = {
         roll: mean_down_cosine(reference, limbs, up)
         for roll in ROLLS_DEG

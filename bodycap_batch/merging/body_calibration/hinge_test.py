@@ -1,11 +1,12 @@
-"""Test whether the motion keeps to the hinges of the skeleton, and loosen those that it violates.
+"""Test whether the motion obeys the hinges of the skeleton, and loosen the violated hinges.
 
-No elbow is a perfect hinge, the joint may be no hinge in a rig, and a sliding strap looks like sideways
-bending. If such a hinge is held to a centimetre, mounts and scale absorb its violation and hide it. The
+A hinge can be violated for three reasons. No elbow is a perfect hinge. The joint may not be a hinge in the
+system that the skeleton comes from. A sliding strap looks like sideways bending. If the graph
+enforces a violated hinge to a centimetre, errors of mounts and scale absorb the violation and hide it. The
 violation can be measured only if the hinge is free.
 
-Source: variance components by redundancy, W. Foerstner, "Ein Verfahren zur Schaetzung von Varianz- und
-Kovarianzkomponenten", AVN 1979. Each hinge has one component.
+Source: estimation of variance components from redundancies, W. Foerstner, "Ein Verfahren zur Schaetzung von
+Varianz- und Kovarianzkomponenten", AVN 1979. Each hinge has one variance component.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCa
 from bodycap_batch.merging.graph.factors import HINGE_SLACK_RATIO
 
 FREE_SIGMA_M = 0.1
-"""Sigma of the distances of a freed hinge, metres: ten times that of a tight one. Evidence: none."""
+"""Sigma of the distances of a freed hinge, metres: ten times `TIGHT_SIGMA_M`. Evidence: none."""
 TIGHT_SIGMA_M = HINGE_SLACK_RATIO * JOINT_SLACK_M
-"""Sigma of the distances of a hinge that the motion keeps to, metres."""
+"""Sigma of the distances of a hinge that the motion obeys, metres."""
 _MIN_VARIANCE_RATIO = 1.5
-"""Minimum variance of a violated hinge's distances, over that of a tight hinge.
+"""Minimum ratio of the variance of a hinge's distances to ``TIGHT_SIGMA_M**2`` for a violated hinge.
 
 Evidence: docs/decisions/body_calibration.md.
 """
@@ -34,11 +35,14 @@ Evidence: docs/decisions/body_calibration.md.
 def observable_hinges(hinges: Sequence[Hinge], measured: Collection[int]) -> list[Hinge]:
     """Return the hinges with a camera on the bone above and on one of the two bones below.
 
-    Only these can be contradicted by measurements.
+    Only these hinges can be contradicted by measurements.
 
     Args:
         hinges: Hinges of the body.
-        measured: Bones that carry cameras.
+        measured: Indices of the bones on which cameras are mounted.
+
+    Returns:
+        The hinges that measurements can contradict.
     """
     return [
         hinge
@@ -48,13 +52,13 @@ def observable_hinges(hinges: Sequence[Hinge], measured: Collection[int]) -> lis
 
 
 def hinge_violation_sigma(linearised: LinearisedCalibration) -> dict[int, float]:
-    """Return by lower bone how far the distances of a freed hinge vary beyond `TIGHT_SIGMA_M`.
+    """Return how far the distances of each freed hinge vary beyond `TIGHT_SIGMA_M`.
 
     Args:
-        linearised: A calibration at its solution. Hinges that are not free are left out.
+        linearised: The calibration graph, linearised at its solution. Hinges that are not free are skipped.
 
     Returns:
-        Sigmas in metres; 0 if the motion keeps to the hinge.
+        By index of the bone below the hinge, sigma in metres; 0 if the motion obeys the hinge.
     """
     out, reduced = {}, linearised.reduced()
     for number, hinge in enumerate(linearised.body.hinges):
@@ -70,12 +74,15 @@ def hinge_violation_sigma(linearised: LinearisedCalibration) -> dict[int, float]
 
 
 def with_hinge_slack(bones: Sequence[Bone], off_hinge_m: Mapping[int, float]) -> tuple[Bone, ...]:
-    """Return the bones with other sigmas of their hinges.
+    """Return the bones with new sigmas for their hinges.
 
     Args:
-        bones: The graph's bones.
-        off_hinge_m: By bone, sigma in metres by which its far end may leave the hinge's plane. Other bones
-            stay as they are.
+        bones: Bones of the graph.
+        off_hinge_m: By index of a bone, sigma (metres) of the distance of the bone's far end from the plane
+            of its hinge. All other bones remain unchanged.
+
+    Returns:
+        All bones, in the same order.
     """
     return tuple(
         replace(bone, off_hinge_m=off_hinge_m[index]) if index in off_hinge_m else bone
@@ -84,7 +91,7 @@ def with_hinge_slack(bones: Sequence[Bone], off_hinge_m: Mapping[int, float]) ->
 
 
 def _hinge_factors(linearised: LinearisedCalibration, number: int) -> IntArray:
-    """Return the indices of one hinge's two distance factors at every tick."""
+    """Return the indices of the two distance factors of one hinge at every tick."""
     ticks = np.arange(len(linearised.world_from_bone))
     joints = sum(bone.parent >= 0 for bone in linearised.body.bones)
     first = linearised.first_joint_factor + joints + 2 * number

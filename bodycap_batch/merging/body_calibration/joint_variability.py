@@ -1,7 +1,9 @@
-"""Estimate the part of a joint's everyday variance that occurs within one capture.
+"""Estimate the fraction of a joint's everyday variance that occurs within one capture.
 
-Source: variance components by redundancy, W. Foerstner, "Ein Verfahren zur Schaetzung von Varianz- und
-Kovarianzkomponenten", AVN 1979. Each joint has one component for all of its axes.
+The everyday variance is the variance of the joint's rotation prior.
+
+Source: estimation of variance components from redundancies, W. Foerstner, "Ein Verfahren zur Schaetzung von
+Varianz- und Kovarianzkomponenten", AVN 1979. Each joint has one variance component for all of its axes.
 """
 
 from __future__ import annotations
@@ -27,21 +29,24 @@ def transient_variance_shares(
     times_ns: IntArray,
     prior_scale: float,
 ) -> FloatArray:
-    """Return the part (B,) of each joint's everyday variance that varies within the capture.
+    """Return the fraction of each joint's everyday variance that varies within the capture.
 
-    The variance estimated for the observable axes of a joint is used for its unobservable axes as well.
+    The observable axes of a joint determine its variance. The unobservable axes get the same variance.
 
     Args:
-        linearised: A calibration at its solution.
-        reduced: Its reduced system.
-        ticks: (N,) sampled ticks that are no T-pose.
-        times_ns: (N,) their times.
-        prior_scale: Factor by which the sigmas of the joint rotation priors were widened.
+        linearised: The calibration graph, linearised at its solution.
+        reduced: The reduced system of `linearised`.
+        ticks: (N,) indices of the sampled ticks outside a T-pose.
+        times_ns: (N,) common times of these ticks.
+        prior_scale: Factor on the sigmas of the joint rotation priors in the calibration graph.
+
+    Returns:
+        (B,) fraction for the joint of each bone.
     """
     out = np.full(len(linearised.body.bones), 1.0 - POSTURE_BIAS_SHARE**2)
     if not len(ticks):
         return out
-    # All samples of one gesture count as one draw.
+    # All samples of one gesture together count as one independent sample.
     repeated = samples_per_gesture(times_ns)
     children = [index for index, bone in enumerate(linearised.body.bones) if bone.parent >= 0]
     for number, index in enumerate(children):

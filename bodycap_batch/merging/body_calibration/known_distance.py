@@ -1,4 +1,7 @@
-"""Metric scale from a distance that the job states: between two frames of one camera or of two cameras."""
+"""Metric scale from a known distance: the job gives the distance between two camera centres.
+
+The two centres belong to two frames of one camera or of two cameras.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,10 @@ _FIELD = "merge.known_distance"
 _MIN_SIGMA = 0.003
 """Relative sigma of a measured distance between two lenses: a few millimetres per metre. Evidence: none."""
 _MIN_SIGNAL_TO_NOISE = 10.0
-"""Minimum distance between the two camera centres, in sigmas of that distance. Evidence: none."""
+"""Minimum ratio of the distance between the two camera centres to the sigma per axis of their difference.
+
+Evidence: none.
+"""
 
 
 def known_distance(
@@ -26,18 +32,22 @@ def known_distance(
     stated: tuple[str, str, float] | None,
     main_from_gauge: Mapping[str, Similarity] | None = None,
 ) -> ScaleSource | None:
-    """Return the scale from the distance that the job states; None if it states none.
+    """Return the scale from the known distance of the job.
 
     Args:
-        trajectories: The cameras' trajectories, each in its own map's gauge.
-        stated: Two frames as ``camera:frame``, and the metres between their camera centres.
-        main_from_gauge: By gauge, similarity from each used map to the main one. None if all cameras are in
-            one map.
+        trajectories: The cameras' trajectories, each in the gauge of its map.
+        stated: Two frames as ``camera:frame``, and the distance between their camera centres in metres. None
+            if the job gives no distance.
+        main_from_gauge: By gauge of each used map, similarity from this map to the main map. None if all
+            cameras are in one map.
+
+    Returns:
+        The scale of the main map; None if the job gives no distance.
 
     Raises:
-        JobError: A camera or frame does not exist, or the two cameras share no map.
-        EstimationError: A frame was not localised, both centres are too near to each other, or their map was
-            not aligned to the main one.
+        JobError: A camera or a frame does not exist, or the two cameras are in different maps.
+        EstimationError: A frame was not localised, the two centres are too near to each other, or their map
+            was not aligned to the main map.
     """
     if stated is None:
         return None
@@ -69,7 +79,7 @@ def known_distance(
 
 
 class _End(NamedTuple):
-    """One end of the distance: the map, the centre (3,) and its variance per axis, in the map's gauge."""
+    """One end of the distance: gauge, camera centre (3,) in this gauge, and its variance per axis."""
 
     gauge: str
     centre: FloatArray
@@ -77,7 +87,7 @@ class _End(NamedTuple):
 
 
 def _find_frame(trajectories: Sequence[Trajectory], name: str) -> _End:
-    """Find the camera centre of ``camera:frame``."""
+    """Return the camera centre of the frame with the name ``camera:frame``."""
     camera, _, number = name.rpartition(":")
     found = next((each for each in trajectories if each.camera == camera), None)
     if found is None:

@@ -1,4 +1,7 @@
-"""Estimate the scale of each limb alone. This is a diagnostic: it shows whether the bones fit each other."""
+"""Estimate a separate scale for each limb.
+
+This is a diagnostic: equal scales show that the bone lengths of the limbs are consistent.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,12 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
 
 _LOG_SCALE_STEP = 0.1
-"""Distance of the three scales at which a limb is calibrated, in log scale. Evidence: none."""
+"""Difference of log scale between the three scales at which a limb is calibrated. Evidence: none."""
 _SAMPLES = 40
-"""Samples of a limb's calibration: half of those of the whole body. Evidence: none."""
+"""Maximum number of sampled times in a limb's calibration: half of the number for the whole body.
+
+Evidence: none.
+"""
 _LIMB_OF_PART = {
     **dict.fromkeys(("Shoulder", "Arm", "ForeArm", "Hand"), "arm"),
     **dict.fromkeys(("UpLeg", "Leg", "Foot", "ToeBase"), "leg"),
@@ -37,22 +43,22 @@ def limb_scales(
     hints: PostureHints,
     step: Callable[[], None],
 ) -> tuple[ScaleSource, ...]:
-    """Estimate the scale from the reference camera and the cameras of one limb, for each limb.
+    """Estimate a scale for each limb from the cameras of this limb and the reference camera.
 
     This is a diagnostic only: the report shows these scales, and nothing else uses them. It costs three
     solutions of a small calibration graph per limb.
 
     Args:
-        skeleton: The body.
+        skeleton: The skeleton of the body.
         mounts: By camera, its mount prior.
-        tracks: Cleaned tracks, that of the reference camera first.
+        tracks: Cleaned tracks. The track of the reference camera is the first.
         scale: The scale of the whole body, metres per map unit.
-        hints: What is known of the posture.
-        step: Called after each iteration; may raise to stop.
+        hints: Facts about the posture that are known before the calibration.
+        step: Function that is called after each iteration. It may raise an exception to stop the work.
 
     Returns:
-        One source per limb. A limb is left out if its cost has no minimum. Empty if fewer than two limbs have
-        cameras.
+        One source per limb whose cost has a minimum. Cameras that share too few frames with the reference
+        camera are not used. Empty if fewer than two limbs have usable cameras.
     """
     limbs: dict[str, list[CameraTrack]] = {}
     for track in tracks[1:]:
@@ -70,7 +76,16 @@ def limb_scales(
 
 
 def _scale_of_limb(name: str, graph: CalibrationGraph, scale: float) -> ScaleSource | None:
-    """Return the minimum of a parabola through the costs of three scales; None if it has none."""
+    """Return the scale at the minimum of a parabola through the costs of three scales.
+
+    Args:
+        name: Name of the limb.
+        graph: The calibration graph of the limb.
+        scale: The middle scale of the three, metres per map unit.
+
+    Returns:
+        The scale of the limb; None if the parabola has no minimum.
+    """
     middle = graph.solve(scale)
     low, high = (graph.solve(scale * float(np.exp(sign * _LOG_SCALE_STEP))) for sign in (-1.0, 1.0))
     curvature = low + high - 2.0 * middle

@@ -1,4 +1,4 @@
-"""Metric scale and vertical from a marker board of known size that keyframes see in the room."""
+"""Metric scale and vertical from a marker board of known size in the room, observed in keyframes."""
 
 from __future__ import annotations
 
@@ -21,20 +21,29 @@ from bodycap_batch.model.scene import Trajectory
 
 SOURCE_NAME = "marker board"
 _MIN_VIEWS = 3
-"""Minimum number of views: two always agree on a board's size, the third one checks them."""
+"""Minimum number of views of the board.
+
+Two views always agree on the size of a board. A third view checks this size.
+"""
 _MIN_SIGMA = 0.003
-"""Minimum sigma of the log of the scale: printers and rulers are off by a millimetre in 30 cm."""
+"""Minimum sigma of the log of the scale. Printers and rulers have errors of a millimetre in 30 cm."""
 _MAX_SIGMA = 0.05
-"""Maximum sigma of the log of the scale. The body alone gives 4 % from a height."""
+"""Maximum sigma of the log of the scale for a usable board.
+
+For comparison: the height of the subject alone gives the scale with a sigma of 4 %.
+"""
 _REWEIGHTINGS = 3
-"""Number of fits, each with the width of the loss from the residuals of the last one.
+"""Number of successive fits. The residuals before each fit determine the width of its loss.
 
 The third fit changes the result by less than a tenth of its sigma.
 """
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
-"""Half a turn about the board's normal."""
+"""Rotation by 180° about the normal of the board."""
 _PLACED_SIGMA_DEG = 1.5
-"""Sigma of the vertical from a board that was hung by eye, degrees. Floors and tables are more exact."""
+"""Sigma of the vertical from a board that was hung by eye, degrees.
+
+It is used for lying boards as well, although floors and tables are more exact.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,15 +51,24 @@ class LocatedBoard:
     """The marker board in the map.
 
     Attributes:
-        scale: The scale from the board.
-        axes: (3,3) its two edges and its normal (towards the cameras), as columns in the main map's gauge.
+        scale: The scale of the main map from the board.
+        axes: (3,3) unit vectors along the two edges of the board, and the normal of the board towards the
+            cameras, as columns in the main map's gauge.
     """
 
     scale: ScaleSource
     axes: FloatArray
 
     def verticals(self, placed: Literal["lying", "hanging"] | None) -> tuple[VerticalHypothesis, ...]:
-        """Return the possible verticals: a lying board's normal, each edge direction of a hanging one."""
+        """Return the possible verticals.
+
+        Args:
+            placed: How the board is placed. The vertical is the normal of a lying board, or one of the four
+                edge directions of a hanging board.
+
+        Returns:
+            The possible verticals. Empty if `placed` is None.
+        """
         if placed is None:
             return ()
         edges = [sign * self.axes[:, axis] for axis in (0, 1) for sign in (1.0, -1.0)]
@@ -63,12 +81,12 @@ class _BoardObservations:
     """The views of the board in one map.
 
     Attributes:
-        map_from_cam: (V,4,4) pose of each view.
-        cam_from_board: (V,4,4) pose of the board from each view alone, metres.
-        view: (N,) index of each corner's view.
-        board_m: (N,3) corners relative to the middle of the board.
-        rays: (N,2) observations of the corners, undistorted, at depth 1.
-        group: (V,) number of the group that shares an error of the map.
+        map_from_cam: (V,4,4) camera pose of each view.
+        cam_from_board: (V,4,4) pose of the board in metres, estimated from each view alone.
+        view: (N,) index of the view of each observed corner.
+        board_m: (N,3) corners in the frame of the board, relative to the middle of the board, metres.
+        rays: (N,2) undistorted observations of the corners, at depth 1.
+        group: (V,) group number of each view. The views of a group share one error of the map.
     """
 
     map_from_cam: FloatArray
@@ -85,22 +103,29 @@ def locate_board(
     board: MarkerBoard | None,
     main_from_gauge: Mapping[str, Similarity] | None = None,
 ) -> LocatedBoard | None:
-    """Locate the job's marker board in the map; None if the job names none.
+    """Locate the marker board of the job in the map.
 
-    The board's position, orientation and size in the map are fitted to its corners in all keyframes, by
-    reprojection. The keyframe poses are fixed. The uncertainty is that of a jackknife over groups of views. A
-    group holds the views of one camera in one second, because their poses share an error. A few groups cannot
-    show this error. The uncertainty is therefore at least what the usual bends of a map cause over the path.
+    A fit estimates the board's position, orientation and size in the map. It minimises the reprojection error
+    of the board's corners in all keyframes. The keyframe poses are fixed.
+
+    A jackknife over groups of views estimates the uncertainty of the size. A group holds the views of one
+    camera in one second, because the poses of these views share an error. With few groups, the jackknife
+    cannot measure this error. The usual bend of a map over the path of the views therefore gives a minimum of
+    the uncertainty.
 
     Args:
         trajectories: The trajectories of the keyframes.
         views: The views of the board.
-        board: The board that the job describes.
-        main_from_gauge: By gauge, the main one first, similarity from each used map to the main one. None if
-            all cameras are in one map.
+        board: The board that the job describes; None if the job describes none.
+        main_from_gauge: By gauge of each used map, similarity from this map to the main map. The main map is
+            the first. None if all cameras are in one map.
+
+    Returns:
+        The board in the map; None if the job describes no board.
 
     Raises:
-        EstimationError: The board was found in too few keyframes, or all of them are near to each other.
+        EstimationError: The board was found in too few keyframes, the keyframes are near to each other, or
+            their poses contradict each other.
 
     Source: B. Efron, C. Stein, "The jackknife estimate of variance", Annals of Statistics 1981.
     """
@@ -122,7 +147,7 @@ def locate_board(
     if main_from_gauge is not None:
         unit, turn = main_from_gauge[gauge].scale, main_from_gauge[gauge].rotation
     axes = so3_exp(found[None, :3])[0]
-    # Detectors disagree on the sign of the normal, but a board is always seen from its front.
+    # Detectors disagree on the sign of the normal. The cameras always see the front of a board.
     axes[:, 2] *= np.sign((seen.map_from_cam[:, :3, 3] - found[3:6]).mean(axis=0) @ axes[:, 2])
     scale = ScaleSource(name=SOURCE_NAME, scale=float(np.exp(-found[6])) / unit, sigma_log=sigma)
     return LocatedBoard(scale, turn @ axes)
@@ -135,10 +160,12 @@ def _select_observations(
     *,
     has_half_turns: bool,
 ) -> tuple[str, _BoardObservations]:
-    """Select the views in the main map, or in the map that has most of them if the main one has too few.
+    """Select the views of the board in one map.
+
+    This is the main map if it has enough views, else the map with the most views.
 
     Returns:
-        The gauge of the map, and the observations.
+        The gauge of the selected map, and the observations of the board in this map.
     """
     paths = {each.camera: each for each in trajectories}
     by_gauge: dict[str, list[BoardView]] = {}
@@ -166,11 +193,11 @@ def _select_observations(
 def _with_one_orientation(
     views: Sequence[BoardView], map_from_cam: FloatArray, group: IntArray, *, has_half_turns: bool
 ) -> _BoardObservations:
-    """Return the views with corners relative to the middle of the board, in one orientation.
+    """Return the views with corners relative to the middle of the board, in one orientation of the board.
 
-    Half a turn maps many chessboards onto themselves, so that a detector may start at either end
-    (`has_half_turns`). The markers of a ChArUco board have numbers; a view of it that is half a turn off is
-    wrong.
+    A rotation by 180° maps many chessboards onto themselves, so a detector may start at either end. With
+    `has_half_turns`, this function rotates such views into the orientation of the first view. A ChArUco board
+    has numbered markers. A view of a ChArUco board with a rotation of 180° is wrong and remains unchanged.
     """
     corners = np.concatenate([view.board_m for view in views])
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
@@ -180,7 +207,7 @@ def _with_one_orientation(
         own = view.cam_from_board.copy()
         own[:3, 3] += own[:3, :3] @ middle
         flip = np.eye(3)
-        # A trace below 1 is a rotation by more than a right angle.
+        # A rotation matrix with a trace below 1 rotates by more than a right angle.
         if has_half_turns and float(np.trace(first[:3, :3].T @ (pose @ own)[:3, :3])) < 1.0:
             flip = _HALF_TURN
         own[:3, :3] = own[:3, :3] @ flip
@@ -198,9 +225,10 @@ def _with_one_orientation(
 
 
 def _initial_fit(seen: _BoardObservations) -> FloatArray:
-    """Return the rotation vector, the position and the log of the size (7,) of the board in the map.
+    """Return an initial fit (7,): rotation vector, position and log of the size of the board in the map.
 
-    The size is in map units per metre. Each view alone gives the middle of the board in metres.
+    The size is in map units per metre. The board poses from the single views determine these values: each
+    view gives the middle of the board in metres.
     """
     rotation = seen.map_from_cam[:, :3, :3]
     turn = nearest_rotation((rotation @ seen.cam_from_board[:, :3, :3]).sum(axis=0))
@@ -217,7 +245,7 @@ def _initial_fit(seen: _BoardObservations) -> FloatArray:
 
 
 def _residuals(seen: _BoardObservations, fit: FloatArray) -> FloatArray:
-    """Return the predicted minus the observed corners (2N,), at depth 1."""
+    """Return the residuals (2N,): predicted minus observed corners, at depth 1."""
     x_in_map = np.exp(fit[6]) * seen.board_m @ so3_exp(fit[None, :3])[0].T + fit[3:6]
     cam_from_map = invert(seen.map_from_cam)[seen.view]
     x_in_cam = np.einsum("nij,nj->ni", cam_from_map[:, :3, :3], x_in_map) + cam_from_map[:, :3, 3]
@@ -226,9 +254,10 @@ def _residuals(seen: _BoardObservations, fit: FloatArray) -> FloatArray:
 
 
 def _fit(seen: _BoardObservations, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the fit (7,) under Cauchy's loss, and the weight of each residual (2N,).
+    """Return the fit (7,) with the Cauchy loss, and the robust weight of each residual (2N,).
 
-    The width of the loss is twice the standard deviation of the residuals, from their median.
+    The width of the loss is twice the standard deviation of the residuals. The median of the absolute
+    residuals gives this standard deviation.
     """
     from scipy.optimize import least_squares
 
@@ -240,7 +269,16 @@ def _fit(seen: _BoardObservations, start: FloatArray) -> tuple[FloatArray, Float
 
 
 def _jackknife_sigma(seen: _BoardObservations, fit: FloatArray, weight: FloatArray) -> float:
-    """Return the sigma of the log of the size, from its changes as each group of views is left out."""
+    """Return the jackknife sigma of the log of the size: its variation as single groups are excluded.
+
+    Args:
+        seen: The observations of the board.
+        fit: (7,) the fit to all views.
+        weight: (2N,) robust weight of each residual.
+
+    Returns:
+        The sigma of the log of the size.
+    """
     step = 1e-6 * np.maximum(1.0, np.abs(fit))
     jacobian = np.stack(
         [
@@ -258,14 +296,17 @@ def _jackknife_sigma(seen: _BoardObservations, fit: FloatArray, weight: FloatArr
         rest = normal - weighted[rows].T @ jacobian[rows]
         changes.append(np.linalg.lstsq(rest, weighted[rows].T @ residual[rows], rcond=None)[0][6])
     count = len(changes)
-    # A few groups underestimate their own spread. Without (n + 1) / (n - 1), four of them give 0.87 of the
-    # error.
+    # A jackknife over few groups underestimates the error. With four groups it would give 0.87 of the error
+    # without the factor (n + 1) / (n - 1) on the usual variance.
     variance = (count + 1) / count * np.sum((np.array(changes) - np.mean(changes)) ** 2)
     return float(np.sqrt(variance))
 
 
 def _map_bend_sigma(seen: _BoardObservations, fit: FloatArray) -> float:
-    """Return the sigma of the log of the size, if both ends of the path have the usual error of a map."""
+    """Return the sigma of the log of the size that the usual error of a map at both ends of the path causes.
+
+    The path is the line along which the camera centres of the views are spread farthest.
+    """
     centre = seen.map_from_cam[:, :3, 3]
     along = np.linalg.svd(centre - centre.mean(axis=0), full_matrices=False)[2][0]
     length_m = float(np.ptp(centre @ along)) / float(np.exp(fit[6]))

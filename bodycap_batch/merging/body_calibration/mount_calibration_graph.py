@@ -1,6 +1,6 @@
 """The calibration graph: mounts and body poses at sampled ticks, solved for a given metric scale.
 
-`calibration_covariance` estimates the uncertainty of a solution.
+The module `calibration_covariance` estimates the uncertainty of a solution.
 """
 
 from __future__ import annotations
@@ -46,30 +46,34 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 JOINT_PRIOR_SCALE = 4.0
 """Factor on the sigmas of the joint rotation priors in this graph.
 
-The prior is applied once per sampled tick. Without the factor, these repeated priors would outweigh the
-measurements. Evidence: none.
+The graph applies each prior once per sampled tick. Without the factor, these repeated priors would outweigh
+the measurements. Evidence: none.
 """
 POINTS_PER_MOUNT = 4
-"""Points that stand for a mount, and factors that each measurement and each mount prior adds to the graph."""
+"""Number of points that represent a mount.
+
+It is also the number of factors that each measurement and each mount prior adds to the graph.
+"""
 
 
 class CalibrationGraph:
-    """The calibration graph of some cameras. Each solution starts from the last one.
+    """The calibration graph of some cameras. Each solution starts from the previous solution.
 
-    Camera centres, and with them the gaps of joints, are uncertain in map units, and keep their sigma there.
-    Sigmas fixed in metres would favour a small scale, because it makes all residuals small.
+    The sigmas of camera centres and joint gaps are constant in map units, because the errors of the map cause
+    them. Sigmas fixed in metres would favour a small scale, because a small scale makes all residuals small.
 
     Attributes:
-        slack_factor: Factor on the sigma of the joints' gaps.
+        slack_factor: Factor on the sigma of the joint gaps.
         mounts: By camera, joint_from_cam (4,4) of the last solution.
 
     Args:
-        skeleton: The body.
-        bones: The graph's bones.
-        samples: The camera poses.
+        skeleton: The skeleton of the body.
+        bones: Bones of the graph.
+        samples: Camera poses at the sampled ticks.
         priors: By camera, its mount prior.
-        provisional: Approximate scale, metres per map unit, at which a joint's gap has its nominal sigma.
-        step: Called after each iteration; may raise to stop.
+        provisional: Approximate scale, metres per map unit. At this scale, a joint gap has the sigma
+            `JOINT_SLACK_M`, times the root of the number of samples that share one error of the map.
+        step: Function that is called after each iteration. It may raise an exception to stop the work.
     """
 
     def __init__(
@@ -93,35 +97,39 @@ class CalibrationGraph:
 
     @property
     def samples(self) -> CalibrationSamples:
-        """The camera poses in use."""
+        """Camera poses at the sampled ticks, as the graph uses them."""
         return self._samples
 
     @property
     def bones(self) -> tuple[Bone, ...]:
-        """The bones with the priors given, before `widen_joint_priors` and `test_hinges`."""
+        """Bones of the graph, without the changes by `widen_joint_priors` and `test_hinges`."""
         return self._bones
 
     @property
     def priors(self) -> Mapping[str, Mount]:
-        """By camera, its mount prior."""
+        """Mount prior of each camera, by camera name."""
         return self._priors
 
     @property
     def scale(self) -> float:
-        """Metres per map unit of the last solution."""
+        """Scale of the last solution, metres per map unit."""
         return self._scale
 
     def set_samples(self, samples: CalibrationSamples) -> None:
-        """Use other poses of the same cameras at the same ticks, and keep the last solution as the start."""
+        """Replace the camera poses. The next solution starts from the last solution.
+
+        Args:
+            samples: Other poses of the same cameras at the same ticks.
+        """
         self._samples = samples
 
     def rescale_sigmas(self, measurement_variance: float, gap_variance: float) -> None:
-        """Rescale the sigmas of the camera poses and of the joints' gaps.
+        """Rescale the sigmas of the camera poses and of the joint gaps.
 
         Args:
             measurement_variance: Factor on the variance of the camera poses. The variance of their
-                independent noise stays as it is.
-            gap_variance: Factor on the variance of the gaps.
+                independent noise remains unchanged.
+            gap_variance: Factor on the variance of the joint gaps.
         """
         samples = self._samples
         self._samples = replace(
@@ -155,20 +163,21 @@ class CalibrationGraph:
 
     def widen_joint_priors(self) -> None:
         """Widen the joint rotation priors that the last solution contradicts."""
-        # A T-pose has a prior of its own. It is no evidence for the posture at other ticks.
+        # A T-pose has a separate prior and is no evidence for the posture at other ticks.
         usual = ~self._samples.posture.t_pose
         if usual.any():
             poses, times_ns = self.poses()[usual], self._samples.times_ns[usual]
             self._rest_bones = widen_joint_priors(self._skeleton, self._bones, poses, times_ns)
 
     def test_hinges(self) -> bool:
-        """Test the hinges that cameras can contradict, and loosen those that the motion violates.
+        """Test the hinges that cameras can contradict, and loosen the violated hinges.
 
-        A joint leaves its hinge for as long as a gesture lasts. All samples of one gesture therefore count as
-        one. Otherwise the many samples of a violated hinge would bend the mounts.
+        A joint that leaves its hinge does so for a whole gesture. All samples of one gesture together
+        therefore count as one sample. Otherwise the many samples of a violated hinge would distort the
+        mounts.
 
         Returns:
-            True if a hinge is violated. The graph then has loosened hinges, and has to be solved again.
+            True if a hinge is violated. The graph then has loosened hinges and must be solved again.
         """
         tested = observable_hinges(self._hinges, self._samples.bones)
         if not tested:
@@ -185,11 +194,15 @@ class CalibrationGraph:
         return True
 
     def hinge_violation_m(self) -> dict[str, float]:
-        """Return by role the sigma (m) of a violated hinge's distances beyond the slack of a joint."""
+        """Return the sigma of each violated hinge's distances, in addition to the slack of a hinge.
+
+        Returns:
+            By role of the bone below the hinge, sigma in metres.
+        """
         return {bone.role: bone.off_hinge_m for bone in self._rest_bones if bone.off_hinge_m > 0.0}
 
     def poses(self) -> FloatArray:
-        """Return world_from_bone (K,B,4,4) of the last solution."""
+        """Return the bone poses world_from_bone (K,B,4,4) of the last solution, metres."""
         ticks = self._samples.valid.shape[1]
         return np.array(
             [
@@ -199,7 +212,7 @@ class CalibrationGraph:
         )
 
     def linearised(self) -> LinearisedCalibration:
-        """Linearise the graph at the last solution."""
+        """Return the graph linearised at the last solution."""
         cameras = self._samples.cameras
         all_points = self._samples.mount_points(self._scale)
         linear = linearise(self._graph(self._metric_poses(self._scale), self._scale), self._values)
@@ -229,7 +242,7 @@ class CalibrationGraph:
         )
 
     def measurement_factors(self, camera: int) -> IntArray:
-        """Return the factor indices (N,4) of a camera's N measurements, one per point of its mount."""
+        """Return the factor indices (N,4) of a camera's N measurements: one factor per point of the mount."""
         first = 0
         for other in range(camera):
             first += POINTS_PER_MOUNT + POINTS_PER_MOUNT * int(self._samples.valid[other].sum())
@@ -241,7 +254,7 @@ class CalibrationGraph:
         )
 
     def _named_mount_factors(self) -> IntArray:
-        """Return the factors of mount orientations that rest on the camera's name alone."""
+        """Return the factor indices of mount orientations that are assumed from the camera's name only."""
         out, first = [], 0
         for camera, name in enumerate(self._samples.cameras):
             if self._priors[name].by_name:
@@ -250,7 +263,12 @@ class CalibrationGraph:
         return np.array(out, dtype=np.int64)
 
     def _set_rest_bones(self, bones: tuple[Bone, ...], repetitions: float) -> None:
-        """Use these bones. Weigh their hinges down by the number of samples that repeat each other."""
+        """Set the bones, and reduce the weight of their hinges.
+
+        Args:
+            bones: The new bones of the graph.
+            repetitions: Number of samples of one gesture. The weight of each hinge is divided by this number.
+        """
         self._rest_bones = bones
         self._hinges = tuple(
             replace(hinge, sigma_m=float(np.sqrt(repetitions)) * hinge.sigma_m)
@@ -258,7 +276,7 @@ class CalibrationGraph:
         )
 
     def _metric_poses(self, scale: float) -> FloatArray:
-        """Return the measured poses (C,K,4,4) in metres."""
+        """Return the measured camera poses (C,K,4,4), with the centres in metres."""
         poses = self._samples.map_from_cam.copy()
         poses[..., :3, 3] *= scale
         return poses
@@ -266,8 +284,8 @@ class CalibrationGraph:
     def _graph(self, world_from_cam: FloatArray, scale: float) -> Any:
         """Build the factor graph.
 
-        The order of its factors is: by camera, the prior of its mount, then its measurements; then by tick,
-        the joints; then by tick, the posture.
+        The factors have this order. First, for each camera: the prior of its mount, then its measurements.
+        Second, for each tick: the joints and hinges. Third, for each tick: the posture.
         """
         samples, graph = self._samples, gtsam.NonlinearFactorGraph()
         all_points = samples.mount_points(scale)
@@ -294,9 +312,9 @@ class CalibrationGraph:
         return graph
 
     def _joint_factors(self, scale: float) -> tuple[JointFactors, JointFactors]:
-        """Return the joint factors of usual ticks and of ticks in a T-pose.
+        """Return the joint factors of usual ticks, and the joint factors of ticks in a T-pose.
 
-        The T-pose prior counts once over all of its ticks.
+        The T-pose prior has the weight of a single tick, distributed over all ticks of the T-pose.
         """
         slack_m = scale * self.slack_factor * self._slack_map
         repetitions = float(np.sqrt(max(self._samples.posture.t_pose.sum(), 1)))
@@ -306,7 +324,10 @@ class CalibrationGraph:
         )
 
     def _initial_values(self, world_from_cam: FloatArray, scale: float) -> Any:
-        """Return the last solution at another scale, or poses by inverse kinematics before the first one."""
+        """Return the initial values: the last solution, moved to the new scale.
+
+        Before the first solution, inverse kinematics from the measured camera poses gives the initial values.
+        """
         if self._values is not None:
             return self._with_mounts(self._rescaled(scale / self._scale), scale)
         samples = self._samples
@@ -321,13 +342,19 @@ class CalibrationGraph:
         return self._with_mounts(values_from_poses(poses), scale)
 
     def _with_mounts(self, values: Any, scale: float) -> Any:
-        """Insert the points of all mounts into the values."""
+        """Insert the points of all mounts into the values, and return the values."""
         for camera, points in enumerate(self._samples.mount_points(scale)):
             insert_mount_points(values, camera, self.mounts[self._samples.cameras[camera]], points)
         return values
 
     def _rescaled(self, ratio: float) -> Any:
-        """Move the body of each tick to another scale. It keeps its shape and moves as a whole."""
+        """Return the last solution, moved to another scale.
+
+        The body of each tick moves as a whole and keeps its shape.
+
+        Args:
+            ratio: Ratio of the new scale to the scale of the last solution.
+        """
         poses = self.poses()
         shift = (ratio - 1.0) * poses[:, :1, :3, 3]
         poses[..., :3, 3] += shift

@@ -1,11 +1,15 @@
 """Estimate the covariance of the calibrated mounts from the residuals of the calibration graph.
 
-The calibration weighs its residuals with pessimistic sigmas. The uncertainty of its result follows from the
-residuals that remain. The variance of each type of residual row is estimated from the rows and their
-redundancy. The covariance of the mounts is that of the same estimator under noise of this estimated size.
+The calibration weighs its residuals with pessimistic sigmas. The residuals at the solution are therefore used
+to estimate the actual uncertainty, in two steps:
 
-Source: variance components by redundancy, W. Foerstner, "Ein Verfahren zur Schaetzung von Varianz- und
-Kovarianzkomponenten", AVN 1979. The covariance has the sandwich form.
+1. For each type of residual rows, the rows and their redundancies give the actual variance of the rows. The
+   redundancy of a row is its contribution to the degrees of freedom, 0 to 1.
+2. The solution is a linear function of the noise in the rows. Noise with these variances therefore gives the
+   covariance of the mounts. This covariance has the sandwich form.
+
+Source: estimation of variance components from redundancies, W. Foerstner, "Ein Verfahren zur Schaetzung von
+Varianz- und Kovarianzkomponenten", AVN 1979.
 """
 
 from __future__ import annotations
@@ -33,22 +37,22 @@ from bodycap_batch.merging.graph.factors import bone_key, mount_keys
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph
 
 _PRIOR_REDUNDANCY = 30.0
-"""Weight of the prior variance of a row type, as a number of redundant rows. Evidence: none."""
+"""Weight of the expected variance factor of a row type, as a number of redundant rows. Evidence: none."""
 
 
 class RowType(IntEnum):
-    """The types of residual rows that have a variance factor of their own."""
+    """The types of residual rows. Each type has a separate variance factor."""
 
     PRIOR = 0
-    """Priors that are taken as they stand: mounts, posture, a T-pose."""
+    """Priors of mounts, posture and T-pose. Their assumed sigmas are used unchanged."""
     MEASUREMENT = 1
     """Measured camera poses."""
     JOINT_GAP = 2
-    """Gaps of joints, and distances of hinges."""
+    """Gaps of joints, and distances of hinges between their anchors and the following joint."""
     JOINT_ROTATION = 3
     """Priors of joint rotations."""
     NAMED_MOUNT = 4
-    """Priors of mount orientations that rest on the camera's name alone."""
+    """Priors of mount orientations that are assumed from the camera's name only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,14 +60,14 @@ class LinearisedCalibration:
     """A calibration graph, linearised at its solution. Only the mounts connect its ticks.
 
     Attributes:
-        linear: The whitened Jacobian.
-        body: Bones and hinges.
-        world_from_bone: (K,B,4,4) solved poses.
-        mount_columns: By camera, (12,) columns of the unknowns that stand for its mount.
+        linear: The whitened Jacobian, with R rows, and its right-hand side.
+        body: Bones and hinges of the graph.
+        world_from_bone: (K,B,4,4) solved bone poses at K ticks, metres.
+        mount_columns: By camera, (12,) columns of the unknowns that represent the camera's mount.
         mount_jacobian: By camera, (6,12) derivative of the right perturbation of joint_from_cam (rotation
-            first) by these unknowns.
+            first) with respect to these unknowns.
         row_types: (R,) `RowType` of each row.
-        first_joint_factor: Index of the first joint factor.
+        first_joint_factor: Index of the first joint factor in the graph.
     """
 
     linear: LinearisedGraph
@@ -75,10 +79,16 @@ class LinearisedCalibration:
     first_joint_factor: int
 
     def reduced(self, common_jacobian: FloatArray | None = None) -> ReducedSystem:
-        """Eliminate the poses of all ticks, so that only the mounts remain as unknowns.
+        """Eliminate the bone poses of all ticks, so that only the unknowns of the mounts remain.
+
+        The unknowns of `common_jacobian` remain as well.
 
         Args:
-            common_jacobian: (R,P) derivatives by further unknowns that all ticks share.
+            common_jacobian: (R,P) derivatives of the rows with respect to P additional unknowns that all
+                ticks share; None without such unknowns.
+
+        Returns:
+            The linear system of the remaining unknowns.
 
         Raises:
             EstimationError: The equations are singular.
@@ -113,24 +123,31 @@ class LinearisedCalibration:
         return ReducedSystem(jacobian=jacobian, covariance=covariance, redundancy=1.0 - leverage)
 
     def variance_factor(self, reduced: ReducedSystem, row_type: RowType, prior: float = 1.0) -> float:
-        """Return the variance of the rows of one type, relative to the variance they were weighed with.
+        """Return the ratio of the actual variance of the rows of one type to their assumed variance.
 
         Args:
             reduced: The reduced system of this linearisation.
             row_type: Type of the rows.
-            prior: Expected factor. It counts if the redundancy is low. It is less than 1 for rows that were
-                weighed down because they share their errors.
+            prior: Expected ratio. It dominates the result if the redundancy of the rows is low. It is less
+                than 1 if the weight of the rows was reduced because several samples share one error.
+
+        Returns:
+            The variance factor of the rows.
         """
         rows = self.row_types == row_type
-        # A pose has six degrees of freedom, its four points have twelve coordinates. The other six carry no
-        # information and never disagree.
+        # A camera pose has six degrees of freedom, but its four points have twelve rows. The other six
+        # degrees of freedom contain no information, and their residuals are zero.
         idle = 0.5 * rows.sum() if row_type == RowType.MEASUREMENT else 0.0
         redundancy = max(float(reduced.redundancy[rows].sum()) - idle, 0.0)
         squares = float((self.linear.rhs[rows] ** 2).sum())
         return (_PRIOR_REDUNDANCY * prior + squares) / (_PRIOR_REDUNDANCY + redundancy)
 
     def posture_bias_jacobian(self) -> Any:
-        """Return the change of the residuals per one-sigma mode of the posture bias: rows (R,M), sparse."""
+        """Return the change of the residuals along each one-sigma mode of the posture bias.
+
+        Returns:
+            (R,M) sparse matrix for M modes.
+        """
         modes = posture_bias_modes(self.body.bones, tuple(self.mount_columns), POSTURE_BIAS_SHARE)
         return joint_residual_jacobian(
             self.linear, self.body, self.first_joint_factor, self.world_from_bone, modes
@@ -142,11 +159,11 @@ class LinearisedCalibration:
         Args:
             reduced: The reduced system of this linearisation.
             factors: (5,) variance factor of each `RowType`.
-            body_modes: Modes in which the body differs from the assumed one.
+            body_modes: Error modes of the assumed body.
 
         Returns:
-            The modes that follow from the noise of the residuals, then `body_modes` with the mounts that
-            follow them.
+            The error modes of the mounts that noise in the residual rows causes. After these modes,
+            `body_modes` with the changes of the mounts that they cause.
         """
         gain = reduced.covariance @ reduced.jacobian.T
         change = block_diag(*self.mount_jacobian.values())
@@ -161,7 +178,15 @@ class LinearisedCalibration:
         return stack_modes([noise_modes, self.propagated(reduced, body_modes)])
 
     def propagated(self, reduced: ReducedSystem, body_modes: ErrorModes) -> ErrorModes:
-        """Return modes in which the body differs from the assumed one, with the mounts that follow them."""
+        """Return error modes of the body, extended by the changes of the mounts that they cause.
+
+        Args:
+            reduced: The reduced system of this linearisation.
+            body_modes: Error modes of the assumed body.
+
+        Returns:
+            `body_modes` with their changes of the mounts.
+        """
         gain = reduced.covariance @ reduced.jacobian.T
         shifts = joint_residual_jacobian(
             self.linear, self.body, self.first_joint_factor, self.world_from_bone, body_modes
@@ -171,16 +196,17 @@ class LinearisedCalibration:
         return replace(body_modes, mounts=self._by_camera(follow))
 
     def _by_camera(self, changes: FloatArray) -> dict[str, FloatArray]:
-        """Split changes (6·C,M) of all mounts by camera."""
+        """Split the changes (6·C,M) of the mounts of C cameras into one array (6,M) per camera."""
         return {camera: changes[6 * index : 6 * index + 6] for index, camera in enumerate(self.mount_columns)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReducedSystem:
-    """The linear system of the mounts, after the poses of all ticks were eliminated.
+    """The linear system of the mounts, after the bone poses of all ticks were eliminated.
 
     Attributes:
-        jacobian: (R,U) derivatives of the rows by the unknowns of the mounts.
+        jacobian: (R,U) derivatives of the rows with respect to U unknowns: the unknowns of all mounts, then
+            the additional unknowns that all ticks share.
         covariance: (U,U) covariance of these unknowns if the variance of every row is 1.
         redundancy: (R,) redundancy of each row, 0 to 1.
     """
@@ -197,14 +223,19 @@ def row_types(
     t_pose_factors: IntArray,
     named_factors: IntArray,
 ) -> IntArray:
-    """Return the `RowType` (R,) of each row of a linearised calibration graph.
+    """Return the `RowType` of each row of a linearised calibration graph.
 
     Args:
-        linear: The graph's Jacobian. The columns of the mounts follow those of all bones.
+        linear: Jacobian of the graph, with the columns of all bones before the columns of the mounts.
         first_joint_factor: Index of the first joint factor.
-        end_joint_factor: Index after the last joint factor.
-        t_pose_factors: Joint factors of ticks in a T-pose. Their prior is taken as it stands.
-        named_factors: Factors of mount orientations that rest on the camera's name alone.
+        end_joint_factor: Index of the last joint factor plus one.
+        t_pose_factors: Indices of the joint factors at ticks in a T-pose. The assumed sigmas of the rotation
+            priors of these factors are used unchanged.
+        named_factors: Indices of the factors of mount orientations that are assumed from the camera's name
+            only.
+
+    Returns:
+        (R,) the `RowType` of each row.
     """
     height = np.diff(linear.first_row)
     factor = np.repeat(np.arange(len(height)), height)
@@ -219,6 +250,6 @@ def row_types(
     is_joint = (factor >= first_joint_factor) & (factor < end_joint_factor)
     out[(factor >= end_joint_factor) | np.isin(factor, t_pose_factors)] = RowType.PRIOR
     out[np.isin(factor, named_factors)] = RowType.NAMED_MOUNT
-    # A joint factor has three rows for the rotation, then three for the gap. A hinge factor has one row.
+    # A joint factor has three rows for the rotation, then three rows for the gap. A hinge factor has one row.
     out[is_joint & ((height[factor] == 1) | (row_in_factor >= 3))] = RowType.JOINT_GAP
     return out

@@ -18,8 +18,9 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 MAP_ERROR_M = 0.005
 """Sigma of the positional error of a map along a camera path, metres.
 
-A map bends: all poses of an interval have the same error. Correlated errors must not count as often as they
-are sampled, or the mounts follow the map. Evidence: docs/decisions/body_calibration.md.
+A map bends, so all poses in a short interval of time have the same error. The graph reduces the weight of
+these correlated errors. Otherwise the mounts would absorb the bends of the map. Evidence:
+docs/decisions/body_calibration.md.
 """
 MAP_ERROR_RAD = float(np.radians(0.25))
 """Sigma of the rotational error of a map along a camera path, radians.
@@ -27,26 +28,31 @@ MAP_ERROR_RAD = float(np.radians(0.25))
 Evidence: docs/decisions/body_calibration.md.
 """
 MAP_ERROR_DURATION_S = 1.0
-"""Time over which the error of a map is nearly constant, seconds.
+"""Duration over which the error of a map is nearly constant, seconds.
 
 Evidence: docs/decisions/body_calibration.md.
 """
 T_POSE_SAMPLES = 8
-"""Additional samples in a T-pose. Evidence: none."""
+"""Maximum number of additional sampled times in a T-pose. Evidence: none."""
 MIN_SAMPLES = 10
-"""Samples that each camera gets, if it was measured so often with another one. Evidence: none."""
+"""Minimum number of samples of each camera at which another camera was measured too. Evidence: none.
+
+A camera that was rarely measured together with another camera has fewer samples.
+"""
 MIN_COMMON_FRAMES = 15
-"""Frames in which a camera has to be measured together with the reference camera before the two are
-calibrated alone: half a second at 30 fps. Evidence: none."""
+"""Minimum number of frames common to a camera and the reference camera for a separate calibration of the two.
+
+The value is half a second at 30 fps. Evidence: none.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostureHints:
-    """Facts on the posture that are known before the calibration.
+    """Facts about the posture that are known before the calibration.
 
     Attributes:
-        vertical: (3,) the vertical in the map; None if unknown.
-        t_pose_ns: First and last common time of a T-pose; None without one.
+        vertical: (3,) the vertical in the gauge of the tracks; None if unknown.
+        t_pose_ns: First and last common time of a T-pose; None if there is no T-pose.
     """
 
     vertical: FloatArray | None = None
@@ -58,17 +64,17 @@ class CalibrationSamples:
     """Camera poses at the ticks that the calibration uses.
 
     Attributes:
-        times_ns: (K,) common time.
-        cameras: Names, in the order of the other fields.
-        bones: Index of each camera's bone.
-        map_from_cam: (C,K,4,4) poses.
-        valid: (C,K) True if the camera was measured.
-        sigma_rad: (C,) rotation sigma of each camera's poses, per axis.
-        sigma_map: (C,) centre sigma of each camera's poses, per axis, map units.
+        times_ns: (K,) common time of each tick.
+        cameras: Names of the C cameras, in the order of the other fields.
+        bones: Index of the bone of each camera.
+        map_from_cam: (C,K,4,4) camera poses in the gauge of the tracks.
+        valid: (C,K) True if the camera was measured at the tick.
+        sigma_rad: (C,) rotation sigma of each camera's poses, radians per axis.
+        sigma_map: (C,) centre sigma of each camera's poses, map units per axis.
         correlated_samples: Number of samples that share one error of the map, at least 1.
-        white_noise_share: Part of the measurements' variance that is independent noise, 0 to 1. The rest is
-            error of the map.
-        posture: What is known of the body at the ticks.
+        white_noise_share: Fraction of the variance of the camera centres that is independent noise, 0 to 1,
+            as a mean over the cameras. The rest of the variance is error of the map.
+        posture: Facts about the posture at the ticks.
     """
 
     times_ns: IntArray
@@ -83,7 +89,7 @@ class CalibrationSamples:
     posture: Posture
 
     def mount_points(self, scale: float) -> list[MountPoints]:
-        """Return the points that stand for each camera's mount, at a scale in metres per map unit."""
+        """Return the points that represent each camera's mount, for a scale in metres per map unit."""
         return [
             MountPoints(float(r), float(scale * m))
             for r, m in zip(self.sigma_rad, self.sigma_map, strict=True)
@@ -97,17 +103,24 @@ def take_samples(
     vertical: FloatArray | None = None,
     t_pose_ns: tuple[int, int] | None = None,
 ) -> CalibrationSamples:
-    """Select up to `count` times, evenly spaced among those at which most cameras were measured together.
+    """Sample the camera poses at times at which many cameras were measured together.
+
+    The times are evenly spaced among the frames of the reference camera with the most measured cameras. If
+    these frames are too few, all frames with at least two measured cameras are used.
 
     Args:
-        tracks: Cleaned tracks, that of the reference camera first.
+        tracks: Cleaned tracks. The track of the reference camera is the first.
         provisional: Approximate scale, metres per map unit.
-        count: Maximum number of times, without those added for a T-pose or a rarely measured camera.
-        vertical: (3,) the vertical in the map; None if unknown.
-        t_pose_ns: First and last common time of a T-pose, in which a few more samples are taken.
+        count: Maximum number of times. Times for a T-pose or for a rarely measured camera are added to these.
+        vertical: (3,) the vertical in the gauge of the tracks; None if unknown.
+        t_pose_ns: First and last common time of a T-pose, which gets additional samples; None if there is no
+            T-pose.
+
+    Returns:
+        The sampled camera poses.
 
     Raises:
-        EstimationError: Too few samples show two cameras at the same time.
+        EstimationError: Two cameras were measured together at too few times.
     """
     times_ns = _sample_times(tracks, count, t_pose_ns)
     sampled = [track.poses_at(times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS) for track in tracks]
@@ -117,7 +130,7 @@ def take_samples(
     white_map = np.array(
         [max(float(np.median(track.sigma_map)), MIN_SIGMA_M / provisional) for track in tracks]
     )
-    # All cameras of a segment see the same error of the map, so together they count as one.
+    # The poses of all cameras on one bone have the same error of the map. Together they count as one camera.
     bones = np.array([track.bone for track in tracks])
     same_bone = (bones[:, None] == bones).sum(axis=1)
     sigma_map = np.sqrt(white_map**2 + same_bone * correlated * (MAP_ERROR_M / provisional) ** 2)
@@ -137,11 +150,11 @@ def take_samples(
 
 @dataclass(frozen=True, slots=True)
 class CameraSubset:
-    """Some of the cameras, sampled for a calibration of their own.
+    """Some of the cameras, sampled for a separate calibration.
 
     Attributes:
-        bones: The bones between these cameras.
-        samples: Their poses at the sampled ticks.
+        bones: Bones of the kinematic chain between these cameras.
+        samples: Poses of these cameras at the sampled ticks.
     """
 
     bones: tuple[Bone, ...]
@@ -156,15 +169,18 @@ def sample_subset(
     count: int,
     hints: PostureHints,
 ) -> CameraSubset:
-    """Sample some of the cameras for a calibration of their own.
+    """Sample some of the cameras for a separate calibration.
 
     Args:
-        skeleton: The body.
+        skeleton: The skeleton of the body.
         mounts: By camera, its mount prior.
-        tracks: Cleaned tracks of these cameras, that of the reference camera first.
+        tracks: Cleaned tracks of these cameras. The track of the reference camera is the first.
         provisional: Approximate scale, metres per map unit.
-        count: Maximum number of samples.
-        hints: What is known of the posture.
+        count: Maximum number of times. Times for a T-pose or for a rarely measured camera are added to these.
+        hints: Facts about the posture that are known before the calibration.
+
+    Returns:
+        The bones between these cameras, and the sampled camera poses.
     """
     roles = [mounts[track.camera].role for track in tracks]
     bones = kinematic_chain(skeleton, roles)
@@ -174,12 +190,23 @@ def sample_subset(
 
 
 def count_common_frames(reference: CameraTrack, track: CameraTrack) -> int:
-    """Count the frames of the reference camera at which the other camera was measured, too."""
+    """Return the number of frames of the reference camera at which another camera was measured too.
+
+    Args:
+        reference: Track of the reference camera.
+        track: Track of the other camera.
+
+    Returns:
+        The number of common frames.
+    """
     return int(track.poses_at(reference.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1].sum())
 
 
 def _sample_times(tracks: Sequence[CameraTrack], count: int, t_pose_ns: tuple[int, int] | None) -> IntArray:
-    """Select times of the reference camera, and own times of cameras that are rarely measured with it."""
+    """Select frame times of the reference camera.
+
+    A camera that was rarely measured together with the reference camera adds some of its own frame times.
+    """
     times_ns = tracks[0].times_ns
     measured = np.array([track.poses_at(times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1] for track in tracks])
     cameras = measured.sum(axis=0)
@@ -207,7 +234,7 @@ def _sample_times(tracks: Sequence[CameraTrack], count: int, t_pose_ns: tuple[in
 
 
 def _own_times(track: CameraTrack, tracks: Sequence[CameraTrack]) -> IntArray:
-    """Select a few of a camera's own times at which another camera was measured, too."""
+    """Select at most `MIN_SAMPLES` frame times of a camera at which another camera was measured too."""
     common = [
         other.poses_at(track.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1]
         for other in tracks
@@ -217,5 +244,5 @@ def _own_times(track: CameraTrack, tracks: Sequence[CameraTrack]) -> IntArray:
 
 
 def _evenly(frames: IntArray, count: int) -> IntArray:
-    """Select up to `count` of the frames (N,), evenly spaced."""
+    """Select at most `count` of the frames (N,), evenly spaced."""
     return frames[evenly_spaced(len(frames), count)]

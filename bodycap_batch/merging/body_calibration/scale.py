@@ -1,25 +1,26 @@
 """Metric scale: its sources, the estimate from the bones, and the combination of all sources.
 
-A map has no unit. The scale is the number of metres per map unit. Its sources, by their name in the report:
+A map has no unit. The scale is the number of metres per map unit. The scale has these sources, listed by
+their names in the report:
 
 - ``skeleton``, ``height``, ``mean stature``: the bones. `estimate_scale` finds the scale at which the
   calibration graph has the lowest cost; `scale_from_bones` adds the uncertainty of the bone lengths
-  (`PROPORTION_SIGMA` in ``anthropometry.py``). The name is the origin of the bone lengths.
-- ``floor``: the height of the reference camera's joint over the floor, by `scale_from_floor`. The floor that
-  the person walks on comes from ``world/floor.py``.
-- ``known distance``: a distance that the job states, by ``known_distance.py``.
-- ``marker board``: a board that the job describes and keyframes see, by ``marker_board.py``.
+  (`PROPORTION_SIGMA` in ``anthropometry.py``). The name says where the bone lengths come from.
+- ``floor``: the height of the reference camera's joint over the floor, see `scale_from_floor`. The module
+  ``world/floor.py`` finds the floor that the person walks on.
+- ``known distance``: a distance given in the job, see ``known_distance.py``.
+- ``marker board``: a board that the job describes and that keyframes observe, see ``marker_board.py``.
 
-`combine_sources` weighs them: a known distance or a marker board replaces bones and floor; otherwise bones
-and floor are averaged, each by its precision. If neither a skeleton nor a height is given, the result has
-at least the uncertainty `STATURE_SIGMA`.
+`combine_sources` combines these sources. A known distance or a marker board replaces bones and floor.
+Otherwise the result is the mean of bones and floor, weighted by their precision. If neither a skeleton nor a
+height is given, the sigma of the result is at least `STATURE_SIGMA`.
 
-Scales for other purposes are found elsewhere, and do not enter this result:
+Other modules estimate scales for other purposes. These scales are not used in the result:
 
-- ``body/initial_poses.py``: the provisional scale, the initial value of the calibration.
-- ``map_alignment/gauss_newton.py`` and ``map_alignment/scale_sources.py``: the scale of the main map while
-  other maps are aligned to it. It uses the provisional scale (``reach``), ``floor`` and the stated sources.
-- ``limb_scales.py``: a scale for each limb alone, a diagnostic of the report.
+- ``body/provisional_scale.py``: the provisional scale, the initial value of the calibration.
+- ``map_alignment/similarity_refinement.py`` and ``map_alignment/scale_sources.py``: the scale of the main map
+  while other maps are aligned to it. It uses the limbs' reach, the floor and the sources given in the job.
+- ``limb_scales.py``: a separate scale for each limb, a diagnostic of the report.
 """
 
 from __future__ import annotations
@@ -35,28 +36,28 @@ from bodycap_batch.merging.body_calibration.mount_calibration_graph import Calib
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO
 
 MEAN_STATURE = "mean stature"
-"""Name of the scale source if neither the skeleton nor the height of the subject is known."""
+"""Name of the scale from the bones if neither the skeleton nor the height of the subject is known."""
 _COARSE_STEP = 0.16
-"""First step of the log of the scale. Evidence: none."""
+"""Step of the log of the scale for the first parabola through the costs. Evidence: none."""
 _FINE_STEP = 0.05
-"""Second step of the log of the scale. Evidence: none.
+"""Step of the log of the scale for the second parabola through the costs. Evidence: none.
 
-The cost is skewed, because an arm can bend but not stretch. The parabola of the coarse step is therefore
-biased towards small scales. The fine step removes most of this bias.
+The cost is not symmetric about its minimum, because an arm can bend but not stretch. The parabola of the
+coarse step is therefore biased towards small scales. The fine step removes most of this bias.
 """
 _MAX_SOLVES = 14
-"""Maximum number of solutions of the graph while a minimum is sought. Evidence: none."""
+"""Number of solutions of the graph after which the search for the minimum stops. Evidence: none."""
 _MIN_SIGMA = 0.01
-"""Minimum sigma of the log of a scale from the bones. Evidence: none."""
+"""Minimum sigma of the log of the scale from the bones. Evidence: none."""
 FLOOR_SIGMA = 0.06
 """Sigma of the log of a joint's height over the floor.
 
-Bent knees lower it by 1 to 6 cm, shoes raise it by 1 to 3 cm. Evidence: none.
+Bent knees lower the joint by 1 to 6 cm, shoes raise the joint by 1 to 3 cm. Evidence: none.
 """
 STATURE_SIGMA = 0.055
-"""Sigma of the log of adults' stature about one mean for both sexes.
+"""Sigma of the log of adults' stature about the common mean of both sexes.
 
-It is 7 cm within each sex; the means of the sexes are 14 cm apart. Evidence: none.
+The stature has a sigma of 7 cm within each sex. The means of the sexes differ by 14 cm. Evidence: none.
 """
 
 
@@ -66,8 +67,8 @@ class ScaleEstimate:
 
     Attributes:
         scale: Metres per map unit.
-        sigma_log: Sigma of its logarithm, from the curvature of the cost.
-        costs: (scale, cost) of every solution.
+        sigma_log: Sigma of the logarithm of the scale, from the curvature of the cost.
+        costs: Pairs (scale, cost), one for every solution of the graph.
         mount_slope: By camera, change of joint_from_cam (4,4) per unit of log scale.
     """
 
@@ -82,10 +83,10 @@ class ScaleSource:
     """A source of the metric scale.
 
     Attributes:
-        name: Name for the report.
+        name: Name of the source in the report.
         scale: Metres per map unit.
-        sigma_log: Sigma of its logarithm.
-        used: False if the source was rejected, or replaced by a better one.
+        sigma_log: Sigma of the logarithm of the scale.
+        used: False if the source was rejected, or replaced by a better source.
     """
 
     name: str
@@ -100,8 +101,8 @@ class MetricScale:
 
     Attributes:
         metres_per_unit: Metres per map unit.
-        sigma_log: Sigma of its logarithm.
-        sources: All sources, used or not. The bones are the first.
+        sigma_log: Sigma of the logarithm of the scale.
+        sources: All sources, both used and unused. The scale from the bones is the first.
     """
 
     metres_per_unit: float
@@ -110,11 +111,17 @@ class MetricScale:
 
 
 def estimate_scale(graph: CalibrationGraph, provisional: float) -> ScaleEstimate:
-    """Minimise the cost of a calibration graph over the log of the scale, by two parabolas.
+    """Find the scale at which a calibration graph has the lowest cost.
+
+    Two parabolas through the costs at three values of log scale give the minimum. The first parabola has a
+    coarse step, the second parabola has a fine step.
 
     Args:
-        graph: The calibration graph. It is left solved at the returned scale.
-        provisional: Initial value, metres per map unit.
+        graph: The calibration graph. At the end, its last solution is at the returned scale.
+        provisional: Initial value of the scale, metres per map unit.
+
+    Returns:
+        The scale, its uncertainty, and the dependence of the mounts on the scale.
     """
     costs: dict[float, float] = {}
     mounts: dict[float, dict[str, FloatArray]] = {}
@@ -137,12 +144,13 @@ def estimate_scale(graph: CalibrationGraph, provisional: float) -> ScaleEstimate
     cost(centre)
     for side in (-_FINE_STEP, _FINE_STEP):
         if not any((x - centre) * side > 0.0 for x in costs):
-            # The search ended at its outermost scale. The slope of the mounts needs one on each side.
+            # The search ended at the smallest or largest solved scale. The slope of the mounts needs a
+            # solution on each side of the minimum.
             cost(centre + side)
     below, above = (_nearest_solution(mounts, centre, sign * _FINE_STEP) for sign in (-1.0, 1.0))
     width = above - below
     slope = {name: (mounts[above][name] - mounts[below][name]) / width for name in mounts[above]}
-    # Solve at the minimum again, because the graph keeps its last solution.
+    # Solve at the minimum once more: the caller uses the mounts of the graph's last solution.
     costs.pop(centre)
     cost(centre)
     return ScaleEstimate(
@@ -156,7 +164,7 @@ def estimate_scale(graph: CalibrationGraph, provisional: float) -> ScaleEstimate
 def _nearest_solution(
     mounts: Mapping[float, Mapping[str, FloatArray]], centre: float, offset: float
 ) -> float:
-    """Return the solved log scale that is nearest to centre + offset, on that side of the centre."""
+    """Return the solved log scale nearest to ``centre + offset``, on the same side of the centre."""
     return min((x for x in mounts if (x - centre) * offset > 0.0), key=lambda x: abs(x - centre - offset))
 
 
@@ -165,8 +173,11 @@ def scale_from_bones(estimate: ScaleEstimate, *, is_measured: bool, has_height: 
 
     Args:
         estimate: The scale at which the calibration graph has the lowest cost.
-        is_measured: True if the skeleton is the subject's own.
+        is_measured: True if the bone lengths of the subject were measured.
         has_height: True if the skeleton was scaled to the subject's height.
+
+    Returns:
+        The scale from the bones.
     """
     name, lengths_sigma = "skeleton", 0.0
     if not is_measured:
@@ -176,12 +187,15 @@ def scale_from_bones(estimate: ScaleEstimate, *, is_measured: bool, has_height: 
 
 
 def scale_from_floor(body: ScaleSource, height_m: float, standing_m: float) -> ScaleSource:
-    """Return the scale from a joint's height over the floor. It is used if within 2 sigma of the body's.
+    """Return the scale from a joint's height over the floor.
 
     Args:
         body: The scale from the bones.
-        height_m: Median height of the joint over the floor, at that scale.
-        standing_m: Height of the joint over the soles of the standing skeleton.
+        height_m: Median height of the joint over the floor at the scale from the bones, metres.
+        standing_m: Height of the joint over the soles of the standing skeleton, metres.
+
+    Returns:
+        The scale from the floor. It is marked as used if its difference from `body` is at most 2 sigma.
     """
     if height_m <= 0.0:
         return ScaleSource(name="floor", scale=body.scale, sigma_log=FLOOR_SIGMA, used=False)
@@ -199,7 +213,11 @@ def combine_sources(
     Args:
         bones: The scale from the bones.
         floor: The scale from the floor; None if no floor was found.
-        stated: Scales from a known distance or a marker board. They replace the others.
+        stated: Scales from a known distance or a marker board. With any of them, bones and floor are not
+            used.
+
+    Returns:
+        The combined scale.
     """
     measured = [bones] if floor is None else [bones, floor]
     if stated:
@@ -212,7 +230,7 @@ def combine_sources(
 
 
 def weighted_mean(sources: Sequence[ScaleSource]) -> tuple[float, float]:
-    """Return scale and sigma of its logarithm from the sources in use, weighted by their precision."""
+    """Return the precision-weighted mean scale of the used sources, and the sigma of its logarithm."""
     used = [source for source in sources if source.used]
     weight = np.array([source.sigma_log**-2 for source in used])
     mean = float(weight @ np.log([source.scale for source in used]) / weight.sum())
@@ -220,7 +238,10 @@ def weighted_mean(sources: Sequence[ScaleSource]) -> tuple[float, float]:
 
 
 def chi_square(sources: Sequence[ScaleSource]) -> tuple[float, int]:
-    """Return the chi-square of all sources, used or not, about their mean, and its degrees of freedom."""
+    """Return the chi-square of all sources about their weighted mean, and its degrees of freedom.
+
+    Unused sources are included.
+    """
     mean, _ = weighted_mean([replace(source, used=True) for source in sources])
     off = np.array([np.log(source.scale / mean) / source.sigma_log for source in sources])
     return float(off @ off), len(sources) - 1

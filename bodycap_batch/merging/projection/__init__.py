@@ -1,1 +1,1 @@
-"""The motion of the rigid skeleton that is nearest to the solution of the factor graph."""
+"""Projection: find the motion of the rigid skeleton that is nearest to the solution of the motion graph."""

@@ -1,8 +1,9 @@
 """Project the solved motion onto a rigid skeleton.
 
 In the motion graph the joints have some slack, so bones can shift by millimetres. In a rigid motion only the
-root moves, and all other joints rotate. This module estimates the rigid motion that is close to the measured
-camera poses and to the motion graph, and whose correction changes slowly over time.
+root shifts, and all other joints only rotate. This module estimates a rigid motion that is close to the
+camera poses and to the motion graph. The difference between rigid motion and motion graph changes slowly over
+time.
 """
 
 from __future__ import annotations
@@ -26,23 +27,29 @@ from bodycap_batch.model.merge_data import CameraClock, SolvedBody, standing_sig
 from bodycap_batch.model.skeleton import Motion, forward_kinematics
 
 _MAX_GAP_INTERVALS = 1.6
-"""Frame intervals. Measured poses are interpolated over gaps up to this. Derivation: between one interval
-(neighbouring frames) and two (a lost frame between them)."""
+"""Maximum time without poses over which camera poses are interpolated, as a number of frame intervals.
+
+Derivation: between one interval (neighbouring frames) and two intervals (one lost frame between them).
+"""
 
 _SNAP_NS = 1_000_000
-"""Nanoseconds. A measured pose this near to a tick is used without interpolation. Evidence: none; motion in 1
-ms is below the noise."""
+"""Maximum time between a camera pose and a tick for use of the pose without interpolation, nanoseconds.
+
+Evidence: none; the motion in 1 ms is below the noise.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Projection:
-    """The motion of the rigid skeleton, and its differences to the solution of the graph.
+    """The motion of the rigid skeleton, and its differences from the solution of the motion graph.
 
     Attributes:
         motion: The rigid motion.
-        gap: Plain JSON values. ``joints``: difference to the joints of the motion graph. ``cameras``:
-            difference to the camera paths (`MergeOptions.camera_paths`). ``feet``:
-            sliding speed of standing feet.
+        gap: Differences between the rigid motion and the solution of the motion graph, as plain JSON values.
+            ``joints``: difference between the poses of the solved joints. ``cameras``: by camera, difference
+            between the camera poses on the rigid skeleton and the camera path (see
+            `MergeOptions.camera_paths`). ``feet``: by joint, sliding speed of standing feet in the rigid
+            motion.
     """
 
     motion: Motion
@@ -54,16 +61,17 @@ def project_motion(
     clocks: Mapping[str, CameraClock],
     row_fraction: Mapping[str, FloatArray] | None = None,
 ) -> Projection:
-    """Project the solution of the factor graph onto its own rigid skeleton.
+    """Project the solution of the motion graph onto its rigid skeleton.
 
     Args:
-        body: The solution of the factor graph.
-        clocks: The clock of each camera, by name.
-        row_fraction: By camera, (N,) mean image row of the observations behind each pose, as a fraction of
-            the image height, for the times of rolling-shutter cameras.
+        body: The solution of the motion graph.
+        clocks: By camera, its clock.
+        row_fraction: By camera, (N,) mean image row of the observations of each of the N frames, as a
+            fraction of the image height. With a rolling shutter, the time of a pose depends on this row.
 
     Returns:
-        The motion on the timeline of merging. Joints that the graph did not solve keep their local rotations.
+        The rigid motion at the ticks of `body`, and its differences from the motion graph. Joints that the
+        graph did not solve keep their local rotations.
     """
     problem = projection_problem(body, clocks, row_fraction)
     result = solve_rigid_motion(problem, initial_motion(body))
@@ -83,7 +91,17 @@ def projection_problem(
     clocks: Mapping[str, CameraClock],
     row_fraction: Mapping[str, FloatArray] | None = None,
 ) -> ProjectionProblem:
-    """Return the least-squares problem of `project_motion`, with the same arguments."""
+    """Return the least-squares problem that `project_motion` solves.
+
+    Args:
+        body: The solution of the motion graph.
+        clocks: By camera, its clock.
+        row_fraction: By camera, (N,) mean image row of the observations of each of the N frames, as a
+            fraction of the image height.
+
+    Returns:
+        The terms of the problem.
+    """
     return ProjectionProblem(
         fps=body.fps,
         skeleton=body.skeleton,
@@ -95,9 +113,16 @@ def projection_problem(
 
 
 def initial_motion(body: SolvedBody) -> RigidMotion:
-    """Return the rigid motion with the rotations of the motion graph.
+    """Return the rigid motion that has the joint rotations of the motion graph.
 
-    The root is where the centres of the solved joints agree best with the graph.
+    At each tick, the position of the root minimises the squared distances between the centres of the solved
+    joints in the rigid motion and in the graph.
+
+    Args:
+        body: The solution of the motion graph.
+
+    Returns:
+        The initial motion of the least-squares problem.
     """
     skeleton, solved = body.skeleton, body.solved
     rotation = body.graph_world_from_joint[..., :3, :3]
@@ -111,7 +136,7 @@ def initial_motion(body: SolvedBody) -> RigidMotion:
 
 
 def _standing_joints(body: SolvedBody) -> tuple[StandingJoint, ...]:
-    """Return the ankles of the feet that stand at some ticks."""
+    """Return the ankles of all feet that stand on the floor at two or more successive ticks."""
     if body.standing is None:
         return ()
     held = body.standing[1:] & body.standing[:-1]
@@ -125,7 +150,7 @@ def _standing_joints(body: SolvedBody) -> tuple[StandingJoint, ...]:
 def _camera_targets(
     body: SolvedBody, clocks: Mapping[str, CameraClock], row_fraction: Mapping[str, FloatArray]
 ) -> tuple[CameraTarget, ...]:
-    """Return the measured poses of each camera, interpolated at the ticks of the motion."""
+    """Return the poses of each camera's path in the world, interpolated at the ticks of the motion."""
     out = []
     mounts = {mount.camera: mount for mount in body.mounts}
     for trajectory in body.trajectories:
@@ -160,7 +185,7 @@ def _camera_targets(
 
 
 def _gap(body: SolvedBody, motion: Motion, cameras: tuple[CameraTarget, ...]) -> dict[str, Any]:
-    """Return the differences of the rigid motion to motion graph and cameras (`Projection.gap`)."""
+    """Return the differences between the rigid motion and the solution of the graph (`Projection.gap`)."""
     exported = motion.world_from_joint()
     out: dict[str, Any] = {}
     if body.solved.any():
@@ -185,13 +210,30 @@ def _gap(body: SolvedBody, motion: Motion, cameras: tuple[CameraTarget, ...]) ->
 
 
 def _slide_speed(centre: FloatArray, standing: StandingJoint, fps: float) -> dict[str, float]:
-    """Return percentiles of the speed of an ankle, with centres (T,3), while its foot stands."""
+    """Return the percentiles of an ankle's speed while its foot stands.
+
+    Args:
+        centre: (T,3) centres of the ankle in the world, metres.
+        standing: The ticks at which the foot stands.
+        fps: Number of ticks per second.
+
+    Returns:
+        The median and the 95th percentile of the speed, metres per second.
+    """
     speed = fps * np.linalg.norm(np.diff(centre, axis=0), axis=1)[standing.held]
     return {f"slide_p{q}_m_per_s": float(np.percentile(speed, q)) for q in (50, 95)}
 
 
 def _pose_difference(first: FloatArray, second: FloatArray) -> dict[str, float]:
-    """Return the median and the 95th percentile of distance and angle between poses (...,4,4)."""
+    """Return the median and the 95th percentile of the distances and angles between two sets of poses.
+
+    Args:
+        first: (...,4,4) poses.
+        second: (...,4,4) poses, one for each pose of `first`.
+
+    Returns:
+        Percentiles of the distance in metres and of the angle in degrees.
+    """
     difference = invert(first) @ second
     distance = np.linalg.norm(difference[..., :3, 3], axis=-1)
     angle = np.rad2deg(rotation_angle_rad(difference[..., :3, :3]))

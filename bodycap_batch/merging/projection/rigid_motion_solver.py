@@ -1,9 +1,13 @@
 """The least-squares problem of the projection onto the rigid skeleton, and its solution.
 
-The unknowns of a tick are a shift of the root and, for each solved joint, a rotation of all its descendants
-about its centre, in world axes. Only neighbouring ticks are linked, so the normal equations are
-block-tridiagonal, and the solution takes a time proportional to the number of ticks. Long motions are solved
-in overlapping windows, so that the memory does not grow with their length.
+The unknowns of a tick are a shift of the root and one rotation for each solved joint. This rotation moves the
+joint and all its descendants about the joint's centre, in world axes.
+
+Only neighbouring ticks are linked, so the normal equations are block-tridiagonal. The solution takes a time
+proportional to the number of ticks. Long motions are solved in overlapping windows, so that the required
+memory does not grow with the length of the motion.
+
+In this module, the correction is the difference of the rigid motion from the motion graph.
 """
 
 from __future__ import annotations
@@ -19,59 +23,86 @@ from bodycap_batch.model.geometry import skew, so3_exp, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
 
 _CAMERA_SIGMA = np.repeat([np.deg2rad(0.5), 0.005], 3)
-"""Radians and metres, one sigma of the rotation and the centre of a localised camera. Evidence:
-docs/decisions/export.md."""
+"""Sigmas of a camera pose: three of the rotation (radians), then three of the centre (metres).
+
+Evidence: docs/decisions/export.md.
+"""
 
 _GRAPH_SIGMA = np.repeat([np.deg2rad(3.0), 0.01], 3)
-"""Radians and metres, one sigma of the difference of a joint to the motion graph. Derivation: less than the
-graph's pose priors (20 to 45°), more than the slack of its joints (5 mm)."""
+"""Sigmas of a joint's difference from the motion graph: three of the rotation (radians), then three of the
+centre (metres).
+
+Derivation: the rotation sigma is smaller than the sigmas of the graph's rotation priors (20 to 45°). The
+sigma of the centre is larger than the slack of the graph's joints (5 mm).
+"""
 
 _CHANGE_SIGMA = np.repeat([0.002, np.deg2rad(0.3)], 3)
-"""Metres and radians, one sigma of the change of the correction in 1/30 s: root shift and rotations.
-Derivation: below what a viewer sees as jitter. It grows with the square root of the time, to 1.1 cm and 1.6°
-in a second."""
+"""Sigmas of the change of the correction in 1/30 s: three of the root shift (metres), then three of a
+rotation (radians).
+
+Derivation: a viewer does not see changes of this size as jitter. The sigmas grow with the square root of the
+time, to 1.1 cm and 1.6° in a second.
+"""
 
 _INDEPENDENT_HZ = 30.0
-"""Hertz. Number of errors per second that count as independent. The weight of a tick is proportional to its
-duration. Evidence: docs/decisions/export.md for the weight; none for the value."""
+"""Number of errors per second that are treated as independent, hertz.
+
+The errors of successive ticks are correlated. The weight of a tick is therefore proportional to its duration.
+Evidence: docs/decisions/export.md for the weight; none for the value.
+"""
 
 _SLIP_HUBER_SIGMAS = 2.0
-"""Sigmas. Threshold of the Huber loss for the movement of a standing foot, as in the motion graph. A larger
-movement counts as slipping."""
+"""Threshold of the Huber loss for the movement of a standing foot, in sigmas.
+
+A larger movement is treated as slipping. The motion graph uses the same threshold.
+"""
 
 _GEMAN_MCCLURE_SQUARED = 100.0
-"""Squared sigmas. Parameter c² of the Geman-McClure loss for a camera. Derivation: 3 to 4 sigmas on each of
-the six components of the error."""
+"""Parameter c² of the Geman-McClure loss for a camera pose, in squared sigmas.
+
+Derivation: an error of 4 sigmas in each of its six components has about the length c = 10.
+"""
 
 _MAX_STEPS = 12
-"""Largest number of Levenberg-Marquardt steps. Evidence: none."""
+"""Maximum number of Levenberg-Marquardt steps. Evidence: none."""
 
 _STEP_TOLERANCE = 1e-6
-"""Metres and radians. The solve ends when all components of a step are below this. Derivation: a micrometre
-and a microradian are far below what a viewer sees."""
+"""Convergence threshold for all components of a step, metres and radians.
+
+Derivation: a viewer cannot see a micrometre or a microradian.
+"""
 
 _JACOBIAN_CHUNK_TICKS = 1000
-"""Ticks whose Jacobians are held in memory at the same time. Evidence: none; it only limits the memory."""
+"""Maximum number of ticks whose Jacobians are in memory at the same time.
+
+Evidence: none; the value only limits the required memory.
+"""
 
 WINDOW_TICKS = 2000
-"""Ticks that are solved together, without the overlaps. Derivation: with 15 joints and four blocks of 18 kB
-per tick, this takes 180 MB at 30 ticks per second and 350 MB at 240."""
+"""Maximum number of ticks in a window, without the overlaps.
+
+Derivation: with 15 joints and four blocks of 18 kB per tick, a window takes 180 MB at 30 ticks per second and
+350 MB at 240 ticks per second.
+"""
 
 OVERLAP_S = 4.0
-"""Seconds that a window is extended by on both sides. Derivation: with sigmas of 0.3° per 1/30 s and 3°, the
-influence of a tick falls by a tenth per 1/30 s, so to e^-12 over the overlap."""
+"""Duration of the overlap that extends a window on each side, seconds.
+
+Derivation: the correction has a sigma of 3°, and its change in 1/30 s has a sigma of 0.3°. The influence of
+a tick therefore falls by a tenth in 1/30 s, and to e^-12 over the overlap.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraTarget:
-    """The measured poses of a camera at T ticks.
+    """The poses of a camera at T ticks, from the camera's path in the world.
 
     Attributes:
         camera: Camera name.
         joint: Index of the joint at which the camera's bone starts.
         joint_from_cam: (4,4) mount of the camera.
-        world_from_cam: (T,4,4) measured poses.
-        found: (T,) True for the ticks with a measured pose.
+        world_from_cam: (T,4,4) camera poses in the world, metres.
+        found: (T,) True for the ticks with a camera pose.
     """
 
     camera: str
@@ -87,8 +118,8 @@ class StandingJoint:
 
     Attributes:
         joint: Index of the joint.
-        held: (T-1,) True if the joint should not move from a tick to the next one.
-        sigma_m: Standard deviation of its movement between two ticks, per axis.
+        held: (T-1,) True if the joint should not move from a tick to the next tick.
+        sigma_m: Standard deviation of the joint's movement between two ticks, metres per axis.
     """
 
     joint: int
@@ -101,11 +132,11 @@ class ProjectionProblem:
     """The terms of the least-squares problem for T ticks.
 
     Attributes:
-        fps: Ticks per second.
+        fps: Number of ticks per second.
         skeleton: The rigid skeleton, with J joints.
         solved: (S,) indices of the joints that the motion graph solved.
-        world_from_joint: (T,J,4,4) joint poses of the motion graph.
-        cameras: Measured poses of the cameras.
+        world_from_joint: (T,J,4,4) joint poses of the motion graph in the world, metres.
+        cameras: Poses of the cameras.
         standing: Joints that should not move while their feet stand.
     """
 
@@ -117,7 +148,10 @@ class ProjectionProblem:
     standing: tuple[StandingJoint, ...] = ()
 
     def ancestor_matrix(self) -> FloatArray:
-        """Return a matrix (J,S): 1 if the solved joint is the joint itself or its ancestor, else 0."""
+        """Return the ancestor matrix (J,S).
+
+        An entry is 1 if the solved joint S is the joint J itself or an ancestor of J, else 0.
+        """
         out = np.zeros((len(self.skeleton.joints), len(self.solved)))
         for joint in range(len(out)):
             ancestor = joint
@@ -128,11 +162,11 @@ class ProjectionProblem:
 
     @property
     def tick_weight(self) -> float:
-        """Weight of the errors of one tick, which is proportional to the duration of a tick."""
+        """Weight of the errors of one tick. It is proportional to the duration of a tick."""
         return _INDEPENDENT_HZ / self.fps
 
     def for_ticks(self, low: int, high: int) -> ProjectionProblem:
-        """Return the problem for the ticks [low, high) only."""
+        """Return the problem restricted to the ticks [low, high)."""
         ticks = slice(low, high)
         cameras = (
             replace(target, world_from_cam=target.world_from_cam[ticks], found=target.found[ticks])
@@ -153,7 +187,7 @@ class RigidMotion:
 
     Attributes:
         root: (T,3) root position in the world, metres.
-        local: (T,J,3,3) parent_from_joint rotations; for the root, world_from_root.
+        local: (T,J,3,3) rotations parent_from_joint; the rotation of the root is world_from_root.
     """
 
     root: FloatArray
@@ -167,13 +201,16 @@ def solve_rigid_motion(
     window_ticks: int = WINDOW_TICKS,
     overlap_s: float = OVERLAP_S,
 ) -> RigidMotion:
-    """Return the rigid motion with the smallest cost; a long motion is solved in overlapping windows.
+    """Return the rigid motion with the smallest cost. A long motion is solved in overlapping windows.
 
     Args:
         problem: The terms of the cost.
-        start: Initial motion.
-        window_ticks: Largest number of ticks that are solved together, without the overlaps.
-        overlap_s: Seconds that a window is extended by on both sides.
+        start: The initial motion.
+        window_ticks: Maximum number of ticks in a window, without the overlaps.
+        overlap_s: Duration of the overlap that extends a window on each side, seconds.
+
+    Returns:
+        The rigid motion at all ticks.
     """
     count, overlap = len(start.root), round(overlap_s * problem.fps)
     root, local = np.empty_like(start.root), np.empty_like(start.local)
@@ -187,13 +224,24 @@ def solve_rigid_motion(
 
 
 def windows(ticks: int, window_ticks: int) -> list[tuple[int, int]]:
-    """Return windows [first, last) of nearly equal length, at most `window_ticks`, that cover all ticks."""
+    """Divide all ticks into windows of nearly equal length.
+
+    Args:
+        ticks: Number of all ticks.
+        window_ticks: Maximum number of ticks in a window.
+
+    Returns:
+        The windows [first, last), without overlaps.
+    """
     cuts = np.linspace(0, ticks, max(1, -(-ticks // window_ticks)) + 1).round().astype(int).tolist()
     return list(pairwise(cuts))
 
 
 def _solve_window(problem: ProjectionProblem, start: RigidMotion) -> RigidMotion:
-    """Minimise the cost by Levenberg-Marquardt; a step that increases the cost is rejected."""
+    """Minimise the cost by Levenberg-Marquardt steps, and return the solved motion.
+
+    A step that increases the cost is rejected.
+    """
     ancestors = problem.ancestor_matrix()
     motion, damping = start, 1e-6
     current_cost = cost(problem, motion)
@@ -214,9 +262,13 @@ def retract(problem: ProjectionProblem, motion: RigidMotion, step: FloatArray) -
     """Return the motion after a step.
 
     Args:
-        problem: The problem, for skeleton and solved joints.
-        motion: The current motion.
-        step: (T,3+3S) shift of the root in metres, and a rotation vector in world axes for each solved joint.
+        problem: The problem, which contains the skeleton and the solved joints.
+        motion: The motion before the step.
+        step: (T,3+3S) shift of the root in metres, then a rotation vector in world axes for each of the S
+            solved joints.
+
+    Returns:
+        The motion after the step.
     """
     rotation = forward_kinematics(problem.skeleton, motion.root, motion.local)[..., :3, :3]
     local = motion.local.copy()
@@ -230,14 +282,16 @@ def retract(problem: ProjectionProblem, motion: RigidMotion, step: FloatArray) -
 
 
 def _camera_error(target: CameraTarget, world: FloatArray, ticks: slice) -> tuple[FloatArray, FloatArray]:
-    """Return the errors (T,6) of a camera in sigmas, and its centres (T,3) on the rigid skeleton.
-
-    Rotation comes before translation. The error of a tick without a measured pose is zero.
+    """Return the errors of a camera, and the camera's centres on the rigid skeleton.
 
     Args:
-        target: The measured poses of the camera.
-        world: (T,J,4,4) joint poses of the rigid skeleton at `ticks`.
-        ticks: The ticks of the target.
+        target: The poses of the camera.
+        world: (T,J,4,4) joint poses of the rigid skeleton at `ticks`, metres.
+        ticks: Indices of the T ticks among all ticks of `target`.
+
+    Returns:
+        (T,6) errors of the camera poses in sigmas, rotation first. The error is zero at a tick without a
+        camera pose. Then (T,3) centres of the camera on the rigid skeleton, in the world.
     """
     rigid = world[:, target.joint] @ target.joint_from_cam
     measured = target.world_from_cam[ticks]
@@ -247,9 +301,15 @@ def _camera_error(target: CameraTarget, world: FloatArray, ticks: slice) -> tupl
 
 
 def _graph_error(problem: ProjectionProblem, world: FloatArray, ticks: slice) -> FloatArray:
-    """Return the differences (T,S,6) of the solved joints to the motion graph, in rad and metres.
+    """Return the differences of the solved joints from the motion graph.
 
-    Rotation comes before translation. `world` has the joint poses of the rigid skeleton at `ticks`.
+    Args:
+        problem: The problem, which contains the poses of the motion graph.
+        world: (T,J,4,4) joint poses of the rigid skeleton at `ticks`, metres.
+        ticks: Indices of the T ticks among all ticks of `problem`.
+
+    Returns:
+        (T,S,6) rotation (radians), then translation (metres), from the motion graph to the rigid skeleton.
     """
     graph, rigid = problem.world_from_joint[ticks][:, problem.solved], world[:, problem.solved]
     rotvec = so3_log(rigid[..., :3, :3] @ np.swapaxes(graph[..., :3, :3], -1, -2))
@@ -259,9 +319,15 @@ def _graph_error(problem: ProjectionProblem, world: FloatArray, ticks: slice) ->
 def _scaled_correction(
     problem: ProjectionProblem, motion: RigidMotion, graph_error: FloatArray
 ) -> FloatArray:
-    """Return the correction (T,3+3S) of the motion graph in sigmas of its change from tick to tick.
+    """Return the correction, divided by the sigmas of its change from tick to tick.
 
-    It consists of the shift of the root and the rotation of each solved joint; `graph_error` is (T,S,6).
+    Args:
+        problem: The problem, which contains the poses of the motion graph.
+        motion: The rigid motion.
+        graph_error: (T,S,6) differences of the solved joints from the motion graph.
+
+    Returns:
+        (T,3+3S) shift of the root, then rotation of each solved joint.
     """
     shift = motion.root - problem.world_from_joint[:, 0, :3, 3]
     rotations = graph_error[..., :3].reshape(len(shift), -1)
@@ -275,7 +341,15 @@ def _change_sigma(problem: ProjectionProblem) -> FloatArray:
 
 
 def cost(problem: ProjectionProblem, motion: RigidMotion) -> float:
-    """Return the value of the robust least-squares cost."""
+    """Return the robust least-squares cost of a rigid motion.
+
+    Args:
+        problem: The terms of the cost.
+        motion: The rigid motion.
+
+    Returns:
+        The cost, without the factor one half.
+    """
     everything = slice(None)
     world = forward_kinematics(problem.skeleton, motion.root, motion.local)
     graph_error = _graph_error(problem, world, everything)
@@ -293,7 +367,7 @@ def cost(problem: ProjectionProblem, motion: RigidMotion) -> float:
 
 
 def _slip(standing: StandingJoint, world: FloatArray) -> FloatArray:
-    """Return the movement (T-1,3) of a joint between ticks in sigmas; zero if it may move."""
+    """Return the movement (T-1,3) of a joint between ticks in sigmas. It is zero where the joint may move."""
     movement = np.diff(world[:, standing.joint, :3, 3], axis=0)
     return np.asarray(np.where(standing.held[:, None], movement / standing.sigma_m, 0.0))
 
@@ -304,7 +378,7 @@ class NormalEquations:
 
     Attributes:
         blocks: (T,n,n) blocks on the diagonal.
-        coupling: (T-1,n,n) blocks that link each tick with the next one.
+        coupling: (T-1,n,n) blocks that link each tick with the next tick.
         gradient: (T,n) half the gradient of the cost.
     """
 
@@ -316,12 +390,15 @@ class NormalEquations:
 def normal_equations(
     problem: ProjectionProblem, motion: RigidMotion, ancestors: FloatArray
 ) -> NormalEquations:
-    """Return the normal equations at a motion.
+    """Return the normal equations, linearised at a motion.
 
     Args:
-        problem: The problem.
+        problem: The terms of the cost.
         motion: The motion at which the cost is linearised.
         ancestors: (J,S) the ancestor matrix of the problem.
+
+    Returns:
+        The normal equations of all ticks.
     """
     world = forward_kinematics(problem.skeleton, motion.root, motion.local)
     ticks, size = len(world), 3 + 3 * len(problem.solved)
@@ -380,7 +457,10 @@ def _add_standing_joints(
 def _weighted_residuals(
     problem: ProjectionProblem, world: FloatArray, ancestors: FloatArray, ticks: slice
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the weighted Jacobian (T,6,n) and error (T,6) of each solved joint and camera, in sigmas."""
+    """Return the weighted Jacobian (T,6,n) and the weighted error (T,6) of each solved joint and each camera.
+
+    The errors are in sigmas.
+    """
     centres = world[:, problem.solved][..., :3, 3]
     out = []
     graph_error = _graph_error(problem, world, ticks)
@@ -397,12 +477,15 @@ def _weighted_residuals(
 
 
 def _jacobian(centres: FloatArray, point: FloatArray, is_ancestor: FloatArray) -> FloatArray:
-    """Return the Jacobian (T,6,n) of rotation and position of a body point with respect to the unknowns.
+    """Return the derivatives of the pose of a point on the body with respect to the unknowns.
 
     Args:
-        centres: (T,S,3) centres of the solved joints.
-        point: (T,3) position of the point.
-        is_ancestor: (S,) 1 if the point moves with a solved joint, else 0.
+        centres: (T,S,3) centres of the solved joints in the world.
+        point: (T,3) position of the point in the world.
+        is_ancestor: (S,) 1 if the point rotates together with the solved joint, else 0.
+
+    Returns:
+        (T,6,n) Jacobian of rotation and position, rotation first, for the n unknowns of each tick.
     """
     ticks, solved = centres.shape[:2]
     out = np.zeros((ticks, 6, 3 + 3 * solved))
@@ -419,7 +502,10 @@ def _solve_tridiagonal(equations: NormalEquations, damping: float) -> FloatArray
 
     Args:
         equations: The normal equations.
-        damping: Relative increase of the matrix's diagonal.
+        damping: Relative increase of the diagonal of the matrix.
+
+    Returns:
+        (T,n) step.
     """
     damped = equations.blocks * (1.0 + damping * np.eye(equations.gradient.shape[1]))
     system = BlockTridiagonal.from_blocks(damped, equations.coupling)

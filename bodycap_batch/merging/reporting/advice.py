@@ -15,11 +15,20 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import split_side
 
 _WELL_KNOWN_MOUNT_DEG = 5.0
-"""Sigma of a mount's rotation up to which no advice is given, degrees per axis. Evidence: none."""
+"""Maximum sigma of a well-known mount's rotation, degrees per axis. Evidence: none.
+
+The report gives advice for mounts with a larger sigma.
+"""
 _WELL_KNOWN_MOUNT_M = 0.02
-"""Sigma of a mount's position up to which no advice is given, metres per axis. Evidence: none."""
+"""Maximum sigma of a well-known mount's position, metres per axis. Evidence: none.
+
+The report gives advice for mounts with a larger sigma.
+"""
 _WELL_KNOWN_SCALE = 0.02
-"""Relative sigma of the metric scale up to which no advice is given. Evidence: none."""
+"""Maximum relative sigma of a well-known metric scale. Evidence: none.
+
+The report gives advice if the sigma of the scale is larger.
+"""
 _MOVEMENTS = {
     "Spine1": "walk straight ahead, turn round, and lift both arms to the side",
     "Spine": "walk straight ahead, turn round, and bend and twist the trunk",
@@ -42,9 +51,13 @@ def describe_clock(camera: str, shift_s: float, scatter_left: float, offset_s: f
 
     Args:
         camera: Camera name.
-        shift_s: Time to add to the camera's timestamps.
-        scatter_left: Part of the scatter of its positions on the body that remains after the shift, 0 to 1.
-        offset_s: The clock offset that includes the shift.
+        shift_s: Time to add to the camera's timestamps, seconds.
+        scatter_left: Ratio of the scatter of the camera's positions with the shift to the scatter without the
+            shift, 0 to 1. The positions are relative to the trunk.
+        offset_s: Clock offset that includes the shift, seconds.
+
+    Returns:
+        A sentence for the report.
     """
     direction = "behind" if shift_s > 0.0 else "ahead"
     return (
@@ -57,7 +70,10 @@ def describe_swapped_sides(swapped: Mapping[str, float]) -> str:
     """Describe cameras on the wrong side of the body, and the likely reasons.
 
     Args:
-        swapped: By camera, the part of its time on the wrong side.
+        swapped: By camera, fraction of its frames on the wrong side of the body.
+
+    Returns:
+        A sentence for the report.
     """
     return (
         f"{' and '.join(sorted(swapped))} stay on the other side of the body: left and right are "
@@ -70,7 +86,10 @@ def describe_mount(mount: Mount, *, t_pose: bool) -> str:
 
     Args:
         mount: The solved mount with its sigmas.
-        t_pose: True if a T-pose was used.
+        t_pose: True if the calibration used a T-pose.
+
+    Returns:
+        A sentence for the report. If the mount is not well known, the sentence contains advice.
     """
     degrees, metres = float(np.degrees(mount.sigma_rad)), mount.sigma_m
     text = f"{mount.camera}'s mount is known to {degrees:.1f}° and {100.0 * metres:.1f} cm (1 sigma)"
@@ -87,7 +106,10 @@ def describe_hinge(role: str, off_m: float) -> str:
 
     Args:
         role: Anatomical name of the bone below the hinge.
-        off_m: Sigma by which the bone's far end leaves the hinge's plane, metres.
+        off_m: Sigma of the distance of the bone's far end from the plane of the hinge, metres.
+
+    Returns:
+        A sentence for the report, with advice.
     """
     side, part = split_side(role)
     joint = f"{side.lower()} {'elbow' if part == 'ForeArm' else 'knee'}"

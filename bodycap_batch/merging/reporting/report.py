@@ -50,25 +50,31 @@ from bodycap_batch.model.merge_report import (
 from bodycap_batch.model.skeleton import Mount
 
 _DOWN_WEIGHTED = 0.25
-"""Robust weight below which a measurement counts as down-weighted. Evidence: none."""
+"""Threshold of the robust weight: a measurement with a smaller weight is down-weighted. Evidence: none.
+
+The report gives the number of down-weighted measurements.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionFacts:
-    """What the report states of the motion, beside its calibration and solution.
+    """Further facts for the report that are not in the calibration or in the solution.
 
     Attributes:
         start_ns: Common time of the first tick.
         end_ns: Common time of the last tick.
-        dropped: By camera, (N,) frames with gross errors.
+        dropped: By camera, (N,) numbers of the frames with gross errors.
         floor: The floor.
-        unused: By camera that is no part of the body, the reason.
-        aligned: By camera of an aligned map, the uncertainty of its map's pose.
-        joint_sigma_m: By role, then ``observed`` or ``filled``, percentiles of the sigma of its centre.
-        joint_gap_m: By role, (T,) gap of the joint.
-        hinge_off_plane_m: By role, (T,) distance of a hinged bone's far end from the hinge's plane.
-        contacts: By foot, how often it stands and how fast it slides meanwhile.
-        rule_violation_m: By soft rule, (T,) by how much it is violated.
+        unused: By unused camera, the reason why it is not used.
+        aligned: By camera whose map was aligned to the main map, uncertainty of the pose of this map.
+        joint_sigma_m: By role of a joint, then by ``observed`` or ``filled`` ticks, percentiles of the sigma
+            of the joint's centre, metres per axis.
+        joint_gap_m: By role of a joint, (T,) distance of the joint from its place on the parent bone, metres.
+        hinge_off_plane_m: By role of the joint at the far end of a hinged bone, (T,) distance of this joint
+            from the plane of the hinge, metres.
+        contacts: By foot, statistics of its contacts: how often it stands, and how fast it slides while it
+            stands.
+        rule_violation_m: By name of a soft rule, (T,) amount by which the motion violates the rule, metres.
     """
 
     start_ns: int
@@ -91,14 +97,17 @@ def build_report(
     tracks: Sequence[CameraTrack],
     facts: MotionFacts,
 ) -> MergeReport:
-    """Build the report.
+    """Build the report of the merging stage.
 
     Args:
         inputs: The inputs of the stage.
         calibration: The calibration of the body.
         solution: The solved motion.
-        tracks: The tracks that were used, that of the reference camera first.
-        facts: What else the report states.
+        tracks: Cleaned tracks of the used cameras. The track of the reference camera is the first.
+        facts: Further facts for the report.
+
+    Returns:
+        The report.
     """
     main_tracks = [track for track in tracks if track.camera not in facts.aligned]
     return MergeReport(
@@ -150,7 +159,10 @@ def _camera_report(track: CameraTrack, solution: MotionSolution, facts: MotionFa
 def _clock_reports(
     clocks: Mapping[str, CameraClock], tracks: Sequence[CameraTrack]
 ) -> dict[str, ClockReport]:
-    """Report suspicious clocks. Aligned maps are not checked: their alignment absorbs a wrong clock."""
+    """Report suspicious clocks of the cameras in the main map.
+
+    The caller passes no tracks of aligned maps, because the alignment of a map absorbs a wrong clock.
+    """
     out = {}
     for camera, doubt in suspicious_clocks(tracks).items():
         offset_s = round(clocks[camera].offset_s + doubt["shift_s"], 2)
@@ -166,7 +178,7 @@ def _clock_reports(
 def _sides_report(
     priors: Collection[Mount], calibration: BodyCalibration, tracks: Sequence[CameraTrack]
 ) -> SwappedSidesReport | None:
-    """Report the limbs' cameras on the other side of the body, if all of them are."""
+    """Report swapped sides. Return None unless all cameras on limbs are on the wrong side of the body."""
     mounts = {mount.camera: mount for mount in (*priors, calibration.reference_prior)}
     wrong = swapped_sides(tracks, mounts, calibration.vertical.up)
     return SwappedSidesReport(cameras=wrong, says=describe_swapped_sides(wrong)) if wrong else None
@@ -288,14 +300,17 @@ def _percentiles(values: FloatArray) -> Percentiles:
 
 
 def longest_gap_s(track: CameraTrack, start_ns: int, end_ns: int) -> float:
-    """Return the longest time (s) without a measurement.
+    """Return the longest time without poses of a camera.
 
-    The times before the first measurement and after the last one count as well.
+    The times before the first pose and after the last pose are included.
 
     Args:
-        track: A camera's track.
+        track: Track of the camera.
         start_ns: Common time of the first tick.
         end_ns: Common time of the last tick.
+
+    Returns:
+        The longest time without poses, seconds.
     """
     times = np.concatenate([[start_ns], np.clip(track.times_ns, start_ns, end_ns), [end_ns]])
     return round(float(np.diff(times).max()) * 1e-9, 4)
