@@ -193,7 +193,7 @@ class Flow:
         return refined, self.register(refined, keyframes, registrations)
 
     def solve_rigs(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
-        """Solve the cameras of each synchronised rig again, from the observations of all cameras of the rig."""
+        """Solve the cameras of each synchronised rig again, from what all the rig's cameras observe."""
         solved = self.runner.run_all(self._rig_tasks(scene_map, registrations, keyframes))
         for artefact in solved.values():
             self.runner.report_notes(artefact, "registration")
@@ -340,7 +340,7 @@ class Flow:
         registrations: ByCamera,
         keyframes: ByCamera,
     ) -> CameraGroupTask:
-        """Return the task of solving the camera `own` with the help of `cameras`; the task names `own` first."""
+        """Return the task of solving the camera `own` with the help of `cameras`; `own` comes first in it."""
         ordered = [own, *(camera for camera in cameras if camera.name != own.name)]
         names = [camera.name for camera in ordered]
         return CameraGroupTask(

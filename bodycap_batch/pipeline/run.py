@@ -154,7 +154,7 @@ def _run_until(
 
 
 def _is_about_data(error: BodycapError) -> bool:
-    """Return True if the job or its videos caused the error, False if the machine or the program caused it."""
+    """Return True if the job or its videos caused the error; False if the machine or the program did."""
     return isinstance(error, JobError | CaptureError | EstimationError)
 
 
@@ -257,7 +257,7 @@ def _versions(flow: Flow) -> dict[str, str]:
 
 
 def files_of(artefact: Artefact) -> list[tuple[str, Path]]:
-    """Return the result files of an artefact: for each file, its name for the user and its path in the store."""
+    """Return the name for the user and the path in the store of each result file of an artefact."""
     return [
         (Path(name).relative_to(RESULTS_FOLDER).as_posix(), artefact.path / name)
         for name in artefact.files

@@ -43,7 +43,8 @@ class Settings:
         until: Name of the last stage to run; "" runs all stages. Results are published only if the last stage
             of the job runs.
         priority: Priority of the job's tasks; waiting tasks with a higher number run first.
-        results_ready: Called with the folder of the results, if they are published before their video is ready.
+        results_ready: Called with the folder of the results, if they are published before their video is
+            ready.
         limits: Maximum sizes of the videos; None (no limits) for a job that the user runs directly.
         turns: The artefacts that jobs of this process are computing; None if the process runs only this job.
     """

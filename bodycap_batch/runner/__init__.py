@@ -1,6 +1,7 @@
 """Run tasks in child processes, on this machine or on other machines.
 
-This package does not import the stages; `child_main.main` receives the functions of the stages as an argument.
+This package does not import the stages; `child_main.main` receives the functions of the stages as an
+argument.
 """
 
 from bodycap_batch.runner.child_process import CHILD_COMMAND

@@ -37,22 +37,22 @@ _PROGRESS_PERIOD_S = 0.2
 """Minimum time (seconds) between two reports of progress. A display that changes faster is hard to read.
 Evidence: none."""
 _GRACE_S = 3.0
-"""Time (seconds) that a stage has to stop by itself after the parent has closed standard input. The parent waits
-for the same time (`child_process.KILL_AFTER_S`). Evidence: none."""
+"""Time (seconds) that a stage has to stop by itself after the parent has closed standard input. The parent
+waits for the same time (`child_process.KILL_AFTER_S`). Evidence: none."""
 RELEASE_PERIOD_S = 0.5
-"""Minimum time (seconds) between two releases of freed memory. A release takes about 50 ms in a large process.
-Evidence: docs/decisions/pipeline.md."""
+"""Minimum time (seconds) between two releases of freed memory. A release takes about 50 ms in a large
+process. Evidence: docs/decisions/pipeline.md."""
 FULL_DISK_BYTES = 8 << 20
-"""Minimum free space (bytes) on the disk. With less space, a full disk is reported as the cause of an unexpected
-failure, because libraries hide the error ENOSPC. Evidence: none."""
+"""Minimum free space (bytes) on the disk. With less space, a full disk is reported as the cause of an
+unexpected failure, because libraries hide the error ENOSPC. Evidence: none."""
 
 
 def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
-    """Run the task file that `arguments` name; without a task file, follow orders until standard input closes.
+    """Run the task file that `arguments` name; without a file, follow orders until standard input closes.
 
-    An order is one JSON line. ``{"task": file, "log": file}`` runs a task and writes the task's printed output
-    to the log. ``{"import": [modules]}`` loads modules while the child has no task. A task that is ordered
-    meanwhile waits until the modules are loaded.
+    An order is one JSON line. ``{"task": file, "log": file}`` runs a task and writes the task's printed
+    output to the log. ``{"import": [modules]}`` loads modules while the child has no task. A task that is
+    ordered meanwhile waits until the modules are loaded.
 
     Args:
         arguments: The path of the task file; empty to follow orders.
@@ -115,7 +115,7 @@ def _run_task_file(file: Path, stages: Mapping[str, TaskFunction], parent: _Pare
 
 
 def import_ahead(modules: Sequence[str]) -> None:
-    """Load modules before a task needs them. A missing module is not an error here; the task reports it later."""
+    """Load modules before a task needs them. A missing module is only logged; the task reports it later."""
     for name in modules:
         try:
             importlib.import_module(name)
@@ -124,7 +124,7 @@ def import_ahead(modules: Sequence[str]) -> None:
 
 
 def _redirect_prints(log: Path) -> None:
-    """Append standard output and standard error to a file from now on, including the output of native libraries."""
+    """Append standard output and error, including the output of native libraries, to a file from now on."""
     with log.open("ab") as stream:
         for number in (1, 2):
             os.dup2(stream.fileno(), number)
@@ -173,17 +173,17 @@ class DiskFailures:
             raise store_error(error, self._store.root) from error
         if isinstance(error, CaptureError | JobError) and (away := _disk_away(error)) is not None:
             raise away from error
-        # A writer that finds the disk full reports its own file. The new error reports the folder of the store.
+        # A writer that finds the disk full reports its own file. The new error names the store's folder.
         other = isinstance(error, Exception) and not isinstance(error, BodycapError)
         if (other or isinstance(error, StoreError)) and self._store.free_bytes() < FULL_DISK_BYTES:
             raise disk_full(self._store.root) from error
 
 
 def _disk_away(error: BodycapError) -> DiskAway | None:
-    """Return a `DiskAway` error if the file that `error` names failed because its disk does not answer, else None.
+    """Return a `DiskAway` error if the file that `error` names is on a disk that does not answer, else None.
 
-    FFmpeg reports EIO for broken files too, and it treats a file that becomes unreachable like a file that ends
-    early. In both cases this function reads the file to find the cause.
+    FFmpeg reports EIO for broken files too, and it treats a file that becomes unreachable like a file that
+    ends early. In both cases this function reads the file to find the cause.
     """
     if error.path is None:
         return None
@@ -195,7 +195,7 @@ def _disk_away(error: BodycapError) -> DiskAway | None:
 
 
 def _read_failure(path: Path) -> OSError | None:
-    """Return the error of reading a regular file at its start and end; None if it is readable or not regular."""
+    """Read a regular file at its start and end, and return the error; None without an error."""
     try:
         if path.is_file():
             with path.open("rb") as stream:
@@ -227,7 +227,7 @@ def _report_unexpected(error: Exception, root: Path, messages: _MessageWriter) -
 
 
 def _pin_threads(threads: int) -> None:
-    """Set OpenCV's number of threads to the task's. Other libraries use one thread; stages start their own threads."""
+    """Set the number of threads of OpenCV. Other libraries use one thread; stages start their own threads."""
     os.environ["OPENCV_FOR_THREADS_NUM"] = str(threads)
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(threads)
@@ -240,7 +240,7 @@ def _reset_peak_memory() -> None:
 
 
 def peak_memory_mb() -> float:
-    """Return the peak resident memory (MB) since `_reset_peak_memory`; without a reset, since the process started."""
+    """Return the peak resident memory (MB) since `_reset_peak_memory`, or since the start without a reset."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith("VmHWM:"):
@@ -277,8 +277,8 @@ class _MessageWriter:
 class StepReporter:
     """Reports the progress of a stage, and releases freed memory when the stage starts another step.
 
-    The C library keeps freed memory. Without the release, the peak memory of a stage would be nearly the sum of
-    the memory of all its steps.
+    The C library keeps freed memory. Without the release, the peak memory of a stage would be nearly the sum
+    of the memory of all its steps.
 
     Args:
         report: Called as ``report(done, total, what)``.

@@ -16,8 +16,8 @@ from typing import Any, BinaryIO
 import bodycap_batch
 
 CHILD_COMMAND = (sys.executable, "-P", "-m", "bodycap_batch.tasks")
-"""Command line of a child, without the task file. It names the package of the stages, which belongs to a higher
-layer; this package must not import it."""
+"""Command line of a child, without the task file. It names the package of the stages, which belongs to a
+higher layer; this package must not import it."""
 KILL_AFTER_S = 3.0
 """Time (seconds) that a child has to end by itself before it is killed. Evidence: none."""
 _POLL_S = 0.2
@@ -121,8 +121,8 @@ class Child:
 def _environment() -> dict[str, str]:
     """Return the environment variables of a child: Python finds this package, and libraries use one thread.
 
-    The variables must be set before the libraries load. With a library's thread pool, floating-point sums would
-    depend on the machine's number of cores. Stages start their own threads instead.
+    The variables must be set before the libraries load. With a library's thread pool, floating-point sums
+    would depend on the machine's number of cores. Stages start their own threads instead.
     """
     package = str(Path(bodycap_batch.__file__).parent.parent)
     path = os.pathsep.join(part for part in (package, os.environ.get("PYTHONPATH")) if part)

@@ -46,7 +46,7 @@ class Executor(Protocol):
     """Runs tasks on this machine or on other machines. Several threads may use it at the same time."""
 
     def execute(self, task: Task, environment: TaskEnvironment) -> None:
-        """Compute and commit the task's artefact. Raises `BodycapError`; `Cancelled` if the task is stopped."""
+        """Compute and commit the task's artefact. Raises `BodycapError`, and `Cancelled` if it is stopped."""
 
     def close(self, logs: Path) -> None:
         """Release what the job with this folder of logs needed, after the job has ended."""
@@ -55,8 +55,8 @@ class Executor(Protocol):
 class Children:
     """Child processes, each of which runs one task after another.
 
-    Each child therefore loads the libraries only once. A child ends when `close` is called, after a crash or a
-    bug, and when its parent process ends.
+    Each child therefore loads the libraries only once. A child ends when `close` is called, after a crash or
+    a bug, and when its parent process ends.
 
     Args:
         command: The child's command line, without the task file.
