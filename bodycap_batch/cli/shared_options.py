@@ -33,7 +33,7 @@ JobArgument = Annotated[
     typer.Argument(
         metavar="JOB_OR_FOLDER",
         help="A job file (YAML), or a folder of videos (its job.yaml is used, if it has one).",
-        readable=False,  # the job loader gives a better message, with a remedy
+        readable=False,  # typer does not check this: the job loader gives a better message, with advice
     ),
 ]
 OutOption = Annotated[Path | None, _out("Folder for the results (default: out/<job>).")]

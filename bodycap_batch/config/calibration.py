@@ -16,8 +16,8 @@ from bodycap_batch.model.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camer
 _MAX_BYTES = 1 << 20
 """Maximum size (bytes) of a calibration file. Real calibration files have a few kilobytes. Evidence: none."""
 _MAX_SECONDS = 1e10
-"""Maximum absolute value (seconds) of a time in a calibration file. Every Unix time is smaller. Evidence:
-none."""
+"""Maximum absolute value (seconds) of a time in a calibration file. Every Unix time is smaller.
+Evidence: none."""
 _CENTRE_INDEX = {
     "SIMPLE_PINHOLE": 1,
     "SIMPLE_RADIAL": 1,

@@ -29,7 +29,7 @@ nanoseconds fits into int64."""
 
 
 class _Block(BaseModel):
-    """Base of the job's blocks: frozen, without unknown keys or NaN."""
+    """Base class of the job's blocks: immutable; unknown keys, NaN and infinity are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -51,7 +51,7 @@ class Flow:
 
     Args:
         job: A resolved job.
-        settings: How the job runs: store, threads, listener, cancellation.
+        settings: Settings of the run: store, threads, listener, cancellation.
         logs: Folder for the logs of the child processes.
     """
 

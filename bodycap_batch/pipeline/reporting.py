@@ -22,7 +22,7 @@ def stored_for_report(job: Job, *, out_dir: Path, settings: Settings) -> ReportT
     Args:
         job: A resolved job.
         out_dir: Folder of the job's results.
-        settings: How the job runs: store, threads, listener, cancellation.
+        settings: Settings of the run: store, threads, listener, cancellation.
 
     Returns:
         The report's task, for `bodycap_batch.tasks.report.load_inputs`.
@@ -62,7 +62,7 @@ def remake_report(job: Job, *, out_dir: Path, settings: Settings) -> Path:
     Args:
         job: A resolved job.
         out_dir: Folder of the job's results.
-        settings: How the job runs: store, threads, listener, cancellation.
+        settings: Settings of the run: store, threads, listener, cancellation.
 
     Returns:
         The path of the report: in `out_dir` if the job is complete, else in ``<out_dir>/partial``.

@@ -1,4 +1,4 @@
-"""Copy results from the store to the user's folder."""
+"""Publish results: link or copy them from the store to the user's folder, and remove outdated results."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
         job: A resolved job.
         out_dir: Folder of the results. Results of an earlier run stay there until this run publishes new
             results. This happens before the video of the new results is rendered.
-        settings: How the job runs: store, threads, listener, cancellation.
+        settings: Settings of the run: store, threads, listener, cancellation.
 
     Returns:
         The summary of the run.

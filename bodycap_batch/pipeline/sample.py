@@ -33,7 +33,7 @@ def prepare_capture(options: Mapping[str, Any], folder: Path, settings: Settings
     Args:
         options: Options of the renderer, as the job gives them.
         folder: Folder for the videos; other files in the folder stay unchanged.
-        settings: How the job runs: store, threads, listener, cancellation.
+        settings: Settings of the run: store, threads, listener, cancellation.
 
     Raises:
         BodycapError: The options are wrong, rendering failed, or the folder cannot be written.

@@ -27,7 +27,7 @@ class StageRunner:
         libraries: Version of each library that computed these tasks, by library name.
 
     Args:
-        settings: How the job runs: store, threads, listener, cancellation.
+        settings: Settings of the run: store, threads, listener, cancellation.
         logs: Folder for the logs of the child processes.
         cameras: Number of cameras of the job. At most this number of tasks runs at the same time.
     """

@@ -101,7 +101,7 @@ class _Parent:
 
 
 def _run_task_file(file: Path, stages: Mapping[str, TaskFunction], parent: _Parent) -> int:
-    """Run a task, report how it ended, and return the exit code."""
+    """Run the task in a task file, report its end to the parent, and return the exit code."""
     task, root = task_from_json(json.loads(file.read_text(encoding="utf-8")))
     try:
         store = Store(root)

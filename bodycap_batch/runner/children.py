@@ -152,7 +152,8 @@ class Children:
     def _take(self, modules: Collection[str], logs: Path) -> tuple[Child, bool]:
         """Return a child for a task that needs `modules`, and whether the child is new.
 
-        The idle child with most of `modules` is preferred; of several, the child with fewest other modules.
+        The idle child that has loaded most of `modules` is preferred. If several children have loaded equally
+        many, the child with the fewest other modules is preferred.
         """
         with self._lock:
             if self._idle:

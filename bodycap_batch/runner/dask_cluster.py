@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 SCHEMES = ("tcp://", "tls://")
 QUEUES = ("slurm", "pbs")
 MEMORY = "memory"
-"""Name of the Dask resource with which a worker declares its memory: the maximum sum (MB) over its running
-tasks."""
+"""Name of the Dask resource with which a worker declares its memory (MB). The tasks that run on the worker at
+the same time reserve at most this memory."""
 _POLL_S = 0.2
 """Time (seconds) between two checks of a waiting job whether it was stopped. Evidence: none."""
 _PROGRESS_PERIOD_S = 1.0
@@ -133,7 +133,7 @@ class Cluster:
         return {MEMORY: min(float(task.memory_mb), largest)} if largest else None
 
     def _largest_worker(self, task: Task) -> float | None:
-        """Return the largest memory (MB) declared by a worker: 0 if there is none, None without workers."""
+        """Return the largest memory (MB) that workers declare: 0 if none declares memory, None without workers."""
         with self._asking:
             if self._largest_memory is None or time.monotonic() - self._last_asked > _WORKERS_PERIOD_S:
                 if self._client.status in _CLIENT_LEFT:
@@ -180,7 +180,8 @@ def start_queue(kind: str, workers: int, cores: int, memory_mb: int) -> Any:
         kind: Kind of the job queue: ``slurm``, ``pbs``, or ``local`` for tests without a queue. Queue,
             account and times come from Dask's configuration (``~/.config/dask/jobqueue.yaml``).
         workers: Number of workers.
-        cores: Number of threads of each task. A worker runs one task at a time, so it gets the same number.
+        cores: Number of threads of each task. A worker runs one task at a time, so each worker gets this
+            number.
         memory_mb: Memory (MB) of each worker.
 
     Returns:

@@ -17,7 +17,7 @@ _HINT = "run the job first (`bodycap run`); if it was run before, `bodycap why` 
 
 
 class NotStored(StoreError):
-    """Error: an artefact is not stored, and the rules forbid to compute it.
+    """Error: an artefact is not stored, and the rules forbid computing it.
 
     Attributes:
         tasks: The tasks that would compute the missing artefacts.
@@ -43,7 +43,7 @@ class Rules:
     """Rules for a runner: what it may compute, and the functions that it calls to decide.
 
     Attributes:
-        cancelled: Called several times a second; True stops the task that calls it.
+        cancelled: Called several times a second; True stops the running tasks.
         may_commit: Called before an artefact is committed; False stops its task.
         before: Called before a task runs; may raise an error to forbid the task.
         compute: If False, only stored artefacts are returned; `NotStored` is raised for a missing artefact.
@@ -65,7 +65,7 @@ class Runner:
         executor: Computes the artefacts that are not stored.
         logs: Folder for the log file and the task file of each task.
         listener: Receives the events of all tasks.
-        rules: What the runner may do.
+        rules: Rules for the runner: what it may compute, and the functions that it calls.
     """
 
     def __init__(

@@ -241,7 +241,7 @@ class Store:
             folders = list(self._temporary.iterdir())
             for folder in (self.root / "digests", self.root / "references"):
                 remove_abandoned(folder)
-        except OSError:  # the next draft reports what is wrong with the folder
+        except OSError:  # not reported here: the next draft fails too, and reports the error
             return 0
         return sum(_remove_if_abandoned(folder) for folder in folders)
 

@@ -33,7 +33,8 @@ def camera_distances(body: BodyInput) -> list[tuple[str, str, float, float]]:
 def mount_prior(mount: MountInput, skeleton: SkeletonModel) -> Mount:
     """Return the prior of a camera's mount.
 
-    Values that the job gives are used; the nominal mount of the named place supplies the other values.
+    A pose given in the job replaces the nominal pose of the named place. Standard deviations given in the job
+    replace the defaults; a given pose has other default deviations than a nominal pose.
     """
     import numpy as np
 

@@ -109,7 +109,7 @@ def _fields(value: Any, plain: Callable[[Any], Any]) -> dict[str, Any]:
 
 
 def _typed(kind: Any, data: Any) -> Any:
-    """Rebuild a value of an annotated type from JSON values."""
+    """Rebuild a value from JSON values, given the annotated type of the value."""
     if (origin := get_origin(kind)) is not None:
         return _generic(origin, get_args(kind), data)
     if kind is Path:
