@@ -133,7 +133,11 @@ class Cluster:
         return {MEMORY: min(float(task.memory_mb), largest)} if largest else None
 
     def _largest_worker(self, task: Task) -> float | None:
-        """Return the largest memory (MB) that workers declare: 0 if none declares memory, None without workers."""
+        """Return the largest memory (MB) that a worker declares.
+
+        Returns:
+            The memory; 0 if no worker declares its memory; None if there is no worker.
+        """
         with self._asking:
             if self._largest_memory is None or time.monotonic() - self._last_asked > _WORKERS_PERIOD_S:
                 if self._client.status in _CLIENT_LEFT:
