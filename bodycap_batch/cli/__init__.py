@@ -1,4 +1,4 @@
-"""The `bodycap` command: turns errors into messages and exit codes."""
+"""The `bodycap` command; it converts errors to messages and exit codes."""
 
 from __future__ import annotations
 
@@ -47,13 +47,14 @@ __all__ = [
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run a command line.
 
     Args:
-        arguments: The words after ``bodycap``; None for those of this process.
+        arguments: The words after ``bodycap``; None for the command line of this process.
 
     Returns:
-        The exit code. If `arguments` is None, the process exits with it instead.
+        The exit code. If `arguments` is None, the function does not return: the process exits with the exit
+        code.
     """
     with raise_on_signal():
         code = _run(sys.argv[1:] if arguments is None else list(arguments))
@@ -75,7 +76,7 @@ def _run(arguments: Sequence[str]) -> int:
         for note in getattr(error, "__notes__", []):
             _write_error(note)
         return error.exit_code
-    except Exception as error:  # noqa: BLE001 - the one place where bugs are caught
+    except Exception as error:  # noqa: BLE001 - the only place where bugs are caught
         if (disk_error := _disk_error(error)) is not None:
             _write_error(f"error: {disk_error}")
             return disk_error.exit_code
@@ -86,7 +87,7 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _disk_error(error: Exception) -> BodycapError | None:
-    """Return the error of a disk that does not answer; None for any other error."""
+    """Return the error for a disk that does not answer; None if `error` has another cause."""
     if not isinstance(error, OSError):
         return None
     from bodycap_batch.store.artefacts import store_error  # slow to import, and not needed for `--help`

@@ -1,4 +1,4 @@
-"""The application that the commands register with."""
+"""The typer application with which all commands register."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import typer
 
 import bodycap_batch
 
-# Help is plain text: rendering it with rich would double the time of `--help`.
+# The help is plain text: formatting it with rich would double the time of `--help`.
 app = typer.Typer(
     name="bodycap",
     no_args_is_help=True,

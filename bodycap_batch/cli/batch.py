@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from bodycap_batch.runner.dask_cluster import Cluster
 
 _MAX_CLUSTER_JOBS = 32
-"""Jobs at the same time on a cluster. A job is a waiting thread; the scheduler orders its tasks by priority.
-Evidence: none."""
+"""Maximum number of jobs that run at the same time on a cluster. Each job is only a waiting thread on this
+machine; the scheduler orders the tasks of all jobs by priority. Evidence: none."""
 
 
 _INTEGER = re.compile(r"-?[0-9]{1,9}")
@@ -117,7 +117,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
 
 @contextmanager
 def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator[tuple[Executor, int]]:
-    """Yield the executor of the tasks, and the number of jobs that keep it busy."""
+    """Yield the executor of the tasks, and the number of jobs to run at the same time by default."""
     if kind == "local":
         from bodycap_batch.runner.pool import LocalPool
 
@@ -147,20 +147,23 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
 
 
 def _with_worker_note(cluster: Cluster) -> Cluster:
-    """Return the cluster, after a note to the user if it has no worker yet.
+    """Print a note to the user if the cluster has no worker yet, and return the cluster.
 
     Dask's messages about a lost connection are switched off: they are long tracebacks, and each job reports
-    its end.
+    the failure itself.
     """
     if not cluster.workers():
         sys.stderr.write("no worker is connected yet; the batch starts when one connects\n")
     for name in ("distributed", "distributed.client", "distributed.core"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # Dask sets the levels when it is imported
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # after the import of Dask, which sets the levels
     return cluster
 
 
 def _batch_results_folder(job: Job, folder: Path) -> Path:
-    """Return the results folder of a job; by default one of its name in the batch's folder."""
+    """Return the results folder of a job.
+
+    By default, it is a folder in the batch's folder `folder`, with the name of the job.
+    """
     busy_jobs = default_out() / job.name
     return folder / job.name if job.out in (None, busy_jobs) else results_folder(job)
 
@@ -182,7 +185,7 @@ def _batch_jobs(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJo
 
 
 class _BatchReporter:
-    """Print the events of all jobs, as lines or JSON."""
+    """Prints the events of all jobs, as plain lines or as JSON lines."""
 
     def __init__(self, *, as_json: bool) -> None:
         self._as_json = as_json
@@ -200,7 +203,7 @@ class _BatchReporter:
         return listen
 
     def report_outcome(self, outcome: Outcome) -> Outcome:
-        """Print how a job ended; return the outcome."""
+        """Print the outcome of a job, and return this outcome."""
         if self._as_json:
             self._write_json({"kind": "job", **outcome.to_dict()})
         elif outcome.error is not None:
@@ -210,7 +213,7 @@ class _BatchReporter:
         return outcome
 
     def print_summary(self, jobs: Sequence[BatchJob], outcomes: Sequence[Outcome]) -> None:
-        """Print a table of all jobs, in the order of the command line."""
+        """Print a table of all jobs and their outcomes, in the order of the command line."""
         if self._as_json:
             return
         found = {outcome.job: outcome for outcome in outcomes}
@@ -232,7 +235,7 @@ class _BatchReporter:
 
 
 def _shown_name(job: Path) -> str:
-    """Return a job's name in a list of jobs. A ``job.yaml`` is shown with its folder."""
+    """Return the name of a job for lists of jobs. The name of a ``job.yaml`` includes its folder."""
     from bodycap_batch.config.folder import JOB_FILES
 
     return f"{job.resolve().parent.name}/{job.name}" if job.name in JOB_FILES else job.name

@@ -22,7 +22,7 @@ _TRUTH_FILES = ("joints.npz", "motion.bvh")
 
 
 class Align(StrEnum):
-    """How the estimate may be aligned with the truth."""
+    """Choices of the transform that aligns the estimate with the truth."""
 
     SIM3 = "sim3"
     SE3 = "se3"
@@ -98,11 +98,11 @@ def _evaluate_trajectories(
 
 
 def _evaluate_motion(estimate: Path, truth: Path) -> dict[str, Any]:
-    """Evaluate all joints, and the joints that the run's metrics.json lists as measured."""
+    """Evaluate all joints, and separately the joints that the run's metrics.json lists as measured."""
     from bodycap_batch.evaluate import MotionOptions, evaluate_motion
 
     figures = _motion_figures(estimate.parent)
-    # A BVH file starts at time zero; the joints of a capture are on the common clock.
+    # The times of a BVH file start at zero; the times of a capture's true joints are on the common clock.
     offset_s = float(figures.get("start_s", 0.0)) if truth.suffix == ".npz" else 0.0
     reports = {"motion": evaluate_motion(estimate, truth, MotionOptions(offset_s=offset_s))}
     joints = figures.get("joints", {}).values()
@@ -114,7 +114,7 @@ def _evaluate_motion(estimate: Path, truth: Path) -> dict[str, Any]:
 
 
 def _motion_figures(results: Path) -> dict[str, Any]:
-    """Return the block of the motion in the results' metrics.json; empty if there is none."""
+    """Return the block `motion` of the metrics.json in a results folder; empty if it does not exist."""
     try:
         return dict(json.loads((results / "metrics.json").read_text(encoding="utf-8"))["motion"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -122,7 +122,7 @@ def _motion_figures(results: Path) -> dict[str, Any]:
 
 
 def _frame_counts(results: Path) -> dict[str, int]:
-    """Return the number of frames of each camera's video, from the results' frames.csv."""
+    """Return the number of video frames of each camera, by camera name, from frames.csv in the results."""
     try:
         with (results / "frames.csv").open(newline="", encoding="utf-8") as stream:
             rows = csv.DictReader(line for line in stream if not line.startswith("#"))
@@ -132,7 +132,7 @@ def _frame_counts(results: Path) -> dict[str, int]:
 
 
 def _table_lines(reports: dict[str, Any]) -> list[str]:
-    """Return the figures as text for the user."""
+    """Return the results of the evaluation as lines of text for the user."""
     lines: list[str] = []
     for name, report in reports.items():
         if name == "trajectories":
@@ -161,9 +161,10 @@ _MOTION_ROWS = (
     ("angle_deg", "angles, degrees", 1),
     ("angle_offset_free_deg", "angles less a constant, degrees", 1),
 )
-"""Key of a figure, its label with the unit, and the factor to that unit."""
+"""Rows of a table: the key of a value, its label with the unit, and the factor that converts it to this
+unit."""
 _RELATIVE_ROWS = (("vector_m", "vector, cm"), ("in_reference_m", "in its frame, cm"))
-"""Key of a figure, and its label with the unit."""
+"""Rows of the table for a pair of cameras: the key of a value, and its label with the unit."""
 
 
 def _camera_line(name: str, score: dict[str, Any]) -> str:
@@ -183,7 +184,7 @@ def _statistics_text(summary: dict[str, float], factor: float) -> str:
 
 
 def _trajectory_pairs(estimate: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
-    """Return the files of the estimate and of the truth, for each camera that both have."""
+    """Return the estimated and the true trajectory file of each camera for which both files exist."""
     if estimate.is_file() and truth.is_file():
         both = estimate.suffix in TUM_SUFFIXES and truth.suffix in TUM_SUFFIXES
         return {estimate.stem: (estimate, truth)} if both else {}
@@ -198,7 +199,7 @@ def _trajectory_pairs(estimate: Path, truth: Path) -> dict[str, tuple[Path, Path
 
 
 def _motion_pair(estimate: Path, truth: Path) -> tuple[Path, Path] | None:
-    """Return the files of the motion and of its truth; None unless both exist."""
+    """Return the file of the estimated motion and the file of the true motion; None if either is missing."""
     estimates = estimate / _MOTION_FILE if estimate.is_dir() else estimate
     truths = truth
     if truth.is_dir():

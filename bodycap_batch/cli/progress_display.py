@@ -1,4 +1,4 @@
-"""Show progress: bars on a terminal, lines in a log, JSON for other programs."""
+"""Show the progress of a job: as bars on a terminal, as lines in a log, or as JSON for other programs."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from rich.progress import Progress, Task, TaskID
 
 _LINE_PERIOD_S = 5.0
-"""A line is printed after this time, seconds. Evidence: none."""
+"""Time (seconds) after which a stage prints its next line. Evidence: none."""
 _LINE_PAUSE_S = 1.0
-"""Lines are at least this far apart, seconds. Evidence: none."""
+"""Minimum time (seconds) between two lines of a stage. Evidence: none."""
 _LINE_PROGRESS = 0.1
-"""A line is printed after this fraction of a stage. Evidence: none."""
+"""Fraction of a stage after which the stage prints its next line. Evidence: none."""
 
 
 class ProgressDisplay(Protocol):
-    """Show events; a context manager."""
+    """A display that shows the events of a job; a context manager."""
 
     def __enter__(self) -> Self: ...
 
@@ -37,14 +37,14 @@ class ProgressDisplay(Protocol):
 
 
 def make_progress_display(*, as_json: bool) -> ProgressDisplay:
-    """Return bars on a terminal, plain lines elsewhere, or JSON lines if `as_json` is True."""
+    """Return a display: JSON lines if `as_json` is True, else bars on a terminal, else plain lines."""
     if as_json:
         return JsonLines()
     return ProgressBars() if sys.stderr.isatty() else ProgressLines()
 
 
 class JsonLines:
-    """Print one JSON object per line on standard output."""
+    """Prints each event as one line with a JSON object on standard output."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -63,7 +63,7 @@ class JsonLines:
 
 
 class ProgressLines:
-    """Print plain lines on standard error, every few seconds or every tenth of a stage."""
+    """Prints plain lines on standard error: every few seconds, or after every tenth of a stage."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -76,7 +76,7 @@ class ProgressLines:
         """Do nothing: there is nothing to close."""
 
     def __call__(self, event: Event) -> None:
-        """Print one event, unless the last line of its stage is too recent."""
+        """Print one event. Progress is printed only if the last line of its stage is not too recent."""
         with self._lock:
             if event.kind == "progress":
                 pace = self._pace.setdefault(f"{event.label} {event.what}", _LinePacer())
@@ -91,14 +91,14 @@ class ProgressLines:
 
 
 class _LinePacer:
-    """Decide when a stage prints its next line, and measure its speed."""
+    """Decides when a stage prints its next line, and measures the speed of the stage."""
 
     def __init__(self) -> None:
         self._first: tuple[float, int] | None = None
         self._written, self._share = time.monotonic(), 0.0
 
     def line(self, event: Event) -> str | None:
-        """Return the line to print now, or None."""
+        """Return the line to print for an event; None if no line is due yet."""
         now, progress = time.monotonic(), event.done / event.total if event.total else 0.0
         self._first = self._first or (now, event.done)
         waited = now - self._written
@@ -123,7 +123,7 @@ class _LinePacer:
 
 
 class ProgressBars:
-    """Show a bar per stage and camera on standard error, with the speed and the time left."""
+    """Shows one bar for each stage and camera on standard error, with the speed and the remaining time."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -135,11 +135,11 @@ class ProgressBars:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Restore the terminal."""
+        """Stop the bars and restore the terminal."""
         self._progress.stop()
 
     def __call__(self, event: Event) -> None:
-        """Update the bar of one event."""
+        """Update the bar of the event's stage and camera."""
         with self._lock:
             if event.kind == "note":
                 self._progress.console.print(event.what, highlight=False)
@@ -173,18 +173,18 @@ def _make_rich_progress() -> Progress:
     from rich.text import Text
 
     class Rate(ProgressColumn):
-        """Column with the units per second."""
+        """Column with the number of units per second."""
 
         def render(self, task: Task) -> Text:
-            """Return the speed as soon as it is known."""
+            """Return the speed; empty if it is unknown or the stage has finished."""
             speed = task.finished_speed or task.speed
             return Text("" if speed is None or task.finished else f"{speed:.3g}/s", style="dim")
 
     class Count(ProgressColumn):
-        """Column with the number of units done."""
+        """Column with the number of finished units and the total."""
 
         def render(self, task: Task) -> Text:
-            """Return the count if the total is known."""
+            """Return both numbers; empty if the total is unknown or the stage has finished."""
             known = task.total is not None and not task.finished
             return Text(f"{int(task.completed)}/{int(task.total or 0)}" if known else "")
 
@@ -200,7 +200,7 @@ def _make_rich_progress() -> Progress:
 
 
 def text_from_event(event: Event) -> str:
-    """Return an event as a sentence for the user."""
+    """Return the text that describes an event to the user."""
     if event.kind == "note":
         return event.what
     words = {

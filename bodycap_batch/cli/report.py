@@ -61,7 +61,10 @@ def report(
 
 
 def job_from_path(path_argument: Path) -> tuple[Path, Path | None]:
-    """Return the job file to load, and the results folder if the path is one."""
+    """Return the job to load for a path, and the results folder.
+
+    The results folder is None if the path is not a results folder. Then the path itself is the job.
+    """
     if (path_argument / "run.json").is_file() and (path_argument / "job.yaml").is_file():
         return path_argument / "job.yaml", path_argument.resolve()
     return path_argument, None

@@ -113,7 +113,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
 
 @contextmanager
 def _report_errors_as_json(display: ProgressDisplay) -> Iterator[None]:
-    """Also print an error as JSON, for a program that follows the progress."""
+    """Print an error as JSON before it is raised again, if the progress is displayed as JSON lines."""
     try:
         yield
     except BodycapError as error:
@@ -132,7 +132,7 @@ def _print_summary(summary: RunSummary, job: Job, display: ProgressDisplay, *, v
             cost = f"{stage.seconds:8.1f} s {stage.peak_memory_mb:7.0f} MB"
             typer.echo(f"{cost}  {stage.stage} {stage.camera}{' (kept)' if stage.reused else ''}".rstrip())
     if not summary.files:
-        # The steps within registration are not stages that the user can name.
+        # Name the last stage that the user can name; rig, recover and others are steps within registration.
         reached = next(stage.stage for stage in reversed(summary.stages) if stage.stage in STAGE_ORDER)
         typer.echo(f"{job.name}: stopped after {reached}, as requested; run it again for the rest")
         return

@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share, and the folders that they mean."""
+"""Options and arguments that several commands share, and the default folders for them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ JobArgument = Annotated[
     typer.Argument(
         metavar="JOB_OR_FOLDER",
         help="A job file (YAML), or a folder of videos (its job.yaml is used, if it has one).",
-        readable=False,  # the job loader gives a better message, with a remedy
+        readable=False,  # typer does not check this: the job loader gives a better message, with advice
     ),
 ]
 OutOption = Annotated[Path | None, _out("Folder for the results (default: out/<job>).")]
@@ -63,16 +63,20 @@ def cores() -> int:
 
 
 def default_out() -> Path:
-    """Return the folder of all results for which no other folder is named."""
+    """Return the default parent folder of all results: ``out`` in the working folder."""
     return Path.cwd() / "out"
 
 
 def results_folder(job: Job) -> Path:
-    """Return the results folder of a job."""
+    """Return the results folder of a job: the job's `out`, else a folder with the job's name in ``out/``."""
     return job.out or default_out() / job.name
 
 
 def default_store(out_dir: Path) -> Path:
-    """Return the store for a results folder: one for all of ``out/``, and one inside any other folder."""
+    """Return the default folder of the store for a results folder.
+
+    All results folders in ``out/`` share the store ``out/.store``. Any other results folder has a separate
+    store inside it.
+    """
     shared = default_out()
     return (shared if out_dir in (shared, shared / out_dir.name) else out_dir) / ".store"

@@ -1,4 +1,4 @@
-"""Handle Ctrl-C and SIGTERM: stop the work, and exit with the exit code of the signal."""
+"""Handle Ctrl-C and SIGTERM: stop the work, and return the exit code for the signal."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ def raise_on_signal() -> Iterator[None]:
 
 @contextmanager
 def event_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that SIGINT and SIGTERM set, for work that ends itself in an orderly way."""
+    """Yield an event that SIGINT and SIGTERM set. The work must check the event and end itself."""
     event = threading.Event()
     with _handle_signals(event.set):
         yield event
 
 
 def signal_exit_code() -> int:
-    """Return 128 plus the number of the signal that stopped the work."""
+    """Return the exit code after a signal: 128 plus the number of the last signal received."""
     return 128 + (_received[-1] if _received else signal.SIGINT)
 
 
 @contextmanager
 def _handle_signals(action: Callable[[], None]) -> Iterator[None]:
-    """Call `action` on SIGINT and SIGTERM; restore the earlier handlers at the end."""
+    """Call `action` when SIGINT or SIGTERM arrives; restore the earlier signal handlers at the end."""
 
     def handle(number: int, _: FrameType | None) -> None:
         _received.append(number)

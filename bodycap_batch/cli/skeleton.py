@@ -67,7 +67,7 @@ def skeleton(
 
 
 def _parse_roles(words: list[str]) -> dict[str, str]:
-    """Return ``JOINT=ROLE`` words as a mapping."""
+    """Return the role of each joint by joint name, from words of the form ``JOINT=ROLE``."""
     pairs = [word.rpartition("=") for word in words]
     bad = next(
         (word for word, (name, _, role) in zip(words, pairs, strict=True) if not (name and role)), None

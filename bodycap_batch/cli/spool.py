@@ -23,9 +23,10 @@ SpoolArgument = Annotated[
 ]
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the job in `bodycap status`.")]
 _AGE_UNITS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
-"""Seconds of a unit of age, and its symbol."""
+"""Units of a job's age: length (seconds) and symbol of each unit."""
 _MAX_CAUSE_LENGTH = 200
-"""Characters of a cause in the table, so that a row stays readable."""
+"""Maximum number of characters of a failure's cause in the table. A longer text would make the row hard to
+read."""
 
 
 @app.command(short_help="List the jobs of a watched folder and their states.")

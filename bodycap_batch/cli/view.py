@@ -87,7 +87,7 @@ def view(
 
 
 def _stored_inputs(job: Job, out_dir: Path, store: Path) -> ReportInputs:
-    """Return the inputs of a job's report from the store."""
+    """Read the inputs of a job's report from the store."""
     from bodycap_batch.pipeline import Settings, stored_for_report
     from bodycap_batch.store.artefacts import Store
     from bodycap_batch.tasks.report import load_inputs
@@ -97,7 +97,7 @@ def _stored_inputs(job: Job, out_dir: Path, store: Path) -> ReportInputs:
 
 
 class _StoredMarks:
-    """Points and skeleton to draw over any frame, read from the store at the first call."""
+    """The points and skeleton to draw over each video frame. The first call reads them from the store."""
 
     def __init__(self, job: Job, out_dir: Path, store: Path) -> None:
         self._of = (job, out_dir, store)
@@ -106,7 +106,10 @@ class _StoredMarks:
         self._looked = False
 
     def __call__(self, camera: str, first: int) -> list[dict[str, Any]]:
-        """Return the marks of a part of a camera's frames; empty if the store does not hold them."""
+        """Return the points and skeleton for `FRAMES_PER_PART` frames of a camera, from the frame `first` on.
+
+        The list is empty if the store does not hold the results.
+        """
         from bodycap_batch.report.serving import FRAMES_PER_PART
 
         with self._lock:

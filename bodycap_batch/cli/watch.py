@@ -129,7 +129,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
 
 
 def _run(watcher: Watcher, stop: threading.Event) -> int:
-    """Run the watcher until it ends or the user stops it."""
+    """Run the watcher until it ends or the user stops it; return the exit code."""
 
     def end() -> None:
         stop.wait()
@@ -141,7 +141,7 @@ def _run(watcher: Watcher, stop: threading.Event) -> int:
 
 @contextmanager
 def _live_page(watcher: Watcher, options: WatchOptions, address: str | None, token: str) -> Iterator[None]:
-    """Serve the live page in the meantime if an address is given."""
+    """Serve the live page while the body of the `with` statement runs; without an address, do nothing."""
     if address is None:
         yield
         return

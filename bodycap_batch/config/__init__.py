@@ -1,4 +1,4 @@
-"""Job files and the options of the stages."""
+"""Read job files; define the options of the stages."""
 
 from bodycap_batch.config.options import (
     ExportOptions,

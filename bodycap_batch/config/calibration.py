@@ -1,4 +1,4 @@
-"""Camera calibrations: given inline, read from ``calib.json``, or left to be estimated."""
+"""Camera calibrations: given inline in the job, or read from a ``calib.json``."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camera, parameter_count
 
 _MAX_BYTES = 1 << 20
-"""Largest calibration file, bytes; real ones have a few kilobytes. Evidence: none."""
+"""Maximum size (bytes) of a calibration file. Real calibration files have a few kilobytes. Evidence: none."""
 _MAX_SECONDS = 1e10
-"""Largest absolute time in a file, seconds: above any Unix time. Evidence: none."""
+"""Maximum absolute value (seconds) of a time in a calibration file. Every Unix time is smaller.
+Evidence: none."""
 _CENTRE_INDEX = {
     "SIMPLE_PINHOLE": 1,
     "SIMPLE_RADIAL": 1,
@@ -24,11 +25,12 @@ _CENTRE_INDEX = {
     "SIMPLE_RADIAL_FISHEYE": 1,
     "RADIAL_FISHEYE": 1,
 }
-"""By camera model with one focal length, the index of the principal point's x; 2 for the other models."""
+"""Index of the principal point's x in the parameters, for each camera model with one focal length. For all
+other models the index is 2."""
 
 
 class Calibration(BaseModel):
-    """Intrinsics of a camera at the image size of its calibration (upright, as a player shows it)."""
+    """Intrinsics of a camera at the size of the calibration images (upright, as a player shows them)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -53,7 +55,7 @@ class Calibration(BaseModel):
     @field_validator("pixel_origin", mode="before")
     @classmethod
     def _first_word(cls, value: object) -> object:
-        """Accept the sentence of a calib.json: ``OpenCV (centre of the first pixel = 0, 0)``."""
+        """Accept the whole sentence in a calib.json: ``OpenCV (centre of the first pixel = 0, 0)``."""
         return value.split(maxsplit=1)[0].lower() if isinstance(value, str) and value.strip() else value
 
     @model_validator(mode="after")
@@ -66,7 +68,7 @@ class Calibration(BaseModel):
         return self
 
     def camera(self) -> Camera:
-        """Return the camera at its calibrated size, with COLMAP's pixel origin."""
+        """Return the camera model at the image size of the calibration, with COLMAP's pixel origin."""
         params = list(self.params)
         if self.pixel_origin == "opencv":
             index = _CENTRE_INDEX.get(self.model, 2)
@@ -80,9 +82,10 @@ class CalibrationEntry:
     """The entry of one camera in a calibration file.
 
     Attributes:
-        calibration: Its intrinsics.
-        offset_s: Common time = camera time + offset.
-        rolling_shutter_s: Time from the first row's exposure to the last row's; None if not stated.
+        calibration: Intrinsics of the camera.
+        offset_s: Clock offset (seconds): common time = camera time + offset.
+        rolling_shutter_s: Time (seconds) from the exposure of the first row to the exposure of the last row;
+            None if the file does not give it.
     """
 
     calibration: Calibration
@@ -91,15 +94,19 @@ class CalibrationEntry:
 
 
 def read_calibration(path: Path, camera: str) -> CalibrationEntry:
-    """Read one camera's entry of a calibration file.
+    """Read the entry of one camera in a calibration file.
 
-    The file holds one calibration for all cameras, or ``{"cameras": {name: {...}}}``; values beside
-    ``cameras`` apply to all of them. Keys: model, params, width, height, pixel_origin; offsets_s (by camera
-    name) or offset_s; rolling_shutter_s. Other keys are ignored.
+    The file holds one calibration for all cameras, or ``{"cameras": {name: {...}}}``. In the second form,
+    values at the same level as ``cameras`` apply to all cameras. Keys: model, params, width, height,
+    pixel_origin; offsets_s (by camera name) or offset_s; rolling_shutter_s. Other keys are ignored.
+
+    Args:
+        path: Path of the calibration file.
+        camera: Camera name.
 
     Raises:
-        CaptureError: The file is unreadable, it has no such camera, or a value is wrong. The error names the
-            field.
+        CaptureError: The file is unreadable, it has no entry for the camera, or a value is wrong. The error
+            names the field.
     """
     data = _read_object(path)
     field = ""

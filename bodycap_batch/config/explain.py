@@ -1,4 +1,4 @@
-"""Turn validation errors of a job into messages with line, field and advice."""
+"""Convert the validation errors of a job to messages with line, field and advice."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bodycap_batch.config.yaml_source import Location, YamlSource, dotted
 from bodycap_batch.core.errors import JobError
 
 _MAX_FURTHER = 5
-"""How many problems are listed after the first. Evidence: none."""
+"""Maximum number of problems that a message lists after the first problem. Evidence: none."""
 _MISSING = "this is missing"
 _DID_YOU_MEAN = "did you mean "
 _EXPECTED = {
@@ -30,16 +30,16 @@ _EXPECTED = {
     "model_type": "a block of `key: value` lines",
     "path_type": "a path",
 }
-"""What a value should be, by the type of pydantic's error."""
+"""Description of the expected value, by the type of pydantic's error."""
 
 
 class Problem(typing.NamedTuple):
     """One problem of a job.
 
     Attributes:
-        location: Where it is.
-        message: What is wrong.
-        hint: What to do.
+        location: Location of the problem in the job.
+        message: Description of the problem.
+        hint: Advice for the user; None without advice.
     """
 
     location: Location
@@ -48,7 +48,13 @@ class Problem(typing.NamedTuple):
 
 
 def job_error(problems: Sequence[Problem], path: Path, source: YamlSource | None = None) -> JobError:
-    """Return one error for all problems: the first one in full, the others briefly."""
+    """Return one error for all problems: the first problem in full, further problems briefly.
+
+    Args:
+        problems: The problems, at least one.
+        path: Path of the job.
+        source: The YAML file of the job, for line numbers; None for a folder of videos.
+    """
     ordered = sorted(problems, key=lambda p: (source.line_of(p.location) or 0) if source else 0)
     first, further = ordered[0], ordered[1 : 1 + _MAX_FURTHER]
     also = "".join(f"\n  also {_place(p, source)}: {p.message}" for p in further)
@@ -67,22 +73,22 @@ def _place(problem: Problem, source: YamlSource | None) -> str:
 
 
 def problems_of(error: ValidationError, model: type[BaseModel], data: object) -> list[Problem]:
-    """Return the problems that pydantic's errors describe.
+    """Convert pydantic's errors to problems.
 
     Args:
-        error: The errors.
-        model: The model that refused the data.
-        data: The data.
+        error: The errors of pydantic.
+        model: The pydantic model that refused the data.
+        data: The refused data.
     """
     errors = error.errors(include_url=False)
-    # pydantic also calls a list too short if all its items are wrong. The errors of the items are clearer.
+    # If all items of a list are wrong, pydantic also reports that the list is too short. This is omitted.
     reported = [e for e in errors if e["type"] != "too_short" or not _has_deeper(e, errors)]
     problems = _without_misspelt([_problem_of(details, model, data) for details in reported])
     return [p if p.hint else p._replace(hint=_description(p.location, model)) for p in problems]
 
 
 def _without_misspelt(problems: list[Problem]) -> list[Problem]:
-    """Drop the missing keys that were misspelt: the misspelling is reported already."""
+    """Return the problems without missing keys whose misspelling is reported already."""
     intended = {
         (*problem.location[:-1], problem.hint.removeprefix(_DID_YOU_MEAN).strip("'?"))
         for problem in problems
@@ -116,7 +122,7 @@ def _problem_of(details: Any, model: type[BaseModel], data: object) -> Problem:
 
 
 def _location_in(loc: Sequence[str | int], data: object, *, missing: bool) -> Location:
-    """Return a location without the parts that pydantic adds (names of union members)."""
+    """Return a location without the parts that pydantic adds for the members of a union."""
     kept: list[str | int] = []
     for position, part in enumerate(loc):
         inside = (isinstance(data, dict) and part in data) or (
@@ -131,7 +137,7 @@ def _location_in(loc: Sequence[str | int], data: object, *, missing: bool) -> Lo
 
 
 def _description(location: Location, model: type[BaseModel]) -> str:
-    """Return the description of the field at a location, or of the nearest field around it."""
+    """Return the description of the field at a location, or else of the nearest enclosing field."""
     while location:
         fields = _fields_at(location[:-1], model)
         text = fields[str(location[-1])].description if str(location[-1]) in fields else None
@@ -160,7 +166,7 @@ def _not_among(location: Location, details: Any) -> Problem:
 
 
 def known_keys(model: type[BaseModel], location: Location) -> list[str]:
-    """Return the keys allowed at a location of a model; empty if there is no model at it."""
+    """Return the keys that a model allows at a location; empty if the location holds no block of keys."""
     return list(_fields_at(location, model))
 
 

@@ -1,4 +1,4 @@
-"""A folder of videos as a capture: the names of the files name the cameras."""
+"""Use a folder of videos as a capture: the file names give the names of the cameras."""
 
 from __future__ import annotations
 
@@ -27,17 +27,18 @@ VIDEO_SUFFIXES = frozenset(
     }
 )
 JOB_FILES = ("job.yaml", "job.yml")
-"""Names of the job file of a folder."""
+"""File names that the job file of a folder may have."""
 RUN_FILE = "run.json"
-"""The record of a run. A folder with it holds results, and so does a ``job.yaml`` in it."""
+"""Name of the file that records a run. A folder with this file holds results. A ``job.yaml`` in such a folder
+is a result too, not a job to run."""
 _GOPRO = re.compile(r"^(G[HXPSLOT])(PR|[0-9]{2})([0-9]{4})$", re.IGNORECASE)
 
 
 def natural_key(path: Path) -> tuple[tuple[int, int | str], ...]:
-    """Return the sort key of a chapter: numbers count by value, and GoPro's names are understood.
+    """Return the key for sorting the chapters of a video: numbers are sorted by value.
 
-    ``GX020123`` is chapter 2 of video 0123. The first chapter of older GoPros is ``GOPR0123``, the next one
-    ``GP010123``.
+    GoPro's names are sorted by video, then by chapter. ``GX020123`` is chapter 2 of video 0123. On older
+    GoPros, the first chapter of video 0123 is ``GOPR0123`` and the second chapter is ``GP010123``.
     """
     gopro = _GOPRO.match(path.stem)
     if gopro:
@@ -48,15 +49,15 @@ def natural_key(path: Path) -> tuple[tuple[int, int | str], ...]:
 
 
 def is_video(path: Path) -> bool:
-    """Return True for a visible file with the suffix of a video."""
+    """Return True if the path is a visible (not hidden) file with the suffix of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
 def chapters_in(folder: Path) -> tuple[Path, ...]:
-    """Return the videos of a camera's folder in the order of their recording.
+    """Return the videos in a camera's folder, in the order in which they were recorded.
 
     Raises:
-        CaptureError: There are none, or the folder cannot be read.
+        CaptureError: The folder holds no video, or it cannot be read.
     """
     try:
         chapters = sorted((path for path in folder.iterdir() if is_video(path)), key=natural_key)
@@ -72,10 +73,12 @@ def chapters_in(folder: Path) -> tuple[Path, ...]:
 
 
 def videos_in(folder: Path) -> list[Path]:
-    """Return the videos and folders of chapters in a folder by name; folders of results do not count.
+    """Return the video files and the folders of chapters in a folder, sorted by name.
+
+    Folders of results are ignored.
 
     Raises:
-        CaptureError: There are none, or the folder cannot be read.
+        CaptureError: The folder holds no video, or it cannot be read.
     """
     try:
         entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
@@ -96,10 +99,12 @@ def _has_chapters(folder: Path) -> bool:
 
 
 def recordings_in(folder: Path) -> list[tuple[str, tuple[Path, ...]]]:
-    """Return the recordings of a folder by name: files, folders of chapters, and chapters of a GoPro.
+    """Return the recordings in a folder: the name of each recording, and its videos in order.
+
+    A recording is a video file, a folder of chapters, or all chapters of one GoPro video.
 
     Raises:
-        CaptureError: There are none, or a folder cannot be read.
+        CaptureError: The folder holds no video, or a folder cannot be read.
     """
     found: dict[str, list[Path]] = {}
     for path in videos_in(folder):
@@ -110,7 +115,7 @@ def recordings_in(folder: Path) -> list[tuple[str, tuple[Path, ...]]]:
 
 
 def job_file_in(folder: Path) -> Path | None:
-    """Return the job file of a folder of videos, if there is one; that of results does not count."""
+    """Return the job file in a folder of videos; None if there is none, or if the folder holds results."""
     if (folder / RUN_FILE).is_file():
         return None
     return next((folder / name for name in JOB_FILES if (folder / name).is_file()), None)
@@ -120,9 +125,9 @@ def folder_capture(folder: Path) -> dict[str, object]:
     """Return the raw ``capture`` block of a job for a folder of videos.
 
     Raises:
-        CaptureError: It has no videos, or is unreadable.
-        JobError: Two cameras have one name, or one of several cameras has a name that is no place on the
-            body.
+        CaptureError: The folder holds no video, or it cannot be read.
+        JobError: Two cameras have the same name. Or there are several cameras, and a camera's name is not a
+            known place on the body.
     """
     videos = videos_in(folder)
     _refuse_missing_videos(folder)
@@ -152,7 +157,11 @@ def _camera_block(folder: Path, name: str, path: Path) -> dict[str, object]:
 
 
 def _refuse_missing_videos(folder: Path) -> None:
-    """Refuse a folder that lacks a camera's videos, before a body is solved without that camera."""
+    """Refuse a folder in which the videos of a camera are missing.
+
+    Otherwise the body would be solved without this camera. Missing videos are broken links, and empty folders
+    with the name of a place on the body.
+    """
     for path in sorted(folder.iterdir()):
         if path.is_symlink() and not path.exists() and path.suffix.lower() in VIDEO_SUFFIXES:
             raise CaptureError(

@@ -1,4 +1,4 @@
-"""Load a job from a YAML file or a folder of videos, and resolve every path in it."""
+"""Load a job from a YAML file or a folder of videos, and resolve all paths of the job."""
 
 from __future__ import annotations
 
@@ -30,19 +30,22 @@ from bodycap_batch.config.yaml_source import YamlSource, read_yaml
 from bodycap_batch.core.errors import CaptureError, JobError
 
 _HEIGHT_M = (0.4, 2.6)
-"""Smallest and largest stature, metres, as for ``height_m`` in a job file. Evidence: none."""
+"""Minimum and maximum stature (metres) on the command line: the limits of ``height_m`` in a job file.
+Evidence: none."""
 _LISTS = ("video", "timestamps")
-"""Fields that may hold one path instead of a list."""
+"""Names of the camera's fields that may hold one path instead of a list of paths."""
 _NAME_LENGTH = 100
-"""Characters of a job's name; the name of a folder may be longer. Evidence: none."""
+"""Maximum number of characters of a job's name. The name of a folder may be longer; it is shortened.
+Evidence: none."""
 
 Prepare = Callable[[Mapping[str, Any], Path], None]
-"""Called with the options of `capture.synthetic` and the folder for its videos."""
+"""Function that renders a synthetic capture. Its arguments are the options of `capture.synthetic` and the
+folder for the videos."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overrides:
-    """Values of the command line that replace those of the job; paths are relative to the working folder."""
+    """Values of the command line that replace values of the job. Paths are relative to the working folder."""
 
     out: Path | None = None
     skeleton: str | None = None
@@ -57,26 +60,29 @@ def load_job(
     policy: PathPolicy | None = None,
     limits: Limits | None = None,
 ) -> Job:
-    """Load a job and resolve it: absolute paths, chapters and sidecars listed, calibrations read.
+    """Load a job and resolve it.
+
+    The resolved job holds absolute paths, all chapters and sidecar files, and the calibrations that were
+    read.
 
     Args:
-        path: A YAML file or a folder of videos. Paths in a YAML file are relative to it, or to the file that
-            a link leads to. If a folder has a ``job.yaml``, that is loaded, with paths relative to the
-            folder.
+        path: Path of a YAML file or of a folder of videos. If the folder holds a ``job.yaml``, this file is
+            loaded. Paths in a YAML file are relative to the folder of the file; if the file is a symbolic
+            link, they are relative to the folder of the link's target.
         overrides: Values of the command line.
-        prepare: Renders the videos of a job with `capture.synthetic` before they are searched for.
-        policy: Which files the job may name; None for the user's own job, which may name any.
-        limits: How large the YAML file may be.
+        prepare: Function that renders the videos of a job with `capture.synthetic` before they are opened.
+        policy: The files that the job may name; None for the user's own job, which may name any file.
+        limits: Maximum size and depth of the YAML file; None for the default limits.
 
     Returns:
-        The job; `Job.model_validate(job.model_dump(mode="json"))` gives it back.
+        The resolved job. `Job.model_validate(job.model_dump(mode="json"))` returns an equal job.
 
     Raises:
-        JobError: The file is not a valid job. The error names file, line, field and a remedy.
+        JobError: The file is not a valid job. The error names the file, line and field, and gives advice.
         CaptureError: A calibration or a folder of videos cannot be used.
     """
     full = path.resolve()
-    # The files beside a job file that was dropped alone belong to others.
+    # A job file that was dropped alone must not use the files in its folder: they belong to other users.
     alone = policy is not None and policy.folder is None and not full.is_dir()
     try:
         full = _job_source(full, policy)
@@ -92,7 +98,7 @@ def load_job(
 
 
 def _job_source(full: Path, policy: PathPolicy | None) -> Path:
-    """Return the job file of a folder, which may be a link, or the path itself."""
+    """Return the job file in a folder; return the path itself if it is a file or holds no job file."""
     found = job_file_in(full) if full.is_dir() else None
     if found is None:
         return full
@@ -102,7 +108,7 @@ def _job_source(full: Path, policy: PathPolicy | None) -> Path:
 
 
 def _read_source(full: Path, limits: Limits) -> YamlSource | None:
-    """Return the YAML of a job; None for a folder of videos."""
+    """Return the parsed YAML file of a job; None for a folder of videos."""
     if full.is_dir():
         return None
     if full.suffix.lower() in VIDEO_SUFFIXES:
@@ -140,16 +146,16 @@ def _load(
     resolved = _resolved(job, base, safe_name(name), full, source)
     if policy is None:
         _require_apart(resolved, full)
-    else:  # the operator chooses the folder of the results
+    else:  # no check of the folder of results here: the operator chooses it
         policy.require_resolved(resolved)
     return resolved
 
 
 def synthetic_folder(job: Job, base: Path) -> Path:
-    """Return the folder for the videos of a synthetic capture, which must be the same for all.
+    """Return the folder for the videos of a synthetic capture. All videos must be in the same folder.
 
     Raises:
-        JobError: The videos lie in several folders.
+        JobError: The job names videos in several folders.
     """
     folders = {(base / video).resolve().parent for camera in job.capture.cameras for video in camera.video}
     if len(folders) > 1:
@@ -172,9 +178,10 @@ def _top_mapping(source: YamlSource) -> dict[str, Any]:
 
 
 def _with_videos_beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Add the videos beside a job file that names no cameras, as for a folder without a job file.
+    """Return the data of a job file; if they name no cameras, add the videos in the job file's folder.
 
-    A job with an unknown key is returned unchanged: the key may be a misspelt ``cameras``.
+    The videos are used as in a folder without a job file. Data with an unknown key are returned unchanged:
+    the key may be a misspelt ``cameras``.
     """
     capture = data.get("capture", {})
     if not isinstance(capture, dict) or "cameras" in capture:
@@ -183,13 +190,16 @@ def _with_videos_beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
         return data
     try:
         videos_in(folder)
-    except CaptureError:  # no videos: the validation reports that the cameras are missing
+    except CaptureError:  # no videos here: the validation reports the missing cameras
         return data
     return {**data, "capture": {**folder_capture(folder), **capture}}
 
 
 def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> Job:
-    """Check the types strictly, through JSON: a list may become a tuple, but "5" is not a number."""
+    """Check the types strictly and return the job.
+
+    The check reads the data as JSON: a list may become a tuple, but the text "5" is not accepted as a number.
+    """
     try:
         return Job.model_validate_json(json.dumps(_with_lists(data)), strict=True)
     except ValidationError as error:
@@ -197,7 +207,7 @@ def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> J
 
 
 def _with_lists(data: dict[str, Any]) -> dict[str, Any]:
-    """Replace a single video or sidecar by a list of one, because the strict check converts nothing."""
+    """Replace a single path by a list with this path, because the strict check does not convert values."""
     capture = data.get("capture")
     if not isinstance(capture, dict) or not isinstance(capture.get("cameras"), list):
         return data
@@ -263,9 +273,10 @@ def _resolved(job: Job, base: Path, name: str, path: Path, source: YamlSource | 
 
 
 def _require_apart(job: Job, full: Path) -> None:
-    """Refuse a folder of results that holds the videos or the job file.
+    """Refuse a job whose results would go into the folder of its videos or of its job file.
 
-    Otherwise a later run could take the preview for a video, or the resolved job would replace the job file.
+    Otherwise a later run could use the preview as an input video, or the resolved job could overwrite the job
+    file.
     """
     videos = {video.parent for camera in job.capture.cameras for video in camera.video}
     kept = full.name == JOB_FILES[0] and full.parent == job.out and not (full.parent / RUN_FILE).is_file()
@@ -305,10 +316,10 @@ def _resolved_camera(camera: CameraConfig, index: int, capture: CaptureConfig, b
 
 
 def _chapters(camera: CameraConfig, base: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """Return the video files of a camera in order, and the sidecars beside them.
+    """Return the video files of a camera in order, and the sidecar files with their timestamps.
 
-    ``<video>.timestamps.txt``, of every chapter or of the folder of chapters, precedes
-    ``<camera>.timestamps.txt``.
+    The sidecar of a folder of chapters is preferred, then the sidecars of the chapters
+    (``<video>.timestamps.txt``), then ``<camera>.timestamps.txt``.
     """
     videos: list[Path] = []
     beside: list[Path] = []
@@ -322,7 +333,10 @@ def _chapters(camera: CameraConfig, base: Path) -> tuple[tuple[Path, ...], tuple
 
 
 def sidecars_of(video: Path) -> list[Path]:
-    """Return the sidecar of a video or folder: ``torso.timestamps.txt`` or ``torso.mp4.timestamps.txt``."""
+    """Return the sidecar file of a video or folder: a list with one path, or an empty list.
+
+    Its name is ``torso.timestamps.txt`` or ``torso.mp4.timestamps.txt``; the first name is preferred.
+    """
     names = (f"{video.stem}.timestamps.txt", f"{video.name}.timestamps.txt")
     return [found for name in names for found in _existing(video.with_name(name))][:1]
 
@@ -332,5 +346,5 @@ def _existing(path: Path) -> list[Path]:
 
 
 def safe_name(text: str) -> str:
-    """Return a text as a name for files: letters, digits, ``.``, ``_`` and ``-``."""
+    """Convert a text to a file name that consists of letters, digits, ``.``, ``_`` and ``-`` only."""
     return re.sub(r"[^A-Za-z0-9._\-]+", "_", text)[:_NAME_LENGTH].strip("._-") or "job"

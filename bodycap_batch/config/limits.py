@@ -1,4 +1,4 @@
-"""Limits for jobs that others submit; jobs that the user runs have none."""
+"""Limits for jobs that other users submit. Jobs that the user runs directly have no limits."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from bodycap_batch.config.yaml_source import MAX_BYTES, MAX_DEPTH
 from bodycap_batch.core.errors import JobError
 
 _MAX_YAML_DEPTH = 100
-"""Largest value of ``yaml_depth``, levels: blocks are read recursively, and Python's own limit is 1,000."""
+"""Maximum value (levels) of ``yaml_depth``. Blocks are read recursively, and Python limits the recursion to
+1,000 levels."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Limits of one job.
+    """Limits of one job. Each attribute is a maximum.
 
     Attributes:
-        yaml_kb: Size of the job file, kilobytes (1024 bytes).
-        yaml_depth: Levels to which its blocks may be nested.
-        files: Number of files in one dropped folder.
-        video_gb: Size of one video file, 10⁹ bytes.
-        video_hours: Duration of one video file.
-        video_px: Long side of a video's frames, pixels.
+        yaml_kb: Maximum size of the job file, in units of 1024 bytes.
+        yaml_depth: Maximum nesting depth of the blocks in the job file, in levels.
+        files: Maximum number of files in one dropped folder.
+        video_gb: Maximum size of one video file, in units of 10⁹ bytes.
+        video_hours: Maximum duration (hours) of one video file.
+        video_px: Maximum length (pixels) of the long side of a video's frames.
     """
 
     yaml_kb: float = MAX_BYTES / 1024
@@ -46,10 +47,10 @@ class Limits:
 
 
 def limits_from(settings: Iterable[str]) -> Limits:
-    """Return the limits that ``name=value`` texts state.
+    """Return the limits given as texts ``name=value``; all other limits keep their defaults.
 
     Raises:
-        JobError: An unknown name, or a value that is not a positive number.
+        JobError: A name is unknown, or a value is not a positive number.
     """
     known = [field.name for field in dataclasses.fields(Limits)]
     values: dict[str, float] = {}

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 LEAST_LOST = 3
-"""Lost frames from which recovery runs for a camera. Fewer do not justify decoding all keyframes again.
+"""Minimum number of lost frames of a camera for recovery to run. Recovering fewer frames does not justify
+decoding all keyframes again.
 Evidence: none."""
 LEAST_POSED = 20
-"""Localised frames from which recovery runs for a camera. Fewer do not determine the motion prior.
+"""Minimum number of localised frames of a camera for recovery to run. Fewer frames do not determine the
+motion prior.
 Evidence: none."""

@@ -21,14 +21,15 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import make_transform, rotation_from_quat_xyzw
 
 NO_SKELETON = "none"
-"""Value of ``skeleton`` for camera paths and a map without a body."""
+"""Value of ``skeleton`` for a job that computes the camera paths and the map, but no body."""
 SKELETON_PRESETS = (NO_SKELETON, "upper_body", "full_body")
 _MAX_SECONDS = 4e9
-"""Largest absolute time, seconds. A Unix time is below it, and sums of two in nanoseconds fit into int64."""
+"""Maximum absolute value (seconds) of a time. Unix times are smaller, and the sum of two such times in
+nanoseconds fits into int64."""
 
 
 class _Block(BaseModel):
-    """Base of the job's blocks: frozen, without unknown keys or NaN."""
+    """Base class of the job's blocks: immutable; unknown keys, NaN and infinity are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -55,7 +56,7 @@ Activity = Literal["walk", "generic"]
 
 
 class MountPose(_Block):
-    """Pose of a camera on its bone: x_in_joint = rotation · x_in_cam + translation."""
+    """Pose of a camera relative to the joint of its bone: x_in_joint = rotation · x_in_cam + translation."""
 
     translation_m: tuple[float, float, float]
     quat_xyzw: Row
@@ -68,7 +69,7 @@ AnyPose = Annotated[
 
 
 class CameraConfig(_Block):
-    """One camera of the capture. Loaded jobs hold absolute paths, every chapter and sidecar listed."""
+    """One camera of the capture. Loaded jobs hold absolute paths and list all chapters and sidecar files."""
 
     name: str = Field(max_length=64, description="names the camera's results")
     video: tuple[Path, ...] = Field(
@@ -103,14 +104,14 @@ class CameraConfig(_Block):
 
     @property
     def role(self) -> str | None:
-        """Role of the bone that carries the camera (``LeftHand``); None if unknown."""
+        """Role of the bone that the camera is mounted on (``LeftHand``); None if the role is unknown."""
         if self.segment is not None:
             return role_of_segment(self.segment)
         found = mount_of(self.mount or self.name)
         return None if found is None else found[1]
 
     def mount_matrix(self) -> FloatArray | None:
-        """Return `joint_from_cam` as a (4,4) transform; None if the job does not state it."""
+        """Return `joint_from_cam` as a (4,4) transform, in metres; None if the job does not give it."""
         pose = self.joint_from_cam
         if isinstance(pose, MountPose):
             return make_transform(rotation_from_quat_xyzw(pose.quat_xyzw), pose.translation_m)
@@ -144,7 +145,7 @@ class CaptureConfig(_Block):
     )
 
     def segments(self) -> list[list[CameraConfig]]:
-        """Return the cameras of each segment that carries two or more."""
+        """Return the cameras of each body segment on which two or more cameras are mounted."""
         by_role: dict[str, list[CameraConfig]] = {}
         for camera in self.cameras:
             if camera.role is not None:
@@ -153,7 +154,7 @@ class CaptureConfig(_Block):
 
 
 class Job(_Block):
-    """Everything that a run needs. If a job file names no cameras, the videos beside it are used."""
+    """Everything that a run needs. If a job file names no cameras, the videos in its folder are used."""
 
     capture: CaptureConfig
     name: str = Field("", max_length=100, description="names the results; default: the file's or folder's")

@@ -1,4 +1,4 @@
-"""Usual names of body cameras, and the bone that carries each of them."""
+"""Usual names of body cameras, and the bone that each camera is mounted on."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _SIDES = {"left": "Left", "right": "Right", "l": "Left", "r": "Right"}
 
 
 def _names() -> Iterator[tuple[str, tuple[str, str]]]:
-    """Yield every known spelling with its (mount, role)."""
+    """Yield every known spelling of a mount, with its pair (mount, role)."""
     for role, spellings in _CENTRAL_SPELLINGS.items():
         for spelling in spellings:
             yield spelling, (_MOUNT_NAME[role], role)
@@ -52,20 +52,21 @@ def _names() -> Iterator[tuple[str, tuple[str, str]]]:
 _MOUNT_BY_SPELLING = {name.replace("_", ""): found for name, found in _names()}
 ROLES = tuple(dict.fromkeys(role for _, role in _MOUNT_BY_SPELLING.values()))
 MOUNT_NAMES = tuple(dict.fromkeys(mount for mount, _ in _MOUNT_BY_SPELLING.values()))
-"""One name for each place that a camera can be mounted on, for messages and help texts."""
+"""The preferred name of each place on the body where a camera can be mounted, for messages and help texts."""
 
 _QUALIFIER = re.compile(r"[_\- ]?(back|front|top|bottom|upper|lower|inner|outer|[0-9]+|[a-c])$")
 
 
 def _key(name: str) -> str:
-    """Return a name without case and separators: ``LeftPalm`` and ``left-palm`` give ``leftpalm``."""
+    """Return a name in lower case and without separators: ``leftpalm`` for ``LeftPalm`` and ``left-palm``."""
     return re.sub(r"[_\-. ]+", "", name).lower()
 
 
 def mount_of(name: str) -> tuple[str, str] | None:
-    """Return the (mount, role) that a camera's name means; None if it names no place on the body.
+    """Return the pair (mount, role) for a camera's name; None if the name is not a known place on the body.
 
-    A qualifier at the end distinguishes cameras on one segment: ``torso_back``, ``torso_2``.
+    A qualifier at the end of the name is ignored. It distinguishes cameras on the same body segment:
+    ``torso_back``, ``torso_2``.
     """
     known = _MOUNT_BY_SPELLING.get(_key(name))
     if known is not None:
@@ -75,6 +76,10 @@ def mount_of(name: str) -> tuple[str, str] | None:
 
 
 def role_of_segment(segment: str) -> str | None:
-    """Return the role that ``segment:`` means: a role (``LeftHand``) or a mount's name; None if unknown."""
+    """Return the role for a value of ``segment:``, which is a role (``LeftHand``) or the name of a mount.
+
+    Returns:
+        The role; None if the value is unknown.
+    """
     roles = {_key(role): role for role in ROLES}
     return roles.get(_key(segment)) or _MOUNT_BY_SPELLING.get(_key(segment), ("", None))[1]

@@ -1,4 +1,4 @@
-"""The typed options of each stage. The key of a stage's artefact holds only its own options."""
+"""The typed options of each stage. The key of a stage's artefact holds only the options of this stage."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 FrameName = Annotated[str, StringConstraints(pattern=r"^.+:\d{1,9}$")]
-"""One frame of a camera, ``camera:frame``, counted from 0 in its joined video regardless of ``start_s``."""
+"""Name of one frame: ``camera:frame``. Frames are counted from 0 at the start of the camera's joined
+chapters; ``start_s`` does not change this count."""
 
 FileFormat = Literal["ply", "bvh", "glb", "fbx", "usd", "c3d", "trc", "tum", "csv", "npz", "colmap"]
 NamePreset = Literal["hik", "mixamo", "biped", "unreal"]
@@ -15,13 +16,13 @@ RootMode = Literal["hips", "ground", "in_place"]
 
 
 class Options(BaseModel):
-    """Base of all blocks of options: frozen, without unknown keys."""
+    """Base class of all blocks of options: immutable; unknown keys are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class KeyframeOptions(Options):
-    """Stage 1, keyframe selection."""
+    """Options of stage 1, the selection of keyframes."""
 
     parallax_px: float = Field(
         15.0, gt=0, description="parallax without rotation that causes a keyframe, at 640 px width"
@@ -36,7 +37,7 @@ class KeyframeOptions(Options):
 
 
 class MapOptions(Options):
-    """Stage 2, the map."""
+    """Options of stage 2, mapping."""
 
     features: int = Field(512, ge=128, description="SIFT features a keyframe, the strongest")
     pairs: Literal["retrieval", "exhaustive"] = Field(
@@ -52,7 +53,7 @@ class MapOptions(Options):
 
 
 class RegistrationOptions(Options):
-    """Stage 3, every frame."""
+    """Options of stage 3, the registration of every frame."""
 
     rounds: int = Field(3, ge=0, description="how often the map may be extended where frames were lost")
     min_inliers: int = Field(15, ge=4, description="PnP inliers below which a frame is refused")
@@ -70,11 +71,11 @@ MARKER_COUNTS = {
     "APRILTAG_36H10": 2320,
     "APRILTAG_36H11": 587,
 }
-"""Number of markers in each of OpenCV's families."""
+"""Number of markers in each of OpenCV's families of markers, by name of the family."""
 
 
 class MarkerBoard(Options):
-    """A flat board with squares of known size in the room."""
+    """A flat board in the room, with squares of known size."""
 
     square_m: float = Field(gt=0, le=2, description="side of one square, metres, as measured on the print")
     columns: int = Field(ge=3, description="chessboard: inner corners in a row; ChArUco: squares in a row")
@@ -91,7 +92,7 @@ class MarkerBoard(Options):
 
 
 class MergeOptions(Options):
-    """Stage 4, the skeleton."""
+    """Options of stage 4, the motion of the skeleton."""
 
     fps: float | None = Field(None, gt=0, description="rate of the motion; default the torso camera's")
     max_gap_s: float = Field(1.0, gt=0, description="longest gap that is filled without a mark")
@@ -113,7 +114,7 @@ class MergeOptions(Options):
 
 
 class ExportOptions(Options):
-    """Stage 5, the files."""
+    """Options of stage 5, the export of the result files."""
 
     formats: tuple[FileFormat, ...] = Field(
         ("ply", "bvh", "glb", "tum", "csv", "colmap"), description="files to write, as a list: [ply, bvh]"

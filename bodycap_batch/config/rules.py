@@ -1,4 +1,4 @@
-"""Rules for a job beyond its types: names, mounts, skeleton, times."""
+"""Rules for a job that its types do not check: names, mounts, skeleton, times, rig, marker board."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from bodycap_batch.config.options import MARKER_COUNTS
 from bodycap_batch.model.skeleton_presets import split_side
 
 _FREE_LIMB = {"Arm": "arm", "ForeArm": "arm", "Hand": "arm", "Leg": "leg", "Foot": "leg"}
-"""Bones that move freely relative to the trunk, and the limb that they belong to."""
+"""Limb of each bone that moves freely relative to the trunk, by the bone's role without its side."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._\-]*")
 _UNFILLED = re.compile(r"<[^<>]*>")
 _MAX_NAME_BYTES = 255
-"""Longest name of a file on common file systems, bytes."""
+"""Maximum length (bytes) of a file name on common file systems."""
 _ROTATION_TOLERANCE = 5e-3
-"""Largest deviation of a stated rotation from an orthonormal one: rounding to three decimals stays below."""
+"""Maximum deviation (no unit) of the elements of R·Rᵀ from the identity, for a rotation R given in the job,
+and of a quaternion's length from 1. Rounding to three decimals causes smaller deviations."""
 
 
 def problems_in(job: Job) -> list[Problem]:
-    """Return the problems of a job that its types do not show; no file is opened."""
+    """Return the problems of a job that its types do not exclude; no file is opened."""
     problems: list[Problem] = []
     for index, camera in enumerate(job.capture.cameras):
         for found in (*_camera_names(job, index), *_mount(job, camera), *_pose(camera), *_paths(camera)):
@@ -36,7 +37,10 @@ def problems_in(job: Job) -> list[Problem]:
 
 
 def skeleton_of(job: Job) -> str:
-    """Return the skeleton of a job: the stated one, else none if all cameras are on one bone."""
+    """Return the skeleton of a job.
+
+    If the job does not give a skeleton: none if all cameras are mounted on one bone, else the upper body.
+    """
     if job.skeleton is not None:
         return job.skeleton
     roles = {camera.role for camera in job.capture.cameras}
@@ -110,7 +114,7 @@ def _paths(camera: CameraConfig) -> Iterator[Problem]:
 
 
 def _unusable(field: str, path: Path) -> Iterator[Problem]:
-    """Yield a problem if no file system accepts a text as a path."""
+    """Yield a problem if common file systems do not accept the path."""
     if "\0" in str(path) or any(len(part.encode(errors="replace")) > _MAX_NAME_BYTES for part in path.parts):
         yield Problem((field,), f"{str(path)[:40]!r} cannot be a path", "check the path")
 
@@ -144,7 +148,10 @@ def _skeleton(job: Job) -> Iterator[Problem]:
 
 
 def _size(job: Job) -> Iterator[Problem]:
-    """Yield a problem if every camera is on another limb, since no distance then shows the body's size."""
+    """Yield a problem if every camera is mounted on a different limb.
+
+    In this case no distance between cameras determines the size of the body.
+    """
     parts = [split_side(camera.role) for camera in job.capture.cameras if camera.role is not None]
     limbs = [(side, _FREE_LIMB.get(part)) for side, part in parts]
     all_differ = len(limbs) == len(set(limbs)) == len(job.capture.cameras) > 1
@@ -164,14 +171,14 @@ def _times(job: Job) -> Iterator[Problem]:
 
 
 def _rig(job: Job) -> Iterator[Problem]:
-    """Yield a problem if a rig has no two cameras on one segment."""
+    """Yield a problem if a job has a synchronised rig, but no two cameras on the same body segment."""
     if job.capture.rig == "synced" and not job.capture.segments():
         message = "`synced` needs cameras on one segment, and no two share one"
         yield Problem(("capture", "rig"), message, "give them one `mount` or `segment`, or leave it out")
 
 
 def named_frames(job: Job) -> Iterator[tuple[tuple[str, str, int], str, int]]:
-    """Yield the frames that a job names: the field, the camera's name and the frame's number."""
+    """Yield each frame that a job names: the location of its field, the camera name and the frame number."""
     distance = job.merge.known_distance
     for block, field, frames in (
         ("map", "init_frames", job.map.init_frames or ()),
@@ -183,7 +190,7 @@ def named_frames(job: Job) -> Iterator[tuple[tuple[str, str, int], str, int]]:
 
 
 def _named_frames(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each named frame whose camera the job does not have."""
+    """Yield a problem for each named frame whose camera is not a camera of the job."""
     names = tuple(camera.name for camera in job.capture.cameras)
     for where, camera, _ in named_frames(job):
         if camera not in names:
@@ -191,7 +198,7 @@ def _named_frames(job: Job) -> Iterator[Problem]:
 
 
 def _board(job: Job) -> Iterator[Problem]:
-    """Yield a problem if a marker board cannot be found, or looks the same after a quarter turn."""
+    """Yield a problem if a marker board cannot be detected, or looks the same after a rotation by 90°."""
     board, where = job.merge.marker_board, ("merge", "marker_board")
     if board is None:
         return

@@ -1,8 +1,8 @@
-"""Which files a job may name that others submit.
+"""The files that a job may name if another user submitted it.
 
-The user's own job may name any path that can be read. A job that was dropped into a watched folder, or sent
-to the live page, may name the files that came with it. It may also name files below the folders that the
-operator opened to all jobs, but it cannot open further folders.
+The user's own job may name any readable path. Another user may drop a job into a watched folder, or send it
+to the live page. Such a job may name the files that were submitted together with it. It may also name files
+below the folders that the operator opened to all jobs. No other files are allowed.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from bodycap_batch.core.errors import JobError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathPolicy:
-    """The folders in which a job's paths must lie.
+    """The folders that must contain all paths of a job.
 
     Attributes:
-        folder: The dropped folder; None for a job file that came alone.
+        folder: The folder that was submitted; None for a job file that was submitted alone.
         roots: Folders that the operator opened to all jobs.
     """
 
@@ -28,14 +28,14 @@ class PathPolicy:
     roots: tuple[Path, ...] = ()
 
     def require_named(self, job: Job, base: Path) -> None:
-        """Check the paths that a job states, before any file is read.
+        """Check the paths that a job names, before any file is read.
 
         Args:
-            job: A validated job with the paths of its file.
-            base: Folder of relative paths.
+            job: A validated job with the paths as given in its file.
+            base: Folder that relative paths start from.
 
         Raises:
-            JobError: A path has ``..``, or lies or leads outside.
+            JobError: A path contains ``..``, or it is outside the allowed folders, also by a symbolic link.
         """
         for field, path in _paths_of(job):
             if ".." in path.parts:
@@ -43,10 +43,10 @@ class PathPolicy:
             self.require(base / path, field)
 
     def require_resolved(self, job: Job) -> None:
-        """Check every file of a resolved job, also the chapters and sidecars found beside its videos.
+        """Check every file of a resolved job, including the chapters and sidecar files that were found.
 
         Raises:
-            JobError: One of them leads outside by a symbolic link.
+            JobError: A file is outside the allowed folders, for example by a symbolic link.
         """
         for field, path in _paths_of(job):
             self.require(path, field)
@@ -55,11 +55,11 @@ class PathPolicy:
         """Check one path; symbolic links are followed.
 
         Raises:
-            JobError: It lies outside.
+            JobError: The path is outside the allowed folders.
         """
         try:
             target = path.resolve()
-        except (OSError, RuntimeError) as error:  # a loop of links
+        except (OSError, RuntimeError) as error:  # the links form a loop
             raise JobError(
                 "cannot be followed: it is a loop of links",
                 path=path,
@@ -83,7 +83,7 @@ class PathPolicy:
 
 
 def _paths_of(job: Job) -> Iterator[tuple[str, Path]]:
-    """Yield every path that a job reads, with its field."""
+    """Yield every path that a job reads, as a pair (field, path)."""
     if job.skeleton is not None and job.skeleton not in SKELETON_PRESETS:
         yield "skeleton", Path(job.skeleton)
     yield from _paths_of_capture(job.capture)

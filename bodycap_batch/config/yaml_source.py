@@ -1,4 +1,4 @@
-"""Read YAML as plain values, with the line of each value.
+"""Read a YAML file as plain values, with the line number of each value.
 
 Scalars follow the core schema of YAML 1.2: ``no``, ``1:30`` and dates stay text, ``1e-3`` is a number.
 """
@@ -15,12 +15,13 @@ import yaml
 from bodycap_batch.core.errors import JobError
 
 MAX_BYTES = 1 << 20
-"""Largest job file, bytes. Evidence: none."""
+"""Maximum size (bytes) of a job file. Evidence: none."""
 MAX_DEPTH = 20
-"""Deepest nesting of a job file, levels; a job needs six. Evidence: none."""
+"""Maximum nesting depth (levels) of a job file. A job needs six levels. Evidence: none."""
 
 Location = tuple[str | int, ...]
-"""Keys and list positions from the top of the file: ``("capture", "cameras", 0, "video")``."""
+"""Location of a value: the keys and list positions from the top of the file, such as
+``("capture", "cameras", 0, "video")``."""
 
 _INT = re.compile(r"[-+]?[0-9]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
@@ -28,7 +29,7 @@ _WORDS: dict[str, bool | None] = {"": None, "~": None, "null": None, "Null": Non
 _WORDS |= {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
 _TAB_INDENT = re.compile(r" *\t")
 _MAX_INT = 1 << 63
-"""Numbers from here on do not fit into int64."""
+"""Smallest absolute value of a number that is refused. It does not fit into int64."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,9 +37,10 @@ class YamlSource:
     """A parsed YAML file.
 
     Attributes:
-        path: The file.
-        data: Its value: dicts with text keys, lists, text, numbers, booleans, None.
-        lines: 1-based line of each value's key (of the item in a list), by location.
+        path: Path of the file.
+        data: Content of the file: dicts with text keys, lists, texts, numbers, booleans, None.
+        lines: Line number (from 1) of each value, by location: the line of the value's key, or of the list
+            item.
     """
 
     path: Path
@@ -46,7 +48,7 @@ class YamlSource:
     lines: dict[Location, int]
 
     def line_of(self, location: Location) -> int | None:
-        """Return the line of a location, or of the nearest value around it."""
+        """Return the line of a location, or else of the nearest enclosing value; None if no line is known."""
         while location not in self.lines:
             if not location:
                 return None
@@ -58,8 +60,8 @@ def read_yaml(path: Path, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DE
     """Read a YAML file of at most `max_bytes`, nested at most `max_depth` levels deep.
 
     Raises:
-        JobError: The file is unreadable, no YAML, too large or too deep, or it has a key twice or anchors.
-            The error names the line.
+        JobError: The file is unreadable, too large or nested too deep, or is not YAML. Or it holds the same
+            key twice, an anchor, an alias or a tag. The error names the line if it is known.
     """
     try:
         if path.stat().st_size > max_bytes:
@@ -88,7 +90,7 @@ def read_yaml(path: Path, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DE
 
 
 def _refuse_unsupported(text: str, path: Path, max_depth: int) -> None:
-    """Refuse deep nesting before anything recurses, and anchors, aliases and tags."""
+    """Refuse too deep nesting, anchors, aliases and tags, before the file is read recursively."""
     depth = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         line = 0 if event.start_mark is None else event.start_mark.line + 1
@@ -126,7 +128,7 @@ def _syntax_error(error: yaml.MarkedYAMLError, text: str, path: Path) -> JobErro
 
 
 def _value(node: yaml.Node, location: Location, lines: dict[Location, int], path: Path) -> object:
-    """Return a node as plain values, and record the lines of everything in it."""
+    """Return a node as plain values, and record the line of the node and of all values inside it."""
     lines.setdefault(location, node.start_mark.line + 1)
     if isinstance(node, yaml.MappingNode):
         return _mapping(node, location, lines, path)
@@ -159,7 +161,7 @@ def _mapping(
 
 
 def _scalar(node: yaml.Node, path: Path) -> object:
-    """Return a scalar by the core schema of YAML 1.2; quoted text stays text."""
+    """Return the value of a scalar according to the core schema of YAML 1.2; quoted text stays text."""
     text = str(node.value)
     if getattr(node, "style", None) is not None:
         return text
@@ -183,5 +185,5 @@ def _scalar(node: yaml.Node, path: Path) -> object:
 
 
 def dotted(location: Location) -> str:
-    """Return a location as messages show it: ``capture.cameras.0.video``."""
+    """Return a location as text for messages: ``capture.cameras.0.video``."""
     return ".".join(str(part) for part in location)

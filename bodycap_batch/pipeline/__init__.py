@@ -1,4 +1,4 @@
-"""Run a job from its videos to its results: the stages in order."""
+"""Run a job from its videos to its results: all stages, one after another."""
 
 from bodycap_batch.pipeline.batch import Batch, BatchJob, Outcome
 from bodycap_batch.pipeline.reporting import remake_report, stored_for_report

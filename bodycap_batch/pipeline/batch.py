@@ -1,4 +1,4 @@
-"""Run many jobs at once: each job in a thread that only waits, while an executor runs their tasks."""
+"""Run many jobs at once. Each job has a thread that only waits; an executor runs the tasks of all jobs."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class BatchJob:
     """One job of a batch.
 
     Attributes:
-        path: A job file or a folder of videos.
-        priority: Jobs of a higher priority run first.
+        path: Path of a job file or of a folder of videos.
+        priority: Priority of the job; jobs with a higher number run first.
     """
 
     path: Path
@@ -39,9 +39,9 @@ class Outcome:
 
     Attributes:
         job: The job.
-        seconds: Time from its start to its end.
-        summary: Its results; None if it failed.
-        error: Why it failed; None if it did not.
+        seconds: Time (seconds) from the job's start to its end.
+        summary: Summary of the job's results; None if the job failed.
+        error: The error that made the job fail; None if the job succeeded.
     """
 
     job: BatchJob
@@ -51,7 +51,7 @@ class Outcome:
 
     @property
     def exit_code(self) -> int:
-        """Exit code: 0, or that of the error."""
+        """Exit code of the job: 0 if it succeeded, else the exit code of its error."""
         return 0 if self.error is None else self.error.exit_code
 
     def to_dict(self) -> dict[str, Any]:
@@ -67,13 +67,13 @@ class Outcome:
 
 
 class Batch:
-    """Jobs that run side by side; the failure of one does not stop the others.
+    """Jobs that run at the same time; a failed job does not stop the other jobs.
 
     Args:
-        settings: Called with a job and its folder of results, or None before the folder is known. All
-            settings share one executor.
-        results: Returns the folder of a resolved job's results.
-        max_jobs: Number of jobs that run at once.
+        settings: Function that returns the settings of a job. Its arguments are the job and the folder of the
+            job's results; the folder is None as long as it is unknown. All settings share one executor.
+        results: Function that returns the folder for the results of a resolved job.
+        max_jobs: Maximum number of jobs that run at the same time.
     """
 
     def __init__(
@@ -86,11 +86,11 @@ class Batch:
         self._results = results
         self._max_jobs = max_jobs
         self._owners: dict[Path, Path] = {}
-        """By folder of results, the job that writes into it."""
+        """Path of the job that writes into a folder of results, by folder."""
         self._lock = threading.Lock()
 
     def run(self, jobs: Sequence[BatchJob]) -> Iterator[Outcome]:
-        """Run the jobs, those of high priority first; yield the outcome of each job when it ends."""
+        """Run the jobs, the highest priority first; yield the outcome of each job when the job ends."""
         ordered = sorted(jobs, key=lambda job: -job.priority)
         started: dict[BatchJob, float] = {}
 
@@ -119,7 +119,7 @@ class Batch:
         return run_job(resolved, out_dir=out_dir, settings=self._settings(job, out_dir))
 
     def _claim_folder(self, out_dir: Path, path: Path) -> None:
-        """Refuse a job that would write into the folder of another job of the batch."""
+        """Refuse a job that would write its results into the same folder as another job of the batch."""
         with self._lock:
             other = self._owners.setdefault(out_dir.resolve(), path)
         if other != path:
@@ -132,7 +132,7 @@ class Batch:
 
 
 def _outcome(job: BatchJob, future: Future[RunSummary], seconds: float) -> Outcome:
-    """Return the outcome of a job that has ended; an unexpected exception gets exit code 70."""
+    """Return the outcome of a job that has ended; an unexpected exception gives exit code 70."""
     failure = future.exception()
     if failure is None:
         return Outcome(job=job, seconds=seconds, summary=future.result())

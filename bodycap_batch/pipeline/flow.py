@@ -1,4 +1,4 @@
-"""The stages of one job: each method creates the typed tasks of a stage and returns their artefacts."""
+"""The stages of one job: each method creates a stage's typed tasks, runs them and returns their artefacts."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ ByCamera = Mapping[str, Artefact]
 
 
 class Flow:
-    """The stages of one job; a context manager that waits for its threads.
+    """The stages of one job; a context manager that waits for its threads at the end.
 
     Args:
         job: A resolved job.
-        settings: Store, threads, listener, cancellation.
-        logs: Folder of the children's logs.
+        settings: Settings of the run: store, threads, listener, cancellation.
+        logs: Folder for the logs of the child processes.
     """
 
     def __init__(self, job: Job, settings: Settings, *, logs: Path) -> None:
@@ -71,7 +71,7 @@ class Flow:
         self.runner.__exit__(*failure)
 
     def check(self) -> None:
-        """Refuse a job that cannot work before hours are spent on it, and report what the user should know.
+        """Check the job before any long computation, and report notes to the user.
 
         Raises:
             BodycapError: The job, a video or a calibration cannot be used.
@@ -87,7 +87,7 @@ class Flow:
         self.runner.report_notes(artefact, "check")
 
     def keyframes(self) -> ByCamera:
-        """Select the keyframes of every camera."""
+        """Select the keyframes of every camera and return the artefact of each camera."""
         capture = self._job.capture
         return self.runner.run_all(
             make_task(
@@ -102,7 +102,7 @@ class Flow:
         )
 
     def map(self, keyframes: ByCamera) -> Artefact:
-        """Build the map of all keyframes."""
+        """Build the map of all keyframes and return its artefact."""
         distances = [] if self._body is None else camera_distances(self._body)
         task = MapTask(
             options=self._job.map,
@@ -114,7 +114,7 @@ class Flow:
             ),
         )
         later: list[Stage[Any]] = [*([MERGE] if has_body(self._job) else []), EXPORT, REPORT]
-        # The mapper keeps one core busy; on another one the libraries of the last stages load.
+        # Mapping keeps one core busy. Meanwhile, another core loads the libraries of the last stages.
         preload = [[module for stage in later for module in stage.modules]] if self._threads > 1 else []
         artefact = self.runner.run(make_task(MAP, task, threads=self._threads), preload)
         self.runner.report_notes(artefact, "map")
@@ -126,9 +126,10 @@ class Flow:
         """Register every frame of every camera against the map.
 
         Args:
-            scene_map: The map.
-            keyframes: By camera.
-            previous: Registrations against an earlier round of the map; their tracks are reused.
+            scene_map: The artefact of the map.
+            keyframes: The keyframes' artefact of each camera, by camera name.
+            previous: The registration of each camera against an earlier round of the map, by camera name; the
+                tracks of these registrations are reused. None in the first round.
         """
         cameras = self._job.capture.cameras
         return self.runner.run_all(
@@ -151,10 +152,10 @@ class Flow:
     def extend_map(
         self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
     ) -> tuple[Artefact, ByCamera]:
-        """Add keyframes where frames were lost and register again, until no frame is gained.
+        """Add keyframes where frames were lost and register again, until no further frame is localised.
 
         Returns:
-            The last map that did not lose frames, and the registrations against it.
+            The last map that did not reduce the number of localised frames, and the registrations against it.
         """
         for _ in range(self._job.registration.rounds):
             summaries = {name: read_summary(artefact.path) for name, artefact in registrations.items()}
@@ -166,7 +167,7 @@ class Flow:
             gained = _localised_frames(again) - _localised_frames(registrations)
             if gained < 0:
                 break
-            # Even if no frame is gained: keyframes that the video contradicts have new poses.
+            # The new map is used even if no frame is gained: misregistered keyframes have new poses in it.
             scene_map, registrations = extended, again
             if gained == 0:
                 break
@@ -175,7 +176,10 @@ class Flow:
     def refine_map(
         self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
     ) -> tuple[Artefact, ByCamera]:
-        """If a shutter rolls, remove the deformation that it causes and solve all poses again."""
+        """Remove the deformation of the map that rolling shutters cause, and solve all poses again.
+
+        If no camera has a rolling shutter, the map and the registrations are returned unchanged.
+        """
         if not any(read_summary(artefact.path)["rolling"] for artefact in registrations.values()):
             return scene_map, registrations
         task = RefineTask(
@@ -189,14 +193,14 @@ class Flow:
         return refined, self.register(refined, keyframes, registrations)
 
     def solve_rigs(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
-        """Solve the cameras of each synchronised rig again, from what all cameras of the rig observe."""
+        """Solve the cameras of each synchronised rig again, from what all the rig's cameras observe."""
         solved = self.runner.run_all(self._rig_tasks(scene_map, registrations, keyframes))
         for artefact in solved.values():
             self.runner.report_notes(artefact, "registration")
         return {**registrations, **solved}
 
     def recover(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
-        """Search for lost frames of the cameras that have both lost and localised frames."""
+        """Recover lost frames of the cameras that have enough lost frames and enough localised frames."""
         recovered = self.runner.run_all(self._recovery_tasks(scene_map, registrations, keyframes))
         return {**registrations, **recovered}
 
@@ -230,14 +234,14 @@ class Flow:
         merged: Artefact | None,
         failure: EstimationError | None,
     ) -> Artefact:
-        """Write the files of the results.
+        """Write the result files and return their artefact.
 
         Args:
-            keyframes: By camera.
-            scene_map: The map.
-            registrations: By camera.
-            merged: The skeleton's motion, if there is one.
-            failure: Why there is none, although the job asks for one.
+            keyframes: The keyframes' artefact of each camera, by camera name.
+            scene_map: The artefact of the map.
+            registrations: The registration of each camera, by camera name.
+            merged: The artefact of the skeleton's motion; None if there is no motion.
+            failure: The reason why the motion that the job asks for is missing; None if no motion is missing.
         """
         segments = self._job.capture.segments()
         task = ExportTask(
@@ -252,18 +256,22 @@ class Flow:
         return self.runner.run(make_task(EXPORT, task, threads=self._threads))
 
     def start_preview(self, results: StageResults) -> Future[Artefact] | None:
-        """Start to render the video of the results beside later stages; None if it is not wanted."""
+        """Start to render the video of the results while later stages run.
+
+        Returns:
+            The future of the video's artefact; None if this run does not render the video.
+        """
         if self._settings.until not in ("", "preview") or results.map is None:
             return None
         task = preview_task(self._job, results, results.map, self._cameras)
         return self.runner.start(make_task(PREVIEW, task, threads=self._threads))
 
     def report(self, results: StageResults, stopped_by: BodycapError | None = None) -> Artefact:
-        """Write the report of all results.
+        """Write the report of all results and return its artefact.
 
         Args:
-            results: The results, as far as the job came.
-            stopped_by: What stopped the job, if anything did.
+            results: The results of the stages that have finished.
+            stopped_by: The error that stopped the job; None if the job was not stopped.
         """
         failure = results.describe_failure(stopped_by or results.failure)
         digests = self._settings.store.digests
@@ -272,7 +280,7 @@ class Flow:
 
     @cached_property
     def _body(self) -> BodyInput | None:
-        """The job's body; None if it asks for no skeleton."""
+        """The body of the job; None if the job asks for no skeleton."""
         return body_input(self._job, self._settings.store.digests) if has_body(self._job) else None
 
     def _check_task(self) -> Task:
@@ -280,7 +288,7 @@ class Flow:
             self._job.capture, self._settings.store.digests, self._settings.listener, self._settings.cancelled
         )
         if has_body(self._job):
-            # Looked at in each run and not part of the stored check: installed libraries can change.
+            # Each run checks this again, even if the stored check is reused: installed libraries can change.
             require_libraries(self._job.export.formats)
         task = CheckTask(
             job=self._job,
@@ -295,7 +303,7 @@ class Flow:
     def _extend(
         self, scene_map: Artefact, wanted: Mapping[str, Sequence[int]], keyframes: ByCamera
     ) -> Artefact:
-        """Add the wanted frames of each camera to the map."""
+        """Add the wanted frames of each camera to the map as keyframes; return the new map's artefact."""
         self._map_round += 1
         task = ExtendTask(
             options=self._job.map,
@@ -316,7 +324,7 @@ class Flow:
     def _recovery_tasks(
         self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
     ) -> Iterator[Task]:
-        """Yield one task for every camera with enough lost frames and enough localised ones."""
+        """Yield one task for every camera with enough lost frames and enough localised frames."""
         for own in self._job.capture.cameras:
             summary = read_summary(registrations[own.name].path)
             if not LEAST_POSED <= summary["localised"] <= summary["frames"] - LEAST_LOST:
@@ -332,7 +340,7 @@ class Flow:
         registrations: ByCamera,
         keyframes: ByCamera,
     ) -> CameraGroupTask:
-        """Return the task of solving one camera with the help of the others, its own camera first."""
+        """Return the task of solving the camera `own` with the help of `cameras`; `own` comes first in it."""
         ordered = [own, *(camera for camera in cameras if camera.name != own.name)]
         names = [camera.name for camera in ordered]
         return CameraGroupTask(
@@ -346,5 +354,5 @@ class Flow:
 
 
 def _localised_frames(registrations: ByCamera) -> int:
-    """Return the number of localised frames of all cameras."""
+    """Return the total number of localised frames of all cameras."""
     return sum(int(read_summary(artefact.path)["localised"]) for artefact in registrations.values())

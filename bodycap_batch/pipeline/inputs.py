@@ -1,4 +1,4 @@
-"""The inputs of the stages' tasks, from a job and its stored artefacts."""
+"""Create the inputs of the stages' tasks from a job and its stored artefacts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, FileR
 
 _FILE_FIELDS = ("video", "timestamps", "mask")
 _MOUNT_FIELDS = ("mount", "segment", "joint_from_cam", "sigma_deg", "sigma_m")
-"""Fields about a camera's place on the body: only the skeleton depends on them."""
+"""Fields that describe a camera's mount on the body. Only the skeleton depends on them, so they are not part
+of a camera's digest."""
 
 
 def camera_digest(
@@ -28,13 +29,13 @@ def camera_digest(
 
     Args:
         capture: The capture block of the job.
-        camera: One of its cameras.
-        digests: Digests of files.
-        on_bytes: Called with the number of bytes of each block read.
+        camera: A camera of this block.
+        digests: Cache of the digests of files.
+        on_bytes: Called with the number of bytes after each block that is read.
 
     Raises:
         CaptureError: A file cannot be read.
-        StoreError: The disk fails; `DiskAway` if it does not answer.
+        StoreError: The disk fails (`DiskAway` if the disk does not answer).
     """
     settings = camera.model_dump(mode="json", exclude=set(_FILE_FIELDS + _MOUNT_FIELDS))
     shared = capture.model_dump(mode="json", include={"start_s", "end_s", "work_px"})
@@ -53,10 +54,10 @@ def camera_digest(
 def camera_digests(
     capture: CaptureConfig, digests: FileDigests, listener: Listener, cancelled: Callable[[], bool]
 ) -> dict[str, str]:
-    """Return `camera_digest` by camera name, and report the progress of reading the videos.
+    """Return the `camera_digest` of each camera, by name, and report the progress of reading the videos.
 
     Raises:
-        Cancelled: The job was stopped meanwhile.
+        Cancelled: The job was stopped while files were read.
         CaptureError, StoreError: See `camera_digest`.
     """
     videos = [path for camera in capture.cameras for path in camera.video]
@@ -89,12 +90,12 @@ def _footage_digest(path: Path, digests: FileDigests, on_bytes: Callable[[int], 
 def capture_ref(
     capture: CaptureConfig, digests: Mapping[str, str], cameras: Sequence[CameraConfig] | None = None
 ) -> CaptureRef:
-    """Return a task's input for the videos of a capture.
+    """Return the reference to the videos of a capture, as input of a task.
 
     Args:
         capture: The capture block of the job.
-        digests: `camera_digest` by camera name; empty if a video cannot be read.
-        cameras: The task's cameras, in this order; default: all.
+        digests: The `camera_digest` of each camera, by camera name; empty if a video cannot be read.
+        cameras: The cameras of the task, in the order that the task needs; None for all cameras.
     """
     chosen = capture.cameras if cameras is None else tuple(cameras)
     config = capture.model_copy(update={"cameras": chosen, "synthetic": None})
@@ -105,22 +106,22 @@ def capture_ref(
 
 
 def artefact_ref(artefact: Artefact) -> ArtefactRef:
-    """Return a task's input for a stored artefact."""
+    """Return the reference to a stored artefact, as input of a task."""
     return ArtefactRef(path=artefact.path, digest=artefact.digest)
 
 
 def optional_ref(artefact: Artefact | None) -> ArtefactRef | None:
-    """Return a task's input for an artefact that may be missing."""
+    """Return the reference to a stored artefact, as input of a task; None if there is no artefact."""
     return None if artefact is None else artefact_ref(artefact)
 
 
 def refs_by_camera(artefacts: Mapping[str, Artefact]) -> dict[str, ArtefactRef]:
-    """Return a task's input for one artefact per camera."""
+    """Return the reference to the artefact of each camera, by camera name, as input of a task."""
     return {name: artefact_ref(artefact) for name, artefact in artefacts.items()}
 
 
 def body_input(job: Job, digests: FileDigests) -> BodyInput:
-    """Return a task's input for the body of a job: skeleton, stature, activity and mounts.
+    """Return the body of a job as input of a task: skeleton, stature, activity and mounts.
 
     Raises:
         JobError: A camera's place on the body is unknown, or the skeleton file cannot be read.
@@ -150,12 +151,12 @@ def _skeleton_digest(path: Path, digests: FileDigests) -> str:
 
 
 def has_body(job: Job) -> bool:
-    """Return False if the job asks for no skeleton."""
+    """Return True if the job asks for a skeleton."""
     return job.skeleton not in (None, "none")
 
 
 def skeleton_file(job: Job) -> Path | None:
-    """Return the user's BVH file, if the job names one."""
+    """Return the path of the user's BVH file; None if the job names no BVH file."""
     named = job.skeleton or ""
     return Path(named) if named.lower().endswith(".bvh") else None
 

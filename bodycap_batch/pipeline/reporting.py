@@ -1,4 +1,4 @@
-"""The report of a job that was run before, made again from stored results."""
+"""Make the report of a job again, from results that an earlier run stored."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from bodycap_batch.tasks.report import ReportTask
 
 
 def stored_for_report(job: Job, *, out_dir: Path, settings: Settings) -> ReportTask:
-    """Find the stored results that a job's report is made from; nothing is computed.
+    """Find the stored results from which a job's report is made; nothing is computed.
 
     Args:
         job: A resolved job.
-        out_dir: Folder of its results.
-        settings: Store, threads, listener, cancellation.
+        out_dir: Folder of the job's results.
+        settings: Settings of the run: store, threads, listener, cancellation.
 
     Returns:
         The report's task, for `bodycap_batch.tasks.report.load_inputs`.
@@ -36,7 +36,11 @@ def stored_for_report(job: Job, *, out_dir: Path, settings: Settings) -> ReportT
 
 
 def _find_stored(job: Job, out_dir: Path, settings: Settings) -> tuple[StageResults, BodycapError | None]:
-    """Return the stored stages up to the export, and the error that names the first missing one."""
+    """Return the stored results of all stages up to the export.
+
+    If a stage is not stored, the results end before this stage. The error that names the first missing stage
+    is then returned too; otherwise None.
+    """
     results = StageResults()
     with Flow(job, replace(settings, compute=False, redo=frozenset()), logs=out_dir / "logs") as flow:
         try:
@@ -51,15 +55,17 @@ def _find_stored(job: Job, out_dir: Path, settings: Settings) -> tuple[StageResu
 
 
 def remake_report(job: Job, *, out_dir: Path, settings: Settings) -> Path:
-    """Write a job's report again; no other stage is computed.
+    """Write a job's report again from stored results.
+
+    Only the report, and the check of the job if it is not stored, are computed.
 
     Args:
         job: A resolved job.
-        out_dir: Folder of its results.
-        settings: Store, threads, listener, cancellation.
+        out_dir: Folder of the job's results.
+        settings: Settings of the run: store, threads, listener, cancellation.
 
     Returns:
-        The report: beside the results if the job is complete, else in ``<out_dir>/partial``.
+        The path of the report: in `out_dir` if the job is complete, else in ``<out_dir>/partial``.
 
     Raises:
         BodycapError: The videos cannot be read, the disk fails, or nothing of the job is stored.

@@ -1,4 +1,4 @@
-"""Copy results from the store to the user's folder."""
+"""Publish results: link or copy them from the store to the user's folder, and remove outdated results."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from bodycap_batch.store.artefacts import disk_errors, sync_folder
 from bodycap_batch.store.digests import remove_abandoned, temporary_beside, write_atomically
 
 PARTIAL = "partial"
-"""Folder below the results for those of a job that has no skeleton, or no results at all."""
+"""Subfolder of the results for a job that did not finish: for results without the skeleton that the job asks
+for, or for the report of a job without results."""
 
 
 def publish(files: Mapping[str, Path], folder: Path) -> None:
-    """Put files into a folder, each one completely or not at all, by hard link if possible.
+    """Put files of the store into a folder: by hard link if possible, else by copy.
+
+    Each file appears completely or not at all.
 
     Args:
-        files: File in the store by its relative name in the folder.
-        folder: The folder; created if it does not exist.
+        files: Path of each file in the store, by the file's new name relative to the folder.
+        folder: The target folder; created if it does not exist.
 
     Raises:
         StoreError: The folder cannot be written.
@@ -43,14 +46,14 @@ def publish(files: Mapping[str, Path], folder: Path) -> None:
 
 
 def write_results_file(folder: Path, name: str, text: str) -> None:
-    """Write a small file of the results. Raises `StoreError`."""
+    """Write a small file with this text into the folder of results. Raises `StoreError`."""
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / name, text.encode())
 
 
 def remove_outdated(folder: Path, keep: Iterable[str]) -> None:
-    """Remove the files of the last run that this run has not written again."""
+    """Remove the result files of the last run, except the files named in `keep`."""
     kept = set(keep)
     for name in _files_of_last_run(folder):
         path = folder / name
@@ -60,7 +63,7 @@ def remove_outdated(folder: Path, keep: Iterable[str]) -> None:
 
 
 def clear_partial(folder: Path) -> None:
-    """Remove the partial results of an earlier run; complete results replace them."""
+    """Remove the partial results of an earlier run, because complete results now replace them."""
     shutil.rmtree(folder / PARTIAL, ignore_errors=True)
 
 
@@ -69,7 +72,7 @@ def _link_or_copy(source: Path, target: Path) -> None:
     try:
         try:
             os.link(source, temporary)
-        except OSError:  # another file system, or one without hard links
+        except OSError:  # another file system, or a file system without hard links
             shutil.copyfile(source, temporary)
             with temporary.open("rb") as stream:
                 os.fsync(stream.fileno())

@@ -1,4 +1,4 @@
-"""Run a job: the stages in order, and the results in the user's folder."""
+"""Run a job: run all stages one after another, and publish the results in the user's folder."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class RunSummary:
 
     Attributes:
         out_dir: Folder of the results.
-        files: Names of the results, relative to the folder; empty if the run ended before the last stage.
-        stages: Every task that went into the results, computed now or reused.
-        versions: Versions of Python, this program and the libraries that computed them.
+        files: Names of the result files, relative to `out_dir`; empty if the run ended before the last stage.
+        stages: The record of every task that contributed to the results, computed in this run or reused.
+        versions: Versions of Python, of this program and of the libraries that computed the results.
     """
 
     out_dir: Path
@@ -56,18 +56,21 @@ class RunSummary:
 
 
 def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
-    """Take a job through all stages; stored results are not computed again.
+    """Run all stages of a job, and publish the results; stored results are not computed again.
 
     Args:
         job: A resolved job.
-        out_dir: Folder of the results. Results of an earlier run stay there until this run has its own, which
-            is before their video is rendered.
-        settings: Store, threads, listener, cancellation.
+        out_dir: Folder of the results. Results of an earlier run stay there until this run publishes new
+            results. This happens before the video of the new results is rendered.
+        settings: Settings of the run: store, threads, listener, cancellation.
+
+    Returns:
+        The summary of the run.
 
     Raises:
         BodycapError: A stage failed. If the skeleton could not be solved, the map, the cameras' paths and the
-            frames are in ``<out_dir>/partial``. If the report or the video failed, the other results are
-            there.
+            frames are in ``<out_dir>/partial``. If only the report or the video failed, all other results are
+            in `out_dir`.
     """
     settings.store.sweep()
     settings.require_owner()
@@ -89,9 +92,9 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
 
 
 def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
-    """Run the stages one after another, write their artefacts into `results`, and yield each stage's name.
+    """Run the stages one after another, put their artefacts into `results`, and yield each stage's name.
 
-    A caller stops the job after a stage by leaving the loop.
+    The name is yielded after the stage has finished. A caller that leaves the loop ends the job there.
     """
     flow.check()
     yield "check"
@@ -126,9 +129,14 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
 def _run_until(
     job: Job, flow: Flow, results: StageResults, out_dir: Path, settings: Settings
 ) -> BodycapError | None:
-    """Run the stages up to the last one wanted; return the error that stopped them if a report can show it.
+    """Run the stages up to the last stage that the user wants.
 
-    The results are published before their video is rendered.
+    If the video of the results is still being rendered when the report is finished, the results are published
+    without it.
+
+    Returns:
+        The error that stopped the stages, if it allows a report or finished results to be published; None if
+        no error occurred. All other errors are raised.
     """
     try:
         for stage in run_stages(job, flow, results):
@@ -137,7 +145,7 @@ def _run_until(
             if stage == "report" and results.preview is not None and not results.preview.done():
                 settings.results_ready(_publish_results(job, flow, results, out_dir, settings))
     except BodycapError as error:
-        # Finished results are published although the report of them could not be written.
+        # Finished results are published even if their report could not be written.
         reportable = results.exported is not None or _is_about_data(error)
         if isinstance(error, Cancelled) or not reportable:
             raise
@@ -146,14 +154,19 @@ def _run_until(
 
 
 def _is_about_data(error: BodycapError) -> bool:
-    """Return True if the job or its videos caused an error, False if the machine or the program did."""
+    """Return True if the job or its videos caused the error; False if the machine or the program did."""
     return isinstance(error, JobError | CaptureError | EstimationError)
 
 
 def _combined_error(failure: EstimationError | None, stopped_by: BodycapError | None) -> BodycapError | None:
-    """Return the error that a job ends with; of two errors, the other one goes into its hint.
+    """Return the error that a job ends with; the message of a second error is added to its hint.
 
-    An error of the machine or the program precedes the missing skeleton; any other error follows it.
+    An error that the machine or the program caused is returned before the error of the missing skeleton. Any
+    other error is only added as a hint.
+
+    Args:
+        failure: The reason why the skeleton is missing; None if it is not missing.
+        stopped_by: The error that stopped the job; None if the job was not stopped.
     """
     if failure is None or stopped_by is None:
         return failure or stopped_by
@@ -165,7 +178,7 @@ def _combined_error(failure: EstimationError | None, stopped_by: BodycapError | 
 def _publish_failure_report(
     flow: Flow, results: StageResults, error: BodycapError, out_dir: Path, settings: Settings
 ) -> None:
-    """Publish the report of a job that was stopped before it had results."""
+    """Publish the report of a job that an error stopped before it had results."""
     try:
         results.reported = flow.report(results, error)
         settings.require_owner()
@@ -177,13 +190,13 @@ def _publish_failure_report(
 
 
 def _add_hint(error: BodycapError, text: str) -> None:
-    """Append a text to an error's hint, once."""
+    """Append a text to an error's hint, if the hint does not contain the text already."""
     if text not in (error.hint or ""):
         error.hint = f"{error.hint}; {text}" if error.hint else text
 
 
 def _summary(flow: Flow, results: StageResults, out_dir: Path) -> RunSummary:
-    """Return the summary of what is stored so far."""
+    """Return the summary of the results and tasks so far."""
     return RunSummary(
         out_dir=out_dir,
         files=tuple(_result_files(results)),
@@ -193,7 +206,7 @@ def _summary(flow: Flow, results: StageResults, out_dir: Path) -> RunSummary:
 
 
 def _publish_results(job: Job, flow: Flow, results: StageResults, out_dir: Path, settings: Settings) -> Path:
-    """Publish the results and return their folder, which is ``partial`` if there is no skeleton."""
+    """Publish the results and return their folder: ``partial`` if the skeleton could not be solved."""
     settings.require_owner()
     if results.failure is None:
         _write_results(job, results, _summary(flow, results, out_dir), settings)
@@ -206,7 +219,10 @@ def _publish_results(job: Job, flow: Flow, results: StageResults, out_dir: Path,
 
 
 def _merge(job: Job, flow: Flow, results: StageResults) -> tuple[Artefact | None, EstimationError | None]:
-    """Return the skeleton's motion, or the reason why the data did not support one."""
+    """Return the skeleton's motion, or the error if the data do not support a motion.
+
+    Both values are None if the job asks for no skeleton.
+    """
     if not has_body(job) or results.map is None:
         return None, None
     try:
@@ -216,7 +232,7 @@ def _merge(job: Job, flow: Flow, results: StageResults) -> tuple[Artefact | None
 
 
 def _write_results(job: Job, results: StageResults, summary: RunSummary, settings: Settings) -> None:
-    """Write the result files, then the record of the run, which therefore names no missing file."""
+    """Write the result files and then the record of the run, so that all files named in the record exist."""
     out_dir = summary.out_dir
     publish(_result_files(results), out_dir)
     resolved = yaml.safe_dump(
@@ -241,7 +257,7 @@ def _versions(flow: Flow) -> dict[str, str]:
 
 
 def files_of(artefact: Artefact) -> list[tuple[str, Path]]:
-    """Return each file meant for the user: its name in the folder of results, its path in the store."""
+    """Return the name for the user and the path in the store of each result file of an artefact."""
     return [
         (Path(name).relative_to(RESULTS_FOLDER).as_posix(), artefact.path / name)
         for name in artefact.files
@@ -250,6 +266,6 @@ def files_of(artefact: Artefact) -> list[tuple[str, Path]]:
 
 
 def _result_files(results: StageResults) -> dict[str, Path]:
-    """Return all files meant for the user, by name."""
+    """Return the path in the store of every result file, by the name for the user."""
     parts = (results.exported, results.reported, results.previewed)
     return {name: path for part in parts if part is not None for name, path in files_of(part)}

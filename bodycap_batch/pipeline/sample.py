@@ -1,4 +1,4 @@
-"""The synthetic capture of a job, rendered on first use."""
+"""Render the synthetic capture of a job on first use."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _STAMP = ".rendered.json"
 
 
 def prepare_capture(options: Mapping[str, Any], folder: Path, settings: Settings) -> None:
-    """Render a synthetic capture into a folder, unless the same capture is complete there.
+    """Render a synthetic capture into a folder, if the folder does not hold the complete capture already.
 
     Args:
-        options: Options of the renderer, as in the job.
-        folder: Folder of the videos; its other files stay.
-        settings: Store, threads, listener, cancellation.
+        options: Options of the renderer, as the job gives them.
+        folder: Folder for the videos; other files in the folder stay unchanged.
+        settings: Settings of the run: store, threads, listener, cancellation.
 
     Raises:
         BodycapError: The options are wrong, rendering failed, or the folder cannot be written.

@@ -1,4 +1,4 @@
-"""How a job runs, and the record of each of its tasks."""
+"""Settings for running a job, and the record of each task that the job ran."""
 
 from __future__ import annotations
 
@@ -20,29 +20,33 @@ def _never() -> bool:
 
 
 def _ignore(_: Path) -> None:
-    """Ignore early results: the caller waits for all of them."""
+    """Ignore results that are published early: the caller waits for the end of the job."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """How a job runs; nothing here changes a result.
+    """Settings for running a job. They do not change the results.
 
     Attributes:
-        store: Where artefacts are stored.
-        threads: Number of cores that the job may keep busy; with an `executor`, each of its tasks.
+        store: The store of the artefacts.
+        threads: Number of cores that the job may keep busy. With an `executor`, each task of the job may keep
+            this number of cores busy.
         listener: Receives the events of the job.
         cancelled: Called several times a second; True stops the job.
         may_commit: Called before each artefact is committed and before results are published. False stops the
-            job, because it belongs to another process now.
-        command: Command line of the children.
-        executor: Runs the tasks of several jobs, here or elsewhere; default: this job's own children.
-        compute: If False, only stored artefacts are used, and `NotStored` is raised for others.
-        redo: Stages that are computed again although they are stored.
-        until: Last stage to run; results are written only after the last stage of all. "" runs all stages.
-        priority: Of waiting jobs, those of a higher priority come first.
-        results_ready: Called with the folder of results that are published before their video.
-        limits: How large the videos may be; None for the user's own videos.
-        turns: Artefacts that other jobs of this process are computing; None if there are no other jobs.
+            job, because another process has taken the job over.
+        command: Command line of the child processes.
+        executor: Runs the tasks of several jobs, on this machine or on other machines. None starts child
+            processes for this job only.
+        compute: If False, only stored artefacts are used; `NotStored` is raised for a missing artefact.
+        redo: Names of the stages that are computed again even if their artefacts are stored.
+        until: Name of the last stage to run; "" runs all stages. Results are published only if the last stage
+            of the job runs.
+        priority: Priority of the job's tasks; waiting tasks with a higher number run first.
+        results_ready: Called with the folder of the results, if they are published before their video is
+            ready.
+        limits: Maximum sizes of the videos; None (no limits) for a job that the user runs directly.
+        turns: The artefacts that jobs of this process are computing; None if the process runs only this job.
     """
 
     store: Store
@@ -63,12 +67,12 @@ class Settings:
     def runner(
         self, logs: Path, stop_also: Callable[[], bool] = _never, before: Callable[[Task], None] = allow
     ) -> Runner:
-        """Return a runner that stops if the user asks for it, or if `stop_also` returns True.
+        """Return a runner that stops when the user asks for it, or when `stop_also` returns True.
 
         Args:
-            logs: Folder of the children's logs.
-            stop_also: Another reason to stop.
-            before: Called before a task runs; may raise to forbid it.
+            logs: Folder for the logs of the child processes.
+            stop_also: Function that returns True if the runner must stop for another reason.
+            before: Called before a task runs; may raise an error to forbid the task.
         """
         executor = self.executor or Children(self.command)
         return Runner(
@@ -86,24 +90,25 @@ class Settings:
         )
 
     def require_owner(self) -> None:
-        """Raise `Cancelled` if the job belongs to another process now."""
+        """Raise `Cancelled` if another process has taken the job over."""
         if not self.may_commit():
             raise Cancelled("the job was stopped or taken over; finished stages are kept")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageRecord:
-    """One task of a run, and what it cost when it was computed.
+    """The record of one task: its identity, and the time and memory of its computation.
 
     Attributes:
         stage: Stage name.
-        camera: Camera name, or "".
-        round: Round of the map, from 0.
-        reused: True if it was computed in an earlier run.
-        seconds: Its duration.
-        cpu_seconds: Processor time of all its threads; None if it was computed by a version without it.
-        peak_memory_mb: Peak memory of its process.
-        artefact: Folder of its artefact, relative to the store.
+        camera: Name of the camera that the task concerns; "" if it concerns no single camera.
+        round: Round of the map, counted from 0.
+        reused: True if the artefact was stored already and this run reused it.
+        seconds: Duration (seconds) of the computation.
+        cpu_seconds: Processor time (seconds) of all threads; None if an old program version, which did not
+            record it, computed the task.
+        peak_memory_mb: Peak memory (MB) of the child process.
+        artefact: Folder of the artefact, relative to the store.
     """
 
     stage: str

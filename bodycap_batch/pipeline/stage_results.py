@@ -1,4 +1,4 @@
-"""The results of a job's stages, as far as the job came; the report and the preview are made from them."""
+"""The results of the stages that a job has finished. The report and the preview are made from them."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from bodycap_batch.tasks.report import ReportTask
 
 @dataclass(slots=True)
 class StageResults:
-    """The artefacts of a job's stages. `run_stages` fills them in one after another.
+    """The artefacts of a job's stages. `run_stages` sets each field when its stage has finished.
 
     Attributes:
-        stage: The stage that runs, or ran last.
-        keyframes: By camera name.
-        map: The map.
-        registrations: By camera name.
-        merged: The skeleton's motion.
-        exported: The result files.
-        reported: The report.
-        preview: The video of the results, while it is rendered beside later stages.
-        previewed: The video of the results.
-        failure: Why the results have no skeleton.
+        stage: Name of the stage that is running, or that ran last.
+        keyframes: The keyframes' artefact of each camera, by camera name.
+        map: The artefact of the map.
+        registrations: The registration of each camera, by camera name.
+        merged: The artefact of the skeleton's motion.
+        exported: The artefact of the result files.
+        reported: The artefact of the report.
+        preview: The future of the video of the results, which is rendered while later stages run.
+        previewed: The artefact of the finished video of the results.
+        failure: The reason why the skeleton that the job asks for is missing.
     """
 
     stage: str = "check"
@@ -52,7 +52,7 @@ class StageResults:
     failure: EstimationError | None = None
 
     def describe_failure(self, error: BodycapError | None) -> dict[str, Any] | None:
-        """Return an error and the stage that it stopped, as the report shows them; None without an error."""
+        """Return an error and the stage it stopped, as JSON values for the report; None without an error."""
         return None if error is None else {"stage": self.stage, **error.to_dict()}
 
 
@@ -67,10 +67,10 @@ def report_task(
 
     Args:
         job: The job.
-        results: Its results, as far as it came.
-        cameras: Digest of each camera by name; empty if a video cannot be read.
-        digests: Digests of files.
-        failure: What stopped the job, see `StageResults.describe_failure`.
+        results: The results of the stages that the job has finished.
+        cameras: The digest of each camera, by camera name; empty if a video cannot be read.
+        digests: Cache of the digests of files.
+        failure: The error that stopped the job, from `StageResults.describe_failure`; None without an error.
     """
     with_body = has_body(job) and results.merged is not None
     return ReportTask(
@@ -94,9 +94,9 @@ def preview_task(
 
     Args:
         job: The job.
-        results: Its results up to the merge.
-        scene_map: The map.
-        cameras: Digest of each camera by name.
+        results: The results of the job's stages up to the merge.
+        scene_map: The artefact of the map.
+        cameras: The digest of each camera, by camera name.
     """
     return PreviewTask(
         capture=capture_ref(job.capture, cameras),

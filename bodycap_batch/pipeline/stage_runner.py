@@ -1,4 +1,4 @@
-"""Run the tasks of one job: side by side where possible, recorded, and stopped together."""
+"""Run the tasks of one job: at the same time where possible, recorded, and all stopped after a failure."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from bodycap_batch.tasks.stage import read_summary
 
 
 class StageRunner:
-    """Runs the tasks of one job; a context manager that waits for its threads.
+    """Runs the tasks of one job; a context manager that waits for its threads at the end.
 
     Attributes:
-        records: Every task that went into the results so far.
-        libraries: Version of each library that computed them.
+        records: The record of every task that has contributed to the results so far.
+        libraries: Version of each library that computed these tasks, by library name.
 
     Args:
-        settings: Store, threads, listener, cancellation.
-        logs: Folder of the children's logs.
-        cameras: Number of cameras of the job; as many tasks may run side by side.
+        settings: Settings of the run: store, threads, listener, cancellation.
+        logs: Folder for the logs of the child processes.
+        cameras: Number of cameras of the job. At most this number of tasks runs at the same time.
     """
 
     def __init__(self, settings: Settings, *, logs: Path, cameras: int) -> None:
@@ -60,14 +60,15 @@ class StageRunner:
 
     @property
     def parallel_tasks(self) -> int:
-        """Number of tasks of this job that are requested at once."""
+        """Maximum number of tasks of this job that are requested at the same time."""
         at_once = self._cameras if self._settings.executor is not None else self._settings.threads
         return max(1, min(at_once, self._cameras))
 
     def threads_per_camera(self) -> list[int]:
-        """Return the threads of each of the tasks that run side by side, one per camera.
+        """Return the number of threads for the task of each camera, in the order of the cameras.
 
-        The last tasks, which run when the others have ended, share all threads.
+        The tasks run in groups of `parallel_tasks`. The last group may be smaller; its tasks share all
+        threads.
         """
         if self._settings.executor is not None:
             return [self._settings.threads] * self._cameras
@@ -76,23 +77,25 @@ class StageRunner:
         return first + [max(1, self._settings.threads // last)] * last
 
     def expect_frames(self, frames: int, large_frames: int) -> None:
-        """Set the size of the job, from which the disk space it needs is estimated.
+        """Set the numbers of frames of the job; they determine the estimate of the disk space that it needs.
 
         Args:
-            frames: Frames of all cameras.
-            large_frames: How many of them are much larger than the size they are processed at.
+            frames: Number of frames of all cameras.
+            large_frames: Number of these frames that are much larger than the image size that all stages work
+                at.
         """
         self._frame_counts = (frames, large_frames)
 
     def run(self, task: Task, preload: Sequence[Sequence[str]] = ()) -> Artefact:
-        """Return a task's artefact, from the store or computed now.
+        """Return a task's artefact: from the store, or computed now if it is not stored.
 
         Args:
             task: The task.
-            preload: Modules that other children load while this task is computed, one list a child.
+            preload: Names of modules that idle child processes load while this task is computed; one list for
+                each child process.
 
         Raises:
-            BodycapError: The task failed; `NotStored` if nothing may be computed.
+            BodycapError: The task failed. `NotStored`: the artefact is missing and nothing may be computed.
         """
         artefact, computed = self._runner.run(replace(task, priority=self._settings.priority), preload)
         self._references.add(artefact.path)
@@ -112,14 +115,14 @@ class StageRunner:
         return artefact
 
     def start(self, task: Task) -> Future[Artefact]:
-        """Run a task beside what follows."""
+        """Start a task in another thread, and return the future of its artefact."""
         return self._pool.submit(self.run, task)
 
     def run_all(self, tasks: Iterable[Task]) -> dict[str, Artefact]:
-        """Run one task per camera side by side and return the artefacts by camera.
+        """Run one task per camera at the same time, and return the artefacts by camera name.
 
         The first failure stops the other tasks. If nothing may be computed, all tasks are looked up, so that
-        `NotStored` names every missing one.
+        `NotStored` names every missing task.
         """
         ordered = list(tasks)
         futures = [self._pool.submit(self.run, task) for task in ordered]
@@ -133,11 +136,11 @@ class StageRunner:
         return {task.camera: future.result() for task, future in zip(ordered, futures, strict=True)}
 
     def keep_only_these(self) -> None:
-        """Drop the references to artefacts that only earlier runs with other options used."""
+        """Keep only the references to artefacts that this run used; drop the references of earlier runs."""
         self._references.keep_only(record.artefact for record in self.records)
 
     def report_notes(self, artefact: Artefact, stage: str) -> None:
-        """Send the notes of an artefact to the listener, each one once."""
+        """Send the notes of an artefact to the listener; a note that was sent before is not repeated."""
         for note in read_summary(artefact.path).get("notes", []):
             self._note(note, stage)
 
@@ -147,14 +150,14 @@ class StageRunner:
             self._settings.listener(Event(kind="note", stage=stage, what=f"note: {text}"))
 
     def _require_room(self, task: Task) -> None:
-        """Refuse to start a task that will not fit on the disk; space may have gone since the check."""
+        """Refuse to start a task if the disk space is too small; it may have shrunk since the job's check."""
         if task.key.stage != "check":
             for folder in self._folders:
                 for note in require_room(folder, *self._frame_counts):
                     self._note(note)
 
     def _stop(self, futures: Sequence[Future[Artefact]]) -> None:
-        """Stop the tasks beside a failed one; tasks that follow, such as a report of the failure, may run."""
+        """Stop all running tasks after a failure. Later tasks, such as the report of the failure, may run."""
         self._stop_all.set()
         for future in futures:
             future.cancel()

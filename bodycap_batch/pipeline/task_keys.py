@@ -1,4 +1,4 @@
-"""Tasks of the runner, and the store's keys, from the typed tasks of the stages."""
+"""Create the tasks of the runner and the keys of the store from the typed tasks of the stages."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ def make_task(
 
     Args:
         stage: The stage.
-        task: What it computes from.
-        camera: The camera that the task concerns, or "".
-        map_round: Round of the map, from 0.
+        task: The typed task: its options and inputs.
+        camera: Name of the camera that the task concerns; "" if it concerns no single camera.
+        map_round: Round of the map, counted from 0.
         threads: Number of threads that the task may keep busy.
     """
     return Task(

@@ -1,4 +1,4 @@
-"""List which stages of a job would run, and why."""
+"""List the stages of a job that would run, and the reason for each stage."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _INPUTS = {
     "body": "the body: {}",
     "extra": "the frames wanted of {}",
 }
-"""Messages for changed inputs of a task, by the field of its dataclass."""
+"""Text for a changed input of a task, by the name of the input's field in the task's dataclass."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,9 +35,9 @@ class Step:
     """One task of a job.
 
     Attributes:
-        stage: Stage, camera and round, for messages.
-        stored: True if the store holds its result.
-        reason: Why it would run.
+        stage: Label of the task for messages: stage, camera and round.
+        stored: True if the store holds the task's result.
+        reason: The reason why the task would run; "" if its result is stored.
     """
 
     stage: str
@@ -50,9 +50,9 @@ class Step:
 
 
 def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
-    """List a job's tasks in order: the stored ones, and those that would run with what has changed.
+    """List a job's tasks: first the tasks with stored results, then the tasks that would run and the reason.
 
-    Nothing is computed. All stages after the first one that would run are listed too: their inputs are new.
+    Nothing is computed. The later stages that depend on a task that would run are listed too.
 
     Raises:
         BodycapError: The job's files cannot be read, or the disk fails.
@@ -81,7 +81,7 @@ def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
 
 
 def _missing_preview(results: StageResults) -> Sequence[Task]:
-    """Return the preview's task if it would run; it is looked up beside the export and the report."""
+    """Return the task of the preview, if it would run; a separate thread has looked it up in the store."""
     if results.preview is None:
         return ()
     failure = results.preview.exception()
@@ -89,19 +89,19 @@ def _missing_preview(results: StageResults) -> Sequence[Task]:
 
 
 def _depends_on(stage: str, first: str, job: Job) -> bool:
-    """Return True if a job has a later stage that uses the results of the stage `first`."""
+    """Return True if the job includes the stage `stage`, and this stage uses the results of `first`."""
     if stage == "preview":
         return job.export.preview and first not in ("export", "report")
     return stage != "merge" or has_body(job)
 
 
 def _position(stage: str) -> int:
-    """Return a stage's position in the order; stages that extend the map count as registration."""
+    """Return a stage's position in `STAGE_ORDER`; a stage that runs during registration has its position."""
     return STAGE_ORDER.index(stage if stage in STAGE_ORDER else "registration")
 
 
 def _reason(task: Task, store: Store) -> str:
-    """Describe how a task differs from the most similar artefact of its stage."""
+    """Describe how a task's key differs from the most similar key of a stored artefact of the same stage."""
     wanted = dict(_leaves(task.key.document()))
     if any((store.root / "corrupt").glob(f"{task.key.stage}-{task.key.name}-*")):
         return "its stored result was damaged"
@@ -117,9 +117,10 @@ def _reason(task: Task, store: Store) -> str:
 
 
 def _changed_names(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Return the names of values that differ.
+    """Return the names of the key's values that differ.
 
-    Another version of the program may name its inputs differently. Then only names that both have count.
+    Another version of the program may name its inputs differently. In this case only names that occur in both
+    keys are compared.
     """
     same_program = before.get("algorithm") == now["algorithm"]
     names = {*before, *now} if same_program else {*before} & {*now}
@@ -137,7 +138,7 @@ def _stored_key(manifest: Path) -> Mapping[str, Any]:
 
 
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted name and the value of every leaf; a list is one value."""
+    """Yield the dotted name and the value of every leaf of nested mappings; a list is treated as one leaf."""
     if isinstance(value, Mapping):
         for key, part in value.items():
             yield from _leaves(part, f"{name}.{key}" if name else str(key))

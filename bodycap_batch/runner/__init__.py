@@ -1,4 +1,8 @@
-"""Run tasks in child processes, here or on other machines. The stages themselves are handed in."""
+"""Run tasks in child processes, on this machine or on other machines.
+
+This package does not import the stages; `child_main.main` receives the functions of the stages as an
+argument.
+"""
 
 from bodycap_batch.runner.child_process import CHILD_COMMAND
 from bodycap_batch.runner.children import Children, Executor, TaskEnvironment

@@ -1,4 +1,4 @@
-"""The child process: run one stage, commit its artefact, report to the parent."""
+"""The child process: it runs tasks, commits their artefacts and reports to the parent process."""
 
 from __future__ import annotations
 
@@ -34,32 +34,32 @@ from bodycap_batch.runner.task import Task, TaskFunction, task_from_json
 from bodycap_batch.store.artefacts import DISK_ERRORS, Store, store_error
 
 _PROGRESS_PERIOD_S = 0.2
-"""Least time between two reports of progress, seconds: a display changes too fast to read otherwise.
+"""Minimum time (seconds) between two reports of progress. A display that changes faster is hard to read.
 Evidence: none."""
 _GRACE_S = 3.0
-"""Time for a stage to stop by itself after the parent has closed standard input, seconds. The parent waits as
-long (`process.KILL_AFTER_S`). Evidence: none."""
+"""Time (seconds) that a stage has to stop by itself after the parent has closed standard input. The parent
+waits for the same time (`child_process.KILL_AFTER_S`). Evidence: none."""
 RELEASE_PERIOD_S = 0.5
-"""Least time between two releases of freed memory. One takes some 50 ms in a large process.
-Evidence: docs/decisions/pipeline.md."""
+"""Minimum time (seconds) between two releases of freed memory. A release takes about 50 ms in a large
+process. Evidence: docs/decisions/pipeline.md."""
 FULL_DISK_BYTES = 8 << 20
-"""Free space below which the full disk counts as the cause of any failure, bytes: libraries hide ENOSPC.
-Evidence: none."""
+"""Minimum free space (bytes) on the disk. With less space, a full disk is reported as the cause of an
+unexpected failure, because libraries hide the error ENOSPC. Evidence: none."""
 
 
 def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
-    """Run the task file named on the command line; without one, follow orders until standard input closes.
+    """Run the task file that `arguments` name; without a file, follow orders until standard input closes.
 
-    An order is one JSON line. ``{"task": file, "log": file}`` runs a task and writes its prints to the log.
-    ``{"import": [modules]}`` loads libraries while the child has no task. Only the first task of such a child
-    waits until its libraries are loaded.
+    An order is one JSON line. ``{"task": file, "log": file}`` runs a task and writes the task's printed
+    output to the log. ``{"import": [modules]}`` loads modules while the child has no task. A task that is
+    ordered meanwhile waits until the modules are loaded.
 
     Args:
-        arguments: The path of the task file, or empty.
-        stages: By stage name, the function that runs its tasks.
+        arguments: The path of the task file; empty to follow orders.
+        stages: The function that runs the tasks of a stage, by stage name.
 
     Returns:
-        The exit code: 0, that of a typed error, or 70.
+        The exit code: 0 without an error, the exit code of a typed error, or 70 for a bug.
     """
     writer = _MessageWriter()
     orders = _OrderReader()
@@ -81,9 +81,9 @@ class _Parent:
     """The connection of one task to the parent process.
 
     Attributes:
-        messages: Messages to the parent.
-        orders: Orders of the parent.
-        asks: Whether the parent is asked before a commit.
+        messages: Writer of the messages to the parent.
+        orders: Reader of the parent's orders and answers.
+        asks: True if the child asks the parent for permission before a commit.
     """
 
     messages: _MessageWriter
@@ -91,7 +91,7 @@ class _Parent:
     asks: bool
 
     def before_commit(self) -> None:
-        """Ask the parent whether the artefact may be committed; raise `Cancelled` if not."""
+        """Ask the parent whether the artefact may be committed; raise `Cancelled` if the parent refuses."""
         if not self.asks:
             return
         self.messages.send("ready")
@@ -101,7 +101,7 @@ class _Parent:
 
 
 def _run_task_file(file: Path, stages: Mapping[str, TaskFunction], parent: _Parent) -> int:
-    """Run a task, report how it ended, and return the exit code."""
+    """Run the task in a task file, report its end to the parent, and return the exit code."""
     task, root = task_from_json(json.loads(file.read_text(encoding="utf-8")))
     try:
         store = Store(root)
@@ -109,13 +109,13 @@ def _run_task_file(file: Path, stages: Mapping[str, TaskFunction], parent: _Pare
     except BodycapError as error:
         parent.messages.send("error", error=error.to_dict())
         return error.exit_code
-    except Exception as error:  # noqa: BLE001 - the one place that catches the bugs of a task
+    except Exception as error:  # noqa: BLE001 - the only place that catches the bugs of a task
         return _report_unexpected(error, root, parent.messages)
     return 0
 
 
 def import_ahead(modules: Sequence[str]) -> None:
-    """Load modules before they are needed; the stage that needs a missing one reports it."""
+    """Load modules before a task needs them. A missing module is only logged; the task reports it later."""
     for name in modules:
         try:
             importlib.import_module(name)
@@ -124,14 +124,14 @@ def import_ahead(modules: Sequence[str]) -> None:
 
 
 def _redirect_prints(log: Path) -> None:
-    """Append standard output and error, also those of native libraries, to a file from now on."""
+    """Append standard output and error, including the output of native libraries, to a file from now on."""
     with log.open("ab") as stream:
         for number in (1, 2):
             os.dup2(stream.fileno(), number)
 
 
 def _run(task: Task, store: Store, function: TaskFunction, parent: _Parent) -> None:
-    """Run a stage's function on verified inputs and commit what it writes."""
+    """Verify the input artefacts of a task, run its stage's function and commit the files that it writes."""
     started, cpu_before = time.monotonic(), time.process_time()
     _pin_threads(task.threads)
     release_memory()
@@ -157,30 +157,33 @@ def _run(task: Task, store: Store, function: TaskFunction, parent: _Parent) -> N
 
 
 class DiskFailures:
-    """Turns the errors of a stage whose disk fails into `StoreError`, before the draft is removed."""
+    """Context manager that converts an error of a stage into `StoreError` if a failing disk caused it.
+
+    This must happen before the draft is removed: the removal frees disk space.
+    """
 
     def __init__(self, store: Store) -> None:
         self._store = store
 
     def __enter__(self) -> None:
-        """Nothing to prepare."""
+        """Do nothing."""
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
             raise store_error(error, self._store.root) from error
         if isinstance(error, CaptureError | JobError) and (away := _disk_away(error)) is not None:
             raise away from error
-        # A writer that finds the disk full knows its own file, but not that the folder belongs to the store.
+        # A writer that finds the disk full reports its own file. The new error names the store's folder.
         other = isinstance(error, Exception) and not isinstance(error, BodycapError)
         if (other or isinstance(error, StoreError)) and self._store.free_bytes() < FULL_DISK_BYTES:
             raise disk_full(self._store.root) from error
 
 
 def _disk_away(error: BodycapError) -> DiskAway | None:
-    """Return the error of a disk that does not answer, if that is why the file named by `error` failed.
+    """Return a `DiskAway` error if the file that `error` names is on a disk that does not answer, else None.
 
-    FFmpeg reports EIO for broken files too. It takes a file that becomes unreachable for one that ends early.
-    In both cases the file is read here to find out.
+    FFmpeg reports EIO for broken files too, and it treats a file that becomes unreachable like a file that
+    ends early. In both cases this function reads the file to find the cause.
     """
     if error.path is None:
         return None
@@ -192,7 +195,7 @@ def _disk_away(error: BodycapError) -> DiskAway | None:
 
 
 def _read_failure(path: Path) -> OSError | None:
-    """Return why a plain file cannot be read at its start or end; None if it can, or for other files."""
+    """Read a regular file at its start and end, and return the error; None without an error."""
     try:
         if path.is_file():
             with path.open("rb") as stream:
@@ -205,13 +208,13 @@ def _read_failure(path: Path) -> OSError | None:
 
 
 def disk_full(root: Path) -> StoreError:
-    """Return the error of a store whose disk is full."""
+    """Return the error for a store whose disk is full."""
     hint = "free some space, or name a folder on another disk with --store; finished stages are kept"
     return StoreError("No space left on device", path=root, hint=hint)
 
 
 def _report_unexpected(error: Exception, root: Path, messages: _MessageWriter) -> int:
-    """Report a bug, or a lack of memory, after which the child ends; return the exit code."""
+    """Report a bug or a lack of memory to the parent, and return the exit code. The child ends afterwards."""
     if isinstance(error, MemoryError):
         full = BodycapError("out of memory", hint="close other programs, or lower work_px in the job")
         messages.send("error", error=full.to_dict(), ends=True)
@@ -224,20 +227,20 @@ def _report_unexpected(error: Exception, root: Path, messages: _MessageWriter) -
 
 
 def _pin_threads(threads: int) -> None:
-    """Give the task's threads to OpenCV. The pools of other libraries are off: stages start own threads."""
+    """Set the number of threads of OpenCV. Other libraries use one thread; stages start their own threads."""
     os.environ["OPENCV_FOR_THREADS_NUM"] = str(threads)
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(threads)
 
 
 def _reset_peak_memory() -> None:
-    """Start to count the peak memory of a task, if the system can (Linux)."""
+    """Reset the peak memory of this process, so that it is measured for the next task only (Linux only)."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 def peak_memory_mb() -> float:
-    """Return the peak of resident memory since `_reset_peak_memory` or else since the start, MB."""
+    """Return the peak resident memory (MB) since `_reset_peak_memory`, or since the start without a reset."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith("VmHWM:"):
@@ -247,7 +250,7 @@ def peak_memory_mb() -> float:
 
 
 class _MessageWriter:
-    """Sends JSON lines to the parent; the prints of libraries go to the log instead."""
+    """Sends JSON lines to the parent; redirects the printed output of libraries to the log."""
 
     def __init__(self) -> None:
         self._stream: TextIO = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
@@ -257,13 +260,13 @@ class _MessageWriter:
         self._last = 0.0
 
     def send(self, event: str, **values: Any) -> None:
-        """Send one message."""
+        """Send one message: the name of an event and its values."""
         with self._lock:
             self._stream.write(json.dumps({"event": event, **values}) + "\n")
             self._stream.flush()
 
     def send_progress(self, done: int, total: int, what: str = "") -> None:
-        """Send the progress, except if the last message is very recent."""
+        """Send the progress, except shortly after an earlier report; the report of the end is always sent."""
         now = time.monotonic()
         if done < total and now - self._last < _PROGRESS_PERIOD_S:
             return
@@ -272,15 +275,15 @@ class _MessageWriter:
 
 
 class StepReporter:
-    """Reports the progress of a stage, and releases freed memory whenever the stage begins another step.
+    """Reports the progress of a stage, and releases freed memory when the stage starts another step.
 
-    The C library keeps freed memory. Without its release, the peak of a stage would be nearly the sum of what
-    its steps need.
+    The C library keeps freed memory. Without the release, the peak memory of a stage would be nearly the sum
+    of the memory of all its steps.
 
     Args:
         report: Called as ``report(done, total, what)``.
-        release: Releases freed memory.
-        period_s: Least time between two releases, seconds.
+        release: Function that releases freed memory to the system.
+        period_s: Minimum time (seconds) between two releases.
     """
 
     def __init__(
@@ -296,7 +299,7 @@ class StepReporter:
         self._last = time.monotonic()
 
     def __call__(self, done: int, total: int, what: str = "") -> None:
-        """Report that `done` of `total` units are done; another name `what` begins another step."""
+        """Report that `done` of `total` units are done. A new value of `what` starts another step."""
         if what != self._step:
             self._step = what
             if time.monotonic() - self._last >= self._period_s:
@@ -306,7 +309,10 @@ class StepReporter:
 
 
 class _OrderReader:
-    """Reads the orders from standard input. If it closes, the parent asks to stop, or has ended."""
+    """Reads the orders from standard input. If standard input closes, the parent asks to stop or has ended.
+
+    The process then kills itself after `_GRACE_S`.
+    """
 
     def __init__(self) -> None:
         self.closed = threading.Event()
@@ -314,7 +320,7 @@ class _OrderReader:
         threading.Thread(target=self._read, daemon=True).start()
 
     def next(self) -> dict[str, Any] | None:
-        """Wait for the next order; return None after the last one."""
+        """Wait for the next order and return it; return None after the last order."""
         return self._queue.get()
 
     def _read(self) -> None:

@@ -1,4 +1,4 @@
-"""A child process: start it, send it orders, read its messages, end it."""
+"""Start a child process, send orders to it, read its messages and end it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from typing import Any, BinaryIO
 import bodycap_batch
 
 CHILD_COMMAND = (sys.executable, "-P", "-m", "bodycap_batch.tasks")
-"""Command line of a child, without the task file. It names the package of the stages, which lies in a layer
-above and is not imported here."""
+"""Command line of a child, without the task file. It names the package of the stages, which belongs to a
+higher layer; this package must not import it."""
 KILL_AFTER_S = 3.0
-"""Time that a child has to end by itself before it is killed, seconds. Evidence: none."""
+"""Time (seconds) that a child has to end by itself before it is killed. Evidence: none."""
 _POLL_S = 0.2
-"""Time after which the parent checks whether the job was stopped, seconds. Evidence: none."""
+"""Time (seconds) between two checks of the parent whether the job was stopped. Evidence: none."""
 _THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -34,7 +34,7 @@ class Child:
     """One child process in its own process group.
 
     Attributes:
-        loaded: Modules that it was asked to load.
+        loaded: Names of the modules that the child was asked to load.
     """
 
     def __init__(self, command: Sequence[str], log: BinaryIO) -> None:
@@ -51,11 +51,11 @@ class Child:
 
     @property
     def returncode(self) -> int:
-        """Exit code of a child that has ended; negative for a signal."""
+        """Exit code of a child that has ended; the negative signal number if a signal ended it."""
         return self._process.returncode
 
     def order(self, order: Mapping[str, Any]) -> None:
-        """Send one order; `follow` notices a child that has ended."""
+        """Send one order. If the child has ended, nothing happens here; `follow` then returns None."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.write(json.dumps(order).encode() + b"\n")
@@ -67,11 +67,11 @@ class Child:
         """Read the child's messages until its task ends.
 
         Args:
-            cancelled: Called several times a second; True stops the wait.
-            on_message: Called with every message but the last.
+            cancelled: Called several times a second; True ends the reading.
+            on_message: Called with every message except the last message.
 
         Returns:
-            The last message; None if the child died or the task was cancelled.
+            The last message of the task; None if the child died or the task was cancelled.
         """
         assert self._process.stdout is not None
         pipe = self._process.stdout.fileno()
@@ -88,7 +88,11 @@ class Child:
         return None
 
     def end(self, *, at_once: bool) -> None:
-        """End the child: close its input, with `at_once` send SIGTERM too, and after a while SIGKILL."""
+        """End the child: close its standard input, and kill it if it has not ended after `KILL_AFTER_S`.
+
+        Args:
+            at_once: Send SIGTERM after standard input is closed.
+        """
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
@@ -103,7 +107,7 @@ class Child:
         self._process.stdout.close()
 
     def kill(self) -> None:
-        """Kill a child that has no task; nothing can be lost."""
+        """Kill a child that has no task. No results can be lost."""
         self._signal(signal.SIGKILL)
         self.end(at_once=False)
 
@@ -115,10 +119,10 @@ class Child:
 
 
 def _environment() -> dict[str, str]:
-    """Return the child's environment variables: this package is found, and thread pools of libraries are off.
+    """Return the environment variables of a child: Python finds this package, and libraries use one thread.
 
-    The pools must be off before the libraries load. Sums of a pool would depend on the machine's cores;
-    stages start their own threads instead.
+    The variables must be set before the libraries load. With a library's thread pool, floating-point sums
+    would depend on the machine's number of cores. Stages start their own threads instead.
     """
     package = str(Path(bodycap_batch.__file__).parent.parent)
     path = os.pathsep.join(part for part in (package, os.environ.get("PYTHONPATH")) if part)
@@ -127,7 +131,7 @@ def _environment() -> dict[str, str]:
 
 
 def describe_end(returncode: int) -> str:
-    """Describe how a child ended that sent no last message."""
+    """Describe the end of a child that sent no last message, from its exit code."""
     if returncode >= 0:
         return f"the stage's process ended with code {returncode} and no message"
     try:
@@ -138,7 +142,7 @@ def describe_end(returncode: int) -> str:
 
 
 def crash_hint(returncode: int) -> str:
-    """Advise the user what to do about a child that ended without a message."""
+    """Return advice for the user after a child that ended without a last message, from its exit code."""
     if returncode == -signal.SIGKILL:
         return (
             "probably out of memory: close other programs, or lower work_px in the job; run it again to go on"

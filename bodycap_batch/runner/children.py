@@ -1,4 +1,4 @@
-"""Run tasks in child processes of this machine."""
+"""Run tasks in child processes on this machine."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from bodycap_batch.runner.task import Task
 from bodycap_batch.store.artefacts import Store, disk_errors
 
 CHILDREN_LOG = "children.log"
-"""Log of what children print while they have no task."""
+"""Name of the log file for the output that children print while they have no task."""
 STOPPED = "stopped on request; finished stages are kept"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskEnvironment:
-    """The environment in which a task runs; nothing here changes its result.
+    """The environment in which a task runs. It does not change the result of the task.
 
     Attributes:
-        store: Where the artefact is committed.
-        logs: Folder for one log file and one task file per task.
+        store: The store into which the artefact is committed.
+        logs: Folder for the log file and the task file of each task.
         progress: Called as ``progress(done, total, what)``.
         cancelled: Called several times a second; True stops the task.
         may_commit: Called before the artefact is committed; False stops the task.
-        preload: Names of modules that other children load at the same time, one list a child.
+        preload: Names of modules that idle children load at the same time; one list for each child.
     """
 
     store: Store
@@ -43,20 +43,20 @@ class TaskEnvironment:
 
 
 class Executor(Protocol):
-    """Runs tasks here or on other machines. Used from several threads."""
+    """Runs tasks on this machine or on other machines. Several threads may use it at the same time."""
 
     def execute(self, task: Task, environment: TaskEnvironment) -> None:
-        """Compute and commit the task's artefact. Raises `BodycapError`, and `Cancelled` if stopped."""
+        """Compute and commit the task's artefact. Raises `BodycapError`, and `Cancelled` if it is stopped."""
 
     def close(self, logs: Path) -> None:
-        """End what the job with these logs needed; the job has ended."""
+        """Release what the job with this folder of logs needed, after the job has ended."""
 
 
 class Children:
     """Child processes, each of which runs one task after another.
 
-    Libraries are therefore loaded once a child. A child ends with `close`, after a crash or a bug, and with
-    its parent.
+    Each child therefore loads the libraries only once. A child ends when `close` is called, after a crash or
+    a bug, and when its parent process ends.
 
     Args:
         command: The child's command line, without the task file.
@@ -68,7 +68,7 @@ class Children:
         self._lock = threading.Lock()
 
     def close(self, logs: Path) -> None:
-        """End the idle children."""
+        """End the idle children; remove their log from the folder `logs` if it is empty."""
         with self._lock:
             waiting, self._idle = self._idle, []
         for child in waiting:
@@ -78,13 +78,13 @@ class Children:
             log.unlink()
 
     def prepare(self, logs: Path, work: Sequence[Sequence[str]]) -> None:
-        """Let idle children load modules, one child for each list; start children if too few are idle.
+        """Let idle children load modules, one child for each list; start new children if too few are idle.
 
-        A task prefers the child that has loaded most of its modules.
+        A later task runs in the child that has loaded most of the task's modules.
 
         Args:
-            logs: Folder of the children's logs.
-            work: Names of modules, one list a child.
+            logs: Folder for the logs of the children.
+            work: Names of the modules to load; one list for each child.
         """
         taken = []
         for modules in work:
@@ -99,7 +99,8 @@ class Children:
         """Compute and commit the task's artefact in a child.
 
         Raises:
-            BodycapError: The error of the child, `StoreError` if the disk fails, `Cancelled` if stopped.
+            BodycapError: The error of the task; `StoreError` if the disk fails; `Cancelled` if the task is
+                stopped.
         """
         log = environment.logs / f"{task.file_stem}.log"
         with disk_errors(environment.logs):
@@ -122,9 +123,9 @@ class Children:
     def _run_in_child(
         self, task: Task, environment: TaskEnvironment, order: Mapping[str, str]
     ) -> tuple[Child, dict[str, Any] | None]:
-        """Run a task in a child and return the child and its last message.
+        """Run a task in a child, and return the child and its last message.
 
-        A child that died while it was idle is replaced.
+        If an idle child has died before it receives the task, another child runs the task.
         """
         preload = environment.preload
         while True:
@@ -136,7 +137,7 @@ class Children:
                 events.append(message["event"])
                 _answer(child, message, environment)
 
-            # The listener of the progress may raise: the disk is full, or its pipe is closed.
+            # The listener of the progress may raise an error, for example if its pipe is closed.
             with ExitStack() as on_error:
                 on_error.callback(child.end, at_once=True)
                 self.prepare(environment.logs, preload)
@@ -149,7 +150,11 @@ class Children:
             preload = ()
 
     def _take(self, modules: Collection[str], logs: Path) -> tuple[Child, bool]:
-        """Return the idle child with most of `modules` and fewest others loaded, or a new child and True."""
+        """Return a child for a task that needs `modules`, and whether the child is new.
+
+        The idle child that has loaded most of `modules` is preferred. If several children have loaded equally
+        many, the child with the fewest other modules is preferred.
+        """
         with self._lock:
             if self._idle:
                 wanted = set(modules)
@@ -165,7 +170,7 @@ class Children:
 
 
 def _answer(child: Child, message: dict[str, Any], environment: TaskEnvironment) -> None:
-    """Answer a child's question, or pass its progress on."""
+    """Answer the child's question before a commit, or report the child's progress."""
     if message["event"] == "ready":
         child.order({"commit": environment.may_commit()})
     elif message["event"] == "progress":
@@ -175,7 +180,7 @@ def _answer(child: Child, message: dict[str, Any], environment: TaskEnvironment)
 def _task_error(
     task: Task, last: dict[str, Any] | None, returncode: int, log: Path, store: Store
 ) -> BodycapError:
-    """Return the error of a task that failed, from the child's last message or from how the child ended."""
+    """Return the error of a failed task, from the child's last message or else from the child's exit code."""
     if last is not None:
         error = error_from_dict(last["error"])
         if "traceback" in last:

@@ -1,7 +1,7 @@
-"""Run tasks on many machines: Dask workers start the same child processes there.
+"""Run tasks on many machines: on each machine, a Dask worker starts the same child processes as a local run.
 
-A worker receives paths, digests and options. Videos and artefacts lie on a disk that all machines share. If a
-worker dies, the scheduler gives its task to another one.
+A worker receives paths, digests and options. Videos and artefacts are stored on a disk that all machines
+share. If a worker dies, the scheduler gives the task to another worker.
 
 Source: the Dask distributed documentation (resources, priorities, allowed failures).
 """
@@ -29,19 +29,20 @@ if TYPE_CHECKING:
 SCHEMES = ("tcp://", "tls://")
 QUEUES = ("slurm", "pbs")
 MEMORY = "memory"
-"""Name of the resource (MB) by which a worker declares the memory that its tasks may use together."""
+"""Name of the Dask resource with which a worker declares its memory (MB). The tasks that run on the worker at
+the same time reserve at most this memory."""
 _POLL_S = 0.2
-"""Time after which a waiting job checks whether it was stopped, seconds. Evidence: none."""
+"""Time (seconds) between two checks of a waiting job whether it was stopped. Evidence: none."""
 _PROGRESS_PERIOD_S = 1.0
-"""Least time between two reports of a task's progress, seconds. Each costs worker, scheduler and client a few
-milliseconds. Evidence: none."""
+"""Minimum time (seconds) between two reports of a task's progress. Each report takes a few milliseconds of
+the worker, the scheduler and the client. Evidence: none."""
 _WORKERS_PERIOD_S = 2.0
-"""Time after which the scheduler is asked again for its workers, seconds. They come and go, but a question
-for each task would take longer than to submit it. Evidence: none."""
+"""Minimum time (seconds) between two requests for the scheduler's list of workers. The list changes, but a
+request for each task would take longer than submitting the task. Evidence: none."""
 _CLIENT_LEFT = ("closing", "closed")
 _WORKER_ENDS = ("closing", "closed", "failed")
 _ALLOWED_FAILURES = 1
-"""How often a task is tried again after its worker died. A task that kills two workers is given up.
+"""Maximum number of repetitions of a task after its worker died. A task whose worker dies twice is given up.
 Evidence: none."""
 
 
@@ -49,11 +50,11 @@ class Cluster:
     """Runs the tasks of several jobs on Dask workers; a context manager.
 
     Args:
-        address: The scheduler, ``tcp://host:8786`` or ``tls://host:8786``.
+        address: Address of the scheduler: ``tcp://host:8786`` or ``tls://host:8786``.
         command: Command line of the children on the workers.
 
     Raises:
-        BodycapError: The scheduler does not answer, or the extra is not installed.
+        BodycapError: The scheduler does not answer, or Dask is not installed (the extra `cluster`).
     """
 
     def __init__(self, address: str, command: Sequence[str] = CHILD_COMMAND) -> None:
@@ -63,8 +64,8 @@ class Cluster:
         self._progress: dict[str, Callable[[int, int, str], None]] = {}
         self._lock = threading.Lock()
         self._turns = Turns()
-        # Another lock than the one above, for which Dask's thread waits in `_receive_progress`: while the
-        # scheduler is asked, that thread must go on to receive the answer.
+        # This lock is separate from `_lock`, for which Dask's thread waits in `_receive_progress`. While the
+        # scheduler is asked, Dask's thread must not wait: it receives the scheduler's answer.
         self._asking = threading.Lock()
         self._largest_memory: float | None = None
         self._last_asked = -math.inf
@@ -72,22 +73,22 @@ class Cluster:
         self._client.run_on_scheduler(_allow_failures, _ALLOWED_FAILURES)
 
     def __enter__(self) -> Cluster:
-        """The cluster itself."""
+        """Return the cluster itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
         self._client.close()
 
     def workers(self) -> dict[str, Mapping[str, float]]:
-        """Return the resources that each worker declares, by its address."""
+        """Return the resources that each worker declares, by the worker's address."""
         workers = self._client.scheduler_info()["workers"]
         return {str(name): dict(info.get("resources") or {}) for name, info in workers.items()}
 
     def execute(self, task: Task, environment: TaskEnvironment) -> None:
-        """Compute and commit the task's artefact on some worker.
+        """Compute and commit the task's artefact on a worker that the scheduler chooses.
 
         Raises:
-            BodycapError: The error of the child; `Cancelled` if stopped; the scheduler was lost.
+            BodycapError: The task failed, or the scheduler was lost; `Cancelled` if the task was stopped.
         """
         with self._turns.taken(task, environment) as is_stored:
             if not is_stored:
@@ -115,13 +116,14 @@ class Cluster:
                 del self._progress[key]
 
     def close(self, logs: Path) -> None:
-        """Do nothing: the children of the workers stay for the other jobs."""
+        """Do nothing: the child processes of the workers are kept for other jobs."""
 
     def _resources(self, task: Task, environment: TaskEnvironment) -> dict[str, float] | None:
-        """Return the resources that a task takes; a task that needs too much takes all of the largest worker.
+        """Return the resources that a task reserves; None if no worker declares its memory.
 
-        This waits for the first worker: a task that is submitted before would have no limits, and large tasks
-        would run together.
+        A task that needs more memory than any worker has reserves all memory of the largest worker. This
+        method waits for the first worker: without a worker, the largest memory is unknown, and a task without
+        a reservation could run at the same time as other large tasks.
         """
         while (largest := self._largest_worker(task)) is None:
             if environment.cancelled():
@@ -131,7 +133,11 @@ class Cluster:
         return {MEMORY: min(float(task.memory_mb), largest)} if largest else None
 
     def _largest_worker(self, task: Task) -> float | None:
-        """Return the memory (MB) that the largest worker declares; 0 if none does; None without a worker."""
+        """Return the largest memory (MB) that a worker declares.
+
+        Returns:
+            The memory; 0 if no worker declares its memory; None if there is no worker.
+        """
         with self._asking:
             if self._largest_memory is None or time.monotonic() - self._last_asked > _WORKERS_PERIOD_S:
                 if self._client.status in _CLIENT_LEFT:
@@ -157,7 +163,7 @@ class Cluster:
         if future.status == "finished":
             try:
                 return dict(future.result())
-            except OSError as error:  # from the connection: errors of the task are part of the answer
+            except OSError as error:  # an error of the connection: the answer holds errors of the task
                 raise _lost(task) from error
         if future.status == "error":
             raise _dask_error(future.exception(), task, environment)
@@ -175,17 +181,18 @@ def start_queue(kind: str, workers: int, cores: int, memory_mb: int) -> Any:
     """Start workers through the job queue of a computing centre.
 
     Args:
-        kind: ``slurm`` or ``pbs``. Queue, account and times come from Dask's configuration
-            (``~/.config/dask/jobqueue.yaml``).
+        kind: Kind of the job queue: ``slurm``, ``pbs``, or ``local`` for tests without a queue. Queue,
+            account and times come from Dask's configuration (``~/.config/dask/jobqueue.yaml``).
         workers: Number of workers.
-        cores: Threads of each task, and so of each worker.
-        memory_mb: Memory of each worker.
+        cores: Number of threads of each task. A worker runs one task at a time, so each worker gets this
+            number.
+        memory_mb: Memory (MB) of each worker.
 
     Returns:
-        A Dask cluster; a context manager with ``scheduler_address``.
+        A Dask cluster: a context manager with the attribute ``scheduler_address``.
 
     Raises:
-        BodycapError: The extra is not installed, or the queue refuses.
+        BodycapError: Dask-Jobqueue is not installed (the extra `cluster`), or the queue refuses the request.
     """
     try:
         import dask_jobqueue
@@ -212,15 +219,15 @@ def start_queue(kind: str, workers: int, cores: int, memory_mb: int) -> Any:
 
 
 def _connect(address: str) -> Client:
-    """Connect to a scheduler. Raises `JobError`."""
+    """Connect to a scheduler and return the client. Raises `JobError`."""
     try:
         from distributed import Client
     except ImportError as error:
         raise _not_installed() from error
     try:
-        # TLS certificates come from Dask's configuration, as does the time to wait for an answer (30 s).
+        # Dask's configuration sets the TLS certificates and the time to wait for an answer (30 s).
         return Client(address, set_as_default=False)
-    except TypeError as error:  # Dask has no SSL context
+    except TypeError as error:  # Dask has no TLS certificates
         raise JobError(
             f"no certificates for the connection to {address}",
             field="--executor",
@@ -240,12 +247,12 @@ def _not_installed() -> JobError:
 
 
 def _allow_failures(count: int, dask_scheduler: Any = None) -> None:
-    """Set the number of allowed failures; this runs on the scheduler."""
+    """Set the number of allowed failures of a task. This function runs on the scheduler."""
     dask_scheduler.allowed_failures = count
 
 
 def _on_worker(order: Mapping[str, Any], topic: str) -> dict[str, Any]:
-    """Run an order; this runs in a thread of a worker."""
+    """Run an order and return its answer. This function runs in a thread of a worker."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -259,17 +266,17 @@ def _on_worker(order: Mapping[str, Any], topic: str) -> dict[str, Any]:
             worker.log_event(topic, {"key": key, "done": done, "total": total, "what": what})
 
     def cancelled() -> bool:
-        # The client has ended or cancelled the task, or the scheduler has ended.
+        # True if the client has ended, if it has cancelled the task, or if the worker or scheduler ends.
         state = worker.state.tasks.get(key)
         return state is None or state.state == "cancelled" or worker.status.name in _WORKER_ENDS
 
-    # All tasks of this worker together use no more threads than it has cores.
+    # All tasks of this worker together must not use more threads than the machine has cores.
     threads = min(order["task"]["threads"], max(1, (os.cpu_count() or 1) // worker.state.nthreads))
     return run_order({**order, "task": {**order["task"], "threads": threads}}, progress, cancelled)
 
 
 def _raise_error_in(answer: Mapping[str, Any]) -> None:
-    """Raise the error that a worker's answer holds, if any."""
+    """Raise the error that a worker's answer holds; do nothing if the answer holds no error."""
     if "error" in answer:
         error = error_from_dict(answer["error"])
         for note in answer.get("notes", []):
@@ -278,7 +285,7 @@ def _raise_error_in(answer: Mapping[str, Any]) -> None:
 
 
 def _dask_error(failure: BaseException, task: Task, environment: TaskEnvironment) -> BodycapError:
-    """Return the error that Dask itself reports; errors of the task are part of its answer."""
+    """Return the error for a failure of Dask itself. Errors of the task are part of the worker's answer."""
     from distributed import KilledWorker
 
     log = environment.logs / f"{task.file_stem}.log"
@@ -293,7 +300,7 @@ def _dask_error(failure: BaseException, task: Task, environment: TaskEnvironment
 
 
 def _lost(task: Task) -> BodycapError:
-    """Return the error of a task whose scheduler cannot be reached any more."""
+    """Return the error for a task whose scheduler can no longer be reached."""
     return BodycapError(
         f"{task.label}: the scheduler was lost",
         hint="start it again, and the same batch: finished stages are kept",

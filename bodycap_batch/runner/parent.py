@@ -1,4 +1,4 @@
-"""The parent process: look a task's artefact up in the store, else have it computed."""
+"""The parent process: look up a task's artefact in the store; if it is missing, have it computed."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _HINT = "run the job first (`bodycap run`); if it was run before, `bodycap why` 
 
 
 class NotStored(StoreError):
-    """An artefact is not stored, and nothing may be computed.
+    """Error: an artefact is not stored, and the rules forbid computing it.
 
     Attributes:
-        tasks: The tasks that would have to run.
+        tasks: The tasks that would compute the missing artefacts.
     """
 
     def __init__(self, tasks: Sequence[Task], path: Path) -> None:
@@ -30,24 +30,24 @@ class NotStored(StoreError):
 
 
 def always() -> bool:
-    """Return True."""
+    """Return True: the default for `Rules.may_commit`."""
     return True
 
 
 def allow(task: Task) -> None:
-    """Allow every task."""
+    """Do nothing, and so allow every task: the default for `Rules.before`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rules:
-    """What a runner may do, and the functions that it asks.
+    """Rules for a runner: what it may compute, and the functions that it calls to decide.
 
     Attributes:
-        cancelled: Called several times a second; True stops the tasks.
-        may_commit: Called before an artefact is committed; False stops the tasks.
-        before: Called before a task runs; may raise to forbid it.
-        compute: If False, only stored artefacts are returned, and `NotStored` is raised for others.
-        redo: Stages that are computed again although they are stored.
+        cancelled: Called several times a second; True stops the running tasks.
+        may_commit: Called before an artefact is committed; False stops its task.
+        before: Called before a task runs; may raise an error to forbid the task.
+        compute: If False, only stored artefacts are returned; `NotStored` is raised for a missing artefact.
+        redo: Names of the stages that are computed again even if their artefacts are stored.
     """
 
     cancelled: Callable[[], bool]
@@ -58,14 +58,14 @@ class Rules:
 
 
 class Runner:
-    """Finds or computes the artefacts of one job; may be used from several threads.
+    """Finds or computes the artefacts of one job. Several threads may use it at the same time.
 
     Args:
-        store: Where artefacts are stored.
+        store: The store of the artefacts.
         executor: Computes the artefacts that are not stored.
-        logs: Folder for one log file and one task file per task.
-        listener: Receives the events.
-        rules: What the runner may do.
+        logs: Folder for the log file and the task file of each task.
+        listener: Receives the events of all tasks.
+        rules: Rules for the runner: what it may compute, and the functions that it calls.
     """
 
     def __init__(
@@ -78,26 +78,26 @@ class Runner:
         self._rules = rules
 
     def __enter__(self) -> Runner:
-        """The runner itself."""
+        """Return the runner itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
-        """End the idle children."""
+        """Release what the executor holds for this job."""
         self._executor.close(self._logs)
 
     def run(self, task: Task, preload: Sequence[Sequence[str]] = ()) -> tuple[Artefact, bool]:
-        """Return the task's artefact and whether it had to be computed.
+        """Return the task's artefact, and True if it was computed now or False if it was stored.
 
         Args:
             task: The task.
-            preload: Modules that other children load while it is computed (see `TaskEnvironment`).
+            preload: Names of modules that idle children load meanwhile (see `TaskEnvironment`).
 
         Raises:
-            BodycapError: The error of the child, `StoreError` if the disk fails, `Cancelled` if stopped,
-                `NotStored` if nothing may be computed.
+            BodycapError: The error of the task; `StoreError` if the disk fails; `Cancelled` if the task is
+                stopped; `NotStored` if the artefact is missing and may not be computed.
         """
         redo = task.key.stage in self._rules.redo
         if not redo and (found := self.store.find(task.key)) is not None:

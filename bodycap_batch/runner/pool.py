@@ -1,4 +1,7 @@
-"""The children of one machine, shared by several jobs: its cores and memory limit the tasks at once."""
+"""The child processes of one machine, which several jobs share.
+
+The machine's cores and memory limit the tasks that run at the same time.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +21,17 @@ from bodycap_batch.runner.task import Task
 from bodycap_batch.runner.turns import Turns
 
 _POLL_S = 0.1
-"""Time after which a waiting task checks whether it was stopped, seconds. Evidence: none."""
+"""Time (seconds) between two checks of a waiting task whether it was stopped. Evidence: none."""
 
 
 class Slots:
-    """Cores and memory that tasks take and return; the task of the highest priority comes first.
+    """Cores and memory that tasks reserve and release; the waiting task of highest priority comes first.
 
-    A task that needs more than the machine has takes everything, so it runs alone.
+    A task that needs more than the machine has reserves everything, so it runs alone.
 
     Args:
-        cores: Number of threads that may be busy at once.
-        memory_mb: Memory that the running tasks may declare together.
+        cores: Maximum number of threads of all running tasks.
+        memory_mb: Maximum memory (MB) of all running tasks, as declared by the tasks.
     """
 
     def __init__(self, cores: int, memory_mb: int) -> None:
@@ -41,7 +44,7 @@ class Slots:
 
     @contextmanager
     def taken(self, task: Task, cancelled: Callable[[], bool]) -> Iterator[None]:
-        """Wait for the cores and memory of a task and hold them. Raises `Cancelled` if stopped meanwhile."""
+        """Wait until a task's cores and memory are free, and reserve them. Raises `Cancelled` if stopped."""
         need = (min(max(1, task.threads), self.cores), min(task.memory_mb, self.memory_mb))
         self._take(need, task.priority, cancelled)
         try:
@@ -56,7 +59,7 @@ class Slots:
         with self._changed:
             heapq.heappush(self._waiting, position)
             try:
-                # Strictly in order: otherwise small tasks could overtake a large one for ever.
+                # Strictly in order: otherwise small tasks could overtake a large task again and again.
                 while self._waiting[0] != position or not self._fits(need):
                     self._changed.wait(_POLL_S)
                     if cancelled():
@@ -72,12 +75,13 @@ class Slots:
 
 
 class LocalPool:
-    """Runs the tasks of several jobs in children of this machine.
+    """Runs the tasks of several jobs in child processes of this machine.
 
     Args:
-        cores: Number of threads that may be busy at once.
-        memory_mb: Memory that the running tasks may declare together; default: four fifths of the machine's.
-        command: Command line of the children.
+        cores: Maximum number of threads of all running tasks.
+        memory_mb: Maximum memory (MB) of all running tasks, as declared by the tasks. None for four fifths of
+            the machine's memory.
+        command: Command line of the child processes.
     """
 
     def __init__(
@@ -89,7 +93,7 @@ class LocalPool:
         self._turns = Turns()
 
     def execute(self, task: Task, environment: TaskEnvironment) -> None:
-        """Compute and commit the task's artefact when cores and memory are free. Raises `BodycapError`."""
+        """Wait for cores and memory; compute and commit the task's artefact. Raises `BodycapError`."""
         with self._turns.taken(task, environment) as is_stored:
             if is_stored:
                 return
@@ -98,14 +102,14 @@ class LocalPool:
                 self._children.execute(task, replace(environment, preload=()))
 
     def close(self, logs: Path) -> None:
-        """Do nothing: the children stay for the other jobs."""
+        """Do nothing: the child processes are kept for other jobs."""
 
     def shutdown(self) -> None:
-        """End all children."""
+        """End all child processes."""
         for logs in self._logs or {Path()}:
             self._children.close(logs)
 
 
 def machine_memory_mb() -> int:
-    """Return the memory of this machine, MB."""
+    """Return the physical memory of this machine, in MB."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20

@@ -1,4 +1,4 @@
-"""Run a task on another machine, in the same child as here."""
+"""Run a task on another machine, in the same kind of child process as on this machine."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _lock = threading.Lock()
 
 
 def remote_order(task: Task, environment: TaskEnvironment, command: tuple[str, ...]) -> dict[str, Any]:
-    """Return what another machine needs to run a task, as JSON values; paths lie on the shared disk."""
+    """Return all that another machine needs to run a task, as JSON values; paths refer to the shared disk."""
     return {
         "task": task.to_json(environment.store.root),
         "logs": str(environment.logs),
@@ -29,15 +29,16 @@ def remote_order(task: Task, environment: TaskEnvironment, command: tuple[str, .
 def run_order(
     order: Mapping[str, Any], progress: Callable[[int, int, str], None], cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
-    """Compute and commit a task's artefact in a child of this machine.
+    """Compute and commit a task's artefact in a child process of this machine.
 
     Args:
-        order: An order of `remote_order`.
+        order: The order that `remote_order` returned on the other machine.
         progress: Called as ``progress(done, total, what)``.
         cancelled: Called several times a second; True stops the task.
 
     Returns:
-        An empty dict, or ``error`` and ``notes`` of the `BodycapError` that ended the task.
+        An empty dict if the artefact is stored, else ``error`` and ``notes`` of the `BodycapError` that ended
+        the task.
     """
     task, root = task_from_json(order["task"])
     try:
@@ -45,7 +46,7 @@ def run_order(
         _require_same_program(task)
         store = Store(root)
         if not task.replaces and store.find(task.key) is not None:
-            return {}  # a worker committed it and died before it could report
+            return {}  # another worker committed the artefact and died before it could report this
         environment = TaskEnvironment(
             store=store,
             logs=Path(order["logs"]),
@@ -60,7 +61,7 @@ def run_order(
 
 
 def _children_of(command: tuple[str, ...]) -> Children:
-    """Return the children of this process; they end with it."""
+    """Return the children that this process starts with a command line; they end when this process ends."""
     with _lock:
         return _children.setdefault(command, Children(command))
 
@@ -75,7 +76,10 @@ def _require_shared(root: Path) -> None:
 
 
 def _require_same_program(task: Task) -> None:
-    """Refuse a task if its program differs here: its result must not be stored under the task's key."""
+    """Refuse a task if this machine has another version of its program or libraries.
+
+    The result would not match the task's key.
+    """
     if task.program is None:
         return
     algorithm, libraries = task.program.versions()

@@ -1,4 +1,4 @@
-"""A task of the runner, and how it is written to and read from JSON."""
+"""The runner's task, and its conversion to and from JSON."""
 
 from __future__ import annotations
 
@@ -13,24 +13,26 @@ from bodycap_batch.store.artefacts import ArtefactKey
 from bodycap_batch.store.code_version import Program
 
 TaskFunction = Callable[[Mapping[str, Any], StageContext, Path], None]
-"""Called in the child with the task's arguments, the context and the folder that becomes the artefact."""
+"""Function that runs a task in the child. Its arguments are the task's arguments, the context, and the folder
+that becomes the artefact."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """One artefact to be computed. Only `key` identifies it.
+    """One artefact to be computed. Only `key` identifies the artefact.
 
     Attributes:
-        key: What the artefact is computed from.
-        arguments: What the child loads, as JSON values: options and paths. The key identifies their content.
-        program: The code that computes it. A worker on another machine must have the same; None: not checked.
-        camera: The camera that it concerns, or "".
-        round: Round of the map, from 0.
-        threads: Number of threads that it may keep busy.
-        modules: Modules that its child loads. A child that has loaded them is preferred.
-        memory_mb: Memory that it may need.
-        priority: Of waiting tasks, the one with the highest priority runs first.
-        replaces: Compute the artefact although it is stored, and replace it.
+        key: The key of the artefact: identifies everything that the artefact is computed from.
+        arguments: The stage's typed task as JSON values: options and paths. The key identifies their content.
+        program: The code that computes the artefact. A worker on another machine must have the same program;
+            None disables this check.
+        camera: Name of the camera that the task concerns; "" if it concerns no single camera.
+        round: Round of the map, counted from 0.
+        threads: Number of threads that the task may keep busy.
+        modules: Names of the modules that the task needs. A child that has loaded them is preferred.
+        memory_mb: Memory (MB) that the task may need.
+        priority: Priority of the task; waiting tasks with a higher number run first.
+        replaces: True to compute the artefact even if it is stored, and to replace the stored artefact.
     """
 
     key: ArtefactKey
@@ -46,22 +48,22 @@ class Task:
 
     @property
     def label(self) -> str:
-        """Stage, camera and round, for messages."""
+        """Label of the task for messages: stage, camera and round."""
         return task_label(self.key.stage, self.camera, self.round)
 
     @property
     def file_stem(self) -> str:
-        """Stage, camera and round, for names of files."""
+        """Stem of the names of the task's files: stage, camera and round."""
         parts = (self.key.stage, self.camera, str(self.round) if self.round else "")
         return "_".join(part for part in parts if part)
 
     def to_json(self, store: Path) -> dict[str, Any]:
-        """Return the task as plain JSON values, with the folder of the store that receives the artefact."""
+        """Return the task as plain JSON values, including the folder `store` that receives the artefact."""
         return {**asdict(self), "store": str(store)}
 
 
 def task_from_json(data: Mapping[str, Any]) -> tuple[Task, Path]:
-    """Rebuild a task and the folder of the store from `Task.to_json`."""
+    """Rebuild a task and the folder of its store from the values that `Task.to_json` returned."""
     values = {item.name: data[item.name] for item in fields(Task)}
     values |= {"key": ArtefactKey(**data["key"]), "modules": tuple(data["modules"])}
     if (program := data["program"]) is not None:

@@ -1,4 +1,4 @@
-"""Compute a task that several jobs need only once: the second job waits, and keeps no worker busy."""
+"""Compute a task only once if several jobs need it. The other jobs wait, and keep no worker busy."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from bodycap_batch.runner.children import STOPPED, Executor, TaskEnvironment
 from bodycap_batch.runner.task import Task
 
 _POLL_S = 0.1
-"""Time after which a waiting job checks whether it was stopped, seconds. Evidence: none."""
+"""Time (seconds) between two checks of a waiting job whether it was stopped. Evidence: none."""
 
 
 class Turns:
-    """The artefacts that are being computed for the jobs of this process."""
+    """The artefacts that are being computed at the moment for the jobs of this process."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -24,7 +24,9 @@ class Turns:
 
     @contextmanager
     def taken(self, task: Task, environment: TaskEnvironment) -> Iterator[bool]:
-        """Wait until no other job computes the task's artefact; yield True if it is stored then.
+        """Wait until no other job computes the task's artefact; then yield True if the artefact is stored.
+
+        False is also yielded for a task that must replace its stored artefact.
 
         Raises:
             Cancelled: The job was stopped while it waited.
@@ -45,11 +47,11 @@ class Turns:
 
 
 class TurnTakingExecutor:
-    """An executor of one job that waits for artefacts which other jobs of this process already compute.
+    """The executor of one job; it waits for artefacts that other jobs of this process are computing.
 
     Args:
-        executor: Runs the other tasks.
-        turns: Shared by the jobs.
+        executor: The executor that computes all other artefacts.
+        turns: The artefacts that are being computed; all jobs of the process share this object.
     """
 
     def __init__(self, executor: Executor, turns: Turns) -> None:
@@ -57,11 +59,11 @@ class TurnTakingExecutor:
         self._turns = turns
 
     def execute(self, task: Task, environment: TaskEnvironment) -> None:
-        """Compute and commit the task's artefact, or wait until another job has. Raises `BodycapError`."""
+        """Compute and commit the task's artefact, or wait for another job to do so. Raises `BodycapError`."""
         with self._turns.taken(task, environment) as is_stored:
             if not is_stored:
                 self._executor.execute(task, environment)
 
     def close(self, logs: Path) -> None:
-        """End what the job with these logs needed; the job has ended."""
+        """Release what the job with this folder of logs needed, after the job has ended."""
         self._executor.close(logs)

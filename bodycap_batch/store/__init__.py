@@ -1,4 +1,4 @@
-"""Stored results of finished tasks, found again by what they were computed from."""
+"""The store of finished tasks' results. The key of a result identifies everything it was computed from."""
 
 from bodycap_batch.store.artefacts import Artefact, ArtefactKey, Store
 

@@ -1,9 +1,9 @@
-"""The artefact store: results of tasks, found by what they were computed from.
+"""The artefact store: it holds the results of tasks and finds a result by its key.
 
-An artefact is a folder. Its key names the stage, the version of its algorithm, its options, the content of
-its inputs, and the libraries. The folder is written to a temporary place in the store and synced. A manifest
-is written last, and then the folder is renamed to its final name in one step. Every folder with the name of a
-key is therefore complete, and a process may be killed at any moment.
+An artefact is a folder. Its key names the stage, the version of the algorithm, the options, the content of
+the inputs, and the versions of the libraries. A process writes the folder to a temporary place in the store,
+syncs it, and writes a manifest last. Then it renames the folder to its final name in one step. Every folder
+with the name of a key is therefore complete, even if a process is killed at any moment.
 """
 
 from __future__ import annotations
@@ -33,43 +33,47 @@ from bodycap_batch.store.digests import (
 )
 
 MANIFEST = "manifest.json"
-"""File that describes an artefact: its key, the digest of each file, and what it cost."""
+"""Name of the file that describes an artefact: its key, the digest of each file, and the cost of computing
+it."""
 _AWAY = frozenset({
     errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.ECONNRESET, errno.ECONNABORTED,
     errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENETUNREACH, errno.ENODEV, errno.ENXIO,
 })  # fmt: skip
-"""Errors of a network disk whose server does not answer, and of a disk that fails."""
+"""Error numbers of a network disk whose server does not answer, and of a failing disk."""
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}) | _AWAY
-"""Errors that a disk causes, not the file."""
+"""Error numbers of failures that the disk causes, not the file."""
 _VOLATILE_SUFFIXES = (".db",)
-"""Endings of files that are no part of the content: equal databases differ in their bytes from run to run."""
+"""Suffixes of files that are not part of the content's digest: the bytes of a database differ from run to
+run, even if its content is equal."""
 _REMEMBER_BYTES = 1 << 20
-"""Size above which a file is hashed again at a look-up only if its inode, size or times have changed, bytes.
-So a finished job of any length is found in a moment. What a task reads is always hashed. Evidence: none."""
+"""Maximum size (bytes) of a file that every look-up hashes again. A larger file is hashed again only if its
+inode, size or times have changed, so the look-up of a long job is fast. The inputs of a task are always
+hashed. Evidence: none."""
 _Found = TypeVar("_Found")
 _LOCK = "lock"
-"""File of a draft that its process holds locked."""
+"""Name of the file in a draft's folder that the draft's process keeps locked."""
 _SETTING_ASIDE = "setting-aside"
-"""Lock of the process that moves artefacts away from their final names."""
+"""Name of the lock file for processes that move artefacts away from their final names."""
 _UNLOCKED = "new-"
 """Prefix of a draft's name until the draft is locked."""
 _STALE_S = 60.0
-"""Age from which a draft that was never locked is removed, seconds: creating and locking one takes
-milliseconds. Evidence: none."""
+"""Minimum age (seconds) before a draft that was never locked is removed. Creating and locking a draft takes
+only milliseconds. Evidence: none."""
 _KEY_LENGTH = 32
-"""Hexadecimal digits of a key's name: 128 bits, too many for two keys ever to have the same name."""
+"""Number of hexadecimal digits in the name of a key. With 128 bits, two keys practically never have the same
+name."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArtefactKey:
-    """What an artefact is computed from; equal keys mean equal results.
+    """The key of an artefact: everything that it is computed from. Equal keys mean equal results.
 
     Attributes:
         stage: Stage name.
         algorithm: Version of the stage's algorithm, see `code_version`.
-        options: The stage's own options, JSON values.
-        inputs: Digest (or small JSON value) of each input.
-        libraries: Version of each library the stage computes with.
+        options: The options of this stage, as JSON values.
+        inputs: Digest, or small JSON value, of each input, by name of the input.
+        libraries: Version of each library that the stage uses, by name of the library.
     """
 
     stage: str
@@ -84,7 +88,7 @@ class ArtefactKey:
 
     @property
     def name(self) -> str:
-        """Short hexadecimal name of the key."""
+        """Hexadecimal name of the key: the first digits of its digest."""
         return json_digest(self.document())[:_KEY_LENGTH]
 
 
@@ -93,10 +97,10 @@ class Artefact:
     """A complete, verified artefact.
 
     Attributes:
-        path: Its folder.
-        digest: Digest of its content. Equal content has an equal digest, whatever it was computed from.
-        made: What it cost (seconds, peak memory, threads); no part of its content.
-        files: Relative path of each file and its SHA-256.
+        path: Folder of the artefact.
+        digest: Digest of the content. Equal contents have equal digests, even if their keys differ.
+        made: Cost of computing the artefact (seconds, peak memory, threads); not part of the content.
+        files: SHA-256 of each file, by its path relative to the folder.
     """
 
     path: Path
@@ -111,7 +115,7 @@ class Draft:
 
     Attributes:
         files: Folder whose content becomes the artefact.
-        work: Scratch folder on the same file system; removed with the draft.
+        work: Folder for temporary files on the same file system; removed together with the draft.
     """
 
     files: Path
@@ -122,7 +126,7 @@ class Store:
     """The artefacts below one folder.
 
     Args:
-        root: The folder; created if it does not exist.
+        root: Folder of the store; created if it does not exist.
 
     Raises:
         StoreError: The folder cannot be created or written.
@@ -141,7 +145,7 @@ class Store:
         self.digests = FileDigests(self.root / "digests")
 
     def find(self, key: ArtefactKey) -> Artefact | None:
-        """Look an artefact up; a damaged one is set aside and counts as missing."""
+        """Return the artefact of a key; None if it is missing or damaged. A damaged artefact is set aside."""
         path = self._path(key)
         with disk_errors(self.root):
             if not path.is_dir():
@@ -150,13 +154,13 @@ class Store:
             return artefact or self._set_aside(path, lambda: self._verified(path, key))
 
     def verify(self, path: Path) -> None:
-        """Hash all files of an artefact that will be read; set it aside if it is damaged.
+        """Hash all files of an artefact that a task will read; set the artefact aside if it is damaged.
 
         Args:
             path: The artefact's folder.
 
         Raises:
-            StoreError: It is damaged. Nothing writes to artefacts, so the disk fails.
+            StoreError: The artefact is damaged. No program writes to artefacts, so the disk is the cause.
         """
         with disk_errors(self.root):
             if not _is_sound(path) and not self._set_aside(path, lambda: _is_sound(path)):
@@ -164,7 +168,7 @@ class Store:
                 raise StoreError("a stored artefact is damaged", path=path, hint=hint)
 
     def artefacts_in(self, value: Any) -> Iterator[Path]:
-        """Yield the folders of artefacts that occur in the arguments of a task."""
+        """Yield the folder of each artefact that the arguments of a task name."""
         if isinstance(value, Mapping):
             value = list(value.values())
         if isinstance(value, list | tuple):
@@ -175,10 +179,10 @@ class Store:
 
     @contextmanager
     def draft(self, key: ArtefactKey) -> Iterator[Draft]:
-        """Yield a temporary folder for an artefact; it is locked while in use and removed afterwards."""
+        """Yield a draft: a temporary folder for an artefact, locked while in use and removed afterwards."""
         with disk_errors(self.root):
             unlocked = Path(tempfile.mkdtemp(dir=self._temporary, prefix=_UNLOCKED))
-            # Network file systems lock only files opened for writing across machines.
+            # Network file systems lock a file across machines only if it is open for writing.
             lock = os.open(unlocked / _LOCK, os.O_RDWR | os.O_CREAT)
             fcntl.flock(lock, fcntl.LOCK_EX)
             folder = unlocked.with_name(f"{key.stage}-{unlocked.name.removeprefix(_UNLOCKED)}")
@@ -205,10 +209,10 @@ class Store:
 
         Args:
             draft: The draft; its files are synced to the disk.
-            key: What they were computed from.
-            made: What they cost.
-            before: Called before the last, atomic step; may raise to prevent it.
-            replace: Replace an artefact that is stored already.
+            key: The key of the artefact.
+            made: Cost of computing the artefact (seconds, peak memory, threads).
+            before: Called before the last, atomic step; may raise an error to prevent the commit.
+            replace: True to replace an artefact of this key that is stored already.
 
         Raises:
             StoreError: The disk is full or fails.
@@ -232,17 +236,17 @@ class Store:
             return self._move_in(draft.files, key)
 
     def sweep(self) -> int:
-        """Remove the drafts of killed processes, and return their number."""
+        """Remove the drafts and temporary files of killed processes; return the number of removed drafts."""
         try:
             folders = list(self._temporary.iterdir())
             for folder in (self.root / "digests", self.root / "references"):
                 remove_abandoned(folder)
-        except OSError:  # the next draft reports what is wrong with the folder
+        except OSError:  # not reported here: the next draft fails too, and reports the error
             return 0
         return sum(_remove_if_abandoned(folder) for folder in folders)
 
     def free_bytes(self) -> int:
-        """Return the free space on the store's disk, bytes."""
+        """Return the free space on the store's disk, in bytes."""
         return shutil.disk_usage(self.root).free
 
     def _path(self, key: ArtefactKey) -> Path:
@@ -276,7 +280,7 @@ class Store:
                 self._has_digest(path / name, expected) for name, expected in manifest["files"].items()
             )
         except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, AttributeError, TypeError):
-            return None  # damaged, or moved away at this moment by another process
+            return None  # the artefact is damaged, or another process has just moved it away
         if not sound:
             return None
         return Artefact(path=path, digest=manifest["digest"], made=manifest["made"], files=manifest["files"])
@@ -288,10 +292,11 @@ class Store:
         return (self.digests.sha256(path) if large else file_sha256(path)) == expected
 
     def _set_aside(self, path: Path, look: Callable[[], _Found]) -> _Found:
-        """Move a damaged artefact away, unless `look` finds a sound one, because another process was faster.
+        """Move a damaged artefact away, and return the result of `look`.
 
-        No other process moves it between `look` and the move, so a new artefact is never moved away. If there
-        was nothing before `look`, a new artefact may have been committed after it.
+        If `look` finds a sound artefact, nothing is moved: another process has already replaced the damaged
+        artefact. A lock prevents other processes from moving the artefact between `look` and the move. If no
+        artefact existed before `look`, nothing is moved either: a new artefact may have been committed since.
         """
         with self._setting_aside():
             existed = os.path.lexists(path)
@@ -303,7 +308,7 @@ class Store:
 
     @contextmanager
     def _setting_aside(self) -> Iterator[None]:
-        """Be the only process that moves artefacts away from their final names."""
+        """Hold the lock that a process needs to move artefacts away from their final names."""
         handle = os.open(self.root / _SETTING_ASIDE, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX)
@@ -314,7 +319,7 @@ class Store:
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """Turn operating system errors of a disk into `StoreError` with a remedy."""
+    """Convert operating system errors into `StoreError` with advice for the user."""
     try:
         yield
     except OSError as error:
@@ -322,7 +327,7 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 
 def store_error(error: OSError, path: Path) -> StoreError:
-    """Return the `StoreError` for an operating system error, with advice what to do about it."""
+    """Return the `StoreError` for an operating system error, with advice for the user."""
     hints = {
         errno.ENOSPC: "free some space, or name another disk with --store; finished stages are kept",
         errno.EDQUOT: "your disk quota is used up; name a folder on another disk with --store",
@@ -341,7 +346,7 @@ def store_error(error: OSError, path: Path) -> StoreError:
 
 
 def _is_sound(path: Path) -> bool:
-    """Return True if every file of an artefact has the digest that its manifest states."""
+    """Return True if every file of an artefact has the digest given in the manifest."""
     try:
         files = json.loads((path / MANIFEST).read_text(encoding="utf-8"))["files"]
         return all(file_sha256(path / name) == expected for name, expected in files.items())
@@ -358,7 +363,7 @@ def _content_digest(files: Mapping[str, str]) -> str:
 
 
 def _sync_files(folder: Path) -> dict[str, str]:
-    """Sync every file below a folder to the disk; return their SHA-256 by relative path."""
+    """Sync every file below a folder to the disk; return the SHA-256 of each file by its relative path."""
     digests: dict[str, str] = {}
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         with path.open("rb") as stream:
@@ -373,7 +378,7 @@ def _sync_folders(folder: Path) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Sync the names in a folder to the disk, so that they survive a power failure."""
+    """Sync a folder's list of names to the disk, so that the names survive a power failure."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -382,7 +387,10 @@ def sync_folder(path: Path) -> None:
 
 
 def _remove_if_abandoned(folder: Path) -> bool:
-    """Remove a draft whose process has ended, which shows in its free lock."""
+    """Remove a draft if its process has ended, and return True if it was removed.
+
+    The process has ended if the draft's lock is free.
+    """
     try:
         if folder.name.startswith(_UNLOCKED) and time.time() - folder.stat().st_mtime < _STALE_S:
             return False

@@ -1,4 +1,4 @@
-"""Versions of algorithms and libraries: a stored result is reused only if both are the same."""
+"""Versions of algorithms and libraries. A stored result is reused only if both versions are unchanged."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from typing import NamedTuple
 
 _PACKAGE = Path(__file__).parent.parent
 _NAMED = re.compile(r"bodycap_batch\.(\w+(?:\.\w+)*)")
-"""A string that names a module of this package, or one of its packages whose data files are read."""
+"""Pattern of a string that names a module of this package, or a subpackage whose data files are read."""
 _NOT_COMPUTING = frozenset(
     {"core.errors", "core.context", "core.progress", "config", "config.options", "config.models"}
 )
-"""Modules that do not affect a result. The values of options are part of the key."""
+"""Modules that are not part of an algorithm's version, because they do not affect a result. Options affect
+results, but the key holds the values of the options separately."""
 _SKIPPED_SUFFIXES = (".pyc", ".pyo")
 _reading = threading.Lock()
-"""Held while sources are read, so that several jobs of one process parse no file twice."""
+"""Lock that is held while sources are read, so that several jobs of one process parse each file only once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,28 +31,29 @@ class Program:
     """The code that computes a result.
 
     Attributes:
-        module: Module below this package that runs the stage; see `algorithm_version`.
-        libraries: Distributions that the result depends on; see `library_versions`.
+        module: Name of the module that runs the stage, relative to this package; see `algorithm_version`.
+        libraries: Python distributions that the result depends on; see `library_versions`.
     """
 
     module: str
     libraries: tuple[str, ...]
 
     def versions(self) -> tuple[str, dict[str, str]]:
-        """Return the version of the algorithm and those of the libraries, as installed here."""
+        """Return the version of the algorithm, and the version of each library installed on this machine."""
         return algorithm_version(self.module), library_versions(self.libraries)
 
 
 @cache
 def algorithm_version(module: str) -> str:
-    """Return the version of a stage's algorithm: a digest of a module's code and of all that it imports.
+    """Return the version of a stage's algorithm: a digest of a module's code and of all code it imports.
 
-    The version is computed, not counted by hand, so changed code never reuses a stored result. Comments,
-    docstrings and the layout of the source are not part of it.
+    The version is computed from the code and not maintained by hand. A stored result is therefore never
+    reused after the code has changed. Comments, docstrings and the layout of the source do not affect the
+    version.
 
     Args:
-        module: Module below this package: the stage's task (``tasks.keyframes``), which imports the
-            algorithm. Only imports from this package count.
+        module: Name of the stage's task module, relative to this package (``tasks.keyframes``). This module
+            imports the algorithm. Only imports from this package are followed.
     """
     digest = hashlib.sha256()
     with _reading:
@@ -63,7 +65,7 @@ def algorithm_version(module: str) -> str:
 
 @cache
 def library_versions(names: tuple[str, ...]) -> dict[str, str]:
-    """Return the installed version of each distribution; one of several alternatives (``a|b``) counts."""
+    """Return the installed version of each distribution; of alternatives (``a|b``), the first installed."""
     return {name.split("|")[0]: _installed(name.split("|")) for name in names}
 
 
@@ -77,7 +79,7 @@ def _installed(alternatives: Iterable[str]) -> str:
 
 
 def _closure(module: str) -> set[Path]:
-    """Return the files of a module and of all that it imports from this package."""
+    """Return the files of a module and of all modules that it imports from this package, also indirectly."""
     waiting, found = [module], set[Path]()
     while waiting:
         new = set(_files(waiting.pop())) - found
@@ -87,7 +89,7 @@ def _closure(module: str) -> set[Path]:
 
 
 class _Source(NamedTuple):
-    """The part of a file that counts in the digest, and the modules of this package that it names."""
+    """The part of a file that the digest includes, and the modules of this package that the file names."""
 
     content: bytes
     mentions: frozenset[str]
@@ -95,7 +97,7 @@ class _Source(NamedTuple):
 
 @cache
 def _source(path: Path) -> _Source:
-    """Read and parse a file; the result is kept, since many stages share files."""
+    """Read and parse a file; the result is cached, because many stages share files."""
     content = path.read_bytes()
     if path.suffix != ".py":
         return _Source(content, frozenset())
@@ -120,8 +122,9 @@ def _mentions(tree: ast.AST) -> Iterator[str]:
 def code_text(tree: ast.AST) -> str:
     """Return a syntax tree as text that is equal on all supported versions of Python.
 
-    Positions, docstrings, other bare strings and empty fields are left out. Python 3.12 added the field
-    ``type_params``, and Python 3.13 prints trees without empty lists. Neither may change a digest.
+    The text omits positions, docstrings, other bare strings and empty fields. Python 3.12 added the field
+    ``type_params``, and Python 3.13 prints trees without empty lists. These differences must not change a
+    digest.
     """
     fields = []
     for name, value in ast.iter_fields(tree):
@@ -136,11 +139,11 @@ _IGNORED_FIELDS = frozenset({"ctx", "kind", "type_comment", "type_ignores"})
 
 
 def _field_text(value: object) -> str:
-    """Return a field of a syntax node as text; an empty field gives an empty text."""
+    """Return a field of a syntax node as text; the text of an empty field is empty."""
     if isinstance(value, ast.Constant):
         return f"{type(value.value).__name__}:{value.value!r}"
     if isinstance(value, ast.JoinedStr):
-        # Python 3.12 adds empty strings to f-strings.
+        # Python 3.12 adds empty strings to the parts of f-strings; they are ignored.
         parts = [part for part in value.values if getattr(part, "value", None) != ""]
         return f"JoinedStr{_field_text(parts)}"
     if isinstance(value, ast.AST):
@@ -152,7 +155,7 @@ def _field_text(value: object) -> str:
 
 
 def _is_bare_string(node: object) -> bool:
-    """Return True for a docstring or the note on an assignment."""
+    """Return True for a bare string: a docstring, or the note below an assignment."""
     return (
         isinstance(node, ast.Expr)
         and isinstance(node.value, ast.Constant)
@@ -162,7 +165,7 @@ def _is_bare_string(node: object) -> bool:
 
 @cache
 def _files(name: str) -> tuple[Path, ...]:
-    """Return the file of a module, or all files of a package, data included."""
+    """Return the file of a module, or all files of a package including its data files."""
     return tuple(_files_of(name))
 
 

@@ -1,4 +1,4 @@
-"""Digests of files, remembered by the files' identity in the file system."""
+"""Digests of files. The digest of a large file is stored under the file's identity in the file system."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from typing import Any
 from bodycap_batch.core.errors import CaptureError
 
 _BLOCK_BYTES = 1 << 20
-"""Bytes that are read and hashed at once. Evidence: none."""
+"""Size (bytes) of the blocks in which a file is read and hashed. Evidence: none."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _TEMPORARY = re.compile(r"\.([0-9a-f]{8})\.(\d+)\.\d+\.part$")
-"""Name of a temporary file: it ends with the machine, the process and a time, since machines may share
-folders."""
+"""Pattern of the name of a temporary file. The name ends with a code of the machine, the process id and a
+time, because several machines may share a folder."""
 _MIN_AGE_S = 1.0
-"""Age from which the digest of a file is remembered, seconds. A younger file may change again within one tick
-of the file system's clock. Evidence: none."""
+"""Minimum age (seconds) of a file whose digest is stored. A younger file may change again without a change of
+its times, within one tick of the file system's clock. Evidence: none."""
 
 
 def json_digest(value: Any) -> str:
@@ -32,7 +32,7 @@ def json_digest(value: Any) -> str:
 
 
 def set_digest(files: Mapping[str, str]) -> str:
-    """Return the SHA-256 of a set of named files, from the digest of each."""
+    """Return the SHA-256 of a set of named files, from the digest of each file by name."""
     return json_digest(dict(sorted(files.items())))
 
 
@@ -48,7 +48,7 @@ def file_sha256(path: Path, on_bytes: Callable[[int], None] | None = None) -> st
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that readers see either the old or the new bytes, also after a power failure."""
+    """Write a file such that readers see either all old or all new bytes, even after a power failure."""
     temporary = temporary_beside(path)
     try:
         with temporary.open("wb") as stream:
@@ -61,7 +61,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def temporary_beside(path: Path) -> Path:
-    """Return a name in the same folder for a file that is renamed to `path` once it is complete."""
+    """Return a path in the same folder for a temporary file that is renamed to `path` when it is complete."""
     return path.with_name(f".{path.name}.{_machine()}.{os.getpid()}.{time.monotonic_ns()}.part")
 
 
@@ -88,20 +88,24 @@ def _is_alive(pid: int) -> bool:
 
 
 class FileDigests:
-    """Digests of large files, kept by device, inode, size, mtime and ctime.
+    """The stored digests of large files. Device, inode, size, mtime and ctime identify the state of a file.
 
-    If the bytes of a file change, its ctime changes, and no program can set that back. So an entry that is
-    found is correct, and a finished job does not read its videos again.
+    If the bytes of a file change, its ctime changes too, and no program can set the ctime back. A stored
+    digest is therefore correct, and a finished job does not read its videos again.
 
     Args:
-        folder: Folder of the entries, one small file each.
+        folder: Folder of the stored digests; each digest is one small file.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def sha256(self, path: Path, on_bytes: Callable[[int], None] | None = None) -> str:
-        """Return the SHA-256 of a file, from the stored entry if the file has not changed.
+        """Return the SHA-256 of a file; if the file has not changed, the stored digest is returned.
+
+        Args:
+            path: Path of the file.
+            on_bytes: Called with the number of bytes after each block that is read.
 
         Raises:
             CaptureError: The file changes while it is read.

@@ -1,4 +1,4 @@
-"""Check the free space on a disk before it is needed."""
+"""Check the free space on a disk before a job needs it."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from pathlib import Path
 from bodycap_batch.core.errors import StoreError
 
 _BYTES_PER_FRAME = 70_000
-"""Intermediate files and results per frame, bytes. Evidence: docs/decisions/pipeline.md."""
+"""Disk space (bytes) per frame for intermediate files and results. Evidence: docs/decisions/pipeline.md."""
 _BYTES_PER_LARGE_FRAME = 150_000
-"""Further bytes per frame of a large video, all of whose frames are stored at the size that is processed.
-Evidence: docs/decisions/pipeline.md."""
+"""Additional disk space (bytes) per frame of a large video. All frames of such a video are stored at the work
+size, the image size that all stages work at. Evidence: docs/decisions/pipeline.md."""
 _HARD_CAPTURE_FACTOR = 4
-"""How much more a difficult capture may need: it has about four times the keyframes.
-Evidence: docs/decisions/pipeline.md."""
+"""Ratio of the disk space of a difficult capture to the space of an easy capture. A difficult capture has
+about four times as many keyframes. Evidence: docs/decisions/pipeline.md."""
 _MIN_BYTES = 50_000_000
-"""Space that even the shortest job needs, bytes. Evidence: none."""
+"""Disk space (bytes) that a job of any length needs. Evidence: none."""
 
 
 def require_room(folder: Path, frames: int, large: int = 0) -> list[str]:
-    """Check that a job's results and intermediate files fit into a folder, and that it may be written.
+    """Check that a folder is writable, and that its disk has room for a job's results and intermediate files.
 
     Args:
-        folder: Folder of the files; it need not exist yet.
-        frames: Frames of all cameras.
-        large: How many of them are much larger than the size they are processed at.
+        folder: Folder for the files; it need not exist yet.
+        frames: Number of frames of all cameras.
+        large: Number of these frames that are much larger than the work size.
 
     Returns:
-        Notes for the user.
+        Notes for the user; empty if there is enough space even for a difficult capture.
 
     Raises:
-        StoreError: The space is too small, or the folder may not be written.
+        StoreError: The free space is too small, or the folder is not writable.
     """
     while not folder.exists():
         folder = folder.parent

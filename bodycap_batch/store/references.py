@@ -1,4 +1,4 @@
-"""The artefacts that jobs still refer to, and the removal of all others."""
+"""The artefacts that jobs still refer to, and the removal of all other artefacts."""
 
 from __future__ import annotations
 
@@ -17,23 +17,25 @@ from bodycap_batch.store.artefacts import Store, disk_errors
 from bodycap_batch.store.digests import json_digest, write_atomically
 
 _FOLDER = "references"
-"""Folder of the store with one list of artefacts per folder of results."""
+"""Subfolder of the store. It holds one file for each folder of results: the list of its artefacts."""
 _LOCK = "in-use"
-"""File that is locked while jobs use the store, and while it is cleaned."""
+"""Name of the file that is locked while jobs use the store, and while the store is cleaned."""
 
 
 class StoreBusy(StoreError):
-    """The store is in use by a job, or is being cleaned; try again later."""
+    """Error: a job is using the store, or the store is being cleaned; try again later."""
 
 
 class References:
-    """The artefacts that one folder of results was made from. They are kept as long as the folder exists.
+    """The references of one folder of results to the artefacts from which the results were made.
+
+    Cleaning the store keeps these artefacts as long as the folder exists.
 
     Args:
         store: The store of the artefacts.
         owner: The folder of results.
-        also: Other places of the folder while it is being moved. The artefacts are kept as long as one of the
-            places exists.
+        also: Other paths that the folder may have while it is being moved. The artefacts are kept as long as
+            one of the paths exists.
     """
 
     def __init__(self, store: Store, owner: Path, also: Iterable[Path] = ()) -> None:
@@ -47,7 +49,7 @@ class References:
         return self._root / _FOLDER / f"{json_digest(self._places[0])[:32]}.json"
 
     def add(self, artefact: Path) -> None:
-        """Refer to one more artefact. Raises `StoreError`."""
+        """Add a reference to an artefact, given its folder. Raises `StoreError`."""
         name = artefact.relative_to(self._root).as_posix()
         with self._lock:
             if name not in self.named:
@@ -55,20 +57,20 @@ class References:
                 self._write()
 
     def keep_only(self, artefacts: Iterable[str]) -> None:
-        """Refer to these artefacts (folders relative to the store) and no others. Raises `StoreError`."""
+        """Replace the references by these artefacts (folders relative to the store). Raises `StoreError`."""
         with self._lock:
             before, self.named = self.named, set(artefacts)
             if before != self.named:
                 self._write()
 
     def take_over(self, artefacts: Iterable[str]) -> None:
-        """Refer to these artefacts too, and write the places of the folder again. Raises `StoreError`."""
+        """Add references to these artefacts, and write them with the folder's paths. Raises `StoreError`."""
         with self._lock:
             self.named |= set(artefacts)
             self._write()
 
     def forget(self) -> None:
-        """Refer to no artefact. Raises `StoreError`."""
+        """Remove all references of this folder of results. Raises `StoreError`."""
         with disk_errors(self._root):
             self._path.unlink(missing_ok=True)
 
@@ -81,16 +83,16 @@ class References:
 
 @contextlib.contextmanager
 def moving(store: Store, before: Path, *, wait: bool = True) -> Iterator[Callable[..., None]]:
-    """Keep the artefacts of a folder of results while its job is moved, also if this process is killed.
+    """Keep the artefacts of a folder of results while the folder is moved, even if this process is killed.
 
     Args:
         store: The store of the artefacts.
-        before: The folder's present place.
-        wait: If the store is being cleaned, wait; if False, raise `StoreBusy`.
+        before: The folder's present path.
+        wait: What to do while the store is being cleaned: True waits for the end, False raises `StoreBusy`.
 
     Yields:
-        A function to call as ``to(after, *others)`` just before the move. `after` is the folder's new place,
-        or the place where it will be computed again; `others` are places where it may lie afterwards.
+        A function to call as ``to(after, *others)`` just before the move. `after` is the folder's new path,
+        or the path where its results will be computed again. `others` are paths that it may have later.
 
     Raises:
         StoreError: The disk fails.
@@ -112,15 +114,15 @@ def moving(store: Store, before: Path, *, wait: bool = True) -> Iterator[Callabl
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Garbage:
-    """The artefacts that no job refers to.
+    """The artefacts that no job refers to, and what else cleaning the store removes.
 
     Attributes:
-        artefacts: Folders relative to the store.
-        corrupt: Damaged artefacts that were set aside.
-        gone: Folders of results that no longer exist.
+        artefacts: Folders of the artefacts that no job refers to, relative to the store.
+        corrupt: Folder names of damaged artefacts that were set aside.
+        gone: Paths of folders of results that no longer exist.
         kept: Number of artefacts that jobs refer to.
-        freed_bytes: Space that their removal frees. A file that is also linked from a folder of results frees
-            nothing.
+        freed_bytes: Disk space (bytes) that the removal frees. The removal of a file that also has a hard
+            link in a folder of results frees no space.
     """
 
     artefacts: tuple[str, ...]
@@ -132,7 +134,10 @@ class Garbage:
 
 @contextlib.contextmanager
 def in_use(store: Store, *, wait: bool = False) -> Iterator[None]:
-    """Use the store, so that it is not cleaned; while it is being cleaned, wait or raise `StoreBusy`."""
+    """Prevent the cleaning of the store while it is in use.
+
+    If the store is being cleaned already: wait for the end if `wait` is True, else raise `StoreBusy`.
+    """
     kind = fcntl.LOCK_SH if wait else fcntl.LOCK_SH | fcntl.LOCK_NB
     with _locked(store, kind, "the store is being cleaned", "start again when `bodycap gc` has ended"):
         yield
@@ -182,7 +187,7 @@ def _locked(store: Store, kind: int, refusal: str, hint: str) -> Iterator[None]:
 
 
 def _read(path: Path) -> tuple[list[str], list[str]]:
-    """Return the places and the artefacts of a list; an unreadable list refers to nothing."""
+    """Read a list of references: the folder's paths and its artefacts; an unreadable list has none."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         places = [content["owner"], *content.get("also", ())]
@@ -192,7 +197,10 @@ def _read(path: Path) -> tuple[list[str], list[str]]:
 
 
 def _exists(place: str) -> bool:
-    """Return True if a place exists. `OSError` of a disk that does not answer prevents any removal."""
+    """Return True if a path exists.
+
+    A disk that does not answer raises `OSError`, so that no artefact is removed by mistake.
+    """
     return bool(place) and Path(place).exists()
 
 
@@ -202,7 +210,7 @@ def _freed_bytes(folder: Path) -> int:
 
 
 def _remove(folders: Iterable[Path], trash: Path) -> None:
-    """Remove folders: first rename each in one step, so that a killed process leaves no half artefact."""
+    """Remove folders. Each is renamed first, in one step: a killed process leaves no incomplete artefact."""
     for folder in folders:
         moved = trash / f"removed-{folder.name}"
         os.replace(folder, moved)

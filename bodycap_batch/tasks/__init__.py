@@ -1,6 +1,6 @@
-"""The stages as tasks: load the inputs, call the stage, save what it returns.
+"""The stages as tasks: each task loads its inputs, calls the stage and saves the stage's result.
 
-One module holds one stage, or a few that share code: the dataclass that describes its task, the function
-that runs it, and its `Stage` entry. The pipeline creates the dataclass; the child process reads it back
-from JSON.
+Each module holds one stage, or a few stages that share code. For each stage, it holds the dataclass that
+describes a task, the function that runs the task, and the stage's `Stage` entry. The pipeline creates the
+dataclass; the child process reads the dataclass back from JSON.
 """

@@ -12,22 +12,30 @@ if TYPE_CHECKING:
 
 
 def load_body(body: BodyInput) -> tuple[SkeletonModel, tuple[Mount, ...]]:
-    """Return the skeleton of a body and the prior of each mount."""
+    """Return the skeleton of a body and the mount prior of each camera."""
     skeleton = _load_skeleton(body)
     return skeleton, tuple(mount_prior(mount, skeleton) for mount in body.mounts)
 
 
 def camera_distances(body: BodyInput) -> list[tuple[str, str, float, float]]:
-    """Return the distances that the body permits, in metres: rows (camera, camera, least, most)."""
+    """Return the smallest and largest distance that the body permits between each pair of cameras.
+
+    Returns:
+        Rows (first camera, second camera, smallest distance, largest distance), in metres.
+    """
     from bodycap_batch.model.skeleton_presets import camera_reach
 
-    # A map has no scale, so only proportions matter to it. A stature that the job states later must not
-    # change the map.
+    # The map's scale is unknown, so mapping uses only the proportions of these distances. The stature is
+    # removed: a user who adds it to the job later must get the same map.
     return camera_reach(*load_body(replace(body, height_m=None)))
 
 
 def mount_prior(mount: MountInput, skeleton: SkeletonModel) -> Mount:
-    """Return the prior of a camera's mount: the nominal pose of its place, or what the job states."""
+    """Return the prior of a camera's mount.
+
+    A pose given in the job replaces the nominal pose of the named place. Standard deviations given in the job
+    replace the defaults; a given pose has other default deviations than a nominal pose.
+    """
     import numpy as np
 
     from bodycap_batch.model.skeleton import Mount

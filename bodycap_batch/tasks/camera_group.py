@@ -1,4 +1,4 @@
-"""The task of solving one camera's frames with the help of other cameras: rig and recover."""
+"""The task of solving one camera's frames with the help of other cameras: for the stages rig and recover."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ class CameraGroupTask:
     """Solve frames of one camera with the help of other cameras.
 
     Attributes:
-        options: Options of registration.
-        cameras: Names of the cameras: the task's own camera, then the others.
-        capture: These cameras, in this order.
-        keyframes: By camera.
+        options: Options of the stage `registration`.
+        cameras: Names of the cameras. The first camera is the one to solve; the other cameras help.
+        capture: The videos of these cameras, in the order of `cameras`.
+        keyframes: The selected keyframes of each camera, by camera name.
         map: The map.
-        registrations: By camera, in this order.
+        registrations: The registration of each camera, by camera name, in the order of `cameras`.
     """
 
     options: RegistrationOptions = field(metadata=NOT_ROUNDS)

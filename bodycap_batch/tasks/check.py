@@ -1,4 +1,4 @@
-"""The task that refuses a job that cannot work."""
+"""The task that checks a job and refuses a job that cannot run."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class CheckTask:
     """Check a job before anything is computed.
 
     Attributes:
-        job: The resolved job. The fields below hold what the check depends on, so it is not in the key.
-        cameras: By camera name, the digest of everything that its frames depend on.
+        job: The resolved job. It is not part of the key: the fields below hold all that the check depends on.
+        cameras: For each camera name, the digest of everything that the camera's frames depend on.
         body: The body; None for a job without a skeleton.
-        formats: Files to export.
-        names: Joint names of the exported files.
-        limits: How large the videos may be; None for the user's own job.
+        formats: Formats of the files to export.
+        names: The convention for the joint names in the exported files.
+        limits: Maximum sizes of the videos; None (no limits) for a job that the user runs directly.
     """
 
     job: Job = field(metadata=omitted_from_key())
@@ -36,7 +36,7 @@ class CheckTask:
 
 
 def run_check(task: CheckTask, context: StageContext, files: Path) -> None:
-    """Check the job; store notes for the user and the number of frames."""
+    """Check the job; store the notes for the user and the numbers of frames."""
     from bodycap_batch.check import require_ready, require_within_limits
 
     context.check_cancelled()

@@ -1,4 +1,4 @@
-"""The task that writes the results."""
+"""The task that writes the result files."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from bodycap_batch.tasks.typed_json import omitted_from_key
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportTask:
-    """Write the files of the results.
+    """Write the result files.
 
     Attributes:
-        options: The stage's options; the preview has a stage of its own.
+        options: The stage's options. `preview` is not part of the key: a separate stage renders the preview.
         map: The map.
-        registrations: By camera.
-        keyframes: By camera.
-        merge: The skeleton's motion; None if the job has none.
-        failure: Why there is no skeleton, although the job asks for one.
-        segments: Names of the cameras on each segment that carries several.
+        registrations: The registration of each camera, by camera name.
+        keyframes: The selected keyframes of each camera, by camera name.
+        merge: The skeleton's motion; None if there is no motion.
+        failure: The reason why the skeleton that the job asks for is missing; None if no skeleton is missing.
+        segments: For each body segment with several cameras, the names of these cameras.
     """
 
     options: ExportOptions = field(metadata=omitted_from_key("preview"))
@@ -39,7 +39,7 @@ class ExportTask:
 
 
 def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
-    """Write the results."""
+    """Write the result files."""
     from bodycap_batch.export import ExportInputs, export_results
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.merge_data import MergeResult

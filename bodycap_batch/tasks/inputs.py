@@ -16,31 +16,31 @@ class ArtefactRef:
 
     Attributes:
         path: Folder of the artefact.
-        digest: Digest of its content.
+        digest: Digest of the artefact's content.
     """
 
     path: Path
     digest: str
 
     def key_content(self) -> str:
-        """Return the digest: where the artefact is stored does not change a result."""
+        """Return the digest only: the place where the artefact is stored does not change a result."""
         return self.digest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileRef:
-    """A file of the user that a task reads.
+    """A file of the user's that a task reads.
 
     Attributes:
-        path: The file.
-        digest: SHA-256 of its bytes.
+        path: Path of the file.
+        digest: SHA-256 of the file's bytes.
     """
 
     path: Path
     digest: str
 
     def key_content(self) -> str:
-        """Return the digest: where the file lies does not change a result."""
+        """Return the digest only: the place where the file is stored does not change a result."""
         return self.digest
 
 
@@ -49,9 +49,9 @@ class CaptureRef:
     """The cameras that a task reads, with their videos.
 
     Attributes:
-        config: The resolved capture block, with the task's cameras only.
-        digests: By camera name, the digest of everything that its frames depend on. Empty if a video cannot
-            be read.
+        config: The resolved capture block of the job, with the task's cameras only.
+        digests: For each camera name, the digest of everything that the camera's frames depend on. Empty if a
+            video cannot be read.
     """
 
     config: CaptureConfig
@@ -64,15 +64,18 @@ class CaptureRef:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MountInput:
-    """Where a job says that a camera is mounted.
+    """The place on the body at which a camera is mounted, as the job gives it.
 
     Attributes:
         camera: Camera name.
-        role: Role of the bone that carries it (``LeftHand``).
-        place: Name of the place on the body, as the job gives it.
-        joint_from_cam: The measured mount, a 4x4 transform row by row; None if it was not measured.
-        sigma_deg: Standard deviation of the rotation per axis, if the job states it.
-        sigma_m: Standard deviation of the position per axis, if the job states it.
+        role: Role of the bone that the camera is mounted on (``LeftHand``).
+        place: Name of the place on the body (the job's `mount`, else the camera name).
+        joint_from_cam: The measured mount: the rows of a 4x4 transform from camera to joint coordinates
+            (metres). None if the mount was not measured.
+        sigma_deg: Standard deviation (degrees) of the mount's rotation about each axis; None if the job does
+            not give it.
+        sigma_m: Standard deviation (metres) of the mount's position along each axis; None if the job does not
+            give it.
     """
 
     camera: str
@@ -88,13 +91,14 @@ class BodyInput:
     """The body of a job: skeleton, stature, activity and mounts.
 
     Attributes:
-        skeleton: Name of a preset; None if the job names a skeleton file.
-        skeleton_file: The user's BVH file, if the job names one.
-        skeleton_map: Role by joint name of the skeleton file.
-        tpose_frame: Frame of the skeleton file that holds its T-pose; None for its zero pose.
-        height_m: Stature, if the job states it.
-        activity: What the subject does.
-        mounts: One per camera.
+        skeleton: Name of a skeleton preset; None if the job names a skeleton file.
+        skeleton_file: The user's BVH file; None if the job names a preset.
+        skeleton_map: Role of each joint that the user assigns, by joint name in the skeleton file.
+        tpose_frame: Index of the skeleton file's frame that shows the T-pose; None if the file's zero pose is
+            the T-pose.
+        height_m: Stature (metres) of the subject; None if the job does not give it.
+        activity: The activity of the subject.
+        mounts: The mount of each camera.
     """
 
     skeleton: str | None
@@ -107,5 +111,5 @@ class BodyInput:
 
 
 def paths_of(artefacts: Iterable[ArtefactRef]) -> list[Path]:
-    """Return the folders of artefacts."""
+    """Return the folder of each artefact."""
     return [artefact.path for artefact in artefacts]

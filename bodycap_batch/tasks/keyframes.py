@@ -18,7 +18,7 @@ class KeyframesTask:
 
     Attributes:
         options: The stage's options.
-        capture: The camera.
+        capture: The video of the camera.
     """
 
     options: KeyframeOptions
@@ -26,7 +26,7 @@ class KeyframesTask:
 
 
 def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> None:
-    """Select the keyframes; store them with copies of their decoded frames."""
+    """Select the keyframes; store them with copies of decoded frames."""
     from bodycap_batch.capture.kept import KEPT_NAME, FrameKeeper
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.keyframes import select_keyframes

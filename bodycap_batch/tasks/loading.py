@@ -1,4 +1,4 @@
-"""Read the inputs of the stages from what earlier stages stored."""
+"""Read the inputs of a stage: the videos, and the artefacts that earlier stages stored."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def load_capture(
     """Open the videos of a task.
 
     Args:
-        capture: The cameras.
-        keyframes: By camera, the keyframes' artefacts. They hold copies of decoded frames, which are read
-            instead of the video.
-        threads: Threads of each video decoder; 0 lets the decoder choose.
+        capture: The cameras and their videos.
+        keyframes: The keyframes' artefact of each camera, by camera name. An artefact may hold copies of
+            decoded frames; these copies are then read instead of the video.
+        threads: Number of threads of each video decoder; 0 lets the decoder choose.
     """
     from bodycap_batch.capture import open_capture
 
@@ -43,7 +43,7 @@ def _kept_frames(keyframes: ArtefactRef | None) -> KeptFrames | None:
 
 
 def load_keyframes(path: Path) -> KeyframeSelection:
-    """Read the keyframes of a camera."""
+    """Read the selected keyframes of a camera from an artefact's folder."""
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.scene import KeyframeSelection
 
@@ -51,7 +51,7 @@ def load_keyframes(path: Path) -> KeyframeSelection:
 
 
 def load_map(path: Path) -> MapResult:
-    """Read a map with its workspace."""
+    """Read a map and the path of its workspace from an artefact's folder."""
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.scene import MapResult
 
@@ -59,7 +59,7 @@ def load_map(path: Path) -> MapResult:
 
 
 def load_registration(path: Path) -> Registration:
-    """Read the poses and observations of a camera."""
+    """Read the poses and observations of a camera from an artefact's folder."""
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.scene import Registration
 

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraDistance:
-    """The distances between two cameras that the body permits.
+    """The smallest and largest distance that the body permits between two cameras.
 
     Attributes:
-        first: Camera name.
-        second: Camera name.
-        least_m: Smallest distance on a body of the preset's size.
-        most_m: Largest distance.
+        first: Name of the first camera.
+        second: Name of the second camera.
+        least_m: Smallest distance (metres), for a body of the skeleton's nominal size.
+        most_m: Largest distance (metres), for a body of the skeleton's nominal size.
     """
 
     first: str
@@ -42,10 +42,10 @@ class MapTask:
 
     Attributes:
         options: The stage's options.
-        capture: All cameras.
-        keyframes: By camera.
-        reach: Distances that the body permits. These rather than the body: a mount that is stated a little
-            more exactly must not change the map.
+        capture: The videos of all cameras.
+        keyframes: The selected keyframes of each camera, by camera name.
+        reach: Distances between cameras that the body permits. The task holds these rounded distances instead
+            of the body, so that a small change of a mount in the job does not change the map.
     """
 
     options: MapOptions
@@ -60,10 +60,10 @@ class ExtendTask:
 
     Attributes:
         options: The stage's options.
-        capture: All cameras.
-        keyframes: By camera.
-        map: The map so far.
-        extra: By camera, indices of the frames to add as keyframes.
+        capture: The videos of all cameras.
+        keyframes: The selected keyframes of each camera, by camera name.
+        map: The map to extend.
+        extra: For each camera name, indices of the frames to add as keyframes.
     """
 
     options: MapOptions
@@ -75,13 +75,13 @@ class ExtendTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefineTask:
-    """Remove the deformation that rolling shutters cause from a map.
+    """Remove from a map the deformation that rolling shutters cause.
 
     Attributes:
         options: The stage's options.
-        capture: All cameras.
-        map: The map so far.
-        registrations: By camera.
+        capture: The videos of all cameras.
+        map: The map to refine.
+        registrations: The registration of each camera against this map, by camera name.
     """
 
     options: MapOptions
@@ -128,7 +128,7 @@ def run_refine(task: RefineTask, context: StageContext, files: Path) -> None:
 
 
 def _save_map(result: MapResult, files: Path) -> None:
-    """Store a map with the workspace that is needed to extend it."""
+    """Store a map with its workspace. Extending the map later needs the workspace."""
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.intrinsics.intrinsics_check import misfit_note
     from bodycap_batch.mapping.matching.flipped_cameras import flip_notes
@@ -155,7 +155,8 @@ def _save_map(result: MapResult, files: Path) -> None:
 _LIBRARIES = (*VISION_LIBRARIES, "pycolmap")
 _MODULES = (*VISION_MODULES, "pycolmap")
 _MEMORY_MB = 1500
-"""Memory to reserve for a task of the mapper, MB. Evidence: docs/decisions/pipeline.md."""
+"""Memory to reserve (MB) for a task that builds, extends or refines a map.
+Evidence: docs/decisions/pipeline.md."""
 MAP = Stage(
     name="map",
     task=MapTask,

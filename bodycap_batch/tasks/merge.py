@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardFootage:
-    """The images in which a marker board is searched for.
+    """The images in which merging searches for the marker board.
 
     Attributes:
-        capture: All cameras.
-        keyframes: By camera.
+        capture: The videos of all cameras.
+        keyframes: The selected keyframes of each camera, by camera name.
     """
 
     capture: CaptureRef
@@ -40,9 +40,9 @@ class MergeTask:
     Attributes:
         options: The stage's options.
         map: The map.
-        registrations: By camera.
+        registrations: The registration of each camera, by camera name.
         body: The body.
-        footage: Where the marker board is searched for; None if the job names none.
+        footage: The images in which the marker board is searched for; None if the job names no marker board.
     """
 
     options: MergeOptions
@@ -96,7 +96,7 @@ def _merge_inputs(task: MergeTask) -> MergeInputs:
 def _with_board(
     inputs: MergeInputs, task: MergeTask, footage: BoardFootage, board: MarkerBoard, context: StageContext
 ) -> MergeInputs:
-    """Add what each keyframe sees of the marker board to the inputs."""
+    """Return the inputs with the views of the marker board in the keyframes added."""
     import dataclasses
 
     import numpy as np

@@ -1,4 +1,4 @@
-"""Names of a job's stages and their order."""
+"""The names of a job's stages, in the order of the stages."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ StageName = Literal["check", "keyframes", "map", "registration", "merge", "expor
 STAGE_ORDER: tuple[StageName, ...] = get_args(StageName)
 """The stages of a job in the order in which they run."""
 _DURING_REGISTRATION = frozenset({"extend", "refine", "rig", "recover"})
-"""Further stages that may run between registration and merge: the map is extended and refined, the cameras of
-a rig are solved together, and lost frames are recovered."""
+"""Further stages that may run between registration and merge. They extend and refine the map, solve the
+cameras of a rig together, and recover lost frames."""
 
 
 def stages_from(stage: StageName) -> frozenset[str]:
-    """Return a stage of `STAGE_ORDER` and all stages after it."""
+    """Return the names of a stage of `STAGE_ORDER` and of all stages that run after this stage."""
     later = set[str](STAGE_ORDER[STAGE_ORDER.index(stage) :])
     return frozenset(later | (_DURING_REGISTRATION if "registration" in later else set()))

@@ -28,12 +28,12 @@ class PreviewTask:
     """Render the results as a video.
 
     Attributes:
-        capture: All cameras.
-        keyframes: By camera.
-        registrations: By camera.
+        capture: The videos of all cameras.
+        keyframes: The selected keyframes of each camera, by camera name.
+        registrations: The registration of each camera, by camera name.
         map: The map.
-        merge: The skeleton's motion; None if the job has none.
-        failure: Why there is no skeleton, although the job asks for one.
+        merge: The skeleton's motion; None if there is no motion.
+        failure: The reason why the skeleton that the job asks for is missing; None if no skeleton is missing.
     """
 
     capture: CaptureRef
@@ -80,7 +80,11 @@ def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInput
 
 
 def _transforms_of(maps: Sequence[Map], merge: MergeResult | None) -> dict[str, Similarity]:
-    """Return the transform of each map to show: all that merging placed, else only the largest map."""
+    """Return the transform of each map to show, by the map's gauge.
+
+    With a motion, these are the transforms of all maps that merging placed in the world. Without a motion,
+    only the largest map is shown, untransformed.
+    """
     import numpy as np
 
     from bodycap_batch.model.geometry import Similarity
@@ -91,7 +95,10 @@ def _transforms_of(maps: Sequence[Map], merge: MergeResult | None) -> dict[str, 
 
 
 def _trunk_first(capture: Capture, merge: MergeResult | None) -> Capture:
-    """Sort the cameras: those on the trunk, which are shown largest, then on limbs, then the unused ones."""
+    """Return the capture with its cameras sorted: first on the trunk, then on limbs, then the unused cameras.
+
+    The preview shows the cameras on the trunk largest.
+    """
     from dataclasses import replace
 
     from bodycap_batch.model.skeleton_presets import split_side

@@ -1,4 +1,4 @@
-"""The task that recovers the lost frames of a camera, after its poses are final."""
+"""The task that recovers the lost frames of a camera after the poses of its other frames are final."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from bodycap_batch.tasks.registration import save_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
 
 _MEMORY_MB = 900
-"""Memory to reserve, MB: as many keyframes and frames as recovery holds at most, at half a megabyte each."""
+"""Memory to reserve (MB) for a recovery task. Recovery holds a limited number of keyframes and frames in
+memory; each needs half a megabyte."""
 
 
 def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> None:
-    """Recover the camera's lost frames; store all its poses."""
+    """Recover the lost frames of the task's first camera; store all poses of this camera."""
     from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
     from bodycap_batch.model.relative_pose import RigPoses
     from bodycap_batch.registration import RecoveryInputs, RegisteredCamera, recover_lost_frames
@@ -28,7 +29,7 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
     in_rig = (paths[0] / f"{RIG_POSES}.json").exists()
     inputs = RecoveryInputs(
         capture=capture,
-        # A generator loads one registration at a time: the tracks of a long video are most of an artefact.
+        # A generator loads one registration at a time: the tracks of a long video need much memory.
         registrations=(
             RegisteredCamera(camera=camera, registration=load_registration(path))
             for camera, path in zip(capture.cameras, paths, strict=True)

@@ -1,4 +1,4 @@
-"""The stored registrations of all cameras, as later stages use them."""
+"""The stored registrations of all cameras, in the form that later stages use."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from bodycap_batch.model.scene import Map, Trajectory
 
 RIG_POSES = "rig"
-"""Name of the bundle that holds the relative poses of a rig's cameras."""
+"""Name of the file, without suffix, that holds the relative poses of a rig's cameras."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,10 +25,10 @@ class RegisteredCameras:
     """The registrations of all cameras.
 
     Attributes:
-        trajectories: One per camera.
-        clocks: By camera.
-        row_fraction: By camera whose poses are not corrected for its rolling shutter: see
-            `mean_row_fraction`.
+        trajectories: The trajectory of each camera.
+        clocks: The clock of each camera, by camera name.
+        row_fraction: The result of `mean_row_fraction`, by camera name. It holds only the cameras with a
+            known rolling shutter whose poses are not corrected for it.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -37,11 +37,11 @@ class RegisteredCameras:
 
     @staticmethod
     def load(paths: Sequence[Path], maps: Sequence[Map]) -> RegisteredCameras:
-        """Read the registrations.
+        """Read the registrations of all cameras.
 
         Args:
-            paths: One artefact per camera.
-            maps: The maps, which state the cameras whose rolling shutter was corrected.
+            paths: The folder of each camera's registration artefact.
+            maps: The maps. They name the cameras whose rolling shutter was corrected.
         """
         from bodycap_batch.formats.dataclass_files import read_dataclass
         from bodycap_batch.model.camera import Camera
@@ -53,7 +53,7 @@ class RegisteredCameras:
         clocks: dict[str, CameraClock] = {}
         rows: dict[str, FloatArray] = {}
         for path in paths:
-            # One at a time: the tracks of a long video take most of an artefact's memory.
+            # Only one registration is in memory at a time: the tracks of a long video need much memory.
             found = load_registration(path)
             name = found.trajectory.camera
             trajectories.append(found.trajectory)
@@ -65,11 +65,12 @@ class RegisteredCameras:
     def relative_poses(
         self, paths: Sequence[Path], segments: Sequence[Sequence[str]]
     ) -> tuple[RelativePose, ...]:
-        """Return the relative pose of every pair of cameras on one segment.
+        """Return the relative pose of every pair of cameras that are mounted on the same body segment.
 
         Args:
-            paths: The artefacts. Those of a rig hold the relative poses from before the rig was solved.
-            segments: Names of the cameras on each segment that carries several.
+            paths: The folder of each camera's registration artefact. If a rig was solved, its artefacts hold
+                relative poses that were estimated before. These stored poses are preferred.
+            segments: For each body segment with several cameras, the names of these cameras.
         """
         from bodycap_batch.formats.dataclass_files import read_dataclass
         from bodycap_batch.model.relative_pose import RigPoses, estimate_relative_pose

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from bodycap_batch.model.scene import Registration
 
 NOT_ROUNDS = omitted_from_key("rounds")
-"""How often the map may be extended decides which rounds run, not the result of one round."""
+"""Metadata that omits the option `rounds` from the key. The option decides how many rounds run; it does not
+change the result of a round."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,10 +29,11 @@ class RegistrationTask:
 
     Attributes:
         options: The stage's options.
-        capture: The camera.
-        keyframes: The camera's keyframes, by its name.
+        capture: The video of the camera.
+        keyframes: The camera's selected keyframes, by camera name (one entry).
         map: The map.
-        previous: The camera's registration against an earlier round of the map; its tracks are reused.
+        previous: The camera's registration against an earlier round of the map; its tracks are reused. None
+            in the first round.
     """
 
     options: RegistrationOptions = field(metadata=NOT_ROUNDS)
@@ -68,13 +70,13 @@ def save_registration(
     rolling: bool,
     notes: Sequence[str] = (),
 ) -> None:
-    """Store the poses of a camera with what later stages need to know of the camera.
+    """Store the poses of a camera, its clock and its camera model.
 
     Args:
-        found: Poses and observations.
+        found: Poses and observations of the camera.
         camera: The camera.
         files: Folder of the artefact.
-        rolling: Whether its shutter rolls.
+        rolling: True if the camera has a rolling shutter.
         notes: Notes for the user.
     """
     from bodycap_batch.formats.dataclass_files import write_dataclass

@@ -1,4 +1,4 @@
-"""The task that writes the page a person reads."""
+"""The task that writes the report: an HTML page for the user."""
 
 from __future__ import annotations
 
@@ -26,15 +26,16 @@ class ReportTask:
 
     Attributes:
         name: The job's name.
-        failure: The error that stopped the job (``BodycapError.to_dict``) and the stage; None if nothing did.
-        max_gap_s: Gaps between two measurements up to this long were filled.
-        capture: All cameras.
-        keyframes: By camera; empty if the job did not come that far.
-        registrations: By camera; empty if the job did not come that far.
-        map: The map; None if the job did not come that far.
-        merge: The skeleton's motion; None if there is none.
-        export: The results; None if the job did not come that far.
-        body: The body; None without a motion.
+        failure: The error that stopped the job (``BodycapError.to_dict``) and the stage where it occurred;
+            None if the job was not stopped.
+        max_gap_s: Maximum time (seconds) between two measurements that merging filled without a mark.
+        capture: The videos of all cameras.
+        keyframes: The selected keyframes of each camera, by camera name; empty if the stage did not finish.
+        registrations: The registration of each camera, by camera name; empty if the stage did not finish.
+        map: The map; None if mapping did not finish.
+        merge: The skeleton's motion; None if there is no motion.
+        export: The result files; None if the export did not finish.
+        body: The body; None if there is no motion.
     """
 
     name: str
@@ -50,18 +51,18 @@ class ReportTask:
 
 
 def run_report(task: ReportTask, context: StageContext, files: Path) -> None:
-    """Write the page."""
+    """Write the report."""
     from bodycap_batch.report import REPORT_FILE, write_report
 
     write_report(load_inputs(task, context.threads), files / RESULTS_FOLDER / REPORT_FILE, context)
 
 
 def load_inputs(task: ReportTask, threads: int = 0) -> ReportInputs:
-    """Read the stored results of a job, as far as there are any.
+    """Read the stored results of a job; results of stages that did not finish are missing.
 
     Args:
-        task: The results.
-        threads: Threads of each video decoder; 0 lets the decoder choose.
+        task: The report's task, which names the stored results.
+        threads: Number of threads of each video decoder; 0 lets the decoder choose.
     """
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.merge_data import CameraClock
@@ -98,7 +99,10 @@ def _load_merge(merge: ArtefactRef | None) -> MergeResult | None:
 
 
 def _open_capture(task: ReportTask, threads: int) -> Capture | None:
-    """Open the videos; return None if they cannot be read and the job failed, perhaps because of them."""
+    """Open the videos.
+
+    If they cannot be read, return None for a job that failed: the videos may be the cause. Otherwise raise.
+    """
     from bodycap_batch.core.errors import CaptureError
 
     try:

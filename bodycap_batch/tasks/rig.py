@@ -1,4 +1,4 @@
-"""The task that solves a camera's frames together with those of the other cameras on its segment."""
+"""The task that solves a camera's frames together with the other cameras on the same body segment."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 
 def run_rig(task: CameraGroupTask, context: StageContext, files: Path) -> None:
-    """Solve the camera's frames within the rig; store their poses and those of the rig."""
+    """Solve the frames of the task's first camera from what all cameras of the rig observe.
+
+    The artefact holds the camera's poses and the relative poses of the rig's cameras.
+    """
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.model.relative_pose import RigPoses, not_rigid_note
     from bodycap_batch.registration import RegisteredCamera, register_in_rig

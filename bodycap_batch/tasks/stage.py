@@ -15,28 +15,28 @@ SUMMARY = "summary.json"
 CAPTURE_FOLDER = "capture"
 """Folder of a synth artefact that holds the videos and the ground truth."""
 RESULTS_FOLDER = "results"
-"""Folder of an artefact that holds the files meant for the user."""
+"""Folder of an artefact that holds the result files for the user."""
 VISION_LIBRARIES = ("numpy", "av", "opencv-python-headless|opencv-python")
-"""Distributions of a stage that decodes and processes images."""
+"""Python distributions that a stage needs to decode and process images."""
 VISION_MODULES = ("bodycap_batch.capture", "bodycap_batch.config.models", "cv2", "av")
-"""Modules that such a stage loads."""
+"""Modules that a stage loads to decode and process images."""
 TaskT = TypeVar("TaskT")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stage(Generic[TaskT]):
-    """A stage, and how the runner treats its tasks.
+    """A stage, and what the runner needs to know to run its tasks.
 
     Attributes:
         name: Stage name.
         task: The dataclass that describes one task of the stage.
-        function: Called in the child with the task, the context and the folder that becomes the artefact.
-            Its module, with all that this imports from the package, is the stage's algorithm: a digest of
-            their code is part of the store's keys.
-        libraries: Distributions that the result depends on (``a|b``: either of them).
-        modules: Modules that take long to load; a child may load them ahead.
-        memory_mb: Memory to reserve for one task. It keeps two large tasks from running together on a small
-            machine.
+        function: Called in the child with the task, the context and the folder that becomes the artefact. The
+            function's module and all modules that it imports from this package are the stage's algorithm. A
+            digest of their code is part of the store's keys.
+        libraries: Python distributions that the result depends on (``a|b``: a or b).
+        modules: Modules that take long to load. A child process may load them before it gets a task.
+        memory_mb: Memory (MB) to reserve for one task. Two large tasks therefore do not run at the same time
+            on a small machine.
     """
 
     name: str
@@ -48,19 +48,25 @@ class Stage(Generic[TaskT]):
 
     @property
     def module(self) -> str:
-        """Module of the stage's task, below this package."""
+        """Name of the module with the stage's task, relative to this package (``tasks.keyframes``)."""
         return self.function.__module__.partition(".")[2]
 
     def run(self, arguments: Mapping[str, Any], context: StageContext, files: Path) -> None:
-        """Run a task whose arguments come from `to_json`; `files` is the folder that becomes the artefact."""
+        """Run a task.
+
+        Args:
+            arguments: The task as JSON values, from `to_json`.
+            context: The stage's context.
+            files: The folder that becomes the artefact.
+        """
         self.function(from_json(self.task, arguments), context, files)
 
 
 def read_summary(artefact: Path) -> dict[str, Any]:
-    """Read the figures of an artefact that decide which task follows."""
+    """Read the summary of an artefact: the numbers and notes that the pipeline uses to continue the job."""
     return dict(json.loads((artefact / SUMMARY).read_text(encoding="utf-8")))
 
 
 def write_summary(files: Path, **values: Any) -> None:
-    """Write the figures of an artefact that decide which task follows."""
+    """Write the summary of an artefact: the numbers and notes that the pipeline uses to continue the job."""
     (files / SUMMARY).write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")

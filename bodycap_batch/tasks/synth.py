@@ -18,8 +18,8 @@ class SynthTask:
 
     Attributes:
         options: The renderer's options.
-        motion: The BVH file that the options name, if any.
-        motion_name: Name of that file, which is written to the ground truth.
+        motion: The BVH file that the options name; None if they name no file.
+        motion_name: Name of this BVH file, which is written to the ground truth; None without a file.
     """
 
     options: SynthOptions = field(metadata=omitted_from_key("motion"))
@@ -28,7 +28,7 @@ class SynthTask:
 
 
 def run_synth(task: SynthTask, context: StageContext, files: Path) -> None:
-    """Render the capture."""
+    """Render the synthetic capture and store it."""
     from bodycap_batch.synthetic import synthesise
 
     synthesise(task.options, files / CAPTURE_FOLDER, context)

@@ -1,8 +1,8 @@
-"""Task dataclasses as JSON, and the part of them that identifies a result in the store.
+"""Convert task dataclasses to JSON, and select the part of a task that identifies its result in the store.
 
 The pipeline writes a task with `to_json` and keys its artefact with `key_inputs` and `key_options`. The child
-process reads the task back with `from_json`. Fields may be dataclasses, pydantic models, paths, JSON values,
-and mappings, tuples and options of these.
+process reads the task back with `from_json`. A field may be a dataclass, a pydantic model, a path or a JSON
+value. It may also be a mapping or tuple of these, or optional (``X | None``).
 """
 
 from __future__ import annotations
@@ -28,39 +28,39 @@ from pydantic import BaseModel
 
 _Loaded = TypeVar("_Loaded")
 _OPTIONS = "options"
-"""Name of the field that holds a stage's options; the store's key has a part of its own for it."""
+"""Name of the field that holds a stage's options; the store's key has a separate part for the options."""
 _OMITTED = "omitted from the key"
 
 
 @runtime_checkable
 class Reference(Protocol):
-    """A value that names content by its path; in the key only the content counts."""
+    """A value that names content by its path; the key contains only the digest of the content."""
 
     def key_content(self) -> Any:
         """Return the digests that identify the content."""
 
 
 def omitted_from_key(*names: str) -> Mapping[str, Any]:
-    """Return metadata for a dataclass field that does not count in the key, or of which some names do not.
+    """Return metadata for a dataclass field that is omitted from the key, entirely or in part.
 
     Args:
-        names: Names inside the field's value; without any, the whole field is omitted.
+        names: Names inside the field's value that are omitted; without names, the whole field is omitted.
     """
     return {_OMITTED: names}
 
 
 def to_json(value: Any) -> Any:
-    """Return a value of a task as plain JSON values, paths included."""
+    """Return a task, or a part of a task, as plain JSON values; paths become strings."""
     return _plain(value, lambda reference: _fields(reference, to_json))
 
 
 def from_json(kind: type[_Loaded], data: Any) -> _Loaded:
-    """Rebuild a task from `to_json`."""
+    """Rebuild a task from the JSON values that `to_json` returned."""
     return cast(_Loaded, _typed(kind, data))
 
 
 def key_inputs(task: Any) -> dict[str, Any]:
-    """Return the inputs of a task as its artefact's key holds them: digests instead of paths."""
+    """Return the inputs of a task in the form of the artefact's key: with digests instead of paths."""
     return {
         field.name: _without(_keyed(getattr(task, field.name)), field)
         for field in dataclasses.fields(task)
@@ -69,7 +69,7 @@ def key_inputs(task: Any) -> dict[str, Any]:
 
 
 def key_options(task: Any) -> dict[str, Any]:
-    """Return the options of a task as its artefact's key holds them; empty for a stage without options."""
+    """Return the options of a task in the form of the artefact's key; empty for a stage without options."""
     for field in dataclasses.fields(task):
         if field.name == _OPTIONS:
             return dict(_without(to_json(task.options), field))
@@ -86,7 +86,7 @@ def _without(value: Any, field: dataclasses.Field[Any]) -> Any:
 
 
 def _plain(value: Any, describe: Callable[[Any], Any]) -> Any:
-    """Turn a value into JSON values; `describe` gives those of a `Reference`."""
+    """Convert a value to JSON values; `describe` returns the JSON values of a `Reference`."""
 
     def plain(part: Any) -> Any:
         return _plain(part, describe)
@@ -109,7 +109,7 @@ def _fields(value: Any, plain: Callable[[Any], Any]) -> dict[str, Any]:
 
 
 def _typed(kind: Any, data: Any) -> Any:
-    """Rebuild a value of an annotated type from JSON values."""
+    """Rebuild a value from JSON values, given the annotated type of the value."""
     if (origin := get_origin(kind)) is not None:
         return _generic(origin, get_args(kind), data)
     if kind is Path:
