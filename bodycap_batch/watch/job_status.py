@@ -89,7 +89,7 @@ class JobStatusFile:
         """Record one event of the job."""
         with self._lock:
             _apply_event(self.document, event)
-            if event.kind != "note" and not self._failed:  # keep the failed stage: a report may follow
+            if event.kind != "note" and not self._failed:  # keep the failed stage, even if a report follows
                 self.document.update(stage=event.stage, camera=event.camera)
                 self._failed = event.kind == "failed"
             if event.kind != "progress":

@@ -101,7 +101,7 @@ class Spool:
         return self.root / FAILED
 
     def make(self) -> None:
-        """Create the folders, and test that a folder can be renamed from the inbox to each of the others.
+        """Create the folders, and test that renaming can move a folder through all of them.
 
         Raises:
             StoreError: A folder cannot be created or written, or the folders are on different file systems.

@@ -80,7 +80,7 @@ class WatcherStatusFile:
             write_atomically(self._path, (json.dumps(document, indent=1) + "\n").encode())
 
     def remove(self) -> None:
-        """Remove the file of this watcher, and the files of watchers that have ended or are silent too long."""
+        """Remove the file of this watcher, and the files of watchers that are no longer active."""
         with contextlib.suppress(OSError):
             self._path.unlink(missing_ok=True)
             for path in self._path.parent.glob(f"{_PREFIX}*{_SUFFIX}"):
