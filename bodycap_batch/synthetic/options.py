@@ -129,7 +129,10 @@ class SynthOptions(Options):
             raise ValueError("gap_frames: shortest first, one frame or more")
 
     def _check_pressed(self) -> None:
-        """Check that only hands of the built-in walker are held against the chest, and that it is rendered."""
+        """Check that only hands of the built-in walker are held against the chest.
+
+        The body must be rendered in this case.
+        """
         for name, (start_s, end_s) in self.pressed_s.items():
             place = mount_of(name)
             if name not in self.cameras or place is None or not place[1].endswith("Hand"):
@@ -159,7 +162,10 @@ class SynthOptions(Options):
 
 
 def _default_lens_params(model: str, width: int, height: int) -> tuple[float, ...]:
-    """Return the parameters of the default lens. It has a usual angle of view and, except FOV, no distortion."""
+    """Return the parameters of the default lens for a camera model.
+
+    The lens has a usual angle of view. It has no distortion, except for the model FOV.
+    """
     focal = width * _DEFAULT_FOCAL_PX / 640.0
     has_one_focal = model in (
         "SIMPLE_PINHOLE",

@@ -131,8 +131,8 @@ def find_press(mount: Mount, skeleton: SkeletonModel, start_s: float, end_s: flo
     Args:
         mount: True mount of the camera on the hand.
         skeleton: Skeleton with the true proportions.
-        start_s: Time at which the camera is at the chest, seconds.
-        end_s: Time at which it leaves, seconds.
+        start_s: Common time (seconds) at which the camera arrives at the chest.
+        end_s: Common time (seconds) at which the camera leaves the chest.
     """
     side = mount.role.removesuffix("Hand")
     bone = skeleton.offsets_m[skeleton.joints.index("Neck")]
