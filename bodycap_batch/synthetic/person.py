@@ -1,4 +1,4 @@
-"""Draw the person who wears the cameras at random.
+"""Draw a random person who wears the cameras.
 
 The true proportions, posture and mounts differ from the nominal values.
 """
@@ -97,7 +97,7 @@ def draw_posture(spread: float, rng: np.random.Generator) -> dict[str, float]:
     The left and the right arm are drawn independently.
 
     Args:
-        spread: Factor by which the standard deviation between people is multiplied.
+        spread: Multiplier of the standard deviation between people.
         rng: Source of randomness.
 
     Returns:

@@ -72,8 +72,7 @@ class ArmAngles:
         if np.any(self.spin):
             arm = arm * _rotation_about("X", walk_weight * self.spin)
         # Pronation rotates the forearm about its bone, so that the thumb moves from the front to the body.
-        # The
-        # rotation is positive on the left side.
+        # It is a positive rotation about X on both sides. The left bone points along +X, the right along -X.
         forearm = _rotation_about("Z", -outward * walk_weight * self.elbow) * _rotation_about(
             "X", walk_weight * self.pronation
         )

@@ -44,7 +44,7 @@ class Triangles:
             metre.
         plane: (F,) number of the textured plane of each triangle. Adjacent triangles in one plane with one
             texture have equal numbers.
-        surface: (F,) number of the surface to which each triangle belongs.
+        surface: (F,) number of the surface that holds each triangle.
         gain: (F,) brightness factor of each triangle.
     """
 
@@ -298,7 +298,7 @@ class SceneRenderer:
         return colours
 
     def _edges(self, faces: IntArray) -> npt.NDArray[np.bool_]:
-        """Return a mask (H,W): True for a pixel with a horizontal or vertical neighbour on another surface."""
+        """Return a mask (H,W): True for a pixel with a direct neighbour on another surface."""
         owner = np.append(self._triangles.surface, NOTHING)[faces]
         edge = np.zeros(owner.shape, dtype=bool)
         across, along = owner[:, 1:] != owner[:, :-1], owner[1:] != owner[:-1]

@@ -22,7 +22,7 @@ _PICTURE_DETAIL = 1.3
 """
 _EDGE_M = 0.06
 """Minimum width (metres) of a face with its material's texture. A narrower face, such as the edge of a board,
-looks painted."""
+gets a texture of painted metal."""
 _MAX_TEXELS = 6000
 """Maximum length (texels) of the longer side of a texture. It limits the memory."""
 HEIGHT_M = 2.8
@@ -62,7 +62,7 @@ class _Builder:
         Args:
             size_m: Width and height of the rectangle, metres.
             texture: Function that draws the texture.
-            detail: Factor by which the texture detail is multiplied.
+            detail: Multiplier of the texture detail.
         """
         scale = min(self.texels_per_m * detail, _MAX_TEXELS / max(size_m))
         width, height = (max(8, round(side * scale)) for side in size_m)

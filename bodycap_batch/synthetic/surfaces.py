@@ -34,7 +34,7 @@ class Surface:
 
     @property
     def normal(self) -> FloatArray:
-        """Unit normal (3,) on the side from which the image does not look mirrored."""
+        """Unit normal (3,) on the front side, where the image does not look mirrored."""
         normal = np.cross(self.down, self.across)
         return np.asarray(normal / np.linalg.norm(normal))
 

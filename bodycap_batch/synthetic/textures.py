@@ -43,8 +43,8 @@ def fractal(height: int, width: int, cell: float, rng: np.random.Generator, octa
         width: Width of the noise image, texels.
         cell: Size of the largest features, texels.
         rng: Source of randomness.
-        octaves: Number of noise images that are added. Each has features of half the size, with half the
-            amplitude.
+        octaves: Number of noise images that are added. Each image has half the feature size and half the
+            amplitude of the previous image.
     """
     out = np.zeros((height, width), np.float32)
     for octave in range(octaves):

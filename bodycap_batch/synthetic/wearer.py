@@ -40,8 +40,8 @@ _CAP_RINGS = 3
 _TEXELS_PER_M = 300.0
 """Detail (texels per metre) of the body's textures."""
 _CLEARANCE_M = 0.02
-"""Maximum distance (metres) between a limb's surface and a camera outside the limb that is still treated as
-inside the limb."""
+"""Maximum distance (metres) of a camera from a limb's surface. A camera that is outside the limb, but within
+this distance, is treated as inside the limb."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

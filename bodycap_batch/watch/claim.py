@@ -142,9 +142,9 @@ def remove_claim_files(job: JobDir) -> None:
 class HeartbeatMonitor:
     """Watch the heartbeats of other watchers.
 
-    A job counts as abandoned if its `owner.json` has not changed for `stale_s` by this process's own clock.
-    Clocks of different machines are never compared. A job counts as abandoned at once in two cases: the owner
-    released it, or the owner was a process of this machine that has ended.
+    A job is treated as abandoned if its `owner.json` has not changed for `stale_s` by this process's own
+    clock. Clocks of different machines are never compared. A job is treated as abandoned at once in two
+    cases: the owner released it, or the owner was a process of this machine that has ended.
 
     Args:
         stale_s: Minimum time (seconds) without a heartbeat before a job may be taken over.
@@ -158,7 +158,7 @@ class HeartbeatMonitor:
         self._seen: dict[Path, tuple[tuple[int, str], float]] = {}
 
     def find_abandoned(self, jobs: list[JobDir]) -> list[JobDir]:
-        """Return those of the given jobs that may be taken over."""
+        """Return the abandoned jobs in a list of jobs. These jobs may be taken over."""
         now = self._clock()
         before, self._seen = self._seen, {}
         abandoned = []

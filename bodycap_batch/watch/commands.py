@@ -203,7 +203,7 @@ def _request_cancel(spool: Spool, name: str) -> JobDir | None:
 
 
 def _dropped_names(job_dir: JobDir) -> tuple[str, ...]:
-    """Return the names by which users may know a job: its name in the inbox with and without the suffix."""
+    """Return the names of a job for users: its former name in the inbox with and without the suffix."""
     dropped = str(read_status(job_dir).get("dropped", ""))
     return dropped, Path(dropped).stem
 

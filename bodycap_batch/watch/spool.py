@@ -78,7 +78,7 @@ class Spool:
     """The four folders of a watcher. Jobs move between the folders by renaming.
 
     Attributes:
-        inbox: Folder into which users drop folders and job files.
+        inbox: Folder where users drop folders and job files.
         root: Parent folder of `running`, `done` and `failed`.
     """
 
