@@ -1,4 +1,4 @@
-"""A person with body cameras in a textured room: videos and their exact ground truth."""
+"""Synthetic captures of a person with body cameras in a textured room: videos with exact ground truth."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ def synthesise(
 ) -> None:
     """Write a synthetic capture.
 
-    The folder holds ``<camera>.mp4`` (or ``poses/<camera>.tum``), ``calib.json``, ``skeleton.bvh`` (the true
-    proportions) and the truth in ``gt/``: ``<camera>.tum``, ``joints.npz``, ``motion.bvh``, ``mounts.json``,
-    explained in ``gt/README.txt``. Mounts and proportions differ from those that the camera names and the
-    stature suggest; only ``gt/`` and ``skeleton.bvh`` hold the true ones. The same options give the same
-    files.
+    The folder holds ``<camera>.mp4`` (or ``poses/<camera>.tum``), ``calib.json``, ``skeleton.bvh`` with the
+    true proportions, and the ground truth in ``gt/``: ``<camera>.tum``, ``joints.npz``, ``motion.bvh`` and
+    ``mounts.json``. The file ``gt/README.txt`` explains the ground truth. The true mounts differ from the
+    nominal mounts of the camera names, and the true proportions differ from the nominal proportions of the
+    stature. Only ``gt/`` and ``skeleton.bvh`` hold the true values. Equal options give equal files.
 
     Args:
         options: The options of the capture.
-        out_dir: A folder that does not exist or is empty. It is written completely or not at all.
-        context: Threads, progress, cancellation.
-        overwrite: Replace an earlier synthetic capture there.
+        out_dir: Path of the folder to write. It must not exist, or must be empty. The folder is written
+            completely or not at all.
+        context: Number of threads, progress reports and cancellation.
+        overwrite: True: replace an earlier synthetic capture in `out_dir`.
 
     Raises:
-        JobError: The folder is not empty, or the BVH file cannot be used.
-        StoreError: The disk refuses a file.
+        JobError: The folder must not be overwritten, or the BVH file cannot be used.
+        StoreError: A file cannot be written to the disk.
         Cancelled: The work was cancelled.
     """
     from bodycap_batch.synthetic.making import write_synthetic_capture

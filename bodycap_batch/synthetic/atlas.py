@@ -1,4 +1,4 @@
-"""All textures in one image pyramid, and filtered look-ups in it."""
+"""One image pyramid that holds all textures, and filtered look-ups in this pyramid."""
 
 from __future__ import annotations
 
@@ -12,33 +12,37 @@ import numpy.typing as npt
 from bodycap_batch.core.arrays import FloatArray
 
 _OCTAVES = 5
-"""Levels of the pyramid above the full size."""
+"""Number of pyramid levels in addition to the full size. Each level has half the size of the previous level.
+"""
 _STEPS = 2
-"""Degrees of blur for each octave: a pyramid level, and the mean of two levels."""
+"""Number of degrees of blur per octave. The two degrees are a pyramid level, and the mean of this level and
+the next level."""
 _BORDER = 2**_OCTAVES
-"""Texels around an image: one texel of the coarsest level. Images lie at multiples of it, so that no texel of
-the coarsest level mixes two images."""
+"""Width (texels of level 0) of the border around an image: one texel of the coarsest level. Image positions
+are multiples of this width, so that a texel of the coarsest level never mixes two images."""
 _BATCH_COLUMNS = 1024
-"""Width of the image in which look-ups are given to cv2.remap, which refuses more than 32,767 rows."""
+"""Number of columns of the array in which look-ups are passed to cv2.remap. cv2.remap refuses arrays with
+more than 32,767 rows, so one long column is not possible."""
 _MAX_TAPS = 6
-"""Look-ups for a pixel at most; limits time."""
+"""Maximum number of look-ups for a pixel. It limits the rendering time."""
 _FOOTPRINT_SCALE = np.float32(1.4)
-"""Size of a pixel's footprint relative to the pixel, because lens and sensor blur a little. Without it, sharp
-edges shift by up to 0.1 px."""
+"""Ratio of the size of a pixel's footprint to the size of the pixel. It is larger than 1 because lens and
+sensor blur slightly. With a ratio of 1, sharp edges would shift by up to 0.1 px."""
 
 Float32 = npt.NDArray[np.float32]
 """An array of float32."""
 Bytes = npt.NDArray[np.uint8]
-"""An array of uint8: an image or a part of it."""
+"""An array of uint8: an image or a part of an image."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filter:
-    """How to average the texture under each of N pixels.
+    """How to average the texture over the footprint of each of N pixels.
 
     Attributes:
-        kind: (N,) 16 · degree of blur (half octaves) + number of look-ups.
-        along: (2,N) longer axis of the footprint, texels of level 0; look-ups are spaced along it.
+        kind: (N,) code of the filter: 16 · degree of blur (half octaves) + number of look-ups.
+        along: (2,N) longer axis of the footprint as a vector, texels of level 0. The look-ups are distributed
+            along this axis.
     """
 
     kind: Bytes
@@ -49,11 +53,11 @@ class Atlas:
     """An image pyramid that holds all textures.
 
     Args:
-        images: RGB images. Each is surrounded by copies of its edge, so that filtering never mixes two
-            images.
+        images: RGB images (H,W,3). Each image is surrounded by copies of its edge pixels, so that filtering
+            never mixes two images.
 
     Attributes:
-        origins: (N,2) texel (x, y) of each image's top left corner at level 0.
+        origins: (N,2) texel coordinates (x, y) of each image's top left corner at level 0.
     """
 
     def __init__(self, images: Sequence[Bytes]) -> None:
@@ -66,22 +70,24 @@ class Atlas:
                 image, _BORDER, bottom, _BORDER, right, cv2.BORDER_REPLICATE
             )
         self.origins: FloatArray = np.array(origins, dtype=np.float64) + _BORDER
-        # Each level is half of the last one. Any other ratio shifts sharp edges by a fraction of a texel.
+        # Each level has half the size of the previous level. Other ratios shift sharp edges by a part of a
+        # texel.
         self._levels = [base]
         for _ in range(_OCTAVES):
             half = self._levels[-1].shape[1] // 2, self._levels[-1].shape[0] // 2
             self._levels.append(cv2.resize(self._levels[-1], half, interpolation=cv2.INTER_AREA))
 
     def sample(self, at: Float32, filters: Filter, cell: npt.NDArray[np.int64] | None = None) -> Bytes:
-        """Return the average of the texture under N pixels.
+        """Return the average of the texture over the footprints of N pixels.
 
         Args:
-            at: (2,N) texel coordinates (x, y) at level 0; the first texel's centre is (0.5, 0.5).
-            filters: Filters of the pixels, or of cells of pixels.
-            cell: (N,) index of each pixel's filter; None if each pixel has its own.
+            at: (2,N) texel coordinates (x, y) of the pixels at level 0. The centre of the first texel is
+                (0.5, 0.5).
+            filters: Filters of single pixels, or of cells of pixels that share a filter.
+            cell: (N,) index of each pixel's filter; None if pixel number i uses filter number i.
 
         Returns:
-            (N,3) RGB.
+            (N,3) RGB colours of the pixels.
         """
         kinds = filters.kind if cell is None else filters.kind[cell]
         out = np.empty((at.shape[1], 3), np.uint8)
@@ -96,7 +102,7 @@ class Atlas:
         return out
 
     def _look_up(self, batch: list[Float32], degree: int, taps: int) -> Bytes:
-        """Return the mean of `taps` look-ups along the footprint's longer axis, in one level or in two."""
+        """Return the mean of `taps` look-ups along the footprint's longer axis, in one or two levels."""
         levels = range(degree // _STEPS, degree // _STEPS + 1 + degree % _STEPS)
         if taps == 1 and len(levels) == 1:
             return np.asarray(self._bilinear(levels[0], batch[0], batch[1]).reshape(-1, 3))
@@ -109,7 +115,7 @@ class Atlas:
         return np.asarray(cv2.convertScaleAbs(total, alpha=1.0 / (taps * len(levels))).reshape(-1, 3))
 
     def _bilinear(self, level: int, x: Float32, y: Float32) -> Bytes:
-        """Return the bilinear look-ups in one level at texel coordinates of level 0."""
+        """Return bilinear look-ups in one pyramid level. The coordinates are texels of level 0."""
         scale, half = np.float32(0.5**level), np.float32(0.5)
         position = x * scale - half, y * scale - half
         found = cv2.remap(self._levels[level], *position, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -122,7 +128,8 @@ def select_filter(footprint: Float32) -> Filter:
     Elongated footprints are averaged from several look-ups along their longer axis.
 
     Args:
-        footprint: (4,N) derivatives of the texel coordinates x and y: one pixel to the right, then down.
+        footprint: (4,N) derivatives of the texel coordinates: of x and y with respect to a step of one pixel
+            to the right, then of x and y with respect to a step of one pixel down.
 
     Source:
         McCormack et al., "Feline: fast elliptical lines for anisotropic texture mapping", 1999.
@@ -136,31 +143,36 @@ def select_filter(footprint: Float32) -> Filter:
 
 
 def _as_batch(values: Float32) -> Float32:
-    """Return values (N,) as an image for cv2.remap, padded with zeros."""
+    """Return values (N,) as a two-dimensional array for cv2.remap, padded with zeros at the end."""
     out = np.zeros(-(-len(values) // _BATCH_COLUMNS) * _BATCH_COLUMNS, np.float32)
     out[: len(values)] = values
     return out.reshape(-1, _BATCH_COLUMNS)
 
 
 def _ellipse_axes(footprint: Float32) -> tuple[Float32, Float32, Float32]:
-    """Return the longer axis (2,N) as a vector and the lengths (N,) of both axes, of footprints (4,N)."""
+    """Return the axes of elliptical footprints (4,N).
+
+    Returns:
+        The longer axis (2,N) as a vector, its length (N,), and the length (N,) of the shorter axis.
+    """
     a, b, c, d = footprint
-    # The matrix of the ellipse is F' F. Its eigenvalues are the squared lengths of the axes.
+    # F has the rows (a, b) and (c, d). The matrix of the ellipse is F' F. Its eigenvalues are the squared
+    # lengths of the axes.
     xx, yy, xy = a * a + c * c, b * b + d * d, a * b + c * d
     mean, half = np.float32(0.5) * (xx + yy), np.float32(0.5) * (xx - yy)
     spread = np.sqrt(half * half + xy * xy)
     major, minor = np.sqrt(mean + spread), np.sqrt(np.maximum(mean - spread, 0))
-    # The eigenvector of the larger eigenvalue, from the half-angle formulas.
+    # The half-angle formulas give the eigenvector of the larger eigenvalue.
     ratio = half / np.maximum(spread, np.float32(1e-12))
     cosine, sine = np.sqrt(np.maximum((1 + ratio) / 2, 0)), np.sqrt(np.maximum((1 - ratio) / 2, 0))
     return np.stack([major * cosine, major * np.copysign(sine, xy)]), major, minor
 
 
 def _pack_on_shelves(sizes: Sequence[tuple[int, ...]]) -> tuple[list[tuple[int, int]], int, int]:
-    """Pack rectangles (height, width) in rows, the tallest first.
+    """Pack rectangles (height, width) in rows. The tallest rectangles come first.
 
     Returns:
-        Origin (x, y) of each rectangle; width and height of the whole.
+        The origin (x, y) of each rectangle, and the width and height of the area that holds all rectangles.
     """
     area = sum(tall * wide for tall, wide in sizes)
     width = max(*(wide for _, wide in sizes), -(-int(np.sqrt(area)) // _BORDER) * _BORDER)

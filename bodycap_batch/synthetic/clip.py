@@ -1,4 +1,4 @@
-"""A motion from a BVH file, interpolated at any time."""
+"""A motion from a BVH file that can be evaluated at any time."""
 
 from __future__ import annotations
 
@@ -14,13 +14,16 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel, forward_kinemati
 
 
 class Clip:
-    """A motion interpolated between its frames (slerp and linear), constant beyond both ends.
+    """A recorded motion that is interpolated between its frames.
+
+    Rotations are interpolated by slerp, positions linearly. The pose is constant before and after the
+    recording.
 
     Args:
         motion: The recorded motion.
-        start_s: Its time at which the capture's clock reads zero, seconds.
-        length_s: Duration of the capture, seconds. This part of the motion is moved to the room's middle, its
-            lowest joint to the floor.
+        start_s: Time (seconds) in the recording at which the capture's common clock is zero.
+        length_s: Duration of the capture, seconds. The motion is moved so that the path of the root in this
+            time is centred in the room, and the lowest joint is on the floor.
     """
 
     def __init__(self, motion: Motion, start_s: float, length_s: float) -> None:
@@ -36,7 +39,7 @@ class Clip:
         self._local[:, 0, :3, 3] = motion.root_in_world_m - middle
 
     def pose(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return root positions (T,3) in the world (m) and local rotations (T,J,3,3) at times (T,)."""
+        """Return root positions (T,3) in the world (m) and local rotations (T,J,3,3) at common times (T,)."""
         frame = np.clip((t_s + self._start_s) * self._fps, 0, len(self._local) - 1)
         before = np.minimum(frame.astype(np.int64), max(len(self._local) - 2, 0))
         after = np.minimum(before + 1, len(self._local) - 1)
@@ -47,6 +50,11 @@ class Clip:
 
 def load_clip(path: Path, start_s: float, length_s: float) -> Clip:
     """Read a BVH file as the motion of a capture.
+
+    Args:
+        path: Path of the BVH file.
+        start_s: Time (seconds) in the recording at which the capture's common clock is zero.
+        length_s: Duration of the capture, seconds.
 
     Raises:
         JobError: The file cannot be read, holds no motion, or is too short.

@@ -1,4 +1,4 @@
-"""Render what each camera records: poses over time, exposure, rolling shutter, noise."""
+"""Render the frames of each camera with exposure, rolling shutter and noise."""
 
 from __future__ import annotations
 
@@ -17,52 +17,56 @@ from bodycap_batch.synthetic.render import SceneRenderer, Triangles, concatenate
 from bodycap_batch.synthetic.wearer import Wearer
 
 _BLUR_STEP_PX = 1.0
-"""Image motion between two sub-frames of a blurred frame, px."""
+"""Maximum image motion (px) between two sub-frames. A frame with motion blur is the mean of its sub-frames.
+"""
 _MAX_BLUR_STEPS = 24
-"""Sub-frames of a blurred frame at most; limits time."""
+"""Maximum number of sub-frames of a blurred frame. It limits the rendering time."""
 _USUAL_DISTANCE_M = 0.5
-"""Distance of near objects, metres, that the number of sub-frames is for."""
+"""Assumed distance (metres) of near objects. It converts a shift of the camera into image motion, which
+determines the number of sub-frames."""
 _NOISE_SURPLUS = 1 << 21
-"""Random numbers beyond one image's: each frame starts at another one of them."""
+"""Number of random values in addition to the values of one image. The noise of each frame starts at a random
+position within this surplus."""
 _SHUTTER_BANDS = 16
-"""Bands of rows of a rolling-shutter image; within each the wearer's body is at rest."""
+"""Maximum number of bands of rows in a rolling-shutter image. The wearer's body does not move within a band.
+"""
 
 
 class MovingBody(Protocol):
-    """A moving body."""
+    """A body that moves: its skeleton, and its pose at any time."""
 
     skeleton: SkeletonModel
 
     def pose(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return root positions (T,3) in the world (m) and local rotations (T,J,3,3) at times (T,)."""
+        """Return root positions (T,3) in the world (m) and local rotations (T,J,3,3) at common times (T,)."""
         ...
 
 
 def joint_poses_at(motion: MovingBody, t_s: FloatArray) -> FloatArray:
-    """Return world_from_joint (T,J,4,4) of all joints at common times (T,) in seconds."""
+    """Return the poses world_from_joint (T,J,4,4) of all joints at common times (T,) in seconds."""
     return forward_kinematics(motion.skeleton, *motion.pose(np.asarray(t_s, dtype=np.float64)))
 
 
 def camera_poses_at(motion: MovingBody, mount: Mount, t_s: FloatArray) -> FloatArray:
-    """Return world_from_cam (T,4,4) at common times (T,) in seconds."""
+    """Return the poses world_from_cam (T,4,4) of a mounted camera at common times (T,) in seconds."""
     joint = motion.skeleton.index_of_role(mount.role)
     return np.asarray(joint_poses_at(motion, t_s)[:, joint] @ mount.joint_from_cam)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraRenderer:
-    """Renders the frames of a camera on a moving body in a room.
+    """Renderer of the frames of a camera on a moving body in a room.
 
     Attributes:
         motion: The moving body.
         mount: True mount of the camera.
-        grid: Viewing rays of its lens.
-        room: The room's triangles.
-        atlas: All textures.
-        scene: Renders the room without the wearer.
-        wearer: The body's surface; None if it is not rendered.
+        grid: Viewing rays of the camera's lens.
+        room: Triangles of the room.
+        atlas: Atlas of all textures.
+        scene: Renderer of the room without the wearer.
+        wearer: Surface of the body; None if the body is not rendered.
         exposure_s: Exposure time, seconds.
-        rolling_shutter_s: Time from the first row to the last, seconds.
+        rolling_shutter_s: Time (seconds) between the exposures of the first and the last row.
     """
 
     motion: MovingBody
@@ -76,7 +80,7 @@ class CameraRenderer:
     rolling_shutter_s: float
 
     def render(self, t_s: float) -> Bytes:
-        """Return the image (H,W,3) without noise, with its exposure centred on a common time."""
+        """Return the image (H,W,3) without noise. The exposure is centred on a common time (seconds)."""
         steps = self._blur_steps(t_s)
         shifts = self.exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
         if steps == 1:
@@ -87,7 +91,7 @@ class CameraRenderer:
         return np.asarray(cv2.convertScaleAbs(total, alpha=1.0 / steps))
 
     def _instant(self, t_s: float) -> Bytes:
-        """Return an image without motion blur."""
+        """Return the image (H,W,3) at a common time (seconds) without motion blur."""
         height = self.grid.in_cam.shape[0]
         if self.rolling_shutter_s == 0.0:
             pose = camera_poses_at(self.motion, self.mount, np.array([t_s]))
@@ -101,14 +105,14 @@ class CameraRenderer:
         return np.concatenate(parts)
 
     def _scene_at(self, t_s: float) -> SceneRenderer:
-        """Return a renderer of the room with the wearer at a common time."""
+        """Return a renderer of the room with the wearer's body at a common time (seconds)."""
         if self.wearer is None:
             return self.scene
         joints = joint_poses_at(self.motion, np.array([t_s]))[0]
         return SceneRenderer(concatenate_triangles(self.room, self.wearer.at(joints)), self.atlas)
 
     def _blur_steps(self, t_s: float) -> int:
-        """Return the number of sub-frames for a blur without visible steps."""
+        """Return the number of sub-frames that gives a motion blur without visible steps."""
         if self.exposure_s == 0.0:
             return 1
         half = self.exposure_s / 2
@@ -121,12 +125,13 @@ class CameraRenderer:
 
 
 class Sensor:
-    """Converts ideal images into recorded ones: white balance, shot and read noise, 8 bits.
+    """Sensor that converts ideal images into recorded images with white balance and noise, in 8 bits.
 
     Args:
-        noise: Standard deviation at mid grey, grey levels; half of its variance does not depend on the light.
-        size: Number of values of one image.
-        seed: Source of white balance and noise.
+        noise: Standard deviation (grey levels) of the noise at mid grey. Half of the variance at mid grey is
+            read noise, which does not depend on the light; the other half is shot noise.
+        size: Number of values of one image: height · width · 3.
+        seed: Seed of white balance and noise.
     """
 
     def __init__(self, noise: float, size: int, seed: np.random.SeedSequence) -> None:
@@ -135,11 +140,14 @@ class Sensor:
         gain = rng.uniform(0.94, 1.06, 3)
         self._mean = (np.arange(256)[:, None] * gain)[None].astype(np.float32)
         self._sigma = (noise * np.sqrt(0.5 + self._mean * (0.5 / 128.0))).astype(np.float32)
-        # To draw a million numbers for a frame takes as long as to render it. Frames take parts of one array.
+        # Drawing a million numbers for each frame takes as long as rendering. So frames share one array.
         self._normal = rng.standard_normal(size + _NOISE_SURPLUS if noise > 0 else 0, dtype=np.float32)
 
     def record(self, image: Bytes, frame: int) -> Bytes:
-        """Return an ideal image (H,W,3) as the recorded frame of that number."""
+        """Return the recorded image (H,W,3) of an ideal image (H,W,3).
+
+        The noise depends on the frame number.
+        """
         mean = cv2.LUT(image, self._mean)
         if len(self._normal):
             start = int(np.random.default_rng([frame, *self._seed]).integers(0, _NOISE_SURPLUS))

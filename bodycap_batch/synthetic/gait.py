@@ -1,6 +1,6 @@
-"""A procedural walk: a path with turns, gait phases, joint angles, arms that reach out.
+"""A procedural walk: a path with bends, a gait phase, joint angles, and arms that reach out.
 
-The motion does not follow the priors of the merging stage: there is no random walk of velocities. Joint
+The motion does not follow the priors of the merging stage, because its velocities are no random walk. Joint
 angles are periodic functions of a gait phase plus a few slow sinusoids. The path is a spline through given
 positions.
 """
@@ -19,7 +19,7 @@ from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
 from bodycap_batch.synthetic.pressing import ArmAngles, Press
 
 _LAP_S = 13.0
-"""Duration of one lap, seconds."""
+"""Duration (seconds) of one lap of the path."""
 _LAP = np.array(
     [
         [0.0, -1.60, -1.00, 90.0],
@@ -35,27 +35,28 @@ _LAP = np.array(
         [11.8, -1.75, -0.40, 345.0],
     ]
 )
-"""One lap: seconds, x, y (m from the room's middle), direction of the face (degrees from +x,
-counter-clockwise). It begins with steps to the right while facing a wall: sideways movement is a good start
-for a map."""
+"""Positions on one lap. Columns: time (seconds); x and y (metres from the room's middle); direction of the
+face (degrees from +x, counter-clockwise). The lap starts with steps to the right while the person faces a
+wall, because sideways movement is a good start for a map."""
 _TURN_S, _TURN_DEG, _SWAY_M = 5.0, 75.0, 0.02
-"""A person who turns on the spot: period (s), angle to either side (degrees), amplitude of the sway (m)."""
+"""Motion of a person who rotates on the spot: period (s), maximum rotation to each side (degrees), amplitude
+of the sway (m)."""
 _ARM_PARTS = ("Lift", "Ahead", "Arm", "Out", "Spin", "Elbow", "Twist")
-"""Parts of an arm's posture, see `WalkStyle`."""
+"""Names of the angles of an arm's posture, explained at `WalkStyle.posture`."""
 _SAMPLE_HZ = 50.0
-"""Rate at which phase and height are sampled for their splines."""
+"""Sampling rate (Hz) of the splines of gait phase and root height."""
 _MARGIN_S = 4.0
-"""Time before and after the capture that the motion covers, seconds."""
+"""Additional time (seconds) that the motion covers before and after the capture."""
 
 
 @dataclass(frozen=True, slots=True)
 class _SlowOscillation:
-    """A slow change of an angle: a few sinusoids between 0.1 and 0.6 Hz.
+    """A slow oscillation of an angle: the sum of K sinusoids between 0.1 and 0.6 Hz.
 
     Attributes:
-        amplitude: (K,) degrees.
-        rate_hz: (K,) frequencies.
-        phase: (K,) radians.
+        amplitude: (K,) amplitudes of the sinusoids, degrees.
+        rate_hz: (K,) frequencies of the sinusoids, Hz.
+        phase: (K,) phases of the sinusoids at time 0, radians.
     """
 
     amplitude: FloatArray
@@ -63,13 +64,13 @@ class _SlowOscillation:
     phase: FloatArray
 
     def __call__(self, t_s: FloatArray) -> FloatArray:
-        """Return the angle (T,) at times (T,), degrees."""
+        """Return the angle (T,) in degrees at common times (T,) in seconds."""
         waves = np.sin(2 * np.pi * self.rate_hz * t_s[:, None] + self.phase)
         return np.asarray((self.amplitude * waves).sum(axis=1))
 
 
 def _draw_oscillation(degrees: float, rng: np.random.Generator) -> _SlowOscillation:
-    """Draw an oscillation with a root mean square of about `degrees`."""
+    """Draw an oscillation at random. Its root mean square is about `degrees`."""
     weight = rng.uniform(0.3, 1.0, 4)
     return _SlowOscillation(
         degrees * weight / np.linalg.norm(weight) * np.sqrt(2.0),
@@ -80,7 +81,18 @@ def _draw_oscillation(degrees: float, rng: np.random.Generator) -> _SlowOscillat
 
 @dataclass(frozen=True, slots=True)
 class _ArmReach:
-    """One arm that reaches out: start, duration of each ramp and of the hold, additional angles (degrees)."""
+    """A movement in which one arm reaches out and returns.
+
+    Attributes:
+        side: ``Left`` or ``Right``.
+        start_s: Common time at which the movement starts, seconds.
+        ramp_s: Duration of reaching out, and of returning, seconds.
+        hold_s: Time for which the arm stays stretched out, seconds.
+        flexion: Additional flexion of the shoulder, degrees.
+        abduction: Additional abduction of the shoulder, degrees.
+        elbow: Additional flexion of the elbow, degrees.
+        pronation: Additional pronation of the forearm, degrees.
+    """
 
     side: str
     start_s: float
@@ -92,40 +104,43 @@ class _ArmReach:
     pronation: float
 
     def weight(self, t_s: FloatArray) -> FloatArray:
-        """Return the weight (T,) of the additional angles, 0 … 1, twice differentiable."""
+        """Return the weight (T,) of the additional angles at common times (T,). It is 0 … 1 and smooth."""
         up = np.clip((t_s - self.start_s) / self.ramp_s, 0, 1)
         down = np.clip((t_s - self.start_s - self.ramp_s - self.hold_s) / self.ramp_s, 0, 1)
         return np.asarray(_smooth_step(up) - _smooth_step(down))
 
 
 def _smooth_step(x: FloatArray) -> FloatArray:
-    """Return a step from 0 to 1 whose first and second derivatives vanish at both ends."""
+    """Return a smooth step from 0 to 1. Its first and second derivatives are zero at both ends."""
     return np.asarray(x**3 * (10 - 15 * x + 6 * x * x))
 
 
 def _periodic_bump(phase: FloatArray, centre_deg: float, width: float) -> FloatArray:
-    """Return a smooth periodic bump of height 1 around a phase."""
+    """Return a smooth periodic function (T,) of the phase (radians) with a peak of height 1 at a centre."""
     return np.asarray(np.exp((np.cos(phase - np.radians(centre_deg)) - 1.0) / width**2))
 
 
 def _rotation_about(axis: str, degrees: FloatArray) -> Rotation:
-    """Return rotations by Euler angles (T,len(axis)) about intrinsic axes, degrees."""
+    """Return rotations by Euler angles (T,len(axis)) in degrees about the intrinsic axes `axis`."""
     return Rotation.from_euler(axis, degrees.reshape(-1, len(axis)), degrees=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WalkStyle:
-    """How a person walks, and what the person does besides.
+    """How a person walks, and what else the person does.
 
     Attributes:
         t_pose_s: Duration of the T-pose at the start, seconds.
-        arms_ahead: 1: both forearms are held up in front of the chest; 0: they hang.
-        presses: Hands that are laid against the chest.
-        on_the_spot: The person turns to both sides on the spot instead of walking.
-        posture: Offsets of joint angles from the mean of people, degrees; 0 if missing. ``Bend`` and ``Turn``
-            of the trunk. With ``Left`` or ``Right`` in front: ``Lift`` and ``Ahead`` of the shoulder, ``Arm``
-            (flexion), ``Out`` (abduction), ``Spin`` of the upper arm, ``Elbow`` and ``Twist`` (pronation).
-            They do not change the arms in a T-pose.
+        arms_ahead: How far both forearms are held up in front of the chest. 0: the arms hang; 1: the forearms
+            are in front of the chest.
+        presses: Times and angles at which a hand is held against the chest.
+        on_the_spot: True: the person does not walk, but rotates to both sides on the spot.
+        posture: Offset (degrees) of each joint angle from the mean of all people, by name; a missing name
+            means 0. Names of the trunk: ``Bend`` (forward) and ``Turn`` (about the vertical). Names of an
+            arm, with the prefix ``Left`` or ``Right``: ``Lift`` (shoulder girdle up), ``Ahead`` (shoulder
+            girdle forward), ``Arm`` (flexion of the shoulder), ``Out`` (abduction of the shoulder), ``Spin``
+            (axial rotation of the upper arm), ``Elbow`` (flexion) and ``Twist`` (pronation). In a T-pose,
+            only the angles of the trunk and of the shoulder girdle are applied.
     """
 
     t_pose_s: float = 0.0
@@ -136,13 +151,14 @@ class WalkStyle:
 
 
 class Walk:
-    """The built-in walk: rotations of all joints at any time.
+    """The built-in walk: the pose of the body at any time.
 
     Args:
-        skeleton: A body with HumanIK names.
-        length_s: End of the time that is covered, seconds; it starts a few seconds before 0.
+        skeleton: Skeleton of the body, with HumanIK joint names.
+        length_s: Latest common time of the capture, seconds. The walk also covers `_MARGIN_S` seconds before
+            time 0 and after this time.
         style: How the person walks.
-        rng: Source of the individual gait.
+        rng: Source of randomness for path and gait.
     """
 
     def __init__(
@@ -153,7 +169,7 @@ class Walk:
         self._arms_ahead = style.arms_ahead
         self._presses = style.presses
         self._posture = style.posture
-        # Separate random streams, so that a longer capture continues the same walk.
+        # Use separate random streams, so that a longer capture starts with the walk of a shorter capture.
         for_path, for_reaches, rng = rng.spawn(3)
         self._route = (_draw_turns if style.on_the_spot else _draw_path)(length_s, for_path)
         self._stride_gain = float(rng.uniform(0.92, 1.08))
@@ -174,13 +190,16 @@ class Walk:
         self._height = CubicSpline(sample_s, self._standing_height(sample_s))
 
     def pose(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return root positions (T,3) in the world (m) and local rotations (T,J,3,3) at times (T,)."""
+        """Return root positions (T,3) in the world (m) and local rotations (T,J,3,3) at common times (T,)."""
         path = self._path(t_s)
         root = np.column_stack([path[:, :2], self._height(t_s)])
         return root, self._rotations(t_s)
 
     def _path(self, t_s: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return x, y (m) and heading (degrees), or their rates, (T,3); a T-pose comes first."""
+        """Return x, y (m) and heading (degrees), or their derivatives with respect to time, as (T,3).
+
+        During a T-pose the person stands at the start of the path.
+        """
         if self._t_pose_s == 0.0:
             return np.asarray(self._route(t_s, derivative))
         x = np.clip(t_s - self._t_pose_s, 0, None)
@@ -189,7 +208,7 @@ class Walk:
         return np.asarray(self._route(walked, 1) * rate[:, None] if derivative else self._route(walked))
 
     def _standing_height(self, t_s: FloatArray) -> FloatArray:
-        """Return the height (T,) of the root, metres, at which the lower foot touches the floor."""
+        """Return the height (T,) of the root in metres at which the lower foot touches the floor."""
         poses = forward_kinematics(self.skeleton, np.zeros((len(t_s), 3)), self._rotations(t_s))
         soles = []
         for joint, name in enumerate(self.skeleton.joints):
@@ -197,18 +216,18 @@ class Walk:
                 end = self.skeleton.end_offsets_m[joint]
                 sole = np.nan_to_num(end) if np.isfinite(end).all() else np.array([0.0, 0.0, -self._ankle_m])
                 soles.append((poses[:, joint, :3, :3] @ sole + poses[:, joint, :3, 3])[:, 2])
-        softness_m = 0.01  # a soft minimum over the soles
+        softness_m = 0.01  # parameter of a soft minimum over the soles
         lowest = -softness_m * np.log(np.exp(-np.array(soles) / softness_m).sum(axis=0))
         return np.asarray(-lowest)
 
     @property
     def _ankle_m(self) -> float:
-        """Height of the ankle over the sole, metres."""
+        """Height of the ankle above the sole, metres."""
         toe = self.skeleton.joints.index("LeftToeBase")
         return float(-self.skeleton.offsets_m[toe, 2] - self.skeleton.end_offsets_m[toe, 2])
 
     def _rotations(self, t_s: FloatArray) -> FloatArray:
-        """Return parent_from_joint (T,J,3,3) at times (T,)."""
+        """Return the rotations parent_from_joint (T,J,3,3) at common times (T,) in seconds."""
         heading = self._path(t_s)[:, 2]
         velocity = self._path(t_s, 1)
         phase, wave = self._phase(t_s), self._oscillations
@@ -243,7 +262,10 @@ class Walk:
         return np.stack([out.get(name, identity).as_matrix() for name in self.skeleton.joints], axis=1)
 
     def _t_pose(self, t_s: FloatArray) -> FloatArray:
-        """Return the weight (T,) of the T-pose: 1 during it, 0 from a second later on."""
+        """Return the weight (T,) of the T-pose.
+
+        It is 1 during the T-pose, and decreases to 0 within 1 s after it.
+        """
         return (
             np.asarray(1.0 - _smooth_step(np.clip(t_s - self._t_pose_s, 0, 1)))
             if self._t_pose_s
@@ -254,10 +276,12 @@ class Walk:
     def _leg(
         side: str, phase: FloatArray, strides: tuple[FloatArray, FloatArray], out: dict[str, Rotation]
     ) -> None:
-        """Add hip, knee and ankle rotations over the gait cycle (phase 0: the heel of this leg strikes).
+        """Add the rotations of hip, knee and ankle of one leg over the gait cycle.
 
-        Source: the shape of sagittal joint angles in level walking, Winter, "Biomechanics and Motor
-            Control of Human Movement", 2009.
+        At phase 0 the heel of this leg touches the ground.
+
+        Source: the shape of sagittal joint angles during walking on horizontal ground, Winter, "Biomechanics
+            and Motor Control of Human Movement", 2009.
         """
         stride, sidestep = strides
         effort = np.minimum(1.0, np.hypot(stride, sidestep))
@@ -276,7 +300,10 @@ class Walk:
     def _arm(
         self, side: str, t_s: FloatArray, swing: tuple[FloatArray, FloatArray], out: dict[str, Rotation]
     ) -> None:
-        """Add clavicle, shoulder, elbow and wrist: swing against the leg, slow oscillations, reaching."""
+        """Add the rotations of clavicle, shoulder, elbow and wrist of one arm.
+
+        The arm swings opposite to the leg. Slow oscillations, reaching and presses are added.
+        """
         forth, walk_weight = swing
         wave, outward = self._oscillations, 1.0 if side == "Left" else -1.0
         held = {part: self._posture.get(side + part, 0.0) for part in _ARM_PARTS}
@@ -312,7 +339,7 @@ class Walk:
 
 
 def _draw_path(length_s: float, rng: np.random.Generator) -> CubicSpline:
-    """Return x, y (m) and heading (degrees) over time: laps through slightly different positions."""
+    """Return x, y (m) and heading (degrees) over time. Each lap has slightly different positions."""
     rows = []
     for lap in range(-1, int(np.ceil(length_s / _LAP_S)) + 2):
         places = _LAP + np.array([lap * _LAP_S, 0.0, 0.0, lap * 360.0])
@@ -324,7 +351,7 @@ def _draw_path(length_s: float, rng: np.random.Generator) -> CubicSpline:
 
 
 def _draw_turns(length_s: float, rng: np.random.Generator) -> CubicSpline:
-    """Return x, y (m) and heading (degrees) over time of a person who turns to both sides on the spot."""
+    """Return x, y (m) and heading (degrees) over time for a person who rotates on the spot."""
     times = np.arange(-2.0 * _MARGIN_S, length_s + 2.0 * _MARGIN_S, 0.1)
     phase = rng.uniform(0, 2 * np.pi, 3)
     x, y = (_SWAY_M * np.sin(rate * times + phase[axis]) for axis, rate in enumerate((1.1, 0.9)))
@@ -333,7 +360,10 @@ def _draw_turns(length_s: float, rng: np.random.Generator) -> CubicSpline:
 
 
 def _draw_reaches(length_s: float, t_pose_s: float, rng: np.random.Generator) -> tuple[_ArmReach, ...]:
-    """Draw when arms reach out: in turn, forward or to the side, every two to four seconds."""
+    """Draw the movements in which an arm reaches out forward or to the side.
+
+    The left and the right arm alternate. A movement starts every 1.8 to 3.2 seconds.
+    """
     out = []
     side = "Left" if rng.uniform() < 0.5 else "Right"
     start = 0.8 + (t_pose_s + 1.0 if t_pose_s > 0 else 0.0)

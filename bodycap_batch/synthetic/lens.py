@@ -1,7 +1,7 @@
-"""Viewing rays of a lens: its distortion is inverted at every pixel.
+"""Viewing rays of a lens, computed by inverting the lens distortion at every pixel.
 
-This follows the published formulas of the models, and only the renderer uses it. The estimators project with
-another implementation, so a mistake in either one shows in tests.
+This module follows the published formulas of the camera models. Only the renderer uses it. The estimators
+project points with another implementation, so tests can detect an error in either implementation.
 """
 
 from __future__ import annotations
@@ -16,20 +16,22 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.model.camera import Camera
 
 _NEWTON_STEPS = 30
-"""Newton steps of an inversion at most."""
+"""Maximum number of Newton steps of an inversion."""
 _DERIVATIVE_STEP = 1e-6
-"""Half of the difference for a numerical derivative, at depth 1."""
+"""Step to each side of a point for a numerical derivative, as a length in the image plane at depth 1."""
 _CONVERGED = 1e-9
-"""Largest error of an inversion, at depth 1."""
+"""Maximum error of a converged inversion, as a length in the image plane at depth 1."""
 _BRANCH_SAMPLES = 8
-"""Points between the centre and a solution at which the distortion must keep its orientation."""
+"""Number of test points between the centre and a solution. The determinant of the distortion's derivative
+must be positive at all test points."""
 _BLOCK = 1 << 13
-"""Points that are inverted together, so that the processor's cache holds them."""
+"""Number of points that are inverted together. A block of this size fits into the processor's cache."""
 _SINGLE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-"""Models with one focal length for both axes."""
+"""Names of the camera models with one focal length for both axes."""
 
 Distortion = Callable[[FloatArray], FloatArray]
-"""Function from the ideal to the distorted image plane, both (...,2) at depth 1."""
+"""Function that maps points (...,2) of the ideal image plane to the distorted image plane, both at depth 1.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,10 +40,10 @@ class RayGrid:
 
     Attributes:
         in_cam: (H,W,3) unit directions in the camera frame (x right, y down, z forward).
-        per_px_x: (H,W,3) change of the direction one pixel to the right.
-        per_px_y: (H,W,3) change of the direction one pixel down.
-        valid: (H,W) False if the lens shows nothing at a pixel: the distortion has no inverse there.
-        planes: (9,H,W) components of the three vectors, float32, for the renderer.
+        per_px_x: (H,W,3) change of the direction for a step of one pixel to the right.
+        per_px_y: (H,W,3) change of the direction for a step of one pixel down.
+        valid: (H,W) False for a pixel without a viewing ray, because the distortion has no inverse there.
+        planes: (9,H,W) components of `in_cam`, `per_px_x` and `per_px_y` as float32, for the renderer.
     """
 
     in_cam: FloatArray
@@ -52,14 +54,20 @@ class RayGrid:
 
 
 def is_fisheye(model: str) -> bool:
-    """Return whether the model distorts an equidistant image plane (angle · direction)."""
+    """Return True if a model distorts an equidistant image plane.
+
+    In such a plane, the distance of a point from the centre is the angle between its ray and the optical
+    axis.
+    """
     return model.endswith("FISHEYE")
 
 
 def _rational(plane: FloatArray, radial: FloatArray, p1: float, p2: float) -> FloatArray:
-    """Return points under Brown's model with a rational radial term; `radial` holds k1 … k6.
+    """Return points (...,2) after distortion by Brown's model with a rational radial term.
 
-    Source: Brown, "Decentering distortion of lenses", 1966; the rational term as in OpenCV.
+    `radial` holds k1 … k6.
+
+    Sources: Brown, "Decentering distortion of lenses", 1966; OpenCV for the rational term.
     """
     x, y = plane[..., 0], plane[..., 1]
     r2 = x * x + y * y
@@ -75,7 +83,7 @@ def _rational(plane: FloatArray, radial: FloatArray, p1: float, p2: float) -> Fl
 
 
 def _thin_prism(plane: FloatArray, params: FloatArray) -> FloatArray:
-    """Return points of an equidistant plane with radial, tangential and thin-prism distortion.
+    """Return points (...,2) of an equidistant plane after radial, tangential and thin-prism distortion.
 
     Source: Weng, Cohen, Herniou, "Camera calibration with distortion models", PAMI 1992.
     """
@@ -93,7 +101,7 @@ def _thin_prism(plane: FloatArray, params: FloatArray) -> FloatArray:
 
 
 def _field_of_view(plane: FloatArray, omega_rad: float) -> FloatArray:
-    """Return points of a perspective plane under a wide-angle model with one parameter.
+    """Return points (...,2) of a perspective plane after distortion by a wide-angle model with one parameter.
 
     Source: Devernay, Faugeras, "Straight lines have to be straight", MVA 2001.
     """
@@ -106,7 +114,7 @@ def _field_of_view(plane: FloatArray, omega_rad: float) -> FloatArray:
 
 
 def distortion_of(camera: Camera) -> Distortion:
-    """Return the distortion of a camera's model."""
+    """Return the distortion function of a camera."""
     extra = camera.params[(3 if camera.model in _SINGLE_FOCAL else 4) :]
     if camera.model == "FOV":
         return lambda plane: _field_of_view(plane, float(extra[0]))
@@ -125,14 +133,17 @@ def distortion_of(camera: Camera) -> Distortion:
 
 
 def focal_and_centre(camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Return the focal lengths (2,) and the principal point (2,) in pixels."""
+    """Return the focal lengths (2,) and the principal point (2,) of a camera in pixels."""
     if camera.model in _SINGLE_FOCAL:
         return np.repeat(camera.params[:1], 2), np.asarray(camera.params[1:3])
     return np.asarray(camera.params[:2]), np.asarray(camera.params[2:4])
 
 
 def _jacobian(distort: Distortion, plane: FloatArray) -> FloatArray:
-    """Return the derivative (N,2,2) of a distortion, by central differences."""
+    """Return the derivative (N,2,2) of a distortion with respect to the points (N,2).
+
+    It is computed by central differences.
+    """
     columns = []
     for axis in range(2):
         step = np.zeros(2)
@@ -145,7 +156,9 @@ def undistort(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, B
     """Invert a distortion for points (N,2) by Newton's method.
 
     Returns:
-        The ideal points (N,2); a mask (N,) of those with an inverse on the branch around the centre.
+        The ideal points (N,2), and a mask (N,). The mask is True for a point with an inverse that is
+        connected with the image centre: the distortion keeps its orientation between the centre and the ideal
+        point.
     """
     found = [
         _undistort_block(distort, distorted[start : start + _BLOCK])
@@ -158,7 +171,7 @@ def undistort(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, B
 
 
 def _undistort_block(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Invert a distortion for a block of points (N,2); results as in `undistort`."""
+    """Invert a distortion for a block of points (N,2). The results are the results of `undistort`."""
     plane = distorted.copy()
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
@@ -185,9 +198,12 @@ def _determinant(matrices: FloatArray) -> FloatArray:
 
 
 def ray_grid(camera: Camera) -> RayGrid:
-    """Return the viewing rays through the centres of all pixels (COLMAP's origin: the first is 0.5, 0.5)."""
+    """Return the viewing rays through the centres of all pixels.
+
+    In COLMAP's pixel coordinates, the centre of the first pixel is (0.5, 0.5).
+    """
     focal, centre = focal_and_centre(camera)
-    # One more ring of pixels around the image allows central derivatives everywhere.
+    # An additional ring of pixels around the image allows central differences at all pixels.
     x, y = np.meshgrid(
         np.arange(-1, camera.width_px + 1) + 0.5, np.arange(-1, camera.height_px + 1) + 0.5, indexing="xy"
     )

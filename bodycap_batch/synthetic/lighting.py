@@ -1,4 +1,4 @@
-"""Compute the light on a room's surfaces once, and paint it into their textures."""
+"""Compute the light on a room's surfaces once, and multiply the textures by this light."""
 
 from __future__ import annotations
 
@@ -14,32 +14,35 @@ from bodycap_batch.synthetic.surfaces import Surface
 from bodycap_batch.synthetic.textures import shade_image
 
 _CELL_M = 0.08
-"""Distance of the points of a surface at which light is computed, metres."""
+"""Distance (metres) between the points of a surface at which the light is computed."""
 _AMBIENT = 0.60
-"""Irradiance without lamps, as a factor on the texture."""
+"""Irradiance without lamps. It is a multiplier of the texture's brightness."""
 _LAMP_SAMPLES = 6
-"""Points of a lamp that shadow rays start from."""
+"""Number of random points on each lamp. Every surface point casts a shadow ray towards each of them."""
 _LAMP_SIZE_M = 0.35
-"""Extent of a lamp along x and y, metres."""
+"""Size (metres) of a lamp along x and y."""
 _LIFT_M = 0.004
-"""Distance from its surface at which a shadow ray starts, metres, so that the surface does not shade
-itself."""
+"""Distance (metres) between a surface and the start of its shadow rays. Without it, the
+surface would shade itself."""
 _LAMP_STRENGTH = 10.0
-"""Irradiance of all lamps together at 1 m, as a factor on the texture, about."""
+"""Irradiance of all lamps together at a distance of 0. It is a multiplier of the texture's brightness. It
+decreases with 1 / (1 + d²), where d is the distance in metres."""
 _MIN_EMISSION = 0.05
-"""Smallest emission of a lamp to the side, relative to straight down."""
+"""Minimum emission of a lamp in any direction, as a fraction of the emission straight down."""
 _RAY_LENGTH = 0.98
-"""Length of a shadow ray that is tested, relative to the distance of the lamp, whose housing must not shade
-it."""
+"""Length of a shadow ray, as a fraction of the distance to the lamp. The ray ends before the lamp, because
+the lamp's housing must not block the ray."""
 
 
 def light_surfaces(surfaces: Sequence[Surface], lamps: FloatArray, rng: np.random.Generator) -> list[Surface]:
-    """Multiply every texture by its irradiance: ambient light plus lamps with soft shadows.
+    """Return the surfaces with their textures multiplied by the irradiance.
+
+    The irradiance is ambient light plus the light of lamps with soft shadows.
 
     Args:
         surfaces: All surfaces of the room.
-        lamps: (L,3) centres of ceiling lamps (m); they shine down.
-        rng: Source of the points of lamps that shadow rays start from.
+        lamps: (L,3) centres (m) of the ceiling lamps in the world. The lamps shine down.
+        rng: Source of randomness for the points of the lamps.
     """
     corners = np.concatenate([surface.corners() for surface in surfaces])
     quads = np.arange(len(surfaces), dtype=np.uint32)[:, None] * 4
@@ -76,7 +79,7 @@ def light_surfaces(surfaces: Sequence[Surface], lamps: FloatArray, rng: np.rando
 
 
 def _light_grid(surface: Surface) -> FloatArray:
-    """Return world positions (R,C,3) of a grid of points on a surface."""
+    """Return the world positions (R,C,3) of a grid of points on a surface, metres."""
     rows = max(2, int(np.linalg.norm(surface.down) / _CELL_M) + 1)
     columns = max(2, int(np.linalg.norm(surface.across) / _CELL_M) + 1)
     v, u = np.meshgrid(np.linspace(0.02, 0.98, rows), np.linspace(0.02, 0.98, columns), indexing="ij")
@@ -84,7 +87,10 @@ def _light_grid(surface: Surface) -> FloatArray:
 
 
 def _with_light(surface: Surface, light: FloatArray) -> Surface:
-    """Return the surface with its texture multiplied by the light (R,C)."""
+    """Return a surface with its texture multiplied by the light (R,C).
+
+    The surface of a lamp stays unchanged.
+    """
     if surface.shines:
         return surface
     height, width = surface.image.shape[:2]

@@ -1,4 +1,4 @@
-"""Write a synthetic capture into a folder that appears only when it is complete."""
+"""Write a synthetic capture. Its folder gets its name only when the capture is complete."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ from bodycap_batch.synthetic.truth import (
 from bodycap_batch.synthetic.wearer import Wearer
 
 _TEXELS_PER_PIXEL_M = 0.85
-"""Texture detail: texels per metre for each pixel of focal length. At 1 m a texel covers a little more than a
-pixel."""
+"""Texture detail: ratio of the texels per metre to the focal length in pixels. At a distance of 1 m, a texel
+covers slightly more than one pixel."""
 _MAX_TEXELS_PER_M = 500.0
-"""Largest texture detail, texels per metre; limits memory."""
+"""Maximum texture detail (texels per metre). It limits the memory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,8 +55,8 @@ class Subject:
 
     Attributes:
         motion: The moving body, centred in the room.
-        mounts: True mounts of its cameras.
-        seeds: Independent sources of randomness for room, body, images, poses and lost frames.
+        mounts: True mounts of the cameras on the body.
+        seeds: Independent random seeds by purpose, for example ``room``, ``clothes`` or ``images``.
     """
 
     motion: MovingBody
@@ -65,7 +65,7 @@ class Subject:
 
 
 def draw_subject(options: SynthOptions) -> Subject:
-    """Draw body, motion and mounts from the seed.
+    """Draw body, motion and mounts at random from the seed of the options.
 
     Raises:
         JobError: The BVH file cannot be used.
@@ -103,7 +103,7 @@ def draw_subject(options: SynthOptions) -> Subject:
 def write_synthetic_capture(
     options: SynthOptions, out_dir: Path, context: StageContext, *, overwrite: bool
 ) -> None:
-    """Write a capture to `out_dir`; see `bodycap_batch.synthetic.synthesise`."""
+    """Write a synthetic capture to `out_dir`, as `bodycap_batch.synthetic.synthesise` describes."""
     out_dir = Path(out_dir)
     _check_output_folder(out_dir, overwrite)
     subject = draw_subject(options)
@@ -118,7 +118,10 @@ def write_synthetic_capture(
 
 
 def _draw_kept_frames(options: SynthOptions, subject: Subject) -> dict[str, BoolArray]:
-    """Return masks of the frames that each camera delivers; the first and the last one always are."""
+    """Draw a mask of the frames that each camera delivers.
+
+    The first and the last frame are always delivered.
+    """
     rng = np.random.default_rng(subject.seeds["drops"])
     out = {}
     for camera in options.cameras:
@@ -138,7 +141,7 @@ def frame_times_ns(options: SynthOptions, camera: str) -> IntArray:
 def _write_camera_truth(
     folder: Path, options: SynthOptions, subject: Subject, mount: Mount, kept: BoolArray
 ) -> None:
-    """Write a camera's true path, its timestamps if frames are lost, and its noisy poses if asked for."""
+    """Write a camera's true path, its timestamps if frames are lost, and its noisy poses if requested."""
     camera = mount.camera
     times_ns = frame_times_ns(options, camera)[kept]
     poses = camera_poses_at(
@@ -160,7 +163,7 @@ def _write_camera_truth(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _FrameRecorder:
-    """Renders the frames of one camera; a frame depends on its number alone."""
+    """Renderer of the recorded frames of one camera. A frame depends only on its number."""
 
     renderer: CameraRenderer
     sensor: Sensor
@@ -194,7 +197,7 @@ def _write_videos(
 
 
 def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRenderer]:
-    """Build the room around the motion, and a renderer for each camera."""
+    """Build the room around the motion, and return a renderer for each camera."""
     camera = options.camera()
     focal, _ = focal_and_centre(camera)
     texels_per_m = min(_TEXELS_PER_PIXEL_M * float(focal.mean()), _MAX_TEXELS_PER_M)
@@ -233,7 +236,10 @@ def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRende
 def _render_in_order(
     pool: ThreadPoolExecutor, recorder: _FrameRecorder, frames: list[int], context: StageContext
 ) -> Iterator[Bytes]:
-    """Render frames in several threads and yield them in order; only a few wait in memory."""
+    """Render frames in several threads, and yield them in order.
+
+    Only a few frames are in memory at a time.
+    """
     waiting: deque[Future[Bytes]] = deque()
     try:
         for frame in frames:
@@ -261,10 +267,10 @@ def _single_opencv_thread() -> Iterator[None]:
 
 
 def _check_output_folder(out_dir: Path, overwrite: bool) -> None:
-    """Check that nothing is overwritten except a synthetic capture, and that only on request.
+    """Check that the capture overwrites nothing, or only an earlier synthetic capture on request.
 
     Raises:
-        JobError: The folder exists and must stay.
+        JobError: The folder exists and must not be overwritten.
     """
     if not out_dir.exists() or (out_dir.is_dir() and not any(out_dir.iterdir())):
         return
@@ -276,10 +282,10 @@ def _check_output_folder(out_dir: Path, overwrite: bool) -> None:
 
 @contextmanager
 def _atomic_folder(out_dir: Path) -> Iterator[Path]:
-    """Yield a temporary folder; rename it to `out_dir` if the block succeeds, else delete it.
+    """Yield a temporary folder. Rename it to `out_dir` if the block succeeds; otherwise delete it.
 
     Raises:
-        StoreError: The disk refuses a file.
+        StoreError: A file or folder cannot be written to the disk.
     """
     folder = out_dir.with_name(f".{out_dir.name}.{secrets.token_hex(4)}")
     old = folder.with_name(folder.name + ".old")
@@ -292,7 +298,7 @@ def _atomic_folder(out_dir: Path) -> Iterator[Path]:
     except OSError as error:
         raise store_error_from_os_error(error, out_dir) from error
     except StoreError as error:
-        # Name the requested folder, not the temporary one, which is deleted.
+        # Name the requested folder in the error, because the temporary folder is deleted.
         path = Path(error.path or out_dir)
         named = out_dir / path.relative_to(folder) if path.is_relative_to(folder) else path
         raise StoreError(error.message, path=named, hint=error.hint) from error

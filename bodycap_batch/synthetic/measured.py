@@ -1,4 +1,4 @@
-"""Camera poses as a localisation would deliver them: noise, gross errors in bursts, gaps."""
+"""Simulated measured camera poses: true poses with noise, bursts of gross errors, and gaps."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.synthetic.options import SynthOptions
 
 _BURST_FRAMES = (2, 7)
-"""Length of a burst of gross errors, frames: smallest and largest + 1."""
+"""Minimum length of a burst of gross errors, and maximum length plus 1, in frames."""
 _GROSS_M = 0.4
-"""Standard deviation of a gross error's shift along an axis, metres."""
+"""Standard deviation (metres) of the shift of a gross error along each axis."""
 _GROSS_RAD = 0.5
-"""Standard deviation of a gross error's rotation about an axis, radians."""
+"""Standard deviation (radians) of the rotation of a gross error about each axis."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredPoses:
-    """A camera's path with errors and gaps.
+    """The measured poses of a camera over T frames, with errors and gaps.
 
     Attributes:
-        world_from_cam: (T,4,4) noisy poses.
-        present: (T,) False in a gap.
-        outlier: (T,) True for a pose with a gross error.
+        world_from_cam: (T,4,4) poses with noise and gross errors.
+        present: (T,) False for a frame in a gap.
+        outlier: (T,) True for a frame whose pose has a gross error.
     """
 
     world_from_cam: FloatArray
@@ -36,7 +36,10 @@ class MeasuredPoses:
 def disturb_poses(
     world_from_cam: FloatArray, options: SynthOptions, rng: np.random.Generator
 ) -> MeasuredPoses:
-    """Add noise, gross errors and gaps to true poses (T,4,4); the first and the last frame are never lost."""
+    """Add noise, gross errors and gaps to true poses (T,4,4).
+
+    The first and the last frame are never in a gap.
+    """
     count = len(world_from_cam)
     outlier = _draw_runs(count, round(options.outliers * count), _BURST_FRAMES, rng)
     sigma_rad = np.radians(options.pose_sigma_deg)
@@ -47,14 +50,15 @@ def disturb_poses(
     shift = shift + outlier[:, None] * rng.normal(0.0, _GROSS_M, (count, 3))
     poses = make_transform(world_from_cam[:, :3, :3] @ turn, world_from_cam[:, :3, 3] + shift)
     present = np.ones(count, dtype=bool)
-    # The ends stay. The last gap is shortened so that the ratio of lost frames is exact.
+    # Keep the first and the last frame. The last drawn gap is shortened to get the exact number of lost
+    # frames.
     shortest, longest = options.gap_frames
     present[1:-1] = ~_draw_runs(max(count - 2, 0), round(options.lost * count), (shortest, longest + 1), rng)
     return MeasuredPoses(world_from_cam=poses, present=present, outlier=outlier)
 
 
 def _draw_runs(count: int, wanted: int, lengths: tuple[int, int], rng: np.random.Generator) -> BoolArray:
-    """Draw runs of frames until exactly `wanted` of `count` frames are marked; return the mask (count,)."""
+    """Draw runs of frames until exactly `wanted` of `count` frames are in a run. Return a mask (count,)."""
     out = np.zeros(count, dtype=bool)
     while int(out.sum()) < min(wanted, count):
         start = int(rng.integers(0, count))

@@ -13,15 +13,17 @@ from bodycap_batch.config.options import Options
 from bodycap_batch.model.camera import CAMERA_MODELS, Camera, parameter_count
 
 _EARLIEST_S = 3.0
-"""Time by which the walk begins before the common clock's zero, seconds."""
+"""Maximum time (seconds) before the common clock's zero at which a camera may start. The built-in walk starts
+even earlier."""
 _DEFAULT_FOCAL_PX = 420.0
-"""Focal length of the default lens at a width of 640 px: an angle of view of 75 degrees."""
+"""Focal length (px) of the default lens at an image width of 640 px. The horizontal angle of view is 75
+degrees."""
 _DEFAULT_FOV_OMEGA_RAD = 0.8
-"""Parameter of the default lens of model FOV, radians. Evidence: none."""
+"""Distortion parameter (radians) of the default lens for the camera model FOV. Evidence: none."""
 
 
 class SynthOptions(Options):
-    """A person who walks with body cameras in a textured room."""
+    """Options of a synthetic capture: a person walks with body cameras in a textured room."""
 
     seconds: float = Field(12.0, gt=0, le=3600, description="length of each camera's video")
     fps: float = Field(30.0, gt=0, le=240, description="frames per second of every camera")
@@ -111,7 +113,10 @@ class SynthOptions(Options):
         return self
 
     def _check_cameras_named(self) -> None:
-        """Check that options by camera name cameras of the capture, and that rates are for poses only."""
+        """Check the options that have a value for each camera, and the lengths of gaps.
+
+        All camera names must exist. Different frame rates are permitted only without videos.
+        """
         for key, named in (("offsets_s", self.offsets_s), ("rates_fps", self.rates_fps)):
             unknown = sorted(set(named) - set(self.cameras))
             if unknown:
@@ -124,7 +129,10 @@ class SynthOptions(Options):
             raise ValueError("gap_frames: shortest first, one frame or more")
 
     def _check_pressed(self) -> None:
-        """Check that only hands of the built-in walker touch the chest, and that the chest is rendered."""
+        """Check that only hands of the built-in walker are held against the chest.
+
+        The body must be rendered in this case.
+        """
         for name, (start_s, end_s) in self.pressed_s.items():
             place = mount_of(name)
             if name not in self.cameras or place is None or not place[1].endswith("Hand"):
@@ -138,11 +146,11 @@ class SynthOptions(Options):
 
     @property
     def frame_count(self) -> int:
-        """Number of frames of a camera at the common rate, dropped ones included."""
+        """Number of frames of a camera at the common frame rate, including dropped frames."""
         return max(1, round(self.seconds * self.fps))
 
     def rate_fps(self, camera: str) -> float:
-        """Return the frames per second of one camera."""
+        """Return the frame rate of one camera, frames per second."""
         return self.rates_fps.get(camera, self.fps)
 
     def camera(self) -> Camera:
@@ -154,7 +162,10 @@ class SynthOptions(Options):
 
 
 def _default_lens_params(model: str, width: int, height: int) -> tuple[float, ...]:
-    """Return the parameters of an undistorted lens with a usual angle of view."""
+    """Return the parameters of the default lens for a camera model.
+
+    The lens has a usual angle of view. It has no distortion, except for the model FOV.
+    """
     focal = width * _DEFAULT_FOCAL_PX / 640.0
     has_one_focal = model in (
         "SIMPLE_PINHOLE",

@@ -1,4 +1,7 @@
-"""Draw the person who wears the cameras: true proportions and mounts, which differ from nominal ones."""
+"""Draw a random person who wears the cameras.
+
+The true proportions, posture and mounts differ from the nominal values.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,16 @@ from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount, r
 
 
 def draw_body(height_m: float, proportion_range: float, rng: np.random.Generator) -> SkeletonModel:
-    """Draw a body of a given stature with other proportions than the nominal body.
+    """Draw a body of a given stature. Its proportions differ from the proportions of the nominal body.
 
-    The length of each bone changes by a ratio of up to ±`proportion_range`, equally on both sides. Then the
-    whole body is scaled to the stature.
+    The length of each bone is multiplied by a random factor between 1 − `proportion_range` and 1 +
+    `proportion_range`. The left and the right side get the same factors. Then the whole body is scaled to the
+    stature.
+
+    Args:
+        height_m: Stature, metres.
+        proportion_range: Maximum relative change of a bone's length.
+        rng: Source of randomness.
     """
     nominal = load_skeleton("full_body", height_m)
     factors: dict[str, float] = {}
@@ -34,7 +43,7 @@ def draw_body(height_m: float, proportion_range: float, rng: np.random.Generator
 
 
 def _with_bones(model: SkeletonModel, offsets_m: FloatArray, end_offsets_m: FloatArray) -> SkeletonModel:
-    """Return a skeleton with other bone vectors, metres."""
+    """Return a copy of a skeleton with new bone vectors (metres)."""
     return SkeletonModel(
         name="synthetic",
         joints=model.joints,
@@ -47,7 +56,10 @@ def _with_bones(model: SkeletonModel, offsets_m: FloatArray, end_offsets_m: Floa
 
 
 def _height_range(body: SkeletonModel) -> tuple[float, float]:
-    """Return the heights of the soles and of the crown over the root in the zero pose, metres."""
+    """Return the heights (metres) of the lowest and the highest point of a body in the zero pose.
+
+    These points are the soles and the crown. The heights are relative to the root.
+    """
     joints = rest_positions(body)
     tips = joints + np.nan_to_num(body.end_offsets_m)
     height = np.concatenate([joints[:, 2], tips[:, 2]])
@@ -65,22 +77,32 @@ _POSTURE_SIGMA_DEG = {
     "Elbow": 3.6,
     "Twist": 14.7,
 }
-"""Standard deviation between people of the joint angles when they stand relaxed, degrees. Shoulder girdle,
-shoulder and elbow: interquartile ranges divided by 1.349, of 158 arms of standing people, Y. Yoshida et al.,
-"Three-dimensional alignment of the upper extremity in the standing neutral position in healthy subjects", J.
-Orthop. Surg. Res. 17, 2022. Trunk: turned like the shoulder blades (3.18 degrees, table 1 of "Standard
-reference values of the upper body posture in healthy middle-aged female adults in Germany", Scientific
-Reports 11, 2021), inclined by half of the standard deviation of the kyphosis, whose upper half it is (6.4
-degrees, Abrisham et al., as cited in https://www.nature.com/articles/s41598-023-27976-8, Scientific Reports
-13, 2023)."""
+"""Standard deviation (degrees) between people of each joint angle in relaxed standing. `WalkStyle.posture`
+explains the names.
+
+Sources: The angles of shoulder girdle, shoulder and elbow are interquartile ranges of 158 arms of standing
+people, divided by 1.349, from Y. Yoshida et al., "Three-dimensional alignment of the upper extremity in the
+standing neutral position in healthy subjects", J. Orthop. Surg. Res. 17, 2022. The rotation of the trunk
+(``Turn``) has the standard deviation of the shoulder blades' rotation, 3.18 degrees, from table 1 of
+"Standard reference values of the upper body posture in healthy middle-aged female adults in Germany",
+Scientific Reports 11, 2021. The forward bend of the trunk (``Bend``) has half of the standard deviation of
+the kyphosis angle, because the bend is the upper half of the kyphosis. The standard deviation of the whole
+angle is 6.4 degrees, from Abrisham et al., as cited in https://www.nature.com/articles/s41598-023-27976-8,
+Scientific Reports 13, 2023."""
 
 
 def draw_posture(spread: float, rng: np.random.Generator) -> dict[str, float]:
-    """Draw one person's offsets of joint angles from the mean of people, degrees, as in `WalkStyle.posture`.
+    """Draw the posture of one person at random.
+
+    The left and the right arm are drawn independently.
 
     Args:
-        spread: Factor on the standard deviation between people. Both sides are drawn independently.
+        spread: Multiplier of the standard deviation between people.
         rng: Source of randomness.
+
+    Returns:
+        Offset (degrees) of each joint angle from the mean of all people, with the names of
+        `WalkStyle.posture`.
     """
     drawn = {}
     for part, degrees in _POSTURE_SIGMA_DEG.items():
@@ -95,22 +117,22 @@ def draw_mounts(
     sigmas: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[Mount, ...]:
-    """Draw true mounts: nominal ones, rotated and shifted at random.
+    """Draw the true mounts of the cameras: the nominal mounts, rotated and shifted at random.
 
     Args:
-        cameras: Mount names.
-        skeleton: The body that wears the cameras.
-        sigmas: Standard deviations in degrees and metres, of all three axes together; each axis gets 1/√3 of
-            it.
+        cameras: Names of the cameras, which are names of mounts.
+        skeleton: Skeleton of the body that wears the cameras.
+        sigmas: Standard deviations of the rotation (degrees) and of the shift (metres). Each value is the
+            root of the sum of the three axes' variances, so that each axis gets 1/√3 of the value.
         rng: Source of randomness.
 
     Raises:
-        JobError: The skeleton has no joint for a camera.
+        JobError: The skeleton has no joint on which a camera is mounted.
     """
     out = []
     for camera in cameras:
         place = mount_of(camera)
-        assert place is not None  # `SynthOptions` refuses other names.
+        assert place is not None  # `SynthOptions` refuses names of other places.
         nominal = nominal_mount(camera, place[1], skeleton)
         turn = so3_exp(rng.normal(0.0, np.radians(sigmas[0]) / np.sqrt(3.0), 3))
         shift = rng.normal(0.0, sigmas[1] / np.sqrt(3.0), 3)

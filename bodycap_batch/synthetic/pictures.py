@@ -8,7 +8,7 @@ import numpy as np
 from bodycap_batch.synthetic.textures import Image, Texture, colour, fractal
 
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
-"""Characters of random words."""
+"""Characters that random words consist of."""
 
 
 def _word(rng: np.random.Generator) -> str:
@@ -17,7 +17,10 @@ def _word(rng: np.random.Generator) -> str:
 
 
 def _write(image: Image, x: float, y: float, size: float, rng: np.random.Generator) -> None:
-    """Write a word with letters about `size` texels tall; x, y (texels) is its top left corner."""
+    """Draw a random word into an image. The letters are about `size` texels tall.
+
+    Its top left corner is at x, y (texels).
+    """
     at = (round(x), round(y + size))
     thickness = max(1, round(size / 9))
     ink = colour(rng, 0.9, (0.05, 0.5)).tolist()
@@ -25,7 +28,7 @@ def _write(image: Image, x: float, y: float, size: float, rng: np.random.Generat
 
 
 def _paper(height: int, width: int, rng: np.random.Generator) -> Image:
-    """Return a sheet of nearly white paper."""
+    """Return the image of a sheet of nearly white paper."""
     out = np.empty((height, width, 3), np.uint8)
     out[:] = np.clip(225 + 0.12 * (colour(rng) - 128), 0, 255)
     return out
@@ -41,7 +44,7 @@ def _framed(image: Image, rng: np.random.Generator) -> Image:
 
 
 def abstract(height: int, width: int, _scale: float, rng: np.random.Generator) -> Image:
-    """Return overlapping shapes, from large to small."""
+    """Return an abstract picture: overlapping shapes, drawn from large to small."""
     out = np.empty((height, width, 3), np.uint8)
     out[:] = colour(rng)
     for ratio, count in ((0.35, 7), (0.15, 22), (0.06, 70), (0.025, 120)):
@@ -63,7 +66,7 @@ def abstract(height: int, width: int, _scale: float, rng: np.random.Generator) -
 
 
 def landscape(height: int, width: int, _scale: float, rng: np.random.Generator) -> Image:
-    """Return ridges, one behind the other, under a cloudy sky."""
+    """Return a picture of several ridges of hills, one behind the other, under a cloudy sky."""
     clouds = fractal(height, width, width / 3, rng, 5)
     out = np.clip(colour(rng, 0.5, (0.7, 0.95)) + 22.0 * clouds[..., None], 0, 255)
     for ridge in range(6):
@@ -78,7 +81,7 @@ def landscape(height: int, width: int, _scale: float, rng: np.random.Generator) 
 
 
 def research_poster(height: int, width: int, _scale: float, rng: np.random.Generator) -> Image:
-    """Return a poster with a title, columns of text and plots."""
+    """Return a picture of a poster with a title, columns of text and plots."""
     out = _paper(height, width, rng)
     unit = min(height, width) / 36.0
     cv2.rectangle(out, (0, 0), (width, int(4 * unit)), colour(rng, 0.9, (0.2, 0.6)).tolist(), -1)
@@ -100,7 +103,7 @@ def research_poster(height: int, width: int, _scale: float, rng: np.random.Gener
 
 
 def _plot(out: Image, box: tuple[int, int, int, int], rng: np.random.Generator) -> None:
-    """Draw a chart into a box: bars, curves or an image."""
+    """Draw a random plot into a box (left, top, width, height; texels): bars, curves or a colour map."""
     left, top, wide, tall = box
     if wide < 8 or tall < 8:
         return
@@ -127,7 +130,7 @@ def _plot(out: Image, box: tuple[int, int, int, int], rng: np.random.Generator) 
 
 
 def street_map(height: int, width: int, _scale: float, rng: np.random.Generator) -> Image:
-    """Return a map: blocks of different colours between streets, with names."""
+    """Return a picture of a street map: blocks of different colours between streets, with names."""
     count = 90
     seeds = rng.uniform(0, 1, (count, 2)) * [width, height]
     y, x = np.mgrid[0:height:3, 0:width:3].astype(np.float32)
@@ -149,7 +152,7 @@ def street_map(height: int, width: int, _scale: float, rng: np.random.Generator)
 
 
 def notes(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return a cork board with sheets of paper pinned to it."""
+    """Return a picture of a cork board with sheets of paper pinned to it."""
     cork = 1.0 + 0.16 * np.tanh(fractal(height, width, 0.012 * scale, rng, 3))
     out = np.clip(cork[..., None] * np.array([185, 140, 95], np.float32), 0, 255).astype(np.uint8)
     for _ in range(int(14 * height * width / scale**2) + 4):
@@ -169,7 +172,7 @@ def notes(height: int, width: int, scale: float, rng: np.random.Generator) -> Im
 
 
 def _paste(out: Image, sheet: Image, corner: tuple[float, float], degrees: float) -> None:
-    """Put a sheet on an image, rotated about the sheet's centre."""
+    """Copy a sheet into an image. The sheet is rotated about its centre."""
     tall, wide = sheet.shape[:2]
     matrix = cv2.getRotationMatrix2D((wide / 2, tall / 2), degrees, 1.0)
     matrix[:, 2] += corner
@@ -180,7 +183,7 @@ def _paste(out: Image, sheet: Image, corner: tuple[float, float], degrees: float
 
 
 def books(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return spines of books of all sizes, with titles, gaps and binders."""
+    """Return a picture of a row of books: spines of different sizes, with titles and gaps."""
     out = np.full((height, width, 3), 25, np.uint8)
     x = 0
     while x < width:
@@ -202,7 +205,7 @@ def books(height: int, width: int, scale: float, rng: np.random.Generator) -> Im
 
 
 def whiteboard(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return a whiteboard with scribbles, boxes and arrows."""
+    """Return a picture of a whiteboard with words, boxes and scribbled lines."""
     out = np.full((height, width, 3), 238, np.uint8)
     pens = [(30, 30, 160), (170, 30, 30), (20, 110, 40), (30, 30, 30)]
     for _ in range(int(30 * height * width / scale**2)):
@@ -220,7 +223,7 @@ def whiteboard(height: int, width: int, scale: float, rng: np.random.Generator) 
 
 
 def cardboard(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return a cardboard box with tape, print and a label."""
+    """Return the texture of a cardboard box with tape, print and a label."""
     shade = 1.0 + 0.05 * fractal(height, width, 0.1 * scale, rng, 4)
     out = np.clip(shade[..., None] * np.array([188, 150, 105], np.float32), 0, 255).astype(np.uint8)
     middle = int(rng.uniform(0.3, 0.7) * width)
@@ -238,7 +241,7 @@ def cardboard(height: int, width: int, scale: float, rng: np.random.Generator) -
 
 
 def screen(height: int, width: int, _scale: float, rng: np.random.Generator) -> Image:
-    """Return a monitor full of windows."""
+    """Return a picture of a monitor that shows many windows."""
     out = np.full((height, width, 3), 35, np.uint8)
     for _ in range(6):
         left, top = int(rng.uniform(0, 0.6) * width), int(rng.uniform(0, 0.6) * height)

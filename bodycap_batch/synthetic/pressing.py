@@ -1,4 +1,7 @@
-"""A hand laid against the chest: joint angles at which its camera sees only the wearer."""
+"""A hand that is held against the chest, so that the camera on the hand sees only the wearer.
+
+This module finds the joint angles of the arm.
+"""
 
 from __future__ import annotations
 
@@ -14,26 +17,38 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import segment_axes
 
 RAMP_S = 0.5
-"""Time that a hand takes from walking to the chest, and back, seconds."""
+"""Time (seconds) in which a hand moves from its walking position to the chest, and also from the chest back.
+"""
 _CHEST_RADIUS_M = 0.125
-"""Distance of the chest's surface from the bone, metres."""
+"""Distance (metres) of the chest's surface from the bone of the trunk."""
 _CHEST_HEIGHT_RATIO = 0.45
-"""Height of the touched point, relative to the bone from Spine1 to the neck."""
+"""Position of the touched point along the bone from Spine1 to the neck, as a fraction of the bone's length.
+"""
 _OFF_CHEST_M = 0.045
-"""Distance of the lens from the cloth, metres: above the renderer's nearest distance, and near enough that
-the chest fills the image."""
+"""Distance (metres) of the lens from the chest's surface. It is larger than the renderer's minimum distance,
+and small enough that the chest fills the image."""
 _LOW_DEG = np.array([-10.0, -40.0, 0.0, -80.0, -80.0, -80.0, -40.0])
-"""Lower limits of the angles of `ArmAngles`, degrees. Evidence: none."""
+"""Minimum of each angle of `ArmAngles`, degrees. Evidence: none."""
 _HIGH_DEG = np.array([110.0, 100.0, 150.0, 90.0, 80.0, 80.0, 40.0])
-"""Upper limits of the angles of `ArmAngles`, degrees. Evidence: none."""
+"""Maximum of each angle of `ArmAngles`, degrees. Evidence: none."""
 _COMFORT = 0.002
-"""Cost of a degree away from the middle of a joint's range, relative to that of 1 cm or 6 degrees of
-misfit."""
+"""Residual for each degree between a joint angle and the middle of its range. For comparison: a camera
+position error of 1 cm, or a viewing direction error of 6 degrees, has a residual of 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArmAngles:
-    """Angles of one arm over time, each (T,) in degrees."""
+    """Angles of one arm over time.
+
+    Attributes:
+        flexion: (T,) flexion of the shoulder, degrees.
+        abduction: (T,) abduction of the shoulder, degrees.
+        elbow: (T,) flexion of the elbow, degrees.
+        pronation: (T,) pronation of the forearm, degrees.
+        spin: (T,) axial rotation of the upper arm, degrees.
+        wrist: (T,) rotation of the hand about its y axis, degrees.
+        radial: (T,) sideways rotation of the hand towards the thumb or the little finger, degrees.
+    """
 
     flexion: FloatArray
     abduction: FloatArray
@@ -44,18 +59,20 @@ class ArmAngles:
     radial: FloatArray
 
     def rotations(self, side: str, walk_weight: FloatArray) -> dict[str, Rotation]:
-        """Return the rotations of upper arm, forearm and hand by joint name.
+        """Return the local rotations of upper arm, forearm and hand by joint name.
 
         Args:
             side: ``Left`` or ``Right``.
-            walk_weight: (T,) 1 while walking; at 0 the arm is stretched out to the side.
+            walk_weight: (T,) weight of the angles: 1 while walking; 0 in a T-pose, with the arm stretched out
+                to the side.
         """
         outward = 1.0 if side == "Left" else -1.0
         hang = walk_weight * (90.0 - self.abduction)
         arm = _rotation_about("X", -walk_weight * self.flexion) * _rotation_about("Y", outward * hang)
         if np.any(self.spin):
             arm = arm * _rotation_about("X", walk_weight * self.spin)
-        # Pronation turns the thumb from the front towards the body: about the bone, positive on the left.
+        # Pronation rotates the forearm about its bone, so that the thumb moves from the front to the body.
+        # It is a positive rotation about X on both sides. The left bone points along +X, the right along -X.
         forearm = _rotation_about("Z", -outward * walk_weight * self.elbow) * _rotation_about(
             "X", walk_weight * self.pronation
         )
@@ -66,19 +83,19 @@ class ArmAngles:
 
 
 def _rotation_about(axis: str, degrees: FloatArray) -> Rotation:
-    """Return rotations by Euler angles (T,len(axis)) about intrinsic axes, degrees."""
+    """Return rotations by Euler angles (T,len(axis)) in degrees about the intrinsic axes `axis`."""
     return Rotation.from_euler(axis, degrees.reshape(-1, len(axis)), degrees=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Press:
-    """One hand at the chest.
+    """A period in which one hand is held against the chest.
 
     Attributes:
         side: ``Left`` or ``Right``.
-        start_s: Time at which its camera is at the chest, seconds.
-        end_s: Time at which it leaves, seconds.
-        degrees: (7,) angles of `ArmAngles` in between.
+        start_s: Common time (seconds) at which the camera on the hand arrives at the chest.
+        end_s: Common time (seconds) at which the camera leaves the chest.
+        degrees: (7,) angles of `ArmAngles` between these times, degrees.
     """
 
     side: str
@@ -87,14 +104,17 @@ class Press:
     degrees: FloatArray
 
     def weight(self, t_s: FloatArray) -> FloatArray:
-        """Return the weight (T,) of the press at times (T,): 1 from start to end, twice differentiable."""
+        """Return the weight (T,) of the press at common times (T,).
+
+        The weight is 1 from `start_s` to `end_s`, and changes smoothly before and after.
+        """
         up = np.clip((t_s - self.start_s) / RAMP_S + 1.0, 0, 1)
         down = np.clip((t_s - self.end_s) / RAMP_S, 0, 1)
         smooth = [x**3 * (10 - 15 * x + 6 * x * x) for x in (up, down)]
         return np.asarray(smooth[0] - smooth[1])
 
     def blended(self, angles: ArmAngles, t_s: FloatArray) -> ArmAngles:
-        """Return the angles of the walk, blended with those of the press."""
+        """Return a weighted mean of given arm angles and the angles of the press at common times (T,)."""
         weight = self.weight(t_s)
         names = ArmAngles.__slots__
         values = {
@@ -105,13 +125,13 @@ class Press:
 
 
 def find_press(mount: Mount, skeleton: SkeletonModel, start_s: float, end_s: float) -> Press:
-    """Find joint angles at which the camera on a hand looks straight into the chest.
+    """Find joint angles at which the camera on a hand looks straight at the chest from a short distance.
 
     Args:
         mount: True mount of the camera on the hand.
-        skeleton: The true body.
-        start_s: Time at which the camera is at the chest, seconds.
-        end_s: Time at which it leaves, seconds.
+        skeleton: Skeleton with the true proportions.
+        start_s: Common time (seconds) at which the camera arrives at the chest.
+        end_s: Common time (seconds) at which the camera leaves the chest.
     """
     side = mount.role.removesuffix("Hand")
     bone = skeleton.offsets_m[skeleton.joints.index("Neck")]
@@ -137,7 +157,7 @@ def find_press(mount: Mount, skeleton: SkeletonModel, start_s: float, end_s: flo
 
 
 def _chest_from_cam(degrees: FloatArray, side: str, mount: Mount, skeleton: SkeletonModel) -> FloatArray:
-    """Return the pose (4,4) of the camera in the frame of the joint of the chest."""
+    """Return the pose (4,4) of the camera in the frame of the chest joint (Spine1)."""
     turns = ArmAngles(*degrees.reshape(7, 1)).rotations(side, np.ones(1))
     joint = skeleton.index_of_role(mount.role)
     chest = skeleton.index_of_role("Spine1")

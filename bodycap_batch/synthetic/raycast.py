@@ -1,4 +1,4 @@
-"""Find the triangle that a ray meets first, with Embree through Open3D."""
+"""Find the first triangle on each ray. Open3D does this with the library Embree."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.formats.open3d_loader import load_open3d
 
 NOTHING = -1
-"""Index for a ray that meets no triangle."""
+"""Face index that is used for a ray that meets no triangle."""
 
 _Float32 = npt.NDArray[np.float32]
 
 
 class RayScene:
-    """Triangles that rays are cast at. A call uses one thread; several threads may call at the same time.
+    """A set of triangles that can be intersected with rays.
+
+    Each call uses one thread. Several threads may call the methods at the same time.
 
     Args:
-        vertices: (V,3) positions.
-        faces: (F,3) vertex indices.
+        vertices: (V,3) positions of the vertices.
+        faces: (F,3) vertex indices of the triangles.
     """
 
     def __init__(self, vertices: FloatArray, faces: npt.NDArray[np.uint32]) -> None:
@@ -29,13 +31,22 @@ class RayScene:
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces))
 
     def first_face(self, rays: _Float32) -> IntArray:
-        """Return the face (N,) that each ray (N,6; origin and direction) meets first, or `NOTHING`."""
+        """Return the index (N,) of the first face on each ray, or `NOTHING`.
+
+        Args:
+            rays: (N,6) origin and direction vector of each ray.
+        """
         answer = self._scene.cast_rays(self._tensor.from_numpy(rays), nthreads=1)
         faces = np.asarray(answer["primitive_ids"].numpy(), dtype=np.int64)
         faces[~np.isfinite(answer["t_hit"].numpy())] = NOTHING
         return faces
 
     def is_occluded(self, rays: _Float32, limit: float) -> BoolArray:
-        """Return a mask (N,) of the rays (N,6) that meet a face within `limit` lengths of their direction."""
+        """Return a mask (N,): True for each ray that meets a face within a maximum distance.
+
+        Args:
+            rays: (N,6) origin and direction vector of each ray.
+            limit: Maximum distance, as a multiple of the length of the direction vector.
+        """
         found = self._scene.test_occlusions(self._tensor.from_numpy(rays), tnear=0.0, tfar=limit, nthreads=1)
         return np.asarray(found.numpy(), dtype=np.bool_)

@@ -1,9 +1,12 @@
-"""Render textured triangles: Embree finds each pixel's triangle, a homography the position on its texture.
+"""Render textured triangles.
 
-Each triangle is flat and its texture is affine on it. So texture coordinates are a projective function of the
-viewing direction, and the derivative of this function gives the exact footprint of a pixel. Pixels at the
-edge of two surfaces get four samples. If four rays two pixels apart meet one plane, the pixels between them
-are taken to meet it too. Objects thinner than two pixels may be missed there.
+The library Embree finds the triangle of each pixel. A homography gives the position of the pixel on the
+triangle's texture. On a flat triangle with an affine texture, the texture coordinates are a projective
+function of the viewing direction. The derivative of this function gives the exact footprint of a pixel.
+
+Pixels at the edge between two surfaces get four samples. To save time, rays are first cast at every second
+pixel. If four neighbouring rays of this grid meet the same plane, the pixels between them are assumed to meet
+this plane too. Objects thinner than two pixels can therefore be missed.
 """
 
 from __future__ import annotations
@@ -21,25 +24,28 @@ from bodycap_batch.synthetic.raycast import NOTHING, RayScene
 from bodycap_batch.synthetic.surfaces import Surface
 
 _NEAR_M = 0.03
-"""Distance from the camera below which nothing is rendered, metres."""
+"""Minimum distance (metres) between the camera and a rendered surface."""
 _SUBPIXELS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
-"""Offsets of the samples of a pixel, px: a rotated grid, with four different rows and columns."""
+"""Offsets (x, y; px) of the four samples of a pixel from its centre. They form a rotated grid with four
+different rows and columns."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Triangles:
-    """Triangles with their planes and textures, all in one frame.
+    """Triangles with their planes and textures, all in the same coordinate frame.
 
     Attributes:
-        vertices: (V,3) positions (m).
-        faces: (F,3) vertex indices.
-        normal: (F,3) unit normals.
-        point: (F,3) a point on each plane.
-        texel_at_point: (F,2) atlas coordinates there.
-        texels_per_m: (F,2,3) gradient of the atlas coordinates.
-        plane: (F,) the same number for adjacent triangles in one plane with one texture.
-        surface: (F,) number of the surface that each belongs to.
-        gain: (F,) brightness factor.
+        vertices: (V,3) positions of the vertices, metres.
+        faces: (F,3) vertex indices of the triangles.
+        normal: (F,3) unit normals of the triangles.
+        point: (F,3) a point on the plane of each triangle, metres.
+        texel_at_point: (F,2) atlas coordinates (texels) at `point`.
+        texels_per_m: (F,2,3) gradient of the atlas coordinates with respect to the position, texels per
+            metre.
+        plane: (F,) number of the textured plane of each triangle. Adjacent triangles in one plane with one
+            texture have equal numbers.
+        surface: (F,) number of the surface that holds each triangle.
+        gain: (F,) brightness factor of each triangle.
     """
 
     vertices: FloatArray
@@ -54,7 +60,12 @@ class Triangles:
 
 
 def triangles_from_surfaces(surfaces: Sequence[Surface], origins: FloatArray) -> Triangles:
-    """Return two triangles for each of N rectangles, given their images' origins (N,2) in the atlas."""
+    """Return two triangles for each of N rectangles.
+
+    Args:
+        surfaces: The N rectangles.
+        origins: (N,2) atlas coordinates (texels) of the top left corners of the rectangles' images.
+    """
     corners = np.array([surface.corners() for surface in surfaces])
     quads = np.arange(len(surfaces))[:, None, None] * 4
     faces = (quads + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
@@ -76,7 +87,7 @@ def triangles_from_surfaces(surfaces: Sequence[Surface], origins: FloatArray) ->
 
 
 def concatenate_triangles(first: Triangles, second: Triangles) -> Triangles:
-    """Return two sets of triangles as one."""
+    """Return one set of triangles that holds all triangles of two sets."""
     return Triangles(
         vertices=np.concatenate([first.vertices, second.vertices]),
         faces=np.concatenate([first.faces, second.faces + np.uint32(len(first.vertices))]),
@@ -97,13 +108,13 @@ def _dot(first: Float32, second: Float32) -> Float32:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Texels:
-    """Texture coordinates of N rays.
+    """Texture coordinates of the points that N rays meet.
 
     Attributes:
-        faces: (N,) triangles that the rays meet, or `NOTHING`.
-        rows: (9,N) homographies of these triangles.
-        inverse: (N,) one over the homographies' third component.
-        at: (2,N) texel coordinates.
+        faces: (N,) indices of the triangles that the rays meet, or `NOTHING`.
+        rows: (9,N) homographies from viewing directions to the textures of these triangles, row by row.
+        inverse: (N,) reciprocal of the third homogeneous coordinate that each homography gives for its ray.
+        at: (2,N) texel coordinates (x, y) of the points.
     """
 
     faces: IntArray
@@ -112,12 +123,12 @@ class _Texels:
     at: Float32
 
     def footprint(self, right: Float32, down: Float32, only: IntArray | None = None) -> Float32:
-        """Return the derivatives (4,M) of `at` for steps of the rays.
+        """Return the derivatives (4,M) of the texel coordinates `at` with respect to pixel steps.
 
         Args:
-            right: (3,M) change of a ray by one pixel to the right.
-            down: (3,M) change by one pixel down.
-            only: (M,) rows of the rays; all by default.
+            right: (3,M) change of each ray for a step of one pixel to the right.
+            down: (3,M) change of each ray for a step of one pixel down.
+            only: (M,) indices of the rays to evaluate; None for all rays.
         """
         rows, inverse, at = self.rows, self.inverse, self.at
         if only is not None:
@@ -134,17 +145,18 @@ class _Texels:
 def _shared_filters(
     texels: _Texels, lens: Sequence[Float32], size: tuple[int, ...], uniform: BoolArray
 ) -> tuple[Filter, IntArray]:
-    """Return filters shared by 2×2 pixels, and each pixel's filter.
+    """Return filters for all pixels. Cells of 2×2 pixels share a filter where possible.
 
     Args:
         texels: Texture coordinates of the H·W pixels.
-        lens: Rays (3,H·W) and their changes by one pixel to the right and down.
-        size: (H,W).
-        uniform: (H·W,) True for pixels between four rays that meet one plane; the others get their own
-            filter.
+        lens: Three arrays (3,H·W): the rays, their changes for a step of one pixel to the right, and their
+            changes for a step of one pixel down.
+        size: Size (H,W) of the image.
+        uniform: (H·W,) True for a pixel between four rays that meet the same plane. Each other pixel gets a
+            separate filter.
 
     Returns:
-        The filters; (H·W,) index of each pixel's filter.
+        The filters, and the index (H·W,) of each pixel's filter.
     """
     index = np.arange(size[0] * size[1]).reshape(size)
     corners = index[::2, ::2].ravel()
@@ -156,11 +168,11 @@ def _shared_filters(
 
 
 class SceneRenderer:
-    """Renders images of triangles.
+    """Renderer of images of textured triangles.
 
     Args:
-        triangles: All triangles, in the world.
-        atlas: Their textures.
+        triangles: All triangles, in the world frame.
+        atlas: Atlas that holds the textures of the triangles.
     """
 
     def __init__(self, triangles: Triangles, atlas: Atlas) -> None:
@@ -170,15 +182,15 @@ class SceneRenderer:
         self._scene = RayScene(triangles.vertices, triangles.faces)
 
     def image(self, grid: RayGrid, world_from_cam: FloatArray, rows: slice) -> Bytes:
-        """Render some rows of an image.
+        """Render consecutive rows of an image.
 
         Args:
             grid: Viewing rays of the lens.
-            world_from_cam: (4,4) pose of all rows, or (rows,4,4) pose of each row.
-            rows: The rows to render.
+            world_from_cam: (4,4) camera pose of all rows, or (rows,4,4) camera pose of each row.
+            rows: Range of the rows to render.
 
         Returns:
-            (rows,W,3) RGB, 0 … 255, without noise.
+            (rows,W,3) RGB image, 0 … 255, without noise.
         """
         poses = world_from_cam.reshape(-1, 4, 4)
         size = grid.valid[rows].shape
@@ -205,7 +217,10 @@ class SceneRenderer:
         return np.asarray(colours.reshape(*size, 3))
 
     def _homographies(self, poses: FloatArray) -> Float32:
-        """Return homographies (9,B·F) of each pose and triangle: direction in the camera to (u·w, v·w, w)."""
+        """Return a homography (9,B·F) for each of B poses and F triangles.
+
+        It maps a direction in the camera frame to homogeneous atlas coordinates (u·w, v·w, w).
+        """
         shape, out = self._triangles, np.empty((3, 3, len(poses), len(self._triangles.faces)))
         rotation, centre = poses[:, :3, :3], poses[:, :3, 3]
         normal = np.einsum("bji,fj->ibf", rotation, shape.normal)
@@ -221,9 +236,10 @@ class SceneRenderer:
     def _hit_grid(
         self, rays: Float32, size: tuple[int, int], poses: FloatArray, pose_of: IntArray | None
     ) -> tuple[IntArray, BoolArray]:
-        """Return the first triangles (H·W,) that a whole grid of rays (3,H·W) meets; only some rays are cast.
+        """Return the index (H·W,) of the first triangle on each ray (3,H·W) of an image, or `NOTHING`.
 
-        Also return a mask (H·W,) of the pixels between four rays that met one plane.
+        Only a part of the rays is cast. Also return a mask (H·W,): True for a pixel between four cast rays
+        that meet the same plane.
         """
         faces = np.full(size[0] * size[1], NOTHING, np.int64)
         index = np.arange(len(faces)).reshape(size)
@@ -247,11 +263,11 @@ class SceneRenderer:
         return faces, known.ravel()
 
     def _hit(self, rays: Float32, poses: FloatArray, pose_of: IntArray | None) -> IntArray:
-        """Return the triangle (N,) that each ray (3,N) meets first, or −1."""
+        """Return the index (N,) of the first triangle on each ray (3,N), or `NOTHING`."""
         rotation, centre = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
         origin_and_ray = np.empty((rays.shape[1], 6), np.float32)
         if pose_of is None:
-            # Not a matrix product: BLAS would start its own threads in each of these threads.
+            # No matrix product here: BLAS would start additional threads in each rendering thread.
             turned, start = np.einsum("ij,jn->in", rotation[0], rays), centre[0][:, None]
         else:
             turned, start = np.einsum("nij,jn->in", rotation[pose_of], rays), centre[pose_of].T
@@ -260,7 +276,7 @@ class SceneRenderer:
         return self._scene.first_face(origin_and_ray)
 
     def _texels(self, faces: IntArray, pose_of: IntArray | None, tables: Float32, rays: Float32) -> _Texels:
-        """Return the texture coordinates of rays (3,N) on their triangles (N,)."""
+        """Return the texture coordinates of rays (3,N) that meet the triangles `faces` (N,)."""
         found = np.maximum(faces, 0)
         entry = found if pose_of is None else pose_of * len(self._triangles.faces) + found
         rows = np.take(tables, entry, axis=1, mode="clip")
@@ -273,7 +289,7 @@ class SceneRenderer:
         return _Texels(faces=faces, rows=rows, inverse=inverse, at=at)
 
     def _colours(self, texels: _Texels, filters: Filter, cell: IntArray | None) -> Bytes:
-        """Return the filtered and shaded texture (N,3); black for rays that met nothing."""
+        """Return the filtered and shaded colours (N,3) of N rays. Rays that meet no triangle are black."""
         colours = self._atlas.sample(texels.at, filters, cell)
         if self._shaded:
             gain = self._triangles.gain[np.maximum(texels.faces, 0)]
@@ -282,7 +298,7 @@ class SceneRenderer:
         return colours
 
     def _edges(self, faces: IntArray) -> npt.NDArray[np.bool_]:
-        """Return a mask (H,W) of the pixels with a neighbour that shows another surface."""
+        """Return a mask (H,W): True for a pixel with a direct neighbour on another surface."""
         owner = np.append(self._triangles.surface, NOTHING)[faces]
         edge = np.zeros(owner.shape, dtype=bool)
         across, along = owner[:, 1:] != owner[:, :-1], owner[1:] != owner[:-1]

@@ -1,7 +1,7 @@
 """A laboratory: walls, floor, ceiling, furniture, and pictures on the walls.
 
-Each surface has its own texture from its own random stream, unless repeated posters are asked for. As in a
-real room, parts of the walls and most of the ceiling have little texture.
+Each surface has a different texture from a separate random stream, unless repeated posters are requested. As
+in a real room, parts of the walls and most of the ceiling have little texture.
 """
 
 from __future__ import annotations
@@ -18,31 +18,34 @@ from bodycap_batch.synthetic.surfaces import UINT8, Surface, box_faces, surface_
 from bodycap_batch.synthetic.textures import Texture
 
 _PICTURE_DETAIL = 1.3
-"""Detail of pictures and books, relative to that of walls and furniture."""
+"""Ratio of the texture detail (texels per metre) of pictures and books to the detail of walls and furniture.
+"""
 _EDGE_M = 0.06
-"""Width below which a face shows the painted edge of a board instead of its texture, metres."""
+"""Minimum width (metres) of a face with its material's texture. A narrower face, such as the edge of a board,
+gets a texture of painted metal."""
 _MAX_TEXELS = 6000
-"""Longer side of a texture at most, texels; limits memory."""
+"""Maximum length (texels) of the longer side of a texture. It limits the memory."""
 HEIGHT_M = 2.8
 """Height of the room, metres."""
 MARGIN_M = 1.7
-"""Distance between the walk and the walls, metres: furniture is up to 0.7 m deep."""
+"""Minimum distance (metres) between the walk and the walls. Furniture at the walls is up to 0.7 m deep."""
 _MIN_HALF_M = (3.4, 3.0)
-"""Half of the room's extent along x and y at least, metres."""
+"""Minimum of half of the room's size along x and y, metres."""
 _CARPETS = ((-0.38, -0.35), (0.42, 0.30), (-0.25, 0.45), (0.4, -0.5))
-"""Centres of the carpets, relative to half of the room's extent."""
+"""Centres (x, y) of the carpets, as fractions of half of the room's size."""
 _PICTURE_BASES_M = (2.05, 1.25, 1.55, 1.10)
-"""Height of the pictures' lower edge on each wall, metres: above its furniture."""
+"""Minimum height (metres) of the pictures' lower edges on each wall. It is above the furniture at this wall.
+"""
 
 
 @dataclass(slots=True)
 class _Builder:
-    """Collects surfaces; each one gets the next child of one seed sequence.
+    """Collector of surfaces. Each random texture uses the next child of one seed sequence.
 
     Attributes:
-        seeds: Source of all random streams.
-        texels_per_m: Detail of the textures.
-        surfaces: The surfaces so far.
+        seeds: Seed sequence of all random streams.
+        texels_per_m: Detail of the textures, texels per metre.
+        surfaces: The surfaces that have been added so far.
     """
 
     seeds: np.random.SeedSequence
@@ -50,17 +53,23 @@ class _Builder:
     surfaces: list[Surface] = field(default_factory=list)
 
     def rng(self) -> np.random.Generator:
-        """Return the next random stream."""
+        """Return a generator with the next random stream."""
         return np.random.default_rng(self.seeds.spawn(1)[0])
 
     def image(self, size_m: tuple[float, float], texture: Texture, detail: float = 1.0) -> UINT8:
-        """Return a new texture for a rectangle of (width, height) metres."""
+        """Return a new image of a texture for a rectangle.
+
+        Args:
+            size_m: Width and height of the rectangle, metres.
+            texture: Function that draws the texture.
+            detail: Multiplier of the texture detail.
+        """
         scale = min(self.texels_per_m * detail, _MAX_TEXELS / max(size_m))
         width, height = (max(8, round(side * scale)) for side in size_m)
         return np.asarray(texture(height, width, scale, self.rng()), dtype=np.uint8)
 
     def textured(self, face: Surface, texture: Texture, detail: float = 1.0) -> None:
-        """Add a face with a new texture."""
+        """Add a face with a new image of a texture. Narrow faces get a metal texture."""
         size = float(np.linalg.norm(face.across)), float(np.linalg.norm(face.down))
         if min(size) < _EDGE_M:
             texture = textures.metal
@@ -69,7 +78,10 @@ class _Builder:
     def box(
         self, centre: FloatArray, size_m: tuple[float, float, float], yaw_deg: float, texture: Texture
     ) -> None:
-        """Add a box with a new texture on each visible face."""
+        """Add the visible faces of a box, each with a new image of a texture.
+
+        The bottom is visible only if it is above the floor.
+        """
         for index, face in enumerate(box_faces(centre, size_m, yaw_deg)):
             if index < 5 or centre[2] - size_m[2] / 2 > 0.05:
                 self.textured(face, texture)
@@ -77,13 +89,13 @@ class _Builder:
 
 @dataclass(frozen=True, slots=True)
 class _Wall:
-    """One wall.
+    """One wall of the room.
 
     Attributes:
-        middle: (3,) its middle at floor height (m).
-        right: (3,) unit vector along it, to the right for a person who looks at it.
-        normal: (3,) unit vector into the room.
-        length_m: Its length.
+        middle: (3,) world position (m) of the wall's middle at floor height.
+        right: (3,) horizontal unit vector along the wall, to the right for a person who looks at the wall.
+        normal: (3,) unit normal of the wall. It points into the room.
+        length_m: Length of the wall, metres.
     """
 
     middle: FloatArray
@@ -92,13 +104,19 @@ class _Wall:
     length_m: float
 
     def point_at(self, along_m: float, height_m: float, off_m: float) -> FloatArray:
-        """Return a point `along_m` to the right of the middle and `off_m` in front of the wall."""
+        """Return a world position (3,) in metres.
+
+        Args:
+            along_m: Distance to the right of the wall's middle, metres.
+            height_m: Height above the floor, metres.
+            off_m: Distance in front of the wall, metres.
+        """
         point = self.middle + along_m * self.right + off_m * self.normal
         return np.asarray(point + np.array([0.0, 0.0, height_m]))
 
     @property
     def yaw_deg(self) -> float:
-        """Direction of the wall about the vertical, degrees."""
+        """Angle (degrees) of `right` about the vertical, measured from the x axis."""
         return float(np.degrees(np.arctan2(self.right[1], self.right[0])))
 
 
@@ -113,11 +131,14 @@ def build_room(
     """Build a furnished and lit room around a walk.
 
     Args:
-        half_extent_m: Extent of the walk from the room's middle along x and y, metres.
-        texels_per_m: Detail of the textures.
-        seed: Source of all textures and positions.
-        furnished: False: plain walls, floor and ceiling, with pictures on the walls only.
-        repeated_posters: True: the same three pictures hang in many positions.
+        half_extent_m: Maximum distances (metres) of the walk from the room's middle along x and y.
+        texels_per_m: Detail of the textures, texels per metre.
+        seed: Seed of all textures and positions.
+        furnished: False: the room has plain walls, floor and ceiling, and pictures on the walls only.
+        repeated_posters: True: three different pictures hang in many positions.
+
+    Returns:
+        The surfaces of the room. Their textures include the light of the lamps.
     """
     half = [max(low, extent + MARGIN_M) for low, extent in zip(_MIN_HALF_M, half_extent_m, strict=True)]
     build = _Builder(seed, texels_per_m)
@@ -140,9 +161,9 @@ def _build_shell(build: _Builder, half: list[float], *, bare: bool) -> list[_Wal
     """Add floor, carpets, ceiling and four walls, and return the walls.
 
     Args:
-        build: Collects the surfaces.
-        half: Half of the room's extent along x and y, metres.
-        bare: True: all surfaces are plain.
+        build: Collector of the surfaces.
+        half: Half of the room's size along x and y, metres.
+        bare: True: all surfaces are plain, and there are no carpets.
     """
     up = np.array([0.0, 0.0, 1.0])
     floor, ceiling = box_faces([0, 0, HEIGHT_M / 2], [2 * half[0], 2 * half[1], HEIGHT_M], 0.0)[4:][::-1]
@@ -162,7 +183,7 @@ def _build_shell(build: _Builder, half: list[float], *, bare: bool) -> list[_Wal
         textures.plaster,
     )
     for angle, texture in zip((90, 0, 270, 180), materials, strict=True):
-        # The wall is in this direction and faces the middle.
+        # The wall is in the direction `outward` from the room's middle, and faces the middle.
         outward = np.round([np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0], 12)
         axis = int(np.argmax(np.abs(outward)))
         wall = _Wall(outward * half[axis], np.cross(up, -outward), -outward, 2 * half[1 - axis])
@@ -174,12 +195,12 @@ def _build_shell(build: _Builder, half: list[float], *, bare: bool) -> list[_Wal
 
 
 def _seen_from_behind(face: Surface) -> Surface:
-    """Return the same rectangle, facing the other way."""
+    """Return a rectangle at the same position whose image faces the opposite side."""
     return replace(face, corner=face.corner + face.across, across=-face.across)
 
 
 def _add_shelves(build: _Builder, wall: _Wall) -> None:
-    """Add open shelves full of books along a wall."""
+    """Add open shelves with books along a wall."""
     rng = build.rng()
     for along in np.arange(-wall.length_m / 2 + 0.9, wall.length_m / 2 - 0.8, 1.75):
         wide, deep, tall = rng.uniform(0.9, 1.3), 0.32, rng.uniform(1.3, 2.1)
@@ -228,7 +249,7 @@ def _add_desks(build: _Builder, wall: _Wall) -> None:
 
 
 def _add_cupboards(build: _Builder, wall: _Wall) -> None:
-    """Add cupboards of different heights with boxes on top along a wall."""
+    """Add cupboards of different heights along a wall, with boxes on top."""
     rng = build.rng()
     for along in np.arange(-wall.length_m / 2 + 0.7, wall.length_m / 2 - 0.6, 1.25):
         wide, deep, tall = rng.uniform(0.7, 1.0), rng.uniform(0.4, 0.6), rng.uniform(0.7, 1.5)
@@ -240,7 +261,7 @@ def _add_cupboards(build: _Builder, wall: _Wall) -> None:
 
 
 def _add_sofa(build: _Builder, wall: _Wall) -> None:
-    """Add a sofa, boxes and a partition at a wall."""
+    """Add a sofa, a pile of boxes and a partition at a wall."""
     rng = build.rng()
     build.box(wall.point_at(-0.9, 0.22, 0.42), (1.9, 0.8, 0.42), wall.yaw_deg, textures.fabric)
     build.box(wall.point_at(-0.9, 0.62, 0.12), (1.9, 0.22, 0.40), wall.yaw_deg, textures.fabric)
@@ -259,12 +280,12 @@ def _add_sofa(build: _Builder, wall: _Wall) -> None:
 
 
 def _add_pictures(build: _Builder, walls: list[_Wall], repeated: bool) -> None:
-    """Add boards, posters and paintings above the furniture; some parts of the walls stay bare."""
+    """Add whiteboards, posters and paintings above the furniture. Some parts of the walls stay bare."""
     rng = build.rng()
     kinds = list(pictures.WALL_PICTURES)
     repeats = [build.image((0.6, 0.8), kind, _PICTURE_DETAIL) for kind in kinds[:3]]
     for index, wall in enumerate(walls):
-        # The first wall has shelves up to 2.1 m, so its pictures are fewer and higher.
+        # The first wall has shelves up to 2.1 m high. So its pictures hang higher and are less tall.
         along = -wall.length_m / 2 + 0.3
         while along < wall.length_m / 2 - 0.7:
             wide, tall = float(rng.uniform(0.45, 1.1)), float(rng.uniform(0.45, 0.95))
@@ -304,7 +325,7 @@ def _add_ceiling_fittings(build: _Builder, half: list[float]) -> None:
 
 
 def _add_lamp_housings(build: _Builder, lamps: FloatArray) -> None:
-    """Add bright panels at the lamps' positions (L,3)."""
+    """Add a bright panel at each lamp position (L,3)."""
     for lamp in lamps:
         tint = build.rng().uniform(0.94, 1.0, 3)
         face = box_faces(lamp + np.array([0, 0, 0.03]), (0.9, 0.3, 0.02), 0.0)[5]
@@ -314,4 +335,4 @@ def _add_lamp_housings(build: _Builder, lamps: FloatArray) -> None:
 
 
 _BLANK: UINT8 = np.zeros((1, 1, 3), np.uint8)
-"""Image of a face before its texture is drawn."""
+"""Placeholder image of a face whose texture has not been drawn yet."""

@@ -1,4 +1,4 @@
-"""Flat, textured rectangles, which a room is made of."""
+"""Flat rectangles with textures. The synthetic room consists of such rectangles."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import so3_exp
 
 UINT8 = npt.NDArray[np.uint8]
-"""An image (H,W,3)."""
+"""An array of uint8, usually an RGB image (H,W,3)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surface:
-    """A rectangle with an image on it.
+    """A flat rectangle with an image as its texture.
 
     Attributes:
-        corner: (3,) world position of the image's top left corner (m).
-        across: (3,) vector from there to the top right corner (m).
-        down: (3,) vector from there to the bottom left corner (m).
+        corner: (3,) world position (m) of the image's top left corner.
+        across: (3,) vector (m) from the top left to the top right corner.
+        down: (3,) vector (m) from the top left to the bottom left corner.
         image: (H,W,3) RGB texture.
-        shines: True for a lamp: no other light is painted on it.
+        shines: True for a lamp. The image of a lamp is not multiplied by the light of the room.
     """
 
     corner: FloatArray
@@ -34,12 +34,12 @@ class Surface:
 
     @property
     def normal(self) -> FloatArray:
-        """Unit vector (3,) towards the side from which the image is not mirrored."""
+        """Unit normal (3,) on the front side, where the image does not look mirrored."""
         normal = np.cross(self.down, self.across)
         return np.asarray(normal / np.linalg.norm(normal))
 
     def corners(self) -> FloatArray:
-        """Return the corners (4,3): top left, top right, bottom right, bottom left."""
+        """Return the world positions (4,3) of the corners: top left, top right, bottom right, bottom left."""
         edges = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ np.stack([self.across, self.down])
         return np.asarray(self.corner + edges)
 
@@ -47,7 +47,14 @@ class Surface:
 def surface_facing(
     centre: npt.ArrayLike, normal: npt.ArrayLike, size_m: tuple[float, float], image: UINT8
 ) -> Surface:
-    """Return an upright rectangle around a centre (3,) that faces a horizontal direction (3,)."""
+    """Return a vertical rectangle that faces a horizontal direction.
+
+    Args:
+        centre: (3,) world position (m) of the centre.
+        normal: (3,) horizontal unit normal on the side of the image.
+        size_m: Width and height, metres.
+        image: (H,W,3) RGB texture.
+    """
     normal = np.asarray(normal, dtype=np.float64)
     up = np.array([0.0, 0.0, 1.0])
     across = np.cross(up, normal) * size_m[0]
@@ -57,12 +64,12 @@ def surface_facing(
 
 
 def box_faces(centre: npt.ArrayLike, size_m: npt.ArrayLike, yaw_deg: float) -> list[Surface]:
-    """Return the six faces of a box with black images of 1×1 texels: four sides, top, bottom.
+    """Return the six faces of a box: four sides, top, bottom. Their images are one black texel.
 
     Args:
-        centre: (3,) middle of the box (m).
-        size_m: (3,) extents along its own x and y axes and the vertical.
-        yaw_deg: Rotation about the vertical.
+        centre: (3,) world position (m) of the middle of the box.
+        size_m: (3,) sizes (m) along the x and y axes of the box, and along the vertical.
+        yaw_deg: Rotation of the box about the vertical, degrees.
     """
     centre, size = np.asarray(centre, dtype=np.float64), np.asarray(size_m, dtype=np.float64)
     turn = so3_exp(np.array([0.0, 0.0, np.radians(yaw_deg)]))

@@ -1,6 +1,7 @@
 """Procedural textures of building materials and furniture: RGB uint8 images of any size.
 
-Sizes are in texels. `scale` is in texels per metre, so that bricks have the same size on every wall.
+The arguments `height` and `width` are in texels. The argument `scale` is in texels per metre, so that bricks
+have the same size on every wall.
 """
 
 from __future__ import annotations
@@ -12,24 +13,39 @@ import numpy as np
 import numpy.typing as npt
 
 Image = npt.NDArray[np.uint8]
-"""(H,W,3) RGB."""
+"""RGB image (H,W,3), uint8."""
 Grey = npt.NDArray[np.float32]
-"""(H,W) brightness, or (3,) a colour."""
+"""Brightness image (H,W) or RGB colour (3,), float32."""
 Texture = Callable[[int, int, float, np.random.Generator], Image]
-"""Function of height and width (texels), texels per metre and a random generator that returns an RGB
-image."""
+"""Function that draws a texture as an RGB image. Its arguments are the height and the width (texels), the
+scale (texels per metre) and a random generator."""
 
 
 def colour(
     rng: np.random.Generator, saturation: float = 0.6, value: tuple[float, float] = (0.3, 0.95)
 ) -> Grey:
-    """Return a random RGB colour (3,), 0 … 255."""
+    """Return a random RGB colour (3,), 0 … 255.
+
+    Args:
+        rng: Source of randomness.
+        saturation: Maximum saturation, 0 … 1.
+        value: Minimum and maximum brightness, 0 … 1.
+    """
     hsv = np.array([[[rng.uniform(0, 360), rng.uniform(0.2, 1.0) * saturation, rng.uniform(*value)]]])
     return np.asarray(cv2.cvtColor(hsv.astype(np.float32), cv2.COLOR_HSV2RGB)[0, 0] * 255.0, dtype=np.float32)
 
 
 def fractal(height: int, width: int, cell: float, rng: np.random.Generator, octaves: int = 4) -> Grey:
-    """Return smooth noise (H,W) about 0, amplitude near 1, with features up to `cell` texels wide."""
+    """Return smooth random noise (H,W) with mean 0 and an amplitude of about 1.
+
+    Args:
+        height: Height of the noise image, texels.
+        width: Width of the noise image, texels.
+        cell: Size of the largest features, texels.
+        rng: Source of randomness.
+        octaves: Number of noise images that are added. Each image has half the feature size and half the
+            amplitude of the previous image.
+    """
     out = np.zeros((height, width), np.float32)
     for octave in range(octaves):
         size = max(cell / 2**octave, 1.0)
@@ -42,25 +58,28 @@ def fractal(height: int, width: int, cell: float, rng: np.random.Generator, octa
 
 
 def tint_shade(shade: Grey, base: Grey) -> Image:
-    """Return a colour (3,) multiplied by a shade (H,W) around 1."""
+    """Return an image of a colour (3,) multiplied by a brightness (H,W) of about 1.
+
+    Negative brightness becomes 0.
+    """
     np.maximum(shade, 0, out=shade)
     return np.asarray(cv2.merge([cv2.convertScaleAbs(shade, alpha=float(part)) for part in base]))
 
 
 def shade_image(image: Image, shade: Grey) -> Image:
-    """Return an image multiplied by a shade (H,W) around 1."""
+    """Return an image multiplied by a brightness (H,W) of about 1."""
     return np.asarray(cv2.multiply(image, cv2.merge([shade.astype(np.float32)] * 3), dtype=cv2.CV_8U))
 
 
 def plaster(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return a painted wall, almost plain."""
+    """Return the texture of a painted wall that is almost plain."""
     shade = 1.0 + 0.012 * fractal(height, width, scale * 0.8, rng, 3)
     shade += 0.008 * rng.standard_normal((height, width), dtype=np.float32)
     return tint_shade(shade, 0.35 * colour(rng, 0.5, (0.75, 0.9)) + np.float32(0.6 * 225.0))
 
 
 def bricks(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return courses of bricks, each with its own tint, with mortar between them."""
+    """Return the texture of rows of bricks with mortar between them. Each brick has a different tint."""
     tall, long, gap = 0.075 * scale, 0.22 * scale, max(1, round(0.009 * scale))
     out = np.full((height, width, 3), 170, np.uint8)
     base = 0.5 * colour(rng, 0.5) + np.float32(0.5) * np.array([165, 90, 70], np.float32)
@@ -77,7 +96,7 @@ def bricks(height: int, width: int, scale: float, rng: np.random.Generator) -> I
 
 
 def planks(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return wooden boards along the width, with grain, knots and joints."""
+    """Return the texture of wooden boards along the width, with grain, knots and joints."""
     board = max(8, round(rng.uniform(0.10, 0.16) * scale))
     base = np.array([[205, 165, 115], [150, 105, 70], [120, 75, 50], [185, 150, 120]], np.float32)
     tint = base[rng.integers(len(base))] * np.float32(rng.uniform(0.85, 1.1))
@@ -97,7 +116,7 @@ def planks(height: int, width: int, scale: float, rng: np.random.Generator) -> I
 
 
 def _grain(rows: int, columns: int, scale: float, rng: np.random.Generator) -> Grey:
-    """Return one board with warped rings and its own brightness."""
+    """Return the brightness image of one wooden board, with warped rings and knots."""
     y = np.linspace(0, rows / scale, rows, dtype=np.float32)[:, None]
     warp = fractal(rows, columns, 0.25 * scale, rng, 3)
     rings = np.sin((y * rng.uniform(250, 420) + 2.2 * warp) + rng.uniform(0, 6))
@@ -111,7 +130,7 @@ def _grain(rows: int, columns: int, scale: float, rng: np.random.Generator) -> G
 
 
 def carpet(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return a woven carpet with irregular medallions, stripes and pile."""
+    """Return the texture of a woven carpet with irregular polygons, a border and pile."""
     out = np.full((height, width, 3), 0, np.uint8)
     out[:] = np.clip(colour(rng, 0.7, (0.3, 0.6)), 0, 255)
     for size, count in ((0.22, 3.5), (0.10, 14.0), (0.045, 50.0)):
@@ -128,7 +147,7 @@ def carpet(height: int, width: int, scale: float, rng: np.random.Generator) -> I
 
 
 def _blot(out: Image, x: float, y: float, size: float, rng: np.random.Generator) -> None:
-    """Draw an irregular polygon of one colour."""
+    """Draw an irregular polygon of one colour around a centre x, y (texels)."""
     corners = int(rng.integers(3, 8))
     angle = np.sort(rng.uniform(0, 2 * np.pi, corners))
     radius = size * rng.uniform(0.4, 1.0, corners)
@@ -137,7 +156,7 @@ def _blot(out: Image, x: float, y: float, size: float, rng: np.random.Generator)
 
 
 def granite(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return speckled stone, for worktops."""
+    """Return the texture of speckled stone for worktops."""
     noise = fractal(height, width, 0.05 * scale, rng, 4) + 0.8 * fractal(height, width, 0.012 * scale, rng, 2)
     shade = 0.85 + 0.18 * np.tanh(1.5 * noise)
     for level, depth in ((1.7, 0.4), (-1.9, 1.5)):
@@ -147,7 +166,7 @@ def granite(height: int, width: int, scale: float, rng: np.random.Generator) -> 
 
 
 def tiles(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return floor tiles of different tones, chipped and stained."""
+    """Return the texture of floor tiles with different brightness, with chips and stains."""
     side = rng.uniform(0.28, 0.36) * scale
     base = colour(rng, 0.3, (0.5, 0.8))
     shade = np.ones((height, width), np.float32)
@@ -170,7 +189,7 @@ def tiles(height: int, width: int, scale: float, rng: np.random.Generator) -> Im
 
 
 def fabric(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return upholstery with woven threads, stripes of random width and a few folds."""
+    """Return the texture of upholstery with woven threads, stripes of random width and a few folds."""
     out = np.empty((height, width, 3), np.uint8)
     stop = 0
     while stop < width:
@@ -182,7 +201,7 @@ def fabric(height: int, width: int, scale: float, rng: np.random.Generator) -> I
 
 
 def ceiling_panels(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return acoustic panels with faint holes, some stains, grilles and a hatch."""
+    """Return the texture of acoustic panels with faint holes, some stains and some grilles."""
     side = 0.6 * scale
     shade = np.full((height, width), 1.0, np.float32)
     holes = rng.uniform(size=(height // 4 + 1, width // 4 + 1)).astype(np.float32)
@@ -208,7 +227,7 @@ def ceiling_panels(height: int, width: int, scale: float, rng: np.random.Generat
 
 
 def _grille(panel: Grey, scale: float, rng: np.random.Generator) -> None:
-    """Draw the slots of an air outlet."""
+    """Draw the slots of an air outlet on a panel."""
     margin = int(rng.uniform(0.06, 0.14) * scale)
     pitch = max(4, int(rng.uniform(0.025, 0.04) * scale))
     for top in range(margin, panel.shape[0] - margin, pitch):
@@ -216,7 +235,7 @@ def _grille(panel: Grey, scale: float, rng: np.random.Generator) -> None:
 
 
 def metal(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
-    """Return painted sheet metal with scratches, dents and a label."""
+    """Return the texture of painted sheet metal with scratches."""
     shade = np.ones((height, width), np.float32) + 0.03 * fractal(height, width, 0.2 * scale, rng, 3)
     for _ in range(int(30 * height * width / scale**2) + 3):
         start = np.array([rng.uniform(0, width), rng.uniform(0, height)])

@@ -1,4 +1,7 @@
-"""Write the files beside the videos: calibration, true paths, joints, body, motion and mounts."""
+"""Write the files of a capture other than videos: calibration and ground truth.
+
+The ground truth is the paths of the cameras, joint positions, body proportions, motion and mounts.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ JOINT_ROLES = {
     "right_shoulder": "RightArm", "left_knee": "LeftLeg", "right_knee": "RightLeg", "left_hip": "LeftUpLeg",
     "right_hip": "RightUpLeg", "left_ankle": "LeftFoot", "right_ankle": "RightFoot",
 }  # fmt: skip
-"""Names in ``gt/joints.npz`` and the roles of the joints they mean."""
+"""Names of the joints in ``gt/joints.npz``, with the role of each joint in the skeleton."""
 
 _README = """Ground truth of a synthetic capture. Metres, Z up, floor at z = 0.
 
@@ -39,11 +42,11 @@ synth.json     the options the capture was made with.
 The body's true proportions are those of ../skeleton.bvh and of motion.bvh.
 """
 MARKER = Path("gt", "synth.json")
-"""File that every completely written capture has."""
+"""Path of a file that every complete synthetic capture has, relative to the capture's folder."""
 
 
 def write_calibration(folder: Path, options: SynthOptions) -> None:
-    """Write ``calib.json``: the intrinsics of all cameras, and their clocks."""
+    """Write ``calib.json``: the intrinsics, the timing and the clock offsets of all cameras."""
     content: dict[str, Any] = {
         "width": options.width,
         "height": options.height,
@@ -61,7 +64,7 @@ def write_calibration(folder: Path, options: SynthOptions) -> None:
 
 
 def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts: tuple[Mount, ...]) -> None:
-    """Write ``skeleton.bvh`` and everything in ``gt/`` except the cameras' paths."""
+    """Write ``skeleton.bvh`` and all files in ``gt/`` except the paths of the cameras."""
     truth = folder / "gt"
     ticks = common_ticks_ns(options)
     root, local = motion.pose(seconds_from_ns(ticks))
@@ -94,12 +97,15 @@ def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts:
 
 
 def seconds_from_ns(times_ns: IntArray) -> FloatArray:
-    """Return times in nanoseconds as seconds."""
+    """Convert times from nanoseconds to seconds."""
     return np.asarray(times_ns * 1e-9, dtype=np.float64)
 
 
 def common_ticks_ns(options: SynthOptions) -> IntArray:
-    """Return the ticks of the capture on the common clock (ns), from the earliest timestamp to the latest."""
+    """Return regular times (nanoseconds) on the common clock at the common frame rate.
+
+    They cover the capture from the earliest to the latest timestamp of all cameras.
+    """
     offsets = [options.offsets_s.get(name, 0.0) for name in options.cameras]
     lasts_s = (options.frame_count - 1) / options.fps + max(offsets) - min(offsets)
     ticks = np.arange(int(np.floor(lasts_s * options.fps + 1e-6)) + 1)
@@ -107,18 +113,25 @@ def common_ticks_ns(options: SynthOptions) -> IntArray:
 
 
 def write_path(path: Path, times_ns: IntArray, world_from_cam: FloatArray, note: str) -> None:
-    """Write a camera's path on its own clock, with a note in the header."""
+    """Write the path of a camera as a TUM file.
+
+    Args:
+        path: Path of the file.
+        times_ns: (T,) times on the camera's own clock, nanoseconds.
+        world_from_cam: (T,4,4) poses of the camera.
+        note: Text for the header of the file.
+    """
     poses = TimedPoses(times_ns=times_ns, world_from_cam=world_from_cam)
     write_tum(path, poses, (note,))
 
 
 def write_timestamps(path: Path, times_ns: IntArray) -> None:
-    """Write the times of a video's frames: seconds, one in each line."""
+    """Write the times of a video's frames in seconds, one time per line."""
     write_text(path, "".join(f"{seconds_text(int(time))}\n" for time in times_ns))
 
 
 def _rest_pose_motion(skeleton: SkeletonModel, fps: float) -> Motion:
-    """Return the zero pose as a motion of one frame."""
+    """Return a motion of one frame with the zero pose of a skeleton."""
     count = len(skeleton.joints)
     return Motion(
         skeleton=skeleton,
@@ -131,7 +144,7 @@ def _rest_pose_motion(skeleton: SkeletonModel, fps: float) -> Motion:
 
 
 def _write_joints(path: Path, motion: MovingBody, ticks_ns: IntArray) -> None:
-    """Write the positions of named joints at the ticks."""
+    """Write the world positions of the joints in `JOINT_ROLES` at given common times (nanoseconds)."""
     indices = {name: motion.skeleton.index_of_role(role) for name, role in JOINT_ROLES.items()}
     present = {name: index for name, index in indices.items() if index is not None}
     world = joint_poses_at(motion, seconds_from_ns(ticks_ns))[:, list(present.values())][..., :3, 3]
@@ -140,5 +153,5 @@ def _write_joints(path: Path, motion: MovingBody, ticks_ns: IntArray) -> None:
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a JSON file."""
+    """Write a JSON file with the given content."""
     write_text(path, json.dumps(content, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""The wearer's body as its cameras see it: rounded limbs that follow the joints."""
+"""The surface of the wearer's body for rendering: rounded limbs that move with the joints."""
 
 from __future__ import annotations
 
@@ -27,35 +27,37 @@ _RADII = {
     "Foot": (0.035, 0.035),
     "ToeBase": (0.03, 0.02),
 }
-"""Radii at both ends of the bone that starts at a joint, metres. Evidence: none."""
+"""Radii (metres) of each limb at the start and at the end of its bone, by the name of the joint at which the
+bone starts. Evidence: none."""
 _SKIN = ("Hand", "Neck", "Head")
 """Body parts without clothes."""
 _TROUSERS = ("Hips", "UpLeg", "Leg")
-"""Body parts in trousers; all others wear a shirt."""
+"""Body parts in trousers. Parts in neither `_SKIN` nor `_TROUSERS` are covered by a shirt."""
 _AROUND = 14
-"""Faces around a limb."""
+"""Number of quadrilateral faces around a limb."""
 _CAP_RINGS = 3
-"""Rings of faces of a limb's rounded end."""
+"""Number of rings of faces at each rounded end of a limb."""
 _TEXELS_PER_M = 300.0
-"""Detail of the body's textures, texels per metre."""
+"""Detail (texels per metre) of the body's textures."""
 _CLEARANCE_M = 0.02
-"""Distance outside a limb's surface up to which a camera counts as inside, metres."""
+"""Maximum distance (metres) of a camera from a limb's surface. A camera that is outside the limb, but within
+this distance, is treated as inside the limb."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Limb:
-    """One rounded cone, in the frame of its joint."""
+    """One limb: a rounded cone in the frame of its joint."""
 
     joint: int
     triangles: Triangles
 
 
 class Wearer:
-    """All limbs of a body that a camera may see.
+    """The surface of a body: all limbs that a camera may see.
 
     Args:
-        skeleton: The true body.
-        seed: Seed of clothes and skin.
+        skeleton: Skeleton with the true proportions.
+        seed: Seed of the textures of clothes and skin.
     """
 
     def __init__(self, skeleton: SkeletonModel, seed: np.random.SeedSequence) -> None:
@@ -74,7 +76,11 @@ class Wearer:
         self._limbs: list[_Limb] = []
 
     def place_textures(self, origins: FloatArray) -> None:
-        """Build the limbs, given the origins (N,2) of their N images in the atlas, in texels."""
+        """Build the N limbs.
+
+        Args:
+            origins: (N,2) atlas coordinates (texels) of the top left corners of the limbs' images.
+        """
         self._limbs = [
             _Limb(joint=joint, triangles=_rounded_cone(start, end, radii, image, origin, index))
             for index, ((joint, start, end, radii, _), image, origin) in enumerate(
@@ -83,9 +89,9 @@ class Wearer:
         ]
 
     def visible_from(self, mount: Mount, skeleton: SkeletonModel) -> Wearer:
-        """Return the same body without the limb that a camera is inside of.
+        """Return the body without the limb on which a camera is mounted, if the camera is inside this limb.
 
-        A real camera's housing would press the cloth in.
+        The limb would hide the view of the camera. The housing of a real camera presses the cloth in.
         """
         joint = skeleton.index_of_role(mount.role)
         centre = mount.joint_from_cam[:3, 3]
@@ -99,7 +105,11 @@ class Wearer:
         return kept
 
     def at(self, world_from_joint: FloatArray) -> Triangles:
-        """Return all limbs in the world, given the joint poses (J,4,4)."""
+        """Return the triangles of all limbs in the world frame.
+
+        Args:
+            world_from_joint: (J,4,4) poses of the joints.
+        """
         parts = [_triangles_in_world(limb.triangles, world_from_joint[limb.joint]) for limb in self._limbs]
         starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
         return Triangles(
@@ -118,11 +128,12 @@ class Wearer:
 
 
 _Bone = tuple[int, FloatArray, FloatArray, tuple[float, float], str]
-"""Joint index, start and end in the joint's frame (m), radii at both ends (m), body part."""
+"""A bone: joint index, start and end in the joint's frame (m), radii at both ends (m), name of the body part.
+"""
 
 
 def _find_bones(skeleton: SkeletonModel) -> list[_Bone]:
-    """Return the bones of a body that have a surface."""
+    """Return the bones of a skeleton that have a surface."""
     rest, out = rest_positions(skeleton), []
     for joint, role in enumerate(skeleton.roles):
         part = split_side(role)[1]
@@ -131,7 +142,8 @@ def _find_bones(skeleton: SkeletonModel) -> list[_Bone]:
         end = skeleton.end_offsets_m[joint]
         children = np.flatnonzero(skeleton.parents == joint)
         if len(children):
-            # A bone of the trunk ends at the child straight above it, a bone of a limb at its only child.
+            # A bone of the trunk ends at the child joint straight above. A bone of a limb ends at the only
+            # child.
             ahead = rest[children] - rest[joint]
             end = ahead[np.argmin(np.abs(ahead[:, 0]))]
         if np.isfinite(end).all() and np.linalg.norm(end) > 0.01:
@@ -140,7 +152,7 @@ def _find_bones(skeleton: SkeletonModel) -> list[_Bone]:
 
 
 def _distance_to_segment(point: FloatArray, start: FloatArray, end: FloatArray) -> float:
-    """Return the distance of a point (3,) to the segment between two points (3,)."""
+    """Return the distance between a point (3,) and a line segment with the ends `start` and `end` (3,)."""
     ratio = np.clip((point - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
     return float(np.linalg.norm(point - start - ratio * (end - start)))
 
@@ -153,7 +165,16 @@ def _rounded_cone(
     origin: FloatArray,
     index: int,
 ) -> Triangles:
-    """Return the triangles of a rounded cone with an image wrapped around it."""
+    """Return the triangles of a rounded cone, with an image wrapped around the cone.
+
+    Args:
+        start: (3,) start of the cone's axis (m).
+        end: (3,) end of the cone's axis (m).
+        radii: Radii (m) at start and end.
+        image: (H,W,3) RGB texture.
+        origin: (2,) atlas coordinates (texels) of the image's top left corner.
+        index: Number of the surface.
+    """
     axis = (end - start) / np.linalg.norm(end - start)
     side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
@@ -176,7 +197,14 @@ def _rounded_cone(
 
 
 def _textured_triangles(vertices: FloatArray, texels: FloatArray, faces: FloatArray, index: int) -> Triangles:
-    """Return triangles with planes and texture gradients, given the atlas coordinates of the vertices."""
+    """Return triangles with their planes and texture gradients.
+
+    Args:
+        vertices: (V,3) positions of the vertices (m).
+        texels: (V,2) atlas coordinates (texels) of the vertices.
+        faces: (F,3) vertex indices of the triangles. Triangles without area are removed.
+        index: Number of the surface.
+    """
     corner = vertices[faces]
     first, second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     normal = np.cross(first, second)
@@ -201,7 +229,7 @@ def _textured_triangles(vertices: FloatArray, texels: FloatArray, faces: FloatAr
 
 
 def _triangles_in_world(limb: Triangles, world_from_joint: FloatArray) -> Triangles:
-    """Return a limb in the world, lit from above."""
+    """Return a limb in the world frame. Its brightness corresponds to light from above."""
     turn, shift = world_from_joint[:3, :3], world_from_joint[:3, 3]
     normal = limb.normal @ turn.T
     return Triangles(
@@ -224,7 +252,7 @@ def _skin(height: int, width: int, rng: np.random.Generator) -> UINT8:
 
 
 def _cloth(height: int, width: int, dye: textures.Grey, rng: np.random.Generator) -> UINT8:
-    """Return a texture of cloth in a colour."""
+    """Return a texture of cloth in the colour `dye`."""
     folds = 0.9 + 0.12 * textures.fractal(height, width, 40.0, rng, 4)
     weave = 0.05 * rng.standard_normal((height, width), dtype=np.float32)
     return textures.tint_shade(folds + weave, dye)

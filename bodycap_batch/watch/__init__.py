@@ -1,4 +1,4 @@
-"""Watch a folder: claim the jobs that are dropped there, run them, and file them under `done` or `failed`."""
+"""Watch a folder: claim the jobs that users drop there, run them, and move them to `done` or `failed`."""
 
 from bodycap_batch.watch.commands import JobRow, cancel_job, job_rows, retry_job
 from bodycap_batch.watch.dropped_job import JobPermissions

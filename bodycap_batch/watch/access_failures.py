@@ -1,4 +1,7 @@
-"""Report and wait while a watcher cannot access its folders: a missing disk, a missing permission."""
+"""Report and wait while a watcher cannot access its folders.
+
+Examples of causes are a missing disk and a missing permission.
+"""
 
 from __future__ import annotations
 
@@ -10,18 +13,22 @@ from bodycap_batch.store.artefacts import store_error
 from bodycap_batch.watch.spool import Spool
 
 _FIRST_PAUSE_S = 1.0
-"""Seconds before the second attempt; the pause doubles with each failure. Evidence: none."""
+"""Time (seconds) between the first failure and the second attempt. Each failure doubles it. Evidence: none.
+"""
 _MAX_PAUSE_S = 60.0
-"""Longest pause between two attempts, seconds. Evidence: none."""
+"""Maximum time (seconds) between two attempts. Evidence: none."""
 
 
 class AccessFailures:
-    """Track failures to access the folders. The operator is informed once at the start and once at the end.
+    """Track failures to access the folders of a spool.
+
+    The operator gets one line when the failures start, one line for each different failure, and one line when
+    the failures end.
 
     Args:
-        spool: The folders.
-        write_line: Called with a line for the operator.
-        clock: This process's own clock, seconds.
+        spool: The spool that the watcher cannot access.
+        write_line: Function that is called with each line for the operator.
+        clock: Function that returns the time of this process's own clock, seconds.
 
     Attributes:
         current: The latest failure; None while the folders are accessible.
@@ -39,17 +46,17 @@ class AccessFailures:
 
     @property
     def text(self) -> str:
-        """The current failure as text; "" if there is none."""
-        failure = self.current  # read once: another thread may clear it
+        """The current failure as text; "" if there is no failure."""
+        failure = self.current  # read only once: another thread may set `current` to None
         return "" if failure is None else f"{failure.path}: {failure.message}"
 
     @property
     def duration_s(self) -> float:
-        """Seconds since the first of the current failures."""
+        """Time (seconds) since the first of the current failures; 0 if there is no failure."""
         return 0.0 if self.current is None else self._clock() - self._since
 
     def record(self, error: OSError | StoreError) -> float:
-        """Record a failure; return the seconds to wait before the next attempt."""
+        """Record a failure, and return the time (seconds) to wait before the next attempt."""
         previous_text = self.text
         failure = store_error(error, self._spool.root) if isinstance(error, OSError) else error
         if self.current is None:
@@ -61,7 +68,7 @@ class AccessFailures:
         return self._pause_s
 
     def clear(self) -> None:
-        """Record that the folders are accessible."""
+        """Record that the folders are accessible again."""
         if self.current is not None:
             self._write_line(
                 f"{self._spool.root} answers again after {self.duration_s:.0f} s; the watcher continues"

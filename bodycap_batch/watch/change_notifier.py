@@ -20,25 +20,26 @@ _NETWORK_FILE_SYSTEMS = (
     "virtiofs",
     "drvfs",
 )
-"""Prefixes of the kernel's names of file systems that report no changes made by another machine."""
+"""Prefixes of the kernel's names of network file systems. These file systems do not report changes that
+another machine makes."""
 _POLL_MS = 1000
-"""Milliseconds between two scans of a folder that is polled. Evidence: none."""
+"""Time (milliseconds) between two scans of a folder that is polled. Evidence: none."""
 _STOP_CHECK_MS = 2000
-"""Milliseconds after which `watchfiles` checks the stop event, and the pause after an error. Evidence: none.
-"""
+"""Time (milliseconds) between two checks of the stop event by `watchfiles`. It is also the pause after an
+error. Evidence: none."""
 
 
 class ChangeNotifier:
-    """Set an event when a folder changes; a context manager.
+    """Set an event when a folder changes. This is a context manager.
 
-    The event only shortens a wait. The watcher also scans the folder at intervals, so a missed event loses
-    nothing.
+    The event only shortens the watcher's wait. The watcher also scans the folder at regular intervals, so it
+    finds every change even if the event is missed.
 
     Args:
         folder: Folder to watch.
-        woken: Set on every change.
-        poll: True to poll the folder. None polls it if it is on a network disk, because such a disk reports
-            no changes.
+        woken: Event that is set on every change.
+        poll: True: poll the folder. False: wait for change reports of the system. None: poll the folder only
+            if the folder is on a network disk, because such a disk does not report all changes.
     """
 
     def __init__(self, folder: Path, woken: threading.Event, *, poll: bool | None) -> None:
@@ -74,7 +75,7 @@ class ChangeNotifier:
                 ):
                     self._woken.set()
             except (OSError, RuntimeError) as error:
-                # The system has no inotify watches left, or the folder vanished. The regular scans continue.
+                # The system has no free inotify watches, or the folder is gone. The regular scans continue.
                 if not self.polling:
                     sys.stderr.write(f"note: {self._folder} is polled from now on, because: {error}\n")
                 self.polling = True
@@ -82,11 +83,11 @@ class ChangeNotifier:
 
 
 def is_on_network_disk(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> bool:
-    """Return True if a folder is on a disk of another machine, or of the host of this virtual machine.
+    """Return True if a folder is on a disk of another machine, or on a disk of this virtual machine's host.
 
     Args:
         folder: Folder to look up.
-        mounts: The kernel's table of mounts.
+        mounts: Path of the kernel's table of mounts.
     """
     try:
         rows = [line.split() for line in mounts.read_text(encoding="utf-8").splitlines()]
@@ -99,5 +100,5 @@ def is_on_network_disk(folder: Path, mounts: Path = Path("/proc/self/mounts")) -
 
 
 def _without_octal_escapes(text: str) -> str:
-    """Return a mount point without the octal codes that the kernel writes for spaces."""
+    """Return a mount point with spaces in place of the octal codes that the kernel writes for them."""
     return text.encode("latin-1", "backslashreplace").decode("unicode_escape") if "\\" in text else text

@@ -1,4 +1,7 @@
-"""Claim a job: `owner.json`, the number of the claim, and its heartbeat."""
+"""Claim a job, and show with a heartbeat that the watcher is alive.
+
+The claims of a job are numbered. The file `owner.json` describes the current claim.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +27,11 @@ class Claim:
 
     Args:
         job: The job's folder.
-        generation: Number of the claim.
+        generation: Number of the claim; the first claim of a job has number 1.
         token: Unique name of the claim.
 
     Attributes:
-        lost: Set once another watcher has taken the job over.
+        lost: Event that is set once another watcher has taken the job over.
     """
 
     def __init__(self, job: JobDir, generation: int, token: str) -> None:
@@ -42,7 +45,7 @@ class Claim:
 
     @property
     def ownership(self) -> Ownership:
-        """The check that precedes each visible step."""
+        """The check that this claim still holds. It precedes each step that other processes can see."""
         return Ownership(owner=self.job.owner, token=self._token, generation=self.generation)
 
     def set_job_dir(self, job: JobDir) -> None:
@@ -51,11 +54,11 @@ class Claim:
             self.job = job
 
     def write_heartbeat(self) -> None:
-        """Show that this watcher is alive, and set `lost` if another watcher has the job."""
+        """Show that this watcher is alive. If another watcher has taken the job over, set `lost` instead."""
         with self._lock:
             if self._ended or self.lost.is_set():
                 return
-            with contextlib.suppress(OSError):  # the job itself reports a full or missing disk
+            with contextlib.suppress(OSError):  # the run of the job reports a full or missing disk
                 if self.ownership.is_held():
                     self._write()
                 else:
@@ -69,7 +72,7 @@ class Claim:
                 self._write(released=True)
 
     def stop_heartbeat(self) -> None:
-        """Write no more heartbeats, for example because the job is being filed."""
+        """Write no more heartbeats, for example because the job has ended and moves to its final folder."""
         with self._lock:
             self._ended = True
 
@@ -85,7 +88,8 @@ def write_owner(job: JobDir, token: str, generation: int, *, beat: int = 0, rele
         job: The job's folder.
         token: Unique name of the claim.
         generation: Number of the claim.
-        beat: Count of heartbeats so far. Each one changes the file.
+        beat: Number of heartbeats so far. Each heartbeat changes the file, because the file holds this
+            number.
         released: True if other watchers may take the job over at once.
     """
     document = {
@@ -102,7 +106,7 @@ def write_owner(job: JobDir, token: str, generation: int, *, beat: int = 0, rele
 
 
 def create_claim(job: JobDir) -> Claim:
-    """Make the first claim of a folder that no other process can see yet."""
+    """Make the first claim of a job whose folder no other process can see yet."""
     token = uuid.uuid4().hex
     generation_marker(job.path, 1).touch(exist_ok=False)
     write_owner(job, token, 1)
@@ -110,10 +114,12 @@ def create_claim(job: JobDir) -> Claim:
 
 
 def take_over_job(job: JobDir) -> Claim | None:
-    """Claim the next generation of a job that its watcher abandoned.
+    """Claim a job that its watcher abandoned.
+
+    The new claim gets the next higher number (generation).
 
     Returns:
-        The claim, or None if another watcher was faster.
+        The claim, or None if another watcher was faster or the job's folder is gone.
     """
     generation = 1 + max(_highest_generation(job), int(read_owner(job.owner).get("generation", 0)))
     token = uuid.uuid4().hex
@@ -128,7 +134,7 @@ def take_over_job(job: JobDir) -> Claim | None:
 
 
 def remove_claim_files(job: JobDir) -> None:
-    """Remove the files of the claims from a job that has been filed."""
+    """Remove the files of all claims from a job that has ended and is in its final folder."""
     for path in (*job.path.glob(f"{MARKER_PREFIX}*"), job.owner, job.cancel):
         path.unlink(missing_ok=True)
 
@@ -136,13 +142,13 @@ def remove_claim_files(job: JobDir) -> None:
 class HeartbeatMonitor:
     """Watch the heartbeats of other watchers.
 
-    A heartbeat has stopped if `owner.json` has not changed for `stale_s` by this process's own clock. Clocks
-    of different machines are never compared. There is no wait if the owner released the job, or was a process
-    of this machine that has ended.
+    A job is treated as abandoned if its `owner.json` has not changed for `stale_s` by this process's own
+    clock. Clocks of different machines are never compared. A job is treated as abandoned at once in two
+    cases: the owner released it, or the owner was a process of this machine that has ended.
 
     Args:
-        stale_s: Seconds without a heartbeat after which a job may be taken over.
-        clock: This process's own clock, seconds.
+        stale_s: Minimum time (seconds) without a heartbeat before a job may be taken over.
+        clock: Function that returns the time of this process's own clock, seconds.
     """
 
     def __init__(self, stale_s: float, clock: Callable[[], float] = time.monotonic) -> None:
@@ -152,7 +158,7 @@ class HeartbeatMonitor:
         self._seen: dict[Path, tuple[tuple[int, str], float]] = {}
 
     def find_abandoned(self, jobs: list[JobDir]) -> list[JobDir]:
-        """Return the jobs that may be taken over."""
+        """Return the abandoned jobs in a list of jobs. These jobs may be taken over."""
         now = self._clock()
         before, self._seen = self._seen, {}
         abandoned = []

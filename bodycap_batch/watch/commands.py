@@ -1,4 +1,4 @@
-"""List the jobs of a spool, retry one, and cancel one."""
+"""List the jobs of a spool, retry a job, and cancel a job."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ from bodycap_batch.watch.spool import (
 )
 
 _MAX_SNAPSHOT_FILES = 1000
-"""Number of files of a waiting entry that are inspected for a list of jobs. Evidence: none."""
+"""Number of files after which the inspection of a waiting entry ends when jobs are listed. Evidence: none."""
 _POLL_S = 0.1
-"""Seconds between two checks of a job that is being cancelled. Evidence: none."""
+"""Time (seconds) between two checks of a job that is being cancelled. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,13 +51,13 @@ class JobRow:
 
     Attributes:
         name: Name of the job.
-        state: waiting (in the inbox), ignored (not a job), claimed, running, interrupted (its watcher is
-            gone), stopped, done, failed, cancelled.
-        stage: Current stage with its camera.
-        progress: Completed fraction of the stage, None if it is unknown.
-        since: Start of the state, UTC.
-        age_s: Seconds since then.
-        cause: What the job waits for, or why it failed.
+        state: State of the job: waiting (in the inbox), ignored (not a job), claimed, running, interrupted
+            (the watcher is gone), stopped, done, failed or cancelled.
+        stage: Name of the current stage, and of the camera that the stage processes.
+        progress: Completed fraction of the stage; None if the fraction is unknown.
+        since: Time at which the state started, UTC.
+        age_s: Time (seconds) since `since`; None if `since` is unknown.
+        cause: What the job waits for, or why the job failed.
         hint: What the user can do.
         path: Path of the job.
     """
@@ -78,7 +78,7 @@ class JobRow:
 
 
 def job_rows(spool: Spool) -> list[JobRow]:
-    """Return every job of a spool: waiting, running, done, failed."""
+    """Return a row for every job of a spool (waiting, running, done, failed) and every ignored path."""
     claimed = [job_row(JobDir(path)) for path in visible_entries(spool.running) if path.is_dir()]
     ended = [
         job_row(JobDir(path)) for folder in (spool.done, spool.failed) for path in visible_entries(folder)
@@ -87,7 +87,7 @@ def job_rows(spool: Spool) -> list[JobRow]:
 
 
 def inbox_rows(spool: Spool) -> list[JobRow]:
-    """Return the entries of the inbox and the paths that are ignored."""
+    """Return a row for each waiting entry of the inbox and for each path that is ignored."""
     waiting = [_waiting_row(entry) for entry in entries_in(spool.inbox)]
     ignored = [
         JobRow(
@@ -103,13 +103,14 @@ def inbox_rows(spool: Spool) -> list[JobRow]:
 
 
 def retry_job(spool: Spool, name: str) -> Path:
-    """Move a failed or cancelled job back to the inbox. Finished stages stay in the store.
+    """Move a failed or cancelled job back to the inbox. The results of its finished stages stay in the store.
 
     Returns:
-        The new path of its input.
+        The new path of the job's input.
 
     Raises:
-        JobError: There is no such job, it has not failed, or another process retries it already.
+        JobError: The job does not exist, it has not failed, its input is gone, or another process already
+            retries it.
     """
     job = spool.find(name)
     if job is None or job.path.parent != spool.failed:
@@ -137,7 +138,7 @@ def _keep_artefacts(job: JobDir, hidden: JobDir, spool: Spool) -> Iterator[Calla
     """Keep a job's artefacts in the store until the job runs again.
 
     Yields:
-        A function to call with the job's next path.
+        A function that must be called with the job's next path.
     """
     store = read_status(job).get("store")
     if not store or not (Path(store) / "artefacts").is_dir():
@@ -154,19 +155,19 @@ def _keep_artefacts(job: JobDir, hidden: JobDir, spool: Spool) -> Iterator[Calla
 
 
 def cancel_job(spool: Spool, name: str, wait_s: float = 5.0) -> JobDir | None:
-    """Cancel a job that waits or runs. The results of its finished stages stay in the store.
+    """Cancel a waiting or running job. The results of its finished stages stay in the store.
 
     Returns:
-        The job's folder. The job may have ended before it could be stopped: `read_status` gives its state.
-        None if no watcher has reacted yet; the next one files the job.
+        The job's folder. The job may have ended before it could be stopped: `read_status` returns its state.
+        None if no watcher has reacted within `wait_s` seconds. The next watcher that runs cancels the job.
 
     Raises:
-        JobError: There is no such job, or it has ended.
+        JobError: The job does not exist, or it has ended.
     """
     end = time.monotonic() + wait_s
     with disk_errors(spool.root):
         while (asked := _request_cancel(spool, name)) is None:
-            # A watcher is claiming the job: it is in neither the inbox nor `running` under its name.
+            # A watcher is claiming the job: the job has left the inbox and has no name in `running` yet.
             if time.monotonic() > end:
                 return None
             time.sleep(_POLL_S)
@@ -180,7 +181,7 @@ def cancel_job(spool: Spool, name: str, wait_s: float = 5.0) -> JobDir | None:
 def _request_cancel(spool: Spool, name: str) -> JobDir | None:
     """Cancel a waiting job or mark a running one. Return None if the job is being claimed.
 
-    A job that is being claimed is marked, too. The mark is lost if the entry is returned to the inbox.
+    A job that is being claimed is also marked. If the entry returns to the inbox, the mark is lost.
     """
     waiting = [entry for entry in entries_in(spool.inbox) if _is_same_name(entry.name, name)]
     job = spool.find(name)
@@ -191,10 +192,10 @@ def _request_cancel(spool: Spool, name: str) -> JobDir | None:
         if waiting:
             return _cancel_waiting(spool, waiting[0])
         for job_dir in map(JobDir, spool.running.glob(f"{CLAIM_PREFIX}*")):
-            if name in _dropped_names(job_dir):  # if its watcher is gone, the next one continues the claim
+            if name in _dropped_names(job_dir):  # if its watcher is gone, the next watcher continues
                 job_dir.cancel.touch()
                 return None
-    except FileNotFoundError:  # another process has claimed or filed it
+    except FileNotFoundError:  # another process has claimed the job, or moved it to its final folder
         return None
     raise _unknown_job(
         spool, name, "is not waiting or running", [entry.name for entry in entries_in(spool.inbox)]
@@ -202,13 +203,16 @@ def _request_cancel(spool: Spool, name: str) -> JobDir | None:
 
 
 def _dropped_names(job_dir: JobDir) -> tuple[str, ...]:
-    """Return the names that a job had in the inbox before it was claimed."""
+    """Return the names of a job for users: its former name in the inbox with and without the suffix."""
     dropped = str(read_status(job_dir).get("dropped", ""))
     return dropped, Path(dropped).stem
 
 
 def _cancel_waiting(spool: Spool, entry: InboxEntry) -> JobDir:
-    """Move a waiting entry to `failed`. Raise `FileNotFoundError` if another process has claimed it."""
+    """Move a waiting entry to `failed`.
+
+    Raise `FileNotFoundError` if another process has claimed the entry.
+    """
     job_dir = JobDir(spool.running / f"{CLAIM_PREFIX}{uuid.uuid4().hex}")
     job_dir.path.mkdir()
     claim = create_claim(job_dir)
@@ -235,7 +239,7 @@ def _cancel_waiting(spool: Spool, entry: InboxEntry) -> JobDir:
 
 
 def _waiting_row(entry: InboxEntry) -> JobRow:
-    """Return the row of an entry of the inbox."""
+    """Return the row of a waiting entry of the inbox."""
     try:
         waits_for = take_snapshot(entry, _MAX_SNAPSHOT_FILES).incomplete_reason
         changed = entry.path.stat().st_mtime
@@ -252,7 +256,7 @@ def _waiting_row(entry: InboxEntry) -> JobRow:
 
 
 def job_row(job: JobDir) -> JobRow:
-    """Return the row of a claimed job, read from its files."""
+    """Return the row of a claimed job. The row is read from the job's files."""
     status = read_status(job)
     state = str(status.get("state", "claimed"))
     if state == "running" and _is_watcher_gone(job):
@@ -282,7 +286,7 @@ def job_row(job: JobDir) -> JobRow:
 
 
 def _is_watcher_gone(job: JobDir) -> bool:
-    """Return True if the job's watcher released it, or was a process of this machine that has ended."""
+    """Return True if the job's watcher released the job, or was a process of this machine that has ended."""
     owner = read_owner(job.owner)
     is_local = bool(machine_id()) and owner.get("machine") == machine_id()
     return bool(owner.get("released")) or (
@@ -291,7 +295,7 @@ def _is_watcher_gone(job: JobDir) -> bool:
 
 
 def _age_s(moment: object) -> float | None:
-    """Return the seconds since a moment given as text; None if the text is not a time."""
+    """Return the time (seconds) since a moment that is given as text; None if the text is not a time."""
     try:
         return round(time.time() - datetime.fromisoformat(str(moment)).timestamp(), 1)
     except ValueError:
@@ -299,7 +303,7 @@ def _age_s(moment: object) -> float | None:
 
 
 def _is_same_name(one: str, other: str) -> bool:
-    """Compare two names regardless of their Unicode normal form."""
+    """Return True if two names are equal regardless of their Unicode normal form."""
     return unicodedata.normalize("NFC", one) == unicodedata.normalize("NFC", other)
 
 

@@ -1,4 +1,4 @@
-"""Read a dropped job, check which paths it may name, and write it for the run."""
+"""Read a dropped job, check that it names only permitted paths, and write it to its folder for the run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class JobPermissions:
 
     Attributes:
         roots: Folders that all jobs may read.
-        limits: How large a job may be.
+        limits: Maximum size of a job.
     """
 
     roots: tuple[Path, ...] = ()
@@ -38,22 +38,23 @@ def read_dropped_job(entry: InboxEntry, snapshot: EntrySnapshot, permissions: Jo
 
     Args:
         entry: A complete entry of the inbox.
-        snapshot: The state of its files.
-        permissions: What the job may name, and how large it may be.
+        snapshot: The state of the entry's files.
+        permissions: Which folders the job may read, and the maximum size of the job.
 
     Returns:
-        The job. Its paths are absolute, and all of them are permitted.
+        The job. All its paths are absolute and permitted.
 
     Raises:
-        JobError: The job is not valid, names a path that is not permitted, or exceeds a limit.
-        CaptureError: A calibration or a folder of videos cannot be used, or a video is too large.
+        JobError: The job is not valid, holds a special file, or names a path that is not permitted.
+        CaptureError: A calibration or a folder of videos cannot be used, a video is too large, or there are
+            too many files.
     """
     if snapshot.undecodable:
         shown = snapshot.undecodable.encode(errors="backslashreplace").decode()
         raise JobError(f"the name {shown} is not UTF-8 text", hint="rename it and drop it again")
     policy = path_policy(entry.path, permissions.roots, is_file=entry.is_file)
     if policy.folder is None:
-        # A link must lead to a permitted folder. A file in the inbox itself may always be read.
+        # A link must lead to a permitted folder. A job file in the inbox itself may always be read.
         if entry.path.is_symlink():
             policy.require(entry.path)
     elif snapshot.files > permissions.limits.files:
@@ -70,32 +71,37 @@ def read_dropped_job(entry: InboxEntry, snapshot: EntrySnapshot, permissions: Jo
         policy.require(decides)
     job = load_job(entry.path, policy=policy, limits=permissions.limits)
     if decides is not None and job.name == safe_name(entry.path.resolve().name):
-        # The job file states no name. Use the name in the inbox: the entry may be a link to another folder.
+        # The name was derived from the folder. Use the name in the inbox: the entry may be a link to a
+        # folder.
         job = job.model_copy(update={"name": safe_name(entry.name)})
     _require_video_sizes(job, permissions.limits)
     return job.model_copy(update={"capture": job.capture.model_copy(update={"synthetic": None})})
 
 
 def path_policy(path: Path, roots: tuple[Path, ...], *, is_file: bool) -> PathPolicy:
-    """Return which paths an entry may name: those in its own folder, unless it is a link or a single file."""
+    """Return the policy for the paths that an entry may name.
+
+    An entry may always name paths below `roots`. A folder may also name paths inside itself. A link or a
+    single file has no such folder.
+    """
     own = None if is_file or path.is_symlink() else path
     return PathPolicy(folder=own, roots=roots)
 
 
 def unread_job_files(folder: Path) -> list[str]:
-    """Return the job files of a folder that are ignored because of their names."""
+    """Return the names of YAML files in a folder that are not read, because none is named like a job file."""
     if job_file_in(folder) is not None:
         return []
     return [path.name for path in visible_entries(folder) if path.suffix.lower() in YAML_SUFFIXES]
 
 
 def write_job(job: Job, job_dir: JobDir, dropped: Path) -> None:
-    """Write a resolved job. Paths to its own input become relative to the job's folder.
+    """Write a resolved job into its folder. Paths to the job's own input become relative to that folder.
 
     Args:
-        job: The job, as `read_dropped_job` returned it.
+        job: The job that `read_dropped_job` returned.
         job_dir: The job's folder.
-        dropped: Path of the job's input now.
+        dropped: Current path of the job's input.
     """
     here = dropped.resolve()
     job_dir.job.write_text(
@@ -109,6 +115,7 @@ def read_job(job_dir: JobDir, permissions: JobPermissions) -> Job:
 
     Raises:
         JobError: The job cannot be read, or names a path that is not permitted.
+        CaptureError: A video is too large.
     """
     policy = path_policy(job_dir.input, permissions.roots, is_file=False)
     job = load_job(job_dir.job, policy=policy, limits=Limits())
@@ -117,7 +124,7 @@ def read_job(job_dir: JobDir, permissions: JobPermissions) -> Job:
 
 
 def make_result_paths_relative(job_dir: JobDir, job: Job) -> None:
-    """Make the video paths in the results' `job.yaml` relative, because the job's folder will be moved.
+    """Make the paths in the `job.yaml` of the results relative, because the job's folder will be moved.
 
     Args:
         job_dir: The job's folder.
@@ -133,7 +140,7 @@ def make_result_paths_relative(job_dir: JobDir, job: Job) -> None:
 
 
 def with_changed_paths(job: Job, change: Callable[[Path], Path]) -> Job:
-    """Return the job with `change` applied to every path."""
+    """Return the job with every path replaced by `change(path)`, and without an output folder."""
 
     def camera(config: CameraConfig) -> CameraConfig:
         return config.model_copy(
@@ -168,7 +175,7 @@ def _relative_to_file(path: Path, job_dir: Path, file: Path) -> Path:
 
 
 def _require_video_sizes(job: Job, limits: Limits) -> None:
-    """Refuse a video that is too large before its bytes are read."""
+    """Raise `CaptureError` for a video file that is too large, before any of its bytes are read."""
     for index, camera in enumerate(job.capture.cameras):
         for path in camera.video:
             if path.is_file() and path.stat().st_size > 1e9 * limits.video_gb:

@@ -1,4 +1,4 @@
-"""Move jobs from the inbox to `running`, where the rename is the claim, and back to the inbox."""
+"""Move jobs from the inbox to `running` and back. The rename out of the inbox is the claim."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ def claim_entry(
 ) -> tuple[Claim, BodycapError | None] | None:
     """Claim a complete entry of the inbox.
 
-    The job is read in the inbox and written to a hidden folder. The entry is then renamed into that folder:
-    this rename is the claim, because only one of two watchers can succeed. Finally the folder gets its name
-    in `running`.
+    First the job is read in the inbox and written to a hidden folder. Then the entry is renamed into that
+    folder. This rename is the claim, because only one of several watchers can succeed. Finally the hidden
+    folder gets its visible name in `running`.
 
     Args:
-        spool: The spool.
-        entry: A complete entry.
-        snapshot: Its state when it was found to be complete.
-        permissions: What the job may name, and how large it may be.
+        spool: The folders of the watcher.
+        entry: A complete entry of the inbox.
+        snapshot: The state of the entry's files when the entry was found to be complete.
+        permissions: Which folders the job may read, and the maximum size of the job.
 
     Returns:
-        The claim and the job's error, if any. None if another watcher was faster or the entry is still
-        changing.
+        The claim, and the error that was found when the job was read (or None). The whole result is None if
+        another watcher was faster, or if the entry is still changing.
 
     Raises:
         StoreError: The entry cannot be moved.
     """
     job_dir = JobDir(spool.running / f"{CLAIM_PREFIX}{uuid.uuid4().hex}")
     try:
-        spool.running.mkdir(exist_ok=True)  # a user may have removed it
+        spool.running.mkdir(exist_ok=True)  # a user may have removed the folder
         job_dir.path.mkdir()
         claim = create_claim(job_dir)
         error = _write_job_files(job_dir, entry, snapshot, permissions)
@@ -60,14 +60,14 @@ def claim_entry(
             return None
         move_to_running(spool, claim)
     except (OSError, StoreError) as failed:
-        with contextlib.suppress(OSError, StoreError):  # if this fails, it stays claimed until a takeover
+        with contextlib.suppress(OSError, StoreError):  # on failure, a later takeover follows
             return_to_inbox(spool, job_dir)
         raise store_error(failed, entry.path) if isinstance(failed, OSError) else failed from failed
     return claim, error
 
 
 def move_to_running(spool: Spool, claim: Claim) -> None:
-    """Move a claimed folder to its final name in `running`."""
+    """Give a claimed hidden folder its visible name in `running`."""
     previous = read_status(claim.job, strict=True)
     status = JobStatusFile(claim.job, previous)
     dropped = str(previous.get("dropped") or "job")
@@ -82,13 +82,13 @@ def move_to_running(spool: Spool, claim: Claim) -> None:
 
 
 def remove_empty_claim(job_dir: JobDir) -> bool:
-    """Remove a hidden folder of a claim if nothing was moved into it.
+    """Remove the hidden folder of a claim if no entry was moved into it.
 
-    The folder is renamed before it is inspected. A watcher that created it and resumes now can then move
-    nothing into it.
+    The folder is renamed before it is inspected. The watcher that created the folder may have been suspended.
+    If that watcher resumes now, it can no longer move an entry into the folder.
 
     Returns:
-        True if the folder was removed, False if it holds an entry.
+        True if the folder was removed, False if the folder holds an entry.
     """
     hidden = JobDir(job_dir.path.with_name(f"{CLAIM_PREFIX}{uuid.uuid4().hex}"))
     os.rename(job_dir.path, hidden.path)
@@ -100,7 +100,7 @@ def remove_empty_claim(job_dir: JobDir) -> bool:
 
 
 def path_exists(path: Path) -> bool:
-    """Return True if a file, folder or link exists. Raise `OSError` if the disk does not answer."""
+    """Return True if a path is a file, folder or link. Raise `OSError` if the disk does not answer."""
     try:
         path.lstat()
     except (FileNotFoundError, NotADirectoryError):
@@ -109,7 +109,7 @@ def path_exists(path: Path) -> bool:
 
 
 def input_path(job_dir: JobDir) -> Path:
-    """Return the path of what was dropped: the folder, or the job file that was dropped alone."""
+    """Return the current path of the dropped folder, or of the job file that was dropped without a folder."""
     document = read_status(job_dir, strict=True)
     return job_dir.input / str(document.get("dropped")) if document.get("kind") == "file" else job_dir.input
 
@@ -117,15 +117,16 @@ def input_path(job_dir: JobDir) -> Path:
 def return_to_inbox(
     spool: Spool, job_dir: JobDir, before_move: Callable[[Path], None] | None = None
 ) -> Path | None:
-    """Move what was dropped back to the inbox, and remove the rest of the job's folder.
+    """Move the dropped folder or job file back to the inbox, and remove the rest of the job's folder.
 
     Args:
-        spool: The spool.
+        spool: The folders of the watcher.
         job_dir: The job's folder.
-        before_move: Called with the target just before the move.
+        before_move: Function that is called with the target path just before the move.
 
     Returns:
-        The new path. None if nothing had been dropped, or another process has moved it already.
+        The new path in the inbox. None if the job's folder holds no input, or if another process has already
+        moved the input.
     """
     dropped, target = input_path(job_dir), None
     if path_exists(dropped):
@@ -141,17 +142,17 @@ def return_to_inbox(
 
 
 def finish_interrupted_retries(spool: Spool) -> None:
-    """Complete the moves to the inbox of `retry` commands that were killed."""
+    """Move jobs to the inbox if the `retry` command that was moving them was killed."""
     for path in sorted(spool.failed.glob(f"{RETRY_PREFIX}*")):
         if not is_process_running(path.name.removeprefix(RETRY_PREFIX)):
-            with contextlib.suppress(FileNotFoundError):  # another watcher is moving it
+            with contextlib.suppress(FileNotFoundError):  # another watcher is moving the job
                 return_to_inbox(spool, JobDir(path))
 
 
 def _write_job_files(
     job_dir: JobDir, entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
 ) -> BodycapError | None:
-    """Read the job and write all its files except the input. Return the job's error, if any."""
+    """Read the job, and write all its files except the input. Return the error of the job, or None."""
     job, error = _read_job_or_error(entry, snapshot, permissions)
     if job is not None:
         write_job(job, job_dir, entry.path.parent / entry.path.name if not entry.is_file else job_dir.input)
@@ -165,7 +166,11 @@ def _write_job_files(
 def _move_entry(
     job_dir: JobDir, entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
 ) -> bool:
-    """Move the entry into the claimed folder. Return False if the entry is gone or has changed."""
+    """Move the entry into the claimed folder.
+
+    Return False if the entry is gone, or has changed since the snapshot. A changed entry returns to the
+    inbox.
+    """
     if entry.is_file:
         job_dir.input.mkdir()
     target = job_dir.input / entry.path.name if entry.is_file else job_dir.input

@@ -1,4 +1,4 @@
-"""List the entries of the inbox, and determine whether they have been copied completely."""
+"""List the entries of the inbox, and determine whether users have copied them completely."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bodycap_batch.watch.spool import visible_entries
 
 READY = "READY"
 NOT_A_JOB = "not a job: neither a folder nor a YAML file"
-"""Reason to ignore a path in the inbox."""
+"""Text that explains why a path in the inbox is ignored."""
 YAML_SUFFIXES = (".yaml", ".yml")
 _PARTIAL_SUFFIX = ".part"
 _FILE_MANAGER_FILES = (
@@ -26,7 +26,8 @@ _FILE_MANAGER_FILES = (
     ".fseventsd",
     ".nomedia",
 )
-"""Files that file managers leave in every folder. Resource forks (``._name``) are treated in the same way."""
+"""Names of hidden files that file managers create in folders. A folder that holds such files can be complete.
+Names that start with ``._`` (resource forks) are treated in the same way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,15 +49,16 @@ class InboxEntry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EntrySnapshot:
-    """The files of an entry at one moment.
+    """The state of an entry's files at one moment.
 
     Attributes:
-        digest: Changes if a file is added, removed or renamed, or if its size or time changes.
-        files: Number of files.
+        digest: Digest of the names, sizes and times of all files. It changes if a file is added, removed,
+            renamed or modified.
+        files: Number of files, at most `max_files` + 1 (see `take_snapshot`).
         ready: True if a file named READY states that the entry is complete.
-        unfinished: A file that is still being copied, relative to the entry; "" if there is none.
-        special: A path that is neither a file nor a folder (a pipe, a device); "" if there is none.
-        undecodable: A name that is not UTF-8 text; "" if there is none.
+        unfinished: Relative path of a file that is still being copied; "" if there is no such file.
+        special: Relative path of a pipe, a device or another special file; "" if there is no such file.
+        undecodable: Relative path that is not UTF-8 text; "" if there is no such path.
     """
 
     digest: str
@@ -68,7 +70,7 @@ class EntrySnapshot:
 
     @property
     def incomplete_reason(self) -> str:
-        """Why the entry cannot be complete yet; "" if there is no reason."""
+        """Reason why the entry cannot be complete yet; "" if there is no reason."""
         if self.ready:
             return ""
         if self.unfinished:
@@ -87,11 +89,11 @@ def ignored_paths_in(inbox: Path) -> list[Path]:
 
 
 def take_snapshot(entry: InboxEntry, max_files: int) -> EntrySnapshot:
-    """Record names, sizes and times of an entry's files. No file is opened.
+    """Record the names, sizes and times of an entry's files. No file is opened.
 
     Args:
         entry: Entry to record.
-        max_files: The count of files ends after this number.
+        max_files: Maximum number of files. The inspection ends at the first file beyond this number.
     """
     digest, count = hashlib.sha256(), 0
     ready, unfinished, special = False, "", ""
@@ -99,7 +101,7 @@ def take_snapshot(entry: InboxEntry, max_files: int) -> EntrySnapshot:
     for path, name in _files_below(entry.path):
         try:
             found = path.stat()
-        except OSError:  # a broken link, which is reported when the job is read
+        except OSError:  # a broken link; the error is reported when the job is read
             found = path.lstat()
         count += 1
         digest.update(repr((name, found.st_size, found.st_mtime_ns, found.st_ino)).encode())
@@ -122,17 +124,17 @@ def take_snapshot(entry: InboxEntry, max_files: int) -> EntrySnapshot:
 
 
 class CompletionTracker:
-    """Follow entries until they are complete.
+    """Observe the entries of the inbox until they are complete.
 
     Args:
-        unchanged_s: Seconds for which names, sizes and times must stay the same.
-        max_files: Number of files of an entry that are inspected.
-        clock: This process's own clock, seconds.
+        unchanged_s: Time (seconds) for which the names, sizes and times of an entry's files must not change.
+        max_files: Maximum number of files of an entry that are inspected.
+        clock: Function that returns the time of this process's own clock, seconds.
 
     Attributes:
-        incomplete: Reasons of entries that are unchanged for that long, but are not complete: an interrupted
-            copy, or no file.
-        unreadable: The errors of those entries that cannot be read at all.
+        incomplete: Reason for each path that has not changed for `unchanged_s`, but is not complete. Examples
+            are an interrupted copy, an empty folder and an unreadable entry.
+        unreadable: Error text for each path in `incomplete` that cannot be read.
     """
 
     def __init__(
@@ -146,7 +148,10 @@ class CompletionTracker:
         self.unreadable: dict[Path, str] = {}
 
     def complete_entries(self, entries: list[InboxEntry]) -> list[tuple[InboxEntry, EntrySnapshot]]:
-        """Return the entries that are complete now; those that were unchanged for longest come first."""
+        """Return the entries that are complete now.
+
+        Entries that have not changed for the longest time come first.
+        """
         now = self._clock()
         found: list[tuple[float, InboxEntry, EntrySnapshot]] = []
         previous, self._seen = self._seen, {}
@@ -169,12 +174,12 @@ class CompletionTracker:
 
     @property
     def is_tracking(self) -> bool:
-        """True if the last scan found entries, which may still be changing."""
+        """True if the last scan found entries. Some of the entries may still be changing."""
         return bool(self._seen)
 
 
 def _try_snapshot(entry: InboxEntry, max_files: int) -> tuple[EntrySnapshot | None, str]:
-    """Return a snapshot of an entry, or the error. The error is "" if the entry is being moved."""
+    """Return a snapshot of an entry and "", or None and the error. The error is "" if the entry is gone."""
     try:
         return take_snapshot(entry, max_files), ""
     except FileNotFoundError:
@@ -197,7 +202,7 @@ def _is_special_file(path: Path) -> bool:
 
 
 def _is_utf8(name: str) -> bool:
-    """Return False for a name with bytes that are not UTF-8. It cannot be written to a text file."""
+    """Return False for a name with bytes that are not UTF-8. Such a name cannot be written to a text file."""
     try:
         name.encode()
     except UnicodeEncodeError:
@@ -212,7 +217,10 @@ def _is_partial_or_hidden(name: str) -> bool:
 
 
 def _files_below(path: Path) -> Iterator[tuple[Path, str]]:
-    """Yield files, links and special files below a folder with their relative names; a file yields itself."""
+    """Yield the path and relative name of each file, link and special file in a folder and its subfolders.
+
+    If the path is not a folder, yield the path itself.
+    """
     if not path.is_dir():
         yield path, path.name
         return

@@ -19,11 +19,11 @@ from bodycap_batch.watch.spool import JobDir
 
 State = Literal["claimed", "running", "stopped", "done", "failed", "cancelled"]
 FINAL = ("done", "failed", "cancelled")
-"""States in which a job is filed."""
+"""States of a job that has ended. A job in such a state moves to its final folder, `done` or `failed`."""
 _WRITE_PERIOD_S = 0.5
-"""Seconds between two writes of progress. Evidence: none."""
+"""Minimum time (seconds) between two writes of the progress. Evidence: none."""
 _MAX_NOTES = 100
-"""Number of notes that are kept, so that the file stays small. Evidence: none."""
+"""Maximum number of notes in the file. The limit keeps the file small. Evidence: none."""
 _FIELD_TYPES: Mapping[str, tuple[type, ...]] = {
     **dict.fromkeys(("kind", "dropped", "state", "stage", "camera"), (str,)),
     "store": (str, NoneType),
@@ -33,18 +33,21 @@ _FIELD_TYPES: Mapping[str, tuple[type, ...]] = {
     "progress": (int, float, NoneType),
     "error": (dict, NoneType),
 }
-"""Types of the fields. A value of another type, for example edited by hand, is ignored."""
+"""Permitted types of each field. A value of another type is ignored: a user may have edited the file."""
 _ACTIVITY_WITHOUT_END = "reading videos"
-"""An activity that is not a stage and reports no end. It is over when a stage starts."""
+"""Label of an activity that is not a stage and reports no end. It ends when a stage starts."""
 
 
 class JobStatusFile:
-    """Keep a job's `status.json` and its log up to date; the stages call it with events.
+    """Keep a job's `status.json` and its log up to date.
+
+    The run of the job calls this object with each event.
 
     Args:
         job: The job's folder.
-        previous: Content of an earlier `status.json` of the job.
-        may_write: Called before each write; False once the job belongs to another watcher.
+        previous: Content of an earlier `status.json` of the job, or None.
+        may_write: Function that is called before each write. It returns False once the job belongs to another
+            watcher.
     """
 
     def __init__(
@@ -86,7 +89,7 @@ class JobStatusFile:
         """Record one event of the job."""
         with self._lock:
             _apply_event(self.document, event)
-            if event.kind != "note" and not self._failed:  # keep the failed stage, though a report follows
+            if event.kind != "note" and not self._failed:  # keep the failed stage, even if a report follows
                 self.document.update(stage=event.stage, camera=event.camera)
                 self._failed = event.kind == "failed"
             if event.kind != "progress":
@@ -95,7 +98,7 @@ class JobStatusFile:
                 self._write()
 
     def update(self, **values: Any) -> None:
-        """Set fields and write the file."""
+        """Set fields of the document, and write the file."""
         with self._lock:
             self.document.update(values)
             self._write()
@@ -113,11 +116,11 @@ class JobStatusFile:
             self._write()
 
     def finish(self, state: State, error: BodycapError | None, target: Path, inbox: Path) -> None:
-        """Write the final state, with the paths that hold once the job's folder is `target`.
+        """Write the final state. Paths in the error are replaced by the paths after the move to `target`.
 
         Args:
             state: The final state.
-            error: Why the job failed, or None.
+            error: Error that ended the job, or None.
             target: The job's folder after the move.
             inbox: The folder in which the job was dropped.
         """
@@ -143,7 +146,7 @@ class JobStatusFile:
     def _write(self) -> None:
         self.document["updated_at"] = utc_text()
         self._written = time.monotonic()
-        if not self._job.path.is_dir() or not self._may_write():  # another watcher has it, or has filed it
+        if not self._job.path.is_dir() or not self._may_write():  # another watcher has claimed or moved it
             return
         temporary = self._job.path / f".status.{os.getpid()}.{threading.get_ident()}.part"
         with disk_errors(self._job.path):
@@ -172,8 +175,8 @@ def read_status(job: JobDir, *, strict: bool = False) -> dict[str, Any]:
 
     Args:
         job: The job's folder.
-        strict: Raise `OSError` if the file exists and the disk cannot read it. Otherwise the result is empty
-            then.
+        strict: True: raise `OSError` if the disk cannot read the file. False: return an empty result in this
+            case.
     """
     try:
         found = json.loads(job.status.read_text(encoding="utf-8"))
@@ -191,7 +194,11 @@ def read_status(job: JobDir, *, strict: bool = False) -> dict[str, Any]:
 
 
 def utc_text(seconds: float | None = None) -> str:
-    """Return a moment (now, or Unix seconds) as text: UTC, whole seconds."""
+    """Return a moment as text: UTC, whole seconds.
+
+    Args:
+        seconds: The moment in Unix seconds; None for the current time.
+    """
     moment = datetime.now(UTC) if seconds is None else datetime.fromtimestamp(seconds, UTC)
     return moment.isoformat(timespec="seconds").replace("+00:00", "Z")
 
@@ -216,13 +223,13 @@ def _apply_event(document: dict[str, Any], event: Event) -> None:
 
 
 def _add_note(document: dict[str, Any], text: str) -> None:
-    """Append a note unless it is known or there are too many."""
+    """Append a note if the document does not hold it yet and holds fewer than `_MAX_NOTES` notes."""
     if text not in document["notes"] and len(document["notes"]) < _MAX_NOTES:
         document["notes"].append(text)
 
 
 def _with_replaced_paths(error: Mapping[str, Any], new_paths: Mapping[str, str]) -> dict[str, Any]:
-    """Return the error with its paths replaced by those after the move."""
+    """Return the error with each old path replaced by the path after the move."""
 
     def changed(text: str) -> str:
         for old, new in new_paths.items():

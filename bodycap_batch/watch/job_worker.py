@@ -1,4 +1,4 @@
-"""Run one claimed job and file it."""
+"""Run one claimed job, and move it to its final folder (`done` or `failed`)."""
 
 from __future__ import annotations
 
@@ -22,19 +22,21 @@ from bodycap_batch.watch.spool import JobDir, Spool, move_to_free_name
 from bodycap_batch.watch.watch_options import WatchOptions
 
 _MAX_DISK_FAILURES = 5
-"""Disk failures after which a job has failed, if its folder could be listed in between. Evidence: none."""
+"""Maximum number of disk failures after which a job is tried again. A failure is counted only if the disk
+itself answers, so that the file is at fault. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOutcome:
-    """How a job ended.
+    """How the processing of a job ended.
 
     Attributes:
         name: Name of the job.
-        state: As in `status.json`. "lost" if another watcher has the job now, "stuck" if its disk fails.
-        exit_code: 0, the exit code of the error, or 70.
+        state: State as in `status.json`; "lost" if another watcher has taken the job over; "stuck" if a disk
+            failed.
+        exit_code: Exit code of the error; 0 if there is no error. A bug of the program has the code 70.
         message: One line for the operator.
-        path: The job's folder; None if the job was not filed.
+        path: The job's final folder; None if the job was not moved there.
     """
 
     name: str
@@ -45,12 +47,12 @@ class JobOutcome:
 
 
 class JobWorker:
-    """Process claimed jobs; one instance for all of them.
+    """Process claimed jobs. One instance processes all jobs of a watcher.
 
     Args:
-        spool: The spool.
-        options: How the spool is watched.
-        stop: Set when the watcher must end.
+        spool: The folders of the watcher.
+        options: Options of the watcher.
+        stop: Event that is set when the watcher must end.
     """
 
     def __init__(self, spool: Spool, options: WatchOptions, stop: threading.Event) -> None:
@@ -62,7 +64,7 @@ class JobWorker:
         self._store = Store(options.store or spool.root / ".store")
 
     def process(self, claim: Claim, read_error: BodycapError | None = None) -> JobOutcome:
-        """Run a claimed job until it is filed, or left for the next watcher.
+        """Run a claimed job until it is in its final folder, or until it is left for a later attempt.
 
         Args:
             claim: The claim on the job.
@@ -75,7 +77,7 @@ class JobWorker:
 
     def _process(self, claim: Claim, read_error: BodycapError | None) -> JobOutcome:
         previous = read_status(claim.job, strict=True)
-        if previous.get("state") in FINAL:  # its watcher ended after the final status, before the move
+        if previous.get("state") in FINAL:  # its watcher wrote the final status, but ended before the move
             return self._file(claim, previous["state"], _error_from_status(previous), None)
         status = JobStatusFile(claim.job, previous, claim.ownership.is_held)
         try:
@@ -84,7 +86,7 @@ class JobWorker:
             self._run(claim, status)
         except Cancelled as error:
             return self._handle_cancelled(claim, status, error)
-        except StoreBusy as error:  # `bodycap gc` runs for some seconds; this was not an attempt
+        except StoreBusy as error:  # `bodycap gc` runs for a few seconds; do not count this attempt
             status.document["attempts"] = int(previous.get("attempts", 0))
             return self._leave(claim, status, error)
         except DiskAway as error:
@@ -112,7 +114,7 @@ class JobWorker:
             generation=claim.generation,
             store=str(self._store.root),
         )
-        if not job_dir.job.is_file():  # its watcher ended before it wrote the job
+        if not job_dir.job.is_file():  # an earlier watcher ended before it wrote the job
             raise JobError("the job was never read", path=job_dir.input, hint="retry it, so that it is read")
         job = read_job(job_dir, self._options.permissions)
         settings = Settings(
@@ -139,7 +141,7 @@ class JobWorker:
             raise Cancelled("stopped before it started", hint="retry it")
 
     def _handle_cancelled(self, claim: Claim, status: JobStatusFile, error: Cancelled) -> JobOutcome:
-        """Handle a stop: the user cancelled the job, the watcher ends, or another watcher has the job."""
+        """Handle a stop: a user cancelled the job, this watcher ends, or another watcher has the job."""
         name = claim.job.name
         if not claim.ownership.is_held():
             claim.lost.set()
@@ -152,7 +154,11 @@ class JobWorker:
         return self._leave(claim, status, error)
 
     def _postpone(self, claim: Claim, status: JobStatusFile, error: DiskAway) -> JobOutcome:
-        """Stop the heartbeat after a disk failure, so that the job starts again when its claim is stale."""
+        """Postpone a job after a disk failure, or end it after too many disk failures.
+
+        The heartbeat of a postponed job stops. The job starts again when its claim is stale, that is, after
+        the maximum time without a heartbeat.
+        """
         name = claim.job.name
         if any(not stage["reused"] for stage in status.document["finished_stages"]):
             del self._disk_failures[name]  # the job has finished a stage since the last failure
@@ -166,16 +172,17 @@ class JobWorker:
         return self._stuck(claim, error)
 
     def _stuck(self, claim: Claim, error: Exception) -> JobOutcome:
-        """Stop the heartbeat after a failure of the spool's own disk.
+        """Stop the heartbeat after a disk failure, and report it to the operator.
 
-        The job is processed again when its claim is stale.
+        The job is processed again when its claim is stale, that is, after the maximum time without a
+        heartbeat.
         """
         claim.stop_heartbeat()
         code, name = StoreError.exit_code, claim.job.name
         return JobOutcome(name=name, state="stuck", exit_code=code, message=f"continues later: {error}")
 
     def _leave(self, claim: Claim, status: JobStatusFile, error: BodycapError) -> JobOutcome:
-        """Leave the job in `running`, for the next watcher or a later attempt of this one."""
+        """Leave the job in `running`, so that the next watcher or this watcher can try it again later."""
         cause = None if isinstance(error, Cancelled) else error.to_dict()
         status.update(state="stopped", active={}, error=cause)
         return self._release(claim, error)
@@ -200,7 +207,10 @@ class JobWorker:
     def _file(
         self, claim: Claim, state: State, error: BodycapError | None, status: JobStatusFile | None
     ) -> JobOutcome:
-        """Write the final status and file the job. If the store is being cleaned, the move follows later."""
+        """Write the final status, and move the job to its final folder.
+
+        If `bodycap gc` is cleaning the store, the job moves at a later attempt.
+        """
         try:
             return self._move(claim, state, error, status)
         except StoreBusy as busy:
@@ -227,7 +237,7 @@ class JobWorker:
                 if status is not None:
                     status.finish(state, error, target, self._spool.inbox)
 
-            folder.mkdir(exist_ok=True)  # a user may have removed it together with the results
+            folder.mkdir(exist_ok=True)  # a user may have removed the folder with all results
             target = move_to_free_name(claim.job.path, folder, claim.job.name, write_final_status)
         remove_claim_files(JobDir(target))
         return JobOutcome(
@@ -240,9 +250,10 @@ class JobWorker:
 
 
 def _is_disk_readable(path: Path) -> bool:
-    """Return True if the disk of an unreadable file answers: then the file is at fault.
+    """Return True if the disk of an unreadable file answers. In this case the file is at fault.
 
-    If the disk does not answer, it is missing, and the watcher waits for it without a limit.
+    If the disk does not answer, the disk is missing. The watcher waits for a missing disk without a time
+    limit.
     """
     try:
         os.statvfs(path.parent)
@@ -253,7 +264,7 @@ def _is_disk_readable(path: Path) -> bool:
 
 
 def _error_from_status(document: dict[str, object]) -> BodycapError | None:
-    """Return the error of a status file, as far as its exit code and message matter."""
+    """Return the error of a status file, or None. The error has at least its exit code and its message."""
     error = document.get("error")
     if not isinstance(error, dict):
         return None

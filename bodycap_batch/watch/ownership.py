@@ -1,4 +1,4 @@
-"""Check whether this process may still write for a job that several machines can see.
+"""Check whether this process may still write files of a job that several machines can see.
 
 A watcher that was suspended does not know that another watcher has taken its job over. Therefore the
 ownership is checked before each visible step: a commit to the store, a result, a move.
@@ -22,17 +22,18 @@ _FIELD_TYPES: Mapping[str, type] = {
     "machine": str,
     "process": str,
 }
-"""Types of the fields of `owner.json`. A value of another type, for example edited by hand, is ignored."""
+"""Types of the fields of `owner.json`. A value of another type is ignored: a user may have edited the file.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ownership:
-    """The ownership of a job by one claim.
+    """The ownership of a job by one claim. The claims of a job are numbered.
 
     Attributes:
         owner: Path of the job's `owner.json`.
         token: Unique name of the claim.
-        generation: Number of the claim; the first claim of a job has 1.
+        generation: Number of the claim; the first claim of a job has number 1.
     """
 
     owner: Path
@@ -40,7 +41,7 @@ class Ownership:
     generation: int
 
     def is_held(self) -> bool:
-        """Return True while no later claim has been made."""
+        """Return True if this claim exists and no later claim has been made."""
         folder = self.owner.parent
         if (
             generation_marker(folder, self.generation + 1).exists()
@@ -48,7 +49,7 @@ class Ownership:
         ):
             return False
         found = read_owner(self.owner)
-        # An earlier owner that was suspended may complete its last heartbeat after it lost the job.
+        # An earlier owner that was suspended may write its last heartbeat after it has lost the job.
         outdated = int(found.get("generation", 0)) < self.generation
         return outdated or (found.get("token"), found.get("generation")) == (self.token, self.generation)
 
@@ -63,7 +64,7 @@ class Ownership:
 
 
 def generation_marker(folder: Path, generation: int) -> Path:
-    """Return the path of the file that claims a generation. Only one process can create it."""
+    """Return the path of the file that marks the claim of a number. Only one process can create this file."""
     return folder / f"{MARKER_PREFIX}{generation}"
 
 

@@ -12,9 +12,9 @@ _PID_NAMESPACE = Path("/proc/self/ns/pid")
 
 
 def machine_id() -> str:
-    """Return an identifier of this machine since its last start, and of its process namespace.
+    """Return an identifier of this machine, its last start and the process namespace.
 
-    A container has a process namespace of its own. The result is "" if the system does not provide this
+    Each container has a separate process namespace. The result is "" if the system does not provide this
     information.
     """
     try:
@@ -26,7 +26,7 @@ def machine_id() -> str:
 
 
 def process_start(pid: int) -> str:
-    """Return the start time of a process of this machine in kernel ticks; "" if there is none."""
+    """Return the start time of a process of this machine in kernel ticks; "" if no such process runs."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2]
     except OSError:
@@ -36,15 +36,18 @@ def process_start(pid: int) -> str:
 
 
 def process_tag() -> str:
-    """Return a text that identifies this process among all machines; it is part of a file's name."""
+    """Return a text that identifies this process among the processes of all machines.
+
+    The text is used as a part of file names.
+    """
     return f"{_machine_tag()}-{os.getpid()}-{process_start(os.getpid())}"
 
 
 def is_process_running(tag: str) -> bool:
-    """Return True if the process of a tag runs on this machine.
+    """Return True if the process that a tag identifies runs on this machine.
 
     Args:
-        tag: Text that begins with a `process_tag`.
+        tag: Text that begins with a result of `process_tag`.
     """
     machine, pid, start, *_ = [*tag.split("-"), "", ""]
     here = bool(machine_id()) and machine == _machine_tag()
@@ -52,7 +55,7 @@ def is_process_running(tag: str) -> bool:
 
 
 def is_from_this_machine(tag: str) -> bool:
-    """Return True if a process of this machine, since its last start, wrote the tag."""
+    """Return True if a tag is from a process of this machine that started after the machine's last start."""
     return bool(machine_id()) and tag.split("-", maxsplit=1)[0] == _machine_tag()
 
 

@@ -1,4 +1,4 @@
-"""The watched folder and its siblings: the folder of each state, and the moves between them."""
+"""The spool: a watched inbox and the folders `running`, `done` and `failed`, with the moves between them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from bodycap_batch.store.artefacts import disk_errors
 INBOX, RUNNING, DONE, FAILED = "inbox", "running", "done", "failed"
 _JOB_FOLDERS = (RUNNING, DONE, FAILED)
 CLAIM_PREFIX, RETRY_PREFIX = ".claim-", ".retry-"
-"""Prefixes of hidden folders between two states. A watcher that starts completes their moves."""
+"""Name prefixes of hidden folders that are moving between two states. If the moving process was killed, a
+watcher completes the move."""
 _MAX_NAME_BYTES = 200
-"""Bytes of a job's name. A number and the suffixes of temporary files must fit into a file system's usual
-255.
-"""
+"""Maximum length (bytes) of a job's name. File systems usually permit 255 bytes. The rest is for a number and
+the suffixes of temporary files."""
 _NAME_TAKEN_ERRORS = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR, errno.EISDIR)
-"""Error numbers of a rename to a name that already exists."""
+"""Error numbers that mean that the target name of a rename already exists."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class JobDir:
 
     @property
     def input(self) -> Path:
-        """What was dropped: a folder. For a job file that was dropped alone, a folder that holds the file."""
+        """The dropped folder, or a folder that holds the job file that was dropped without a folder."""
         return self.path / "input"
 
     @property
@@ -49,36 +49,36 @@ class JobDir:
 
     @property
     def job(self) -> Path:
-        """The resolved job; paths to its own videos are relative to it."""
+        """File of the resolved job. Paths to the job's own videos are relative to the folder of this file."""
         return self.path / "job.yaml"
 
     @property
     def status(self) -> Path:
-        """State of the job, for other programs."""
+        """File with the state of the job, for other programs."""
         return self.path / "status.json"
 
     @property
     def owner(self) -> Path:
-        """File of the watcher that runs the job."""
+        """File that identifies the watcher that runs the job."""
         return self.path / "owner.json"
 
     @property
     def cancel(self) -> Path:
-        """A file that exists once the user has asked to cancel the job."""
+        """File that exists once a user has requested to cancel the job."""
         return self.path / "cancel"
 
     @property
     def log(self) -> Path:
-        """Log of the job, one line per event."""
+        """Log file of the job, with one line per event."""
         return self.result / "logs" / "job.log"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spool:
-    """The four folders of a watched spool. Jobs move between them by renaming.
+    """The four folders of a watcher. Jobs move between the folders by renaming.
 
     Attributes:
-        inbox: Folder into which users drop folders and job files.
+        inbox: Folder where users drop folders and job files.
         root: Parent folder of `running`, `done` and `failed`.
     """
 
@@ -101,10 +101,10 @@ class Spool:
         return self.root / FAILED
 
     def make(self) -> None:
-        """Create the folders, and test that a folder can be renamed from each to the next.
+        """Create the folders, and test that renaming can move a folder through all of them.
 
         Raises:
-            StoreError: The folders cannot be created or written, or are not on one file system.
+            StoreError: A folder cannot be created or written, or the folders are on different file systems.
         """
         with disk_errors(self.root):
             for folder in (self.inbox, self.running, self.done, self.failed):
@@ -112,17 +112,20 @@ class Spool:
             self._try_to_rename()
 
     def jobs(self) -> Iterator[JobDir]:
-        """Yield every claimed job: running, done, failed."""
+        """Yield every job in `running`, `done` and `failed`."""
         for folder in (self.running, self.done, self.failed):
             yield from (JobDir(path) for path in visible_entries(folder))
 
     def find(self, name: str) -> JobDir | None:
-        """Return the claimed job of that name, or None."""
+        """Return the job in `running`, `done` or `failed` with a given name, or None."""
         wanted = unicodedata.normalize("NFC", name)
         return next((job for job in self.jobs() if unicodedata.normalize("NFC", job.name) == wanted), None)
 
     def free_name(self, name: str) -> str:
-        """Return the name; if a job has it already, the first free one of name-2, name-3 and so on."""
+        """Return the name if no job has it.
+
+        Otherwise return the first free name of name-2, name-3 and so on.
+        """
         folders = (self.running, self.done, self.failed)
         for number in itertools.count(1):
             candidate = name if number == 1 else f"{name}-{number}"
@@ -152,13 +155,14 @@ class Spool:
 
 
 def spool_from_path(path: Path) -> Spool:
-    """Return the spool of a path: the path is the inbox, or the parent folder of the inbox.
+    """Return the spool of a path. The path is either the inbox or the parent folder of the inbox.
 
-    A folder with another name is an inbox only if `running`, `done` and `failed` exist beside it. Any other
-    folder is the parent of the inbox, so that its content is never taken for jobs.
+    A folder that is not named `inbox` is treated as an inbox only if `running`, `done` and `failed` exist
+    beside it. Any other folder is treated as the parent of the inbox. Its content is therefore never treated
+    as jobs.
 
     Raises:
-        StoreError: The path is a file, or one of the folders that jobs are moved to.
+        StoreError: The path is a file, or it is `running`, `done` or `failed`.
     """
     full = Path(os.path.abspath(path))
     if os.path.lexists(full) and not full.is_dir():
@@ -177,15 +181,15 @@ def spool_from_path(path: Path) -> Spool:
 def move_to_free_name(
     source: Path, folder: Path, name: str, before_move: Callable[[Path], None] | None = None, suffix: str = ""
 ) -> Path:
-    """Rename a file or folder into another folder, under the first free name (name, name-2, name-3 ...).
+    """Move a file or folder into another folder, with the first free name (name, name-2, name-3 ...).
 
     Args:
-        source: Path to move.
-        folder: Folder to move it to.
-        name: Name that it should get.
-        before_move: Called with the target just before each attempt. There are several attempts if a name is
-            taken meanwhile.
-        suffix: End of the name; a number is inserted before it.
+        source: Path of the file or folder to move.
+        folder: Folder that receives it.
+        name: Preferred new name.
+        before_move: Function that is called with the target path just before each attempt. There are several
+            attempts if another process takes a name in the meantime.
+        suffix: Suffix of the name, for example ".yaml"; a number is inserted before the suffix.
 
     Returns:
         The new path.
@@ -207,7 +211,10 @@ def move_to_free_name(
 
 
 def visible_entries(folder: Path) -> list[Path]:
-    """Return the entries of a folder without a leading dot, sorted; empty if there is no folder."""
+    """Return the sorted entries of a folder whose names do not start with a dot.
+
+    The result is empty if the folder does not exist.
+    """
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except (FileNotFoundError, NotADirectoryError):
@@ -215,7 +222,10 @@ def visible_entries(folder: Path) -> list[Path]:
 
 
 def folder_name_from_text(text: str) -> str:
-    """Return a name for a job's folder: not too long, without control characters or a leading dash or dot."""
+    """Return a valid name for a job's folder that is close to a text.
+
+    The name is short enough, and has no control characters and no leading dash or dot.
+    """
     clean = "".join("_" if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") else c for c in text).strip()
     clean = unicodedata.normalize("NFC", clean)
     short = clean.encode()[:_MAX_NAME_BYTES].decode(errors="ignore").strip()

@@ -1,4 +1,4 @@
-"""Options that an operator sets for a watched folder."""
+"""The options that an operator sets for a watched folder."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from bodycap_batch.runner import CHILD_COMMAND
 from bodycap_batch.watch.dropped_job import JobPermissions
 
 _MAX_HEARTBEAT_S = 5.0
-"""Longest time between two heartbeats, seconds. Evidence: none."""
+"""Maximum time (seconds) between two heartbeats. Evidence: none."""
 _HEARTBEATS_PER_TIMEOUT = 4
-"""Heartbeats within `stale_s`, so that one late heartbeat does not make a job look abandoned. Evidence: none.
-"""
+"""Minimum number of heartbeats within `stale_s`. With several heartbeats, one late heartbeat does not make a
+job look abandoned. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WatchOptions:
-    """How a folder is watched. No option changes a result.
+    """Options of a watcher. The options do not change the results of a job.
 
     Attributes:
-        permissions: What a job may name, and how large it may be.
-        store: Folder of the artefacts; None for ``.store`` beside the folders of the spool.
-        jobs: Number of jobs that run at the same time.
-        threads: Cores to use, shared by these jobs.
-        unchanged_s: Seconds for which an entry must not change before it counts as complete.
-        stale_s: Seconds without a heartbeat of another watcher after which its jobs are taken over.
-        poll: True to poll for changes, as network disks need; None to poll network disks only.
-        once: Stop when nothing is left to do.
+        permissions: Which folders a job may read, and the maximum size of a job.
+        store: Folder of the artefacts; None for the folder ``.store`` beside `running`.
+        jobs: Maximum number of jobs that run at the same time.
+        threads: Number of processor cores that all running jobs share.
+        unchanged_s: Time (seconds) for which an entry must not change before it is treated as complete.
+        stale_s: Time (seconds) without a heartbeat after which another watcher's job is taken over.
+        poll: True: poll the inbox for changes (network disks need this). False: do not poll. None: poll only
+            if the inbox is on a network disk.
+        once: True: stop when nothing is left to do.
         command: Command line of the child processes.
     """
 
@@ -44,5 +45,5 @@ class WatchOptions:
 
     @property
     def heartbeat_period_s(self) -> float:
-        """Seconds between two heartbeats."""
+        """Time (seconds) between two heartbeats."""
         return min(_MAX_HEARTBEAT_S, self.stale_s / _HEARTBEATS_PER_TIMEOUT)

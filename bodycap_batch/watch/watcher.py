@@ -1,4 +1,4 @@
-"""Watch a folder: claim complete jobs, run them, and take over abandoned ones."""
+"""Watch a folder: claim complete jobs, run them, and take over abandoned jobs."""
 
 from __future__ import annotations
 
@@ -34,31 +34,32 @@ from bodycap_batch.watch.watcher_status import WatcherStatusFile
 
 MessageSink = Callable[[str], None]
 _BUSY_POLL_S = 1.0
-"""Seconds between two scans of the inbox while something is running or being copied. Evidence: none."""
+"""Time (seconds) between two scans of the inbox while a job runs or an entry is in the inbox. Evidence: none.
+"""
 _IDLE_POLL_S = 5.0
-"""Seconds between two scans while nothing is running or copied, in case a change is not reported. Evidence:
-none."""
+"""Time (seconds) between two scans while no job runs and the inbox is empty. The scans find changes that the
+system does not report. Evidence: none."""
 _SCAN_PAUSE_FACTOR = 20.0
-"""Least time between two scans as a multiple of a scan's duration, so that scans take at most 5 % of the
-time. A scan of a thousand large folders on a slow disk takes seconds."""
+"""Minimum ratio of the time between two scans to the duration of a scan. With a ratio of 20, scans take at
+most 5 % of the time. A scan of a thousand large folders on a slow disk takes several seconds."""
 _TAKEOVER_PERIOD_S = 2.0
-"""Seconds between two searches for abandoned jobs. Evidence: none."""
+"""Minimum time (seconds) between two searches for abandoned jobs. Evidence: none."""
 
 
 class Watcher:
     """One process that runs the jobs of a spool. Several processes may work on the same spool.
 
     Args:
-        spool: The folders.
-        options: How they are watched.
-        write_line: Called with a line for the operator.
+        spool: The folders of the watcher.
+        options: Options of the watcher.
+        write_line: Function that is called with each line for the operator.
 
     Attributes:
-        spool: The folders.
-        access_failures: Why the folders cannot be accessed, if so.
+        spool: The folders of the watcher.
+        access_failures: Tracker of failures to access the folders.
 
     Raises:
-        StoreError: The folders cannot be written, or are not on one file system.
+        StoreError: A folder cannot be created or written, or the folders are on different file systems.
     """
 
     def __init__(self, spool: Spool, options: WatchOptions, write_line: MessageSink) -> None:
@@ -85,18 +86,21 @@ class Watcher:
         self._worst_exit_code = 0
 
     def stop(self) -> None:
-        """End the watcher; running jobs continue at the next start. May be called from any thread."""
+        """End the watcher.
+
+        Running jobs stop, and continue at the next start. Any thread may call this method.
+        """
         self._stop.set()
         self._woken.set()
 
     def run(self) -> int:
-        """Watch until stopped, or with `once` until nothing is left to do.
+        """Watch until `stop` is called. With the option `once`, also end when nothing is left to do.
 
-        The watcher waits for a missing disk with growing pauses. With `once` it waits no longer than for a
-        job of another watcher.
+        The watcher waits for a missing disk with growing pauses. With `once` it waits for at most `stale_s`
+        seconds, which is also the time after which it takes over the job of another watcher.
 
         Returns:
-            The worst exit code of the jobs that ended.
+            The highest exit code of the jobs that ended and of the watcher's own disk failures.
         """
         heartbeat = threading.Thread(target=self._write_heartbeats, name="heartbeat")
         with (
@@ -110,7 +114,7 @@ class Watcher:
                     if (pause_s := self._step(pool)) is None:
                         break
                     self._woken.wait(pause_s)
-                    self._woken.clear()  # before the test of `_stop`, because `stop` sets `_stop` first
+                    self._woken.clear()  # clear before `_stop` is tested, because `stop` sets `_stop` first
             finally:
                 self._stop.set()
                 heartbeat.join()
@@ -118,7 +122,7 @@ class Watcher:
         return self._worst_exit_code
 
     def _step(self, pool: ThreadPoolExecutor) -> float | None:
-        """Start the jobs that can start. Return the seconds until the next scan, or None to end."""
+        """Start the jobs that can start. Return the time (seconds) until the next scan, or None to end."""
         try:
             is_finished = not self._fill(pool) and self._options.once
             if is_finished:
@@ -147,7 +151,7 @@ class Watcher:
             self._retry_failure_reported = True
 
     def _report_left_entries(self) -> None:
-        """Report why paths stay in the inbox although nothing is left to do."""
+        """Report for each path that stays in the inbox why it is not processed."""
         for path, reason in self._tracker.incomplete.items():
             self._write_line(f"{path.name}: left in the inbox: {reason}")
         for path in ignored_paths_in(self.spool.inbox):
@@ -173,7 +177,10 @@ class Watcher:
             self._report_end(outcome)
 
     def _report_end(self, outcome: JobOutcome) -> None:
-        """Report how a job ended. A repeated reason to postpone it is reported once."""
+        """Report how a job ended.
+
+        If the job is postponed again for the same reason, report the reason once.
+        """
         where = f" -> {outcome.path}" if outcome.path is not None else ""
         line = f"{outcome.name}: {outcome.state}{where}" + (f": {outcome.message}" if outcome.message else "")
         if line != self._last_reports.pop(outcome.name, ""):
@@ -182,7 +189,7 @@ class Watcher:
             self._last_reports[outcome.name] = line
 
     def _fill(self, pool: ThreadPoolExecutor) -> bool:
-        """Start jobs while there is room. Return False if nothing runs and nothing is expected."""
+        """Start jobs up to the maximum number. Return False if no job runs and no job is expected."""
         free = self._options.jobs - len(self._running)
         for claim in self._take_over_abandoned(free):
             self._start(pool, claim, None)
@@ -195,7 +202,7 @@ class Watcher:
         return bool(self._running or self._complete or self._has_waiting or self._has_left_jobs)
 
     def _scan_inbox(self) -> None:
-        """Scan the inbox, unless the last scan was too recent for its duration."""
+        """Scan the inbox if enough time has passed since the last scan (see `_SCAN_PAUSE_FACTOR`)."""
         started = time.monotonic()
         if started < self._next_scan_at:
             return
@@ -213,7 +220,7 @@ class Watcher:
         self._next_scan_at = now + _SCAN_PAUSE_FACTOR * (now - started)
 
     def _report_unreadable(self) -> None:
-        """Report each entry that cannot be read, once."""
+        """Report each entry that cannot be read. Each entry is reported once."""
         found = self._tracker.unreadable
         for path in found.keys() - self._unreadable.keys():
             self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
@@ -230,7 +237,11 @@ class Watcher:
     def _try_claim(
         self, entry: InboxEntry, snapshot: EntrySnapshot
     ) -> tuple[Claim, BodycapError | None] | None:
-        """Claim an entry. If it cannot be moved, report that once and retry later or when it changes."""
+        """Claim an entry. Return None if it cannot be claimed.
+
+        If the entry cannot be moved, report this once, and try again after `stale_s` seconds or when the
+        entry changes.
+        """
         digest, until = self._unmovable.get(str(entry.path), ("", 0.0))
         if digest == snapshot.digest and time.monotonic() < until:
             return None
@@ -244,7 +255,7 @@ class Watcher:
             return None
 
     def _take_over_abandoned(self, max_jobs: int) -> list[Claim]:
-        """Take over up to `max_jobs` jobs that their watchers abandoned."""
+        """Take over at most `max_jobs` jobs that other watchers abandoned."""
         now = time.monotonic()
         if max_jobs <= 0 or now < self._next_takeover_at:
             return []
@@ -260,16 +271,20 @@ class Watcher:
         for job in self._heartbeat_monitor.find_abandoned([job for job in jobs if job.path not in own_jobs]):
             if len(found) < max_jobs and (claim := self._take_over(job)) is not None:
                 found.append(claim)
-        self._has_left_jobs = bool(found)  # there may be more of them than free slots
+        self._has_left_jobs = bool(found)  # there may be more abandoned jobs than free slots
         return found
 
     def _take_over(self, job: JobDir) -> Claim | None:
-        """Take a job over. If the disk fails, the next attempt follows when the claim is stale again."""
+        """Take a job over. Return None if there is nothing to run, or if another watcher was faster.
+
+        If the disk fails, also return None. The next attempt follows when the claim is stale again, that is,
+        after `stale_s` seconds without a heartbeat.
+        """
         try:
             claim = take_over_job(job)
             if claim is None or not job.path.name.startswith(CLAIM_PREFIX):
                 return claim
-            if remove_empty_claim(job):  # its watcher ended before it moved the entry
+            if remove_empty_claim(job):  # the claiming watcher ended before it moved the entry
                 return None
             move_to_running(self.spool, claim)
         except (StoreError, OSError) as error:

@@ -1,4 +1,7 @@
-"""Show that a watcher runs and what stops it: a small file in `running`, for `bodycap status`."""
+"""Show that a watcher runs, and why it cannot access its folders.
+
+Each watcher writes a small file in `running`. `bodycap status` reads these files.
+"""
 
 from __future__ import annotations
 
@@ -18,21 +21,21 @@ from bodycap_batch.watch.spool import Spool
 
 _PREFIX, _SUFFIX = ".watcher-", ".json"
 _MAX_SILENCE_S = 86_400.0
-"""Seconds. A killed watcher of another machine looks like a silent one; after a day it is no longer listed.
-"""
+"""Maximum time (seconds) without an update before a watcher of another machine is no longer listed: one day.
+This machine cannot determine whether a silent watcher of another machine was killed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WatcherStatus:
-    """A watcher as other processes see it.
+    """The status of a watcher, as other processes can read it.
 
     Attributes:
-        host: Name of its machine.
-        pid: Its process number there.
-        since: Start of the watcher, UTC.
-        seen: Last update by the watcher's own clock, UTC. "" for a watcher of this machine, which is known to
-            run.
-        trouble: Why it cannot access its folders; "" if it can.
+        host: Name of the watcher's machine.
+        pid: Process number of the watcher on its machine.
+        since: Start time of the watcher, UTC.
+        seen: Time of the last update by the watcher's own clock, UTC. It is "" for a watcher of this machine,
+            because this machine can check whether the watcher runs.
+        trouble: Why the watcher cannot access its folders; "" if it can access them.
     """
 
     host: str
@@ -54,10 +57,10 @@ class WatcherStatus:
 class WatcherStatusFile:
     """The status file of this watcher.
 
-    Write errors are ignored, because the disk may be the failure to report.
+    Write errors are ignored, because a failure of this disk may be the trouble that the file should report.
 
     Args:
-        spool: The folders that are watched.
+        spool: The folders of the watcher.
     """
 
     def __init__(self, spool: Spool) -> None:
@@ -65,7 +68,7 @@ class WatcherStatusFile:
         self._since = utc_text()
 
     def write(self, trouble: str) -> None:
-        """State that the watcher runs, and why it cannot access its folders ("" if it can)."""
+        """Record that the watcher runs, and why it cannot access its folders ("" if it can access them)."""
         document = {
             "host": socket.gethostname(),
             "pid": os.getpid(),
@@ -77,7 +80,7 @@ class WatcherStatusFile:
             write_atomically(self._path, (json.dumps(document, indent=1) + "\n").encode())
 
     def remove(self) -> None:
-        """Remove the file of this watcher, and those of killed watchers of this machine."""
+        """Remove the file of this watcher, and the files of watchers that are no longer active."""
         with contextlib.suppress(OSError):
             self._path.unlink(missing_ok=True)
             for path in self._path.parent.glob(f"{_PREFIX}*{_SUFFIX}"):
@@ -86,14 +89,17 @@ class WatcherStatusFile:
 
 
 def active_watchers(spool: Spool) -> list[WatcherStatus]:
-    """Return the watchers of a spool that run, as far as this machine can determine."""
+    """Return the running watchers of a spool.
+
+    For other machines, these are the watchers that have updated their file within `_MAX_SILENCE_S` seconds.
+    """
     paths = sorted(spool.running.glob(f"{_PREFIX}*{_SUFFIX}"))
     found = (_read_watcher_status(path) for path in paths if not _is_abandoned(path))
     return [watching for watching in found if watching is not None]
 
 
 def _is_abandoned(path: Path) -> bool:
-    """Return True if the watcher of a file has ended, or has been silent for too long."""
+    """Return True if the watcher that wrote a file has ended, or has been silent for too long."""
     tag = path.name.removeprefix(_PREFIX)
     if is_from_this_machine(tag):
         return not is_process_running(tag)
@@ -104,7 +110,7 @@ def _is_abandoned(path: Path) -> bool:
 
 
 def _read_watcher_status(path: Path) -> WatcherStatus | None:
-    """Return the content of a watcher's file; None if it cannot be read."""
+    """Return the content of a watcher's file; None if the file cannot be read."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         here = is_from_this_machine(path.name.removeprefix(_PREFIX))

@@ -1,9 +1,9 @@
 """Decide which requests may use the live page.
 
-A server that listens on loopback only is still open to other web pages. A page in the user's browser can send
-requests to 127.0.0.1; with a name server of its own (DNS rebinding) it can even read the answers. Therefore
-the Host header must be a name of this page, and a request that changes something must come from the page
-itself.
+A server that listens only on loopback can still be attacked by other web pages. Such a page runs in the
+user's browser and can send requests to 127.0.0.1. If the attacker also controls a name server (DNS
+rebinding), the page can even read the answers. Therefore the Host header must be a name of the live page. A
+request that changes something must come from the live page itself.
 """
 
 from __future__ import annotations
@@ -21,23 +21,25 @@ from bodycap_batch.core.errors import JobError
 
 COOKIE = "bodycap_token"
 _READING_METHODS = ("GET", "HEAD")
-"""HTTP methods that change nothing."""
+"""HTTP methods that only read."""
 _MIN_TOKEN_LENGTH = 16
-"""Characters of a token. 16 characters of the permitted 64 are 96 bits, too many to guess."""
+"""Minimum number of characters of a token. There are 64 permitted characters, so 16 characters hold up to 96
+bits. A random token of this length cannot be guessed."""
 _PORT = re.compile(r":[0-9]+$")
-"""A port in a Host header. Browsers omit the default port."""
+"""Pattern of the port in a Host header. Browsers omit the default port."""
 _TOKEN = re.compile(rf"[A-Za-z0-9_\-]{{{_MIN_TOKEN_LENGTH},200}}")
 _TOKEN_HINT = "python3 -c 'import secrets; print(secrets.token_urlsafe())' makes one"  # noqa: S105 - a remedy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Access:
-    """Address of the page, and the token that it requires.
+    """Address of the live page, and the token that the page requires.
 
     Attributes:
-        host: Address to listen on.
+        host: Name or address to listen on.
         port: Port to listen on.
-        token: Token that a browser must send; "" if none is required (loopback).
+        token: Token that a browser must send; "" if no token is required. Only a loopback address may do
+            without a token.
     """
 
     host: str
@@ -46,16 +48,16 @@ class Access:
 
     @property
     def url(self) -> str:
-        """Address of the page."""
+        """Address (URL) of the page."""
         return f"http://{_host_in_url(self.host)}:{self.port}/"
 
     def refusal(self, method: str, headers: Mapping[str, str], query: str) -> tuple[int, str] | None:
-        """Return the status code and the reason if a request is refused, or None if it is allowed.
+        """Return the status code and the reason if a request is refused, or None if the request is allowed.
 
         Args:
             method: HTTP method, for example GET or POST.
-            headers: Headers by lower-case name.
-            query: The part of the address after the question mark.
+            headers: HTTP headers by lower-case name.
+            query: Part of the requested address after the question mark.
         """
         host = headers.get("host", "").lower()
         if not self._is_this_page(host):
@@ -81,7 +83,7 @@ class Access:
             return False
         if is_loopback(self.host):
             return name in ("localhost", "127.0.0.1", "[::1]", _host_in_url(self.host))
-        # Another site can point its own name here, but it can use neither an address nor this machine's name.
+        # An attacker can let a foreign name point to this machine, but not an address or this machine's name.
         return _is_address(name) or name in (self.host.lower(), *_host_names())
 
     def _shows_token(self, headers: Mapping[str, str], query: str) -> bool:
@@ -99,10 +101,15 @@ class Access:
 
 
 def access_from_address(address: str, token: str) -> Access:
-    """Return the access for ``HOST:PORT`` of the command line.
+    """Return the access for an address of the command line.
+
+    Args:
+        address: Text of the form ``HOST:PORT``.
+        token: Token that the page requires; "" for no token.
 
     Raises:
-        JobError: The text is not an address, or the address is not loopback and there is no token.
+        JobError: The text is not an address, the token is not valid, or an address other than loopback has no
+            token.
     """
     host, _, port = address.rpartition(":")
     host = host.strip("[]")

@@ -34,16 +34,17 @@ if TYPE_CHECKING:
 
 _PAGE_FOLDER = Path(__file__).with_name("page")
 _UPDATE_PERIOD_S = 1.0
-"""Seconds between two looks for changes to send. Evidence: none."""
+"""Time (seconds) between two checks for changes to send. Evidence: none."""
 _KEEP_ALIVE_S = 15.0
-"""Seconds of silence after which a comment keeps the connection open. Evidence: none."""
+"""Maximum time (seconds) without data on an event stream. After this time the server sends a comment, which
+keeps the connection open. Evidence: none."""
 _MAX_JSON_BYTES = 4096
-"""Bytes of a request's JSON document, which holds a name only. Evidence: none."""
+"""Maximum size (bytes) of a request's JSON document. The document holds only a name. Evidence: none."""
 _PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
     "form-action 'none'; frame-ancestors 'none'; base-uri 'none'"
 )
-# A result is sandboxed: its scripts cannot send requests in the name of this page.
+# A result file is sandboxed: scripts in a result cannot send requests with the rights of this page.
 _RESULT_POLICY = "sandbox allow-scripts allow-popups allow-downloads"
 _COMMON_HEADERS = {
     "x-content-type-options": "nosniff",
@@ -57,10 +58,10 @@ def make_app(job_list: JobList, access: Access, uploads: Uploads, stopped: threa
     """Return the page as an ASGI application.
 
     Args:
-        job_list: Jobs to show.
-        access: Who may use the page.
-        uploads: Receives the files that browsers send.
-        stopped: Set when the watcher ends; it ends the event streams.
+        job_list: The jobs to show.
+        access: Address of the page, and the token that it requires.
+        uploads: Receiver of the files that browsers send.
+        stopped: Event that is set when the watcher ends. It ends the event streams.
     """
     page = _Routes(job_list, uploads, stopped)
     routes = [
@@ -83,14 +84,17 @@ def make_app(job_list: JobList, access: Access, uploads: Uploads, stopped: threa
 
 
 class _AccessControl:
-    """Pass on the requests that `Access` allows, and store a token from the address in a cookie."""
+    """Pass the requests that `Access` allows to the page, and refuse all other requests.
+
+    A token in the address is stored in a cookie.
+    """
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
         self._access = access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Check one request."""
+        """Check one request, and answer it or pass it to the page."""
         if scope["type"] != "http":
             return
         request = Request(scope)
@@ -108,7 +112,7 @@ class _AccessControl:
 
 
 class _Routes:
-    """Functions that answer the requests."""
+    """The functions that answer requests, one for each route."""
 
     def __init__(self, job_list: JobList, uploads: Uploads, stopped: threading.Event) -> None:
         self._spool = job_list.spool
@@ -149,7 +153,7 @@ class _Routes:
         )
 
     async def result(self, request: Request) -> Response:
-        """Return one file of a job's results, and no file outside of them."""
+        """Return one file from a job's folder of results. Files outside this folder are not found."""
         job = await run_in_threadpool(self._job, request)
         if job is None:
             return _not_found()
@@ -178,7 +182,7 @@ class _Routes:
         key, name = request.path_params["key"], request.path_params["name"]
         try:
             await self._uploads.write(key, name, int(size), request.stream())
-        except ClientDisconnect:  # the browser cannot receive an error message any more
+        except ClientDisconnect:  # the browser can no longer receive an error message
             return Response(status_code=400)
         return JSONResponse({}, headers=_COMMON_HEADERS)
 
@@ -199,7 +203,7 @@ class _Routes:
         )
 
     async def _changes(self, request: Request) -> AsyncIterator[str]:
-        """Yield all jobs as server-sent events whenever one of them has changed."""
+        """Yield the list of all jobs as a server-sent event whenever a job has changed."""
         sent, silent_s = "", 0.0
         while not self._stopped.is_set() and not await request.is_disconnected():
             text = await run_in_threadpool(self._job_list.json_text)
@@ -227,7 +231,7 @@ async def _read_small_json(request: Request) -> dict[str, Any]:
 
 
 async def _error_response(_: Request, error: Exception) -> Response:
-    """Return a typed error as the page shows it."""
+    """Return an error in the form that the page can show."""
     assert isinstance(error, BodycapError)
     code = 507 if isinstance(error, StoreError) else 413 if isinstance(error, CaptureError) else 400
     return JSONResponse({"message": error.message, "hint": error.hint}, code, headers=_COMMON_HEADERS)

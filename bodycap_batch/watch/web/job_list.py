@@ -1,4 +1,4 @@
-"""The jobs as the live page shows them, as JSON text. The spool is read once for all browsers."""
+"""The list of jobs for the live page, as JSON text. The spool is read once for all browsers."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from bodycap_batch.watch.spool import JobDir, Spool, visible_entries
 
 REPORT = "report.html"
 _MAX_AGE_S = 0.8
-"""Seconds for which the text is reused, below the page's update period of 1 s."""
+"""Maximum age (seconds) of the text before the spool is read again. It is shorter than the page's update
+period of 1 s."""
 _MAX_ENDED = 500
-"""Number of ended jobs on the page, the latest ones. Evidence: none."""
+"""Maximum number of ended jobs on the page. The page shows the most recent jobs. Evidence: none."""
 _MAX_LOG_BYTES = 64 << 10
-"""Bytes of the end of a log that are shown. Evidence: none."""
+"""Maximum size (bytes) of the part of a log that is shown. The part is the end of the log. Evidence: none."""
 
 
 class JobList:
-    """The jobs of a spool in the page's format; thread-safe.
+    """The jobs of a spool in the format of the page. This class is thread-safe.
 
     Args:
-        spool: The spool.
-        trouble: Returns why the watcher cannot access its folders; "" if it can.
-        clock: This process's own clock, seconds.
+        spool: The folders of the watcher.
+        trouble: Function that returns why the watcher cannot access its folders; "" if it can access them.
+        clock: Function that returns the time of this process's own clock, seconds.
     """
 
     def __init__(
@@ -44,9 +45,9 @@ class JobList:
         self._ended: dict[Path, tuple[int, dict[str, Any]]] = {}
 
     def json_text(self) -> str:
-        """Return all jobs as JSON text, at most a second old.
+        """Return all jobs as JSON text that is at most one second old.
 
-        While the disk is missing, return the last known jobs.
+        While the disk is missing, return the jobs that were read last.
         """
         with self._lock:
             now = self._clock()
@@ -78,7 +79,7 @@ class JobList:
 
 
 def read_log_end(job: JobDir) -> str:
-    """Return the end of a job's log."""
+    """Return the end of a job's log; "" if the log cannot be read."""
     try:
         with job.log.open("rb") as stream:
             stream.seek(0, 2)
@@ -89,7 +90,7 @@ def read_log_end(job: JobDir) -> str:
 
 
 def list_result_files(job: JobDir) -> list[str]:
-    """Return the result files of a job, relative to its folder of results."""
+    """Return the paths of a job's result files, relative to the job's folder of results."""
     if not job.result.is_dir():
         return []
     files = (path for path in job.result.rglob("*") if path.is_file() and not path.name.startswith("."))
@@ -101,7 +102,7 @@ def _job_entry(job: JobDir) -> dict[str, Any]:
 
 
 def _browser_entry(row: JobRow, job: JobDir | None) -> dict[str, Any]:
-    """Return a row for the browser, which computes ages itself."""
+    """Return a row in the format of the page. The row has no age, because the browser computes the age."""
     entry = row.to_dict()
     del entry["age_s"], entry["path"]
     status = {} if job is None else read_status(job)

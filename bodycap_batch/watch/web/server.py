@@ -16,17 +16,17 @@ from bodycap_batch.watch.web.job_list import JobList
 from bodycap_batch.watch.web.uploads import Uploads, remove_abandoned_uploads
 
 _SHUTDOWN_S = 2
-"""Seconds that open connections have to end. Evidence: none."""
+"""Maximum time (seconds) that open connections have to end at a shutdown. Evidence: none."""
 
 
 class LivePage:
-    """The server of the live page; a context manager.
+    """The server of the live page. This is a context manager.
 
     Args:
-        spool: The spool to show.
-        access: Address to listen on (port 0: any free port), and the required token.
-        limits: Largest uploads.
-        trouble: Returns why the watcher cannot access its folders; "" if it can.
+        spool: The folders whose jobs the page shows.
+        access: Address to listen on, and the required token. With port 0, the system selects a free port.
+        limits: Maximum size and number of uploaded files.
+        trouble: Function that returns why the watcher cannot access its folders; "" if it can access them.
 
     Raises:
         JobError: The extra `web` is not installed, or the server cannot listen on the address.

@@ -1,4 +1,4 @@
-"""Receive videos from browsers in hidden folders of the inbox, until they are complete."""
+"""Receive videos from browsers. An upload stays in a hidden folder of the inbox until it is complete."""
 
 from __future__ import annotations
 
@@ -24,14 +24,15 @@ _PREFIX = ".upload-"
 _OTHER_FILES = ("calib.json", *JOB_FILES)
 _OTHER_SUFFIXES = (".timestamps.txt", ".bvh", ".png")
 _MAX_OTHER_BYTES = 64 << 20
-"""Largest size of a file that is not a video: calibration, timestamps, mask, skeleton. Evidence: none."""
+"""Maximum size (bytes) of a file that is not a video: job, calibration, timestamps, mask, skeleton. Evidence:
+none."""
 _NAME = re.compile(r"[^/\\\x00-\x1f\x7f.][^/\\\x00-\x1f\x7f]{0,199}")
 _MIN_FREE_BYTES = 1 << 30
-"""Bytes that an upload leaves free on the disk. Evidence: none."""
+"""Minimum free space (bytes) on the disk after an upload. Evidence: none."""
 _MAX_OPEN_UPLOADS = 8
-"""Folders that may be uploaded at the same time. Evidence: none."""
+"""Maximum number of folders that are uploaded at the same time. Evidence: none."""
 _MAX_SILENCE_S = 86_400.0
-"""Seconds without data after which an upload is removed: a day. Evidence: none."""
+"""Maximum time (seconds) without data before an upload is removed: one day. Evidence: none."""
 
 
 @dataclass(slots=True)
@@ -41,9 +42,9 @@ class _Upload:
     Attributes:
         name: Name that the job will get.
         folder: Hidden folder that receives the files.
-        touched: Time of the last data, by the monotonic clock in seconds.
-        files: Complete files.
-        coming: Files that are being received, with their sizes in bytes.
+        touched: Time at which the last data arrived, by the monotonic clock in seconds.
+        files: Names of the files that are complete.
+        coming: Size (bytes) of each file that is being received, by name.
         discarded: True if the upload was cancelled.
     """
 
@@ -59,8 +60,8 @@ class Uploads:
     """The folders that browsers are uploading.
 
     Args:
-        spool: Complete folders are moved to its inbox.
-        limits: Largest files and their number.
+        spool: The folders of the watcher. Complete uploads are moved to the inbox.
+        limits: Maximum size and number of files.
     """
 
     def __init__(self, spool: Spool, limits: Limits) -> None:
@@ -70,10 +71,10 @@ class Uploads:
         self._lock = threading.Lock()
 
     def start(self, name: str) -> str:
-        """Start the upload of a folder; return its key.
+        """Start the upload of a folder, and return the key of the upload.
 
         Raises:
-            JobError: The name cannot be used, or there are too many uploads at the same time.
+            JobError: The name cannot be used, or too many folders are being uploaded.
         """
         if not _NAME.fullmatch(name.strip()):
             hint = "letters, digits, spaces; no / and no leading dot"
@@ -94,18 +95,18 @@ class Uploads:
             return key
 
     async def write(self, key: str, name: str, size: int, chunks: AsyncIterator[bytes]) -> None:
-        """Write one file.
+        """Receive one file of an upload, and write it to the disk.
 
         Args:
             key: The key that `start` returned.
-            name: The file's path in the folder, at most one folder deep.
-            size: Stated size in bytes.
-            chunks: The content.
+            name: Path of the file relative to the uploaded folder, with at most one subfolder.
+            size: Size (bytes) that the browser gives for the file.
+            chunks: The content of the file.
 
         Raises:
-            JobError: The key is unknown, or the name is not permitted.
-            CaptureError: The file is too large, or its size differs from the stated one.
-            StoreError: The disk is full.
+            JobError: The key is unknown, the upload was discarded, or the name is not permitted.
+            CaptureError: The file is too large, its size differs from `size`, or there are too many files.
+            StoreError: The disk is full or cannot be written.
         """
         upload, path = self._reserve(key, name, size)
         target = upload.folder / path
@@ -123,10 +124,10 @@ class Uploads:
         upload.files.add(name)
 
     def finish(self, key: str) -> str:
-        """Move the complete folder into the inbox; return its name there.
+        """Move a complete upload into the inbox, and return the name of the folder in the inbox.
 
         Raises:
-            JobError: The folder holds no video, or a file is still being sent.
+            JobError: The key is unknown, the folder holds no video, or a file is still being sent.
         """
         with self._lock:
             upload = self._get(key)
@@ -160,7 +161,7 @@ class Uploads:
         return self._open[key]
 
     def _reserve(self, key: str, name: str, size: int) -> tuple[_Upload, PurePosixPath]:
-        """Return the upload and the checked path, reserved for this request."""
+        """Check the path of a file, reserve it for this request, and return the upload and the path."""
         with self._lock:
             upload = self._get(key)
             with disk_errors(upload.folder):
@@ -170,13 +171,19 @@ class Uploads:
 
     @staticmethod
     def _require_not_discarded(upload: _Upload) -> None:
-        """Raise the error of an unknown upload, instead of the file's error, if the upload was discarded."""
+        """Raise the error for an unknown upload if the upload was discarded.
+
+        It replaces the error of the file.
+        """
         if upload.discarded:
             raise _unknown_upload() from None
 
     @staticmethod
     def _remove(upload: _Upload) -> None:
-        """Remove the folder. A request that still writes to it removes the rest."""
+        """Remove the folder of an upload.
+
+        A request that still writes to the folder removes the remaining files when it ends.
+        """
         upload.discarded = True
         shutil.rmtree(upload.folder, ignore_errors=True)
 
@@ -191,7 +198,7 @@ class Uploads:
             known = ", ".join((*_OTHER_FILES, *_OTHER_SUFFIXES))
             raise JobError(f"{path.name} is neither a video nor any of {known}", hint="leave it out")
         sent = {*upload.files, *upload.coming}
-        # Compare the names too: some disks do not distinguish upper and lower case.
+        # Compare the names in lower case: some disks do not distinguish upper and lower case.
         if name.lower() in {other.lower() for other in sent} or (upload.folder / path).exists():
             raise JobError(f"{name} was sent twice", hint="give each file its own name")
         if any(str(path.parent) == other or str(PurePosixPath(other).parent) == name for other in sent):
@@ -202,7 +209,7 @@ class Uploads:
         if not 0 < size <= most:
             hint = "cut the recording, or ask the operator to raise --limit video_gb"
             raise CaptureError(f"{size / 1e9:.3g} GB, the limit is {most / 1e9:.3g}", path=name, hint=hint)
-        # Other uploads may not have received all their bytes yet. Count them, so that the disk does not fill.
+        # Subtract the bytes that are still to be received, so that several uploads do not fill the disk.
         coming = sum(sum(other.coming.values()) for other in self._open.values())
         if shutil.disk_usage(upload.folder).free - coming - size < _MIN_FREE_BYTES:
             raise StoreError(
@@ -221,7 +228,7 @@ def _unknown_upload() -> JobError:
 
 
 def remove_abandoned_uploads(inbox: Path) -> None:
-    """Remove the uploads of killed servers. Other watchers' uploads stay, because they may be in progress."""
+    """Remove the uploads of killed servers. The uploads of other running watchers are not removed."""
     for folder in inbox.glob(f"{_PREFIX}*"):
         with contextlib.suppress(OSError):
             if _is_abandoned(folder):
@@ -229,7 +236,10 @@ def remove_abandoned_uploads(inbox: Path) -> None:
 
 
 def _is_abandoned(folder: Path) -> bool:
-    """Return True if the process that receives the upload has ended, or nothing has changed for a day."""
+    """Return True if the process that receives an upload has ended.
+
+    A process of another machine is treated as ended if its folder has not changed for a day.
+    """
     tag = folder.name.removeprefix(_PREFIX)
     if is_from_this_machine(tag):
         return not is_process_running(tag)
@@ -237,7 +247,7 @@ def _is_abandoned(folder: Path) -> bool:
 
 
 async def _receive_file(target: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> None:
-    """Write a file under a temporary name, and rename it once it is complete."""
+    """Write a file with a temporary name, and rename the file once it is complete."""
     target.parent.mkdir(exist_ok=True)
     partial = target.with_name(f"{target.name}.part")
     try:
@@ -251,7 +261,7 @@ async def _receive_file(target: Path, size: int, chunks: AsyncIterator[bytes], u
 
 
 async def _write_chunks(path: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> int:
-    """Write the content, at most one chunk more than stated; return the number of bytes received."""
+    """Write the content of a file, and return the number of bytes received. Stop if there are too many."""
     written = 0
     with path.open("xb") as stream:
         async for chunk in chunks:
