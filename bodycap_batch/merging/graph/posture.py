@@ -1,5 +1,4 @@
-"""Knowledge about the posture before the motion is solved: walking and its direction, standing, or a
-T-pose."""
+"""Knowledge about the posture before the motion is solved: walking, standing or a T-pose, and direction."""
 
 from __future__ import annotations
 
