@@ -80,7 +80,7 @@ def provisional_scale(
     """Estimate metres per map unit from the largest distances between cameras of related bones.
 
     At a given scale, each pair of cameras gives the distance between two points of the body. The lengths of
-    the bones bound this distance. The result is the scale at which the largest distances equal those of
+    the bones bound this distance. The result is the scale at which the largest distances equal the lengths of
     stretched limbs.
 
     Args:

@@ -29,8 +29,8 @@ none."""
 _SPEED_HALF_WINDOW_NS = 1.5e8
 """Half of the duration (nanoseconds) over which a speed is computed. Noise averages out over 0.3 s."""
 _SHOULDER_WIDTH_M = 0.2
-"""Distance (metres) between the shoulders, which is added to the lengths of the arms. It is smaller than that
-of any adult."""
+"""Distance (metres) between the shoulders, which is added to the lengths of the arms. It is smaller than the
+shoulder width of any adult."""
 
 _SIGMA_DEG = {
     "Shoulder": (4.0, 4.0, 4.0), "Arm": (15.0, 6.0, 6.0), "ForeArm": (20.0, 6.0, 6.0),

@@ -16,14 +16,14 @@ _SEARCH_STEP_S = 0.05
 _MAX_SHIFT_S = 3.0
 """Maximum shift (seconds) that is tried. Evidence: none."""
 _MIN_OVERLAP_RATIO = 3.0
-"""Minimum ratio of the time that both cameras share to the largest shift. Evidence: none."""
+"""Minimum ratio of the time that both cameras share to the largest shift that is tried. Evidence: none."""
 _MAX_SAMPLES = 200
 """Maximum number of frames of the limb's camera that are compared. It bounds the time of the search."""
 _MIN_SAMPLES = 30
 """Minimum number of frames for a scatter: one second at 30 fps. With fewer frames, the scatter is not
 reliable."""
 _MIN_SHIFT_S = 0.25
-"""Minimum shift (seconds) of a suspicious clock. Even with a right clock, the best shift may be almost this
+"""Minimum shift (seconds) of a suspicious clock. Even with a correct clock, the best shift may be almost this
 large. Evidence: docs/decisions/merging.md."""
 _MAX_SCATTER_RATIO = 0.7
 """Maximum ratio of the scatter with the shift to the scatter without a shift, for a suspicious clock.
@@ -52,7 +52,7 @@ def suspicious_clocks(tracks: Sequence[CameraTrack]) -> dict[str, dict[str, floa
 
     A straight walk does not reveal a wrong clock, because it moves the limb's camera by a constant. At a
     wrong shift, a swinging arm may then accidentally follow the rotations of the trunk. A wrong shift
-    increases the distance between the cameras; the right shift hardly does. A shift is therefore accepted
+    increases the distance between the cameras; the correct shift hardly does. A shift is therefore accepted
     only if it also decreases this distance.
 
     Args:
@@ -79,7 +79,7 @@ def best_time_shift(trunk: CameraTrack, limb: CameraTrack) -> TimeShift | None:
     """Find the time shift of a limb's camera that minimises the scatter of its position in the trunk's axes.
 
     Returns:
-        The shift; None if the cameras were localised at the same time for too short a time.
+        The shift; None if the time in which both cameras were localised is too short.
     """
     start, end = (pick(trunk.times_ns[at], limb.times_ns[at]) for pick, at in ((max, 0), (min, -1)))
     max_shift_s = min(_MAX_SHIFT_S, 1e-9 * float(end - start) / _MIN_OVERLAP_RATIO)

@@ -37,7 +37,7 @@ def swapped_sides(
         up: (3,) vertical in the map.
 
     Returns:
-        By camera, the fraction of frames on the wrong side. The result is empty if a limb is on its right
+        By camera, the fraction of frames on the wrong side. The result is empty if a limb is on the correct
         side, or if the first camera does not show where the body faces. This camera is then on a limb or
         upside down, or the person lies.
     """

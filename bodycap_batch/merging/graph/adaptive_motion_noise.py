@@ -28,7 +28,7 @@ def scale_motion_noise(bones: Sequence[Bone], tracks: Sequence[CameraTrack]) -> 
         tracks: Tracks without outliers, poses in metres.
 
     Returns:
-        The bones with power spectral densities that are equal to the usual ones or larger.
+        The bones. Each power spectral density is at least as large as its usual value.
     """
     ratio = np.ones((len(bones), 2))
     for track in tracks:

@@ -171,7 +171,7 @@ def _boundaries(tick_times_ns: IntArray, tracks: Sequence[CameraTrack], parts: i
 
 
 def _localised_cameras_near(tick_times_ns: IntArray, tracks: Sequence[CameraTrack]) -> FloatArray:
-    """Return the mean number (T,) of localised cameras from `_BLEND_S` before to after each tick."""
+    """Return the mean number (T,) of localised cameras within `_BLEND_S` of each tick."""
     cameras = np.zeros(len(tick_times_ns))
     for track in tracks:
         after = np.searchsorted(track.times_ns, tick_times_ns)

@@ -130,7 +130,7 @@ def align_cameras(
         main: Trajectories of the main map's cameras, the trajectory of the trunk's camera first.
         further: Trajectories of the cameras of other maps.
         step: Called after each iteration; may raise to stop.
-        options: Merge options with what the job gives about the scale.
+        options: Merge options, of which ``known_distance`` and ``marker_board`` are used.
     """
     identity = Similarity(1.0, np.eye(3), np.zeros(3))
     if not further:
@@ -182,7 +182,7 @@ def _align_all(
 
     Args:
         inputs: Merge inputs, of which the skeleton and mounts are used.
-        options: Merge options with what the job gives about the scale.
+        options: Merge options, of which ``known_distance`` and ``marker_board`` are used.
         bones: The graph's bones, for all cameras.
         tracks: By gauge, the tracks of each map. The main map is first, with the trunk's camera first. The
             function removes maps that it cannot align.
@@ -287,7 +287,7 @@ def align_maps(
 
     Args:
         inputs: Merge inputs, of which the skeleton and mounts are used.
-        options: Merge options with what the job gives about the scale.
+        options: Merge options, of which ``known_distance`` and ``marker_board`` are used.
         bones: The graph's bones, for all cameras.
         tracks: By gauge, the tracks of each map. The main map is first, with the trunk's camera first.
         step: Called after each iteration; may raise to stop.

@@ -41,7 +41,7 @@ class StatedConstraints:
 def stated_constraints(inputs: MergeInputs, options: MergeOptions, gauge: str) -> StatedConstraints:
     """Return the scales and verticals that the job gives for one map alone.
 
-    What the job gives for other maps is used later, after all maps are aligned.
+    Scales and verticals for other maps are used later, after all maps are aligned.
 
     Args:
         inputs: Merge inputs, of which the trajectories and the views of the board are used.

@@ -57,7 +57,7 @@ class _Step:
 
 
 class MapAlignmentProblem:
-    """A calibration with the similarities of further maps as unknowns. All its other unknowns are eliminated.
+    """A calibration with the similarities of further maps as unknowns. All other unknowns are eliminated.
 
     Args:
         calibration: Graph of the calibration, with all maps at their initial similarities.

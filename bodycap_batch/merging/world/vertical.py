@@ -25,11 +25,11 @@ from bodycap_batch.merging.world.planes import (
 )
 
 _LEAN_SAMPLES = 3.0
-"""Number of independent observations that the tilt of the trunk (its lean) over a whole capture counts as.
-The posture's systematic bias is the same at all instants. Evidence: none."""
+"""Weight of the trunk's tilt (its lean) over a whole capture, as a number of independent observations. The
+number is small because the posture's systematic bias is equal at all instants. Evidence: none."""
 _PLANE_SHARE_NATS = 6.0
-"""Cost (nats) of a vertical from planes, per fraction of the planes' points that do not agree with the
-vertical. Evidence: none."""
+"""Cost (nats) of a vertical from planes if no point of the planes agrees with it. The cost is proportional
+to the fraction of points that do not agree. Evidence: none."""
 _WALK_NATS, _BODY_NATS = 1.5, 12.0
 """Costs (nats) of a vertical from the walk, and of a vertical that is based only on the tilt of the trunk.
 Because of these costs, a vertical from planes is preferred if it also agrees with the body. Evidence:
@@ -45,11 +45,11 @@ _FLOOR_TOLERANCE, _MAX_SHARE_BELOW = 0.35, 0.02
 rough scale and for bent knees. Second: maximum fraction of map points below the floor; such points are wrong.
 Evidence: none."""
 _MIN_MARGIN_NATS = 3.0
-"""Minimum difference (nats) of the best rival's negative log-likelihood from that of the vertical. With a
+"""Minimum difference (nats) between the negative log-likelihoods of the best rival and the vertical. With a
 smaller difference, the vertical is not determined. Three nats are odds of twenty to one."""
 _STATED_SIGMAS = 3.0
-"""Maximum angle between a vertical given in the job and planes that agree with it, in sigmas of the given
-vertical."""
+"""Maximum angle between a vertical given in the job and a vertical from planes that replaces it. Its unit is
+the sigma of the given vertical."""
 _DISTINCT_DEG = 20.0
 """Minimum angle (degrees) between the vertical and a rival. A smaller angle is an error of the same vertical.
 Evidence: none."""
@@ -60,8 +60,10 @@ _SAME_DEG, _MAX_FLOOR_TILT_DEG = 1.0, 5.0
 """First: minimum angle (degrees) between a new start of the search and all directions that were found before.
 Second: maximum angle (degrees) between a floor and the horizontal plane. Evidence: none."""
 _MIN_PLANE_SIGMA_DEG, _WALK_SIGMA_DEG, _BODY_SIGMA_DEG = 0.7, 2.0, 15.0
-"""Sigmas (degrees): minimum for a vertical from planes, value for a vertical from the walk, and minimum for a
-vertical from the body of a walker. Planes: docs/decisions/merging.md. The path of a walking trunk is
+"""Sigmas (degrees). First: minimum sigma of a vertical from planes. Second: sigma of a vertical from the
+walk.
+Third: minimum sigma of a vertical from the body of a walker. Planes: docs/decisions/merging.md. The path of a
+walking trunk is
 horizontal to two degrees. A rotation of the camera's mount looks like a tilt of the body."""
 _PLANE_SIGMA_LIMIT_DEG = 1.5
 """Maximum misalignment (degrees) of a plane that is used for the sigma of a vertical. Evidence: none."""

@@ -24,8 +24,8 @@ def rotation_to_z_up(up: FloatArray) -> FloatArray:
 def initial_heading(forward: FloatArray, centre_m: FloatArray, fps: float) -> float:
     """Return the body's mean heading over its first moving second, in radians from +x towards +y.
 
-    The first moving second starts when the body first moves horizontally. If the body never moves, it starts
-    at tick 0.
+    The first moving second starts when the body first moves horizontally. If the body never moves, this
+    second starts at tick 0.
 
     Args:
         forward: (T,3) forward directions of the body, z up.
