@@ -404,8 +404,7 @@ def hinge_deviations(
 ) -> dict[str, FloatArray]:
     """Return by role the distance (T,), metres, of the bone after each hinge from the hinge's plane.
 
-    The role is that of the bone that follows the hinge's lower bone, and the distance is measured at its
-    joint.
+    That bone follows the lower bone of the hinge. The distance is measured from its joint to the plane.
     """
     out = {}
     for hinge in hinges(skeleton, tuple(bones)):

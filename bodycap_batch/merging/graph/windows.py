@@ -156,7 +156,7 @@ def split_timeline(
 def _boundaries(tick_times_ns: IntArray, tracks: Sequence[CameraTrack], parts: int) -> list[int]:
     """Return the index after each window's last tick.
 
-    The boundaries lie near those of windows of equal length, where most cameras are localised.
+    The boundaries lie where most cameras are localised, near the boundaries of windows of equal length.
     """
     count = len(tick_times_ns)
     even = np.linspace(0, count, parts + 1).round().astype(int)

@@ -61,10 +61,9 @@ _SAME_DEG, _MAX_FLOOR_TILT_DEG = 1.0, 5.0
 Second: maximum angle (degrees) between a floor and the horizontal plane. Evidence: none."""
 _MIN_PLANE_SIGMA_DEG, _WALK_SIGMA_DEG, _BODY_SIGMA_DEG = 0.7, 2.0, 15.0
 """Sigmas (degrees). First: minimum sigma of a vertical from planes. Second: sigma of a vertical from the
-walk.
-Third: minimum sigma of a vertical from the body of a walker. Planes: docs/decisions/merging.md. The path of a
-walking trunk is
-horizontal to two degrees. A rotation of the camera's mount looks like a tilt of the body."""
+walk. Third: minimum sigma of a vertical from the body of a walker. Planes: docs/decisions/merging.md. The
+path of a walking trunk is horizontal to two degrees. A rotation of the camera's mount looks like a tilt of
+the body."""
 _PLANE_SIGMA_LIMIT_DEG = 1.5
 """Maximum misalignment (degrees) of a plane that is used for the sigma of a vertical. Evidence: none."""
 
