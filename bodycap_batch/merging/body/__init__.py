@@ -1,1 +1,1 @@
-"""The body as the graph sees it: bones and joint priors, initial poses, T-pose, trunk lean, completion."""
+"""The body in the graph: bones, joint priors, initial poses, T-pose, tilt of the trunk, completion."""

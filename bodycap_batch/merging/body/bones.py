@@ -1,4 +1,4 @@
-"""The bones that are variables of the graph, with the prior of each joint."""
+"""The bones that are variables of the graph, and the prior of each joint."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions, segment_axes, split_side
 
 JOINT_SLACK_M = 0.005
-"""Sigma per axis, in metres, of the gap between a bone's joint and its place on the parent: soft tissue, and
-room for the optimiser. Evidence: none."""
+"""Slack of a joint: sigma per axis (metres) of the gap between a bone's joint and its place on the parent
+bone. It allows for soft tissue, and gives the optimiser room. Evidence: none."""
 
 HINGE_ARM_M = 0.3
-"""Distance in metres of a hinge's two anchors from the joint, along its axis. Evidence: none."""
+"""Distance (metres) of each of a hinge's two anchors from the joint, along the hinge's axis. Evidence:
+none."""
 
 
 @dataclass(frozen=True, slots=True)
 class _JointPrior:
-    """Prior of a joint.
+    """Prior of a joint's rotation and of its bone's acceleration.
 
     Attributes:
-        relaxed_flexion_deg: Flexion of a person who stands relaxed.
-        sigma_deg: Sigmas about the along, forward and flexion axes.
+        relaxed_flexion_deg: Flexion (degrees) of a person who stands relaxed.
+        sigma_deg: Sigmas (degrees) of the rotation about the along, forward and flexion axes.
         psd_rotation: Power spectral density of the rotational acceleration, rad²/s³.
-        psd_translation: The same of the acceleration, m²/s³.
+        psd_translation: Power spectral density of the translational acceleration, m²/s³.
     """
 
     relaxed_flexion_deg: float
@@ -53,19 +54,19 @@ _PRIORS = {
     "Foot": _JointPrior(0.0, (10.0, 10.0, 20.0), 18.0, 24.0),
     "ToeBase": _JointPrior(0.0, (5.0, 5.0, 20.0), 18.0, 24.0),
 }
-"""By part of the body. Sigmas: the everyday range of each joint; two sigmas are about half of the range of
-motion in D. A. Neumann, "Kinesiology of the Musculoskeletal System". Power spectral densities: measured on
-walking with reaching."""
+"""Prior of each joint, by part of the body. Sigmas: everyday range of each joint; two sigmas are about half
+of the range of motion in D. A. Neumann, "Kinesiology of the Musculoskeletal System". Power spectral
+densities: measured on walking with reaching."""
 _BONE_AFTER_HINGE = {"ForeArm": "Hand", "Leg": "Foot"}
-"""Bones that start at a hinge, with the bone that follows."""
+"""By bone that starts at a hinge, the next bone of the limb."""
 
 
 class LimbChain(NamedTuple):
-    """The parts of a limb below one of its bones.
+    """The bones of a limb below a given bone.
 
     Attributes:
-        following: The bone that follows; None if that is the end of the limb.
-        end: The end of the limb.
+        following: Next bone of the limb; None if the next bone is the end of the limb.
+        end: Bone at the end of the limb.
     """
 
     following: str | None
@@ -78,22 +79,23 @@ LIMB_CHAINS = {
     "UpLeg": LimbChain("Leg", "Foot"),
     "Leg": LimbChain(None, "Foot"),
 }
-"""By limb bone."""
+"""By limb bone, the bones of the limb below it."""
 _REST_ABDUCTION_DEG = {"Arm": 10.0, "UpLeg": 0.0}
-"""Abduction, in degrees, of limbs that hang in the rest pose. Evidence: none."""
+"""Abduction (degrees) of limbs that hang in the rest pose. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hinge:
-    """A hinge joint: equal distances from two points on its axis keep the following joint in its plane.
+    """A hinge joint. Equal distances from two points on its axis keep the following joint in its plane.
 
     Attributes:
         upper: Index of the bone above the hinge.
-        lower: Index of the bone that starts at it.
+        lower: Index of the bone that starts at the hinge.
         following: Index of the bone that starts at the lower bone's far end.
-        anchors_m: (2,3) the two points in the upper bone's frame.
-        range_m: Their distance from the following bone's joint.
-        sigma_m: Sigma of that distance in addition to the joint's slack: the lower bone's `off_hinge_m`.
+        anchors_m: (2,3) positions of the two points in the upper bone's frame.
+        range_m: Distance (metres) of each point from the following bone's joint.
+        sigma_m: Sigma (metres) of this distance in addition to the slack of a joint. It is the `off_hinge_m`
+            of the lower bone.
     """
 
     upper: int
@@ -109,14 +111,15 @@ class Bone:
     """A bone of the graph.
 
     Attributes:
-        joint: Index of its joint in the skeleton.
+        joint: Index of the bone's joint in the skeleton.
         role: Anatomical name.
-        parent: Index of its parent among the bones, −1 for the first.
-        offset_m: (3,) centre of its joint in the parent's frame.
+        parent: Index of the parent bone among the bones, −1 for the first bone.
+        offset_m: (3,) centre of the bone's joint in the parent bone's frame.
         mean_rotation: (3,3) parent_from_bone in the rest pose.
-        rotation_covariance: (3,3) rad², in the bone's own axes.
-        psd: (6,) power spectral density of its acceleration, rotation first.
-        off_hinge_m: Sigma of its far end's distance from the hinge's plane, in addition to a joint's slack.
+        rotation_covariance: (3,3) covariance, rad², of the joint's rotation in the bone's own axes.
+        psd: (6,) power spectral density of the bone's acceleration, rotation first.
+        off_hinge_m: Sigma (metres) of the distance of the bone's far end from the hinge's plane, in addition
+            to the slack of a joint.
     """
 
     joint: int
@@ -130,11 +133,11 @@ class Bone:
 
 
 def kinematic_chain(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tuple[Bone, ...]:
-    """Return the bones that carry cameras and those between them, parents before their children.
+    """Return the bones with cameras and the bones between them, parents before their children.
 
     Args:
         skeleton: The body.
-        mounted_roles: Roles of the bones that carry a camera; each is a joint of the skeleton.
+        mounted_roles: Roles of the bones with a camera. Each role is that of a joint of the skeleton.
     """
     joints = [skeleton.roles.index(role) for role in set(mounted_roles)]
     chains = [joints_to_root(skeleton, joint) for joint in joints]
@@ -147,7 +150,7 @@ def kinematic_chain(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tu
 
 
 def joints_to_root(skeleton: SkeletonModel, joint: int) -> list[int]:
-    """Return the joint and its ancestors, the root last."""
+    """Return the joint and its ancestors, the joint first and the root last."""
     chain = [joint]
     while skeleton.parents[chain[-1]] >= 0:
         chain.append(int(skeleton.parents[chain[-1]]))
@@ -199,7 +202,7 @@ def _rest_rotation(skeleton: SkeletonModel, role: str, prior: _JointPrior) -> Fl
 
 
 def hinges(skeleton: SkeletonModel, bones: tuple[Bone, ...]) -> tuple[Hinge, ...]:
-    """Return the elbows and knees, if the bone after the lower one is in the graph too."""
+    """Return the hinges (elbows and knees) whose lower bone has a following bone in the graph."""
     index = {bone.role: position for position, bone in enumerate(bones)}
     out = []
     for bone in bones:

@@ -16,19 +16,19 @@ from bodycap_batch.model.skeleton import SkeletonModel
 def complete_skeleton(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Return poses of all joints.
+    """Return the poses of all joints.
 
     From the first solved bone towards the root, the trunk straightens joint by joint to an upright pelvis
-    with the same heading, so that legs without cameras stand. Below the solved bones, joints keep their zero
-    rotation.
+    with the heading of the first solved bone. Legs without cameras therefore stand. Below the solved bones,
+    joints keep their zero rotation.
 
     Args:
         skeleton: The body.
         bones: The solved bones.
-        world_from_bone: (T,B,4,4), z up.
+        world_from_bone: (T,B,4,4) poses of the solved bones, z up.
 
     Returns:
-        world_from_joint (T,J,4,4), and (J,) whether each joint was solved.
+        Poses world_from_joint (T,J,4,4), and (J,) whether each joint was solved.
     """
     ticks, count = len(world_from_bone), len(skeleton.joints)
     out = np.tile(np.eye(4), (ticks, count, 1, 1))
@@ -51,7 +51,7 @@ def _straighten_trunk_above(skeleton: SkeletonModel, first: Bone, out: FloatArra
     trunk = out[:, first.joint].copy()
     trunk[:, :3, :3] = trunk[:, :3, :3] @ first.mean_rotation.T
     pelvis = make_transform(_yaw_only(trunk[:, :3, :3]), np.zeros(3))
-    # Joints without a role are helpers, most of them without length. They rotate with their parent.
+    # Joints without a role are helpers, and most of them have no length. They rotate with their parent.
     last = len(chain) - 1
     bending = [step for step in range(1, len(chain)) if skeleton.roles[chain[step]] or step == last]
     for step in range(1, len(chain)):
@@ -64,7 +64,7 @@ def _straighten_trunk_above(skeleton: SkeletonModel, first: Bone, out: FloatArra
 
 
 def _yaw_only(rotation: FloatArray) -> FloatArray:
-    """Return rotations (T,3,3) about z with the heading of the given ones; the zero pose faces −y."""
+    """Return the rotations (T,3,3) about z with the headings of given rotations; the zero pose faces −y."""
     forward, left = -rotation[:, :, 1], rotation[:, :, 0]
     # If the body bends far forward, its forward axis points down. The left axis then gives the heading.
     level = forward + 0.0
@@ -85,10 +85,11 @@ def observed_joints(
     tick_times_ns: IntArray,
     max_gap_s: float,
 ) -> BoolArray:
-    """Return (T,J) which joints the cameras measured at each tick.
+    """Return whether the cameras measured each joint at each tick (T,J).
 
-    A bone with a camera is measured at a tick on a frame, and in gaps of at most `max_gap_s`. A bone without
-    a camera is measured if bones on both sides of it are.
+    A bone with a camera is measured at a tick if the camera has a frame within half a tick interval. It is
+    also measured if the tick lies between two frames that are at most `max_gap_s` apart. A bone without a
+    camera is measured if bones on both sides of it are measured.
     """
     measured: dict[int, BoolArray] = {}
     for track in tracks:
@@ -115,13 +116,15 @@ def _measured_above(
     below: Mapping[int, BoolArray],
     never: BoolArray,
 ) -> dict[int, BoolArray]:
-    """Return by bone the ticks (T,) at which a bone is measured that is neither this one nor below it.
+    """Return by bone the ticks (T,) at which a bone that is not in the bone's own subtree is measured.
+
+    The subtree of a bone consists of the bone and all bones below it.
 
     Args:
         bones: The graph's bones.
-        measured: By bone, the ticks at which its own cameras measure it.
-        below: By bone, the ticks at which it or a bone below it is measured.
-        never: (T,) False.
+        measured: By bone, (T,) whether the bone's own cameras measure it.
+        below: By bone, (T,) whether a bone in its subtree is measured.
+        never: (T,) mask that is False at all ticks.
     """
     above: dict[int, BoolArray] = {0: never}
     for index, bone in enumerate(bones[1:], start=1):
@@ -136,7 +139,7 @@ def _measured_above(
 
 
 def _nearest_times(sorted_ns: IntArray, times_ns: IntArray) -> IntArray:
-    """Return for each of `times_ns` (T,) the nearest of the sorted times (N,)."""
+    """Return the nearest of the sorted times (N,) for each of `times_ns` (T,)."""
     after = np.clip(np.searchsorted(sorted_ns, times_ns), 0, len(sorted_ns) - 1)
     before = np.maximum(after - 1, 0)
     closer = np.abs(sorted_ns[before] - times_ns) <= np.abs(sorted_ns[after] - times_ns)

@@ -1,4 +1,4 @@
-"""Initial poses of all bones from the measured ones, by two-bone inverse kinematics."""
+"""Initial poses of all bones from the measured bones, by two-bone inverse kinematics."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from bodycap_batch.model.skeleton_presets import split_side
 
 
 def fill_gaps(poses: FloatArray, valid: BoolArray) -> FloatArray:
-    """Interpolate poses (T,4,4) over the ticks where `valid` (T,) is False.
+    """Interpolate poses (T,4,4) at the ticks where `valid` (T,) is False.
 
-    Before the first valid tick and after the last one, the nearest valid pose is repeated. Unlike
-    `bodycap_batch.model.geometry.poses_at`, valid poses and ends come back unchanged to the last bit.
+    Before the first valid tick and after the last valid tick, the nearest valid pose is repeated. In contrast
+    to `bodycap_batch.model.geometry.poses_at`, this function keeps valid poses and the ends unchanged to the
+    last bit.
     """
     known = np.flatnonzero(valid)
     ticks = np.arange(len(poses))
@@ -35,11 +36,12 @@ def pose_bones(
     Args:
         skeleton: The body.
         bones: The graph's bones.
-        measured: By bone index, world_from_bone (T,4,4) from its camera, without gaps.
+        measured: By bone index, poses world_from_bone (T,4,4) from the bone's camera, at every tick.
 
     Returns:
-        world_from_bone (T,B,4,4). Unmeasured limb bones are solved by inverse kinematics, elbows pointing out
-        and back, knees forward. All other bones are in the rest pose on their parent.
+        Poses world_from_bone (T,B,4,4). Inverse kinematics solves limb bones without a measurement: elbows
+        point outward and backward, knees forward. All other bones without a measurement are in the rest pose
+        on their parent.
     """
     ticks = len(next(iter(measured.values())))
     out = np.tile(np.eye(4), (ticks, len(bones), 1, 1))
@@ -55,7 +57,7 @@ def pose_bones(
 
 
 def _first_bone_from_below(bones: Sequence[Bone], measured: Mapping[int, FloatArray]) -> FloatArray:
-    """Return poses (T,4,4) of the first bone from the nearest measured one, with joints in the rest pose."""
+    """Return poses (T,4,4) of the first bone from the nearest measured bone, with joints in the rest pose."""
     nearest = min(measured)
     pose, current = measured[nearest], nearest
     while current > 0:
@@ -73,14 +75,14 @@ def _aim_limb(
     out: FloatArray,
     position: int,
 ) -> None:
-    """Rotate an unmeasured limb bone towards the measured end of its limb.
+    """Rotate a limb bone without a measurement towards the measured end of its limb.
 
     Args:
         skeleton: The body.
         bones: The graph's bones.
-        index: Position of each role among the bones.
-        measured: By bone index, world_from_bone (T,4,4).
-        out: (T,B,4,4) the poses so far; the rotation of the bone is written into it.
+        index: By role, the position of a bone among the bones.
+        measured: By bone index, measured poses world_from_bone (T,4,4).
+        out: (T,B,4,4) poses so far. The function writes the rotation of the bone into them.
         position: Index of the bone.
     """
     side, part = split_side(bones[position].role)
@@ -115,13 +117,13 @@ def _two_bone_ik(
     """Solve the inverse kinematics of two bones.
 
     Args:
-        to_goal: (N,3) from the upper bone's joint to the end of the lower bone.
-        lengths: Of the upper and of the lower bone.
-        pole: (N,3) direction in which the joint between the bones points.
+        to_goal: (N,3) vectors from the upper bone's joint to the end of the lower bone.
+        lengths: Lengths of the upper bone and of the lower bone.
+        pole: (N,3) directions in which the joint between the bones points.
 
     Returns:
-        Direction (N,3) of the upper bone, and the axis (N,3) about which the lower bone is rotated against
-        it.
+        Directions (N,3) of the upper bone, and axes (N,3) about which the lower bone is rotated relative to
+        the upper bone.
     """
     upper, lower = lengths
     distance = np.linalg.norm(to_goal, axis=1, keepdims=True)
@@ -138,7 +140,9 @@ def _two_bone_ik(
 def _rotation_from_axes(along: FloatArray, third: FloatArray) -> FloatArray:
     """Return rotations (N,3,3) with the columns along, third × along, third.
 
-    `third` (N,3) is made orthogonal to `along` (N,3).
+    Args:
+        along: (N,3) directions of the first column. They are normalised.
+        third: (N,3) approximate directions of the third column. They are made orthogonal to `along`.
     """
     along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     third = third - (third * along).sum(axis=1, keepdims=True) * along

@@ -1,4 +1,4 @@
-"""A provisional metric scale from the distances between cameras, before anything is solved."""
+"""A provisional metric scale from the distances between cameras, before the motion is solved."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import split_side
 
 _REACH_QUANTILE = 0.9
-"""Quantile of the distances that counts as the largest one, so that single wrong poses do not."""
+"""Quantile of the distances that is used as their maximum. A single wrong pose cannot change it much."""
 _MAX_EXTENSION = 0.96
-"""Extension of a nearly straight limb over its length: walking elbows keep 15 to 30° of flexion."""
+"""Ratio of the extension of a nearly straight limb to its length. The elbows of a walker keep 15 to 30° of
+flexion."""
 _MIN_COMMON_FRAMES = 10
-"""Frames that two cameras must share for their distance to count. Evidence: none."""
+"""Minimum number of frames in which two cameras are localised at the same time, for their distance to be
+used. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReachConstraint:
-    """Bound of the distance of a bone's joint from a point of another bone.
+    """Bound on the distance of a bone's joint from a point on another bone.
 
     Attributes:
-        anchor_m: (3,) the point, in the frame of the other bone.
-        reach_m: Largest distance of the joint from it.
+        anchor_m: (3,) position of the point in the other bone's frame.
+        reach_m: Maximum distance (metres) of the joint from the point.
     """
 
     anchor_m: FloatArray
@@ -38,12 +40,13 @@ class ReachConstraint:
 
 @dataclass(frozen=True, slots=True)
 class DistanceConstraint:
-    """Bound of the length of ``scale · camera_offsets + mount_offsets_m``, the vector between two points.
+    """Bound on the length of ``scale · camera_offsets + mount_offsets_m``, the vector between two points.
 
     Attributes:
-        camera_offsets: (N,3) differences of the cameras' centres, map units.
-        mount_offsets_m: (N,3) from the cameras to the points on the bones, as the mounts imply.
-        reach_m: Largest length; 0 if both points are the same.
+        camera_offsets: (N,3) differences of the two cameras' centres, map units.
+        mount_offsets_m: (N,3) differences of the vectors from each camera to its point, according to the
+            mounts.
+        reach_m: Maximum length (metres) of the vector; 0 if both points are one point of the body.
     """
 
     camera_offsets: FloatArray
@@ -51,13 +54,17 @@ class DistanceConstraint:
     reach_m: float
 
     def typical_scale(self) -> float:
-        """Return the scale (metres per map unit) from the typical distance of the cameras alone."""
+        """Return the scale (metres per map unit) that explains the median distance of the cameras."""
         expected = self.reach_m + np.linalg.norm(self.mount_offsets_m, axis=1).mean()
         measured = float(np.median(np.linalg.norm(self.camera_offsets, axis=1)))
         return float(expected / max(measured, 1e-12))
 
     def cost(self, scale: float) -> float:
-        """Return how far (metres) the largest distance at a scale is from that of a stretched limb."""
+        """Return the misfit (metres) of a scale.
+
+        The cost is the difference of the largest distance from the length of a stretched limb. If both points
+        are one point of the body, the cost is their median distance.
+        """
         distance = np.linalg.norm(scale * self.camera_offsets + self.mount_offsets_m, axis=1)
         if self.reach_m > 0.0:
             return abs(float(np.quantile(distance, _REACH_QUANTILE)) - _MAX_EXTENSION * self.reach_m)
@@ -72,15 +79,15 @@ def provisional_scale(
 ) -> float:
     """Estimate metres per map unit from the largest distances between cameras of related bones.
 
-    At a given scale, each pair of cameras gives the distance between two points of the body, which the
-    lengths of the bones bound. The result is the scale at which the largest distances equal those of
+    At a given scale, each pair of cameras gives the distance between two points of the body. The lengths of
+    the bones bound this distance. The result is the scale at which the largest distances equal the lengths of
     stretched limbs.
 
     Args:
         bones: The graph's bones.
-        tracks: All cameras, in the gauge of one map.
-        mounts: By camera.
-        ignored_cameras: Their distances from their kinematic neighbours are not used.
+        tracks: Tracks of all cameras, in the gauge of one map.
+        mounts: Mount of each camera by camera name.
+        ignored_cameras: Names of cameras whose distances from their kinematic neighbours are not used.
 
     Raises:
         EstimationError: No two related cameras were localised at the same time, or the distances fit no
@@ -112,7 +119,11 @@ def provisional_scale(
 def kinematic_neighbours(
     bones: Sequence[Bone], tracks: Sequence[CameraTrack]
 ) -> list[tuple[CameraTrack, CameraTrack]]:
-    """Pair each camera with that of the nearest ancestor that has one, else with that nearest to the root."""
+    """Pair each camera with a camera nearer to the root.
+
+    The second camera is the camera of the nearest ancestor bone with a camera. If no ancestor has a camera,
+    it is the camera nearest to the root.
+    """
     out = []
     by_bone = {track.bone: track for track in reversed(tracks)}
     root = next((track for track in tracks if track.bone == min(by_bone)), tracks[0])
@@ -129,10 +140,11 @@ def kinematic_neighbours(
 def distance_constraint(
     bones: Sequence[Bone], track: CameraTrack, other: CameraTrack, mounts: Mapping[str, Mount]
 ) -> DistanceConstraint | None:
-    """Return the bound that the body puts on the distance between two cameras.
+    """Return the bound that the body sets on the distance between two cameras.
 
     Returns:
-        None if the body does not bound it, or if both were hardly localised at the same time.
+        The bound; None if the body does not bound the distance, or if the cameras were localised at the same
+        time in too few frames.
     """
     constraint = reach_constraint(bones, track.bone, other.bone)
     if constraint is None:
@@ -149,16 +161,16 @@ def distance_constraint(
 
 
 def reach_constraint(bones: Sequence[Bone], bone: int, other: int) -> ReachConstraint | None:
-    """Return how far a bone's joint can be from a point of another bone.
+    """Return the bound on the distance of a bone's joint from a point on another bone.
 
     Returns:
-        None if a second limb lies between the bones: the distance then depends on both limbs.
+        The bound; None if a second limb lies between the bones. The distance then depends on both limbs.
     """
     up, down = _bones_to_root(bones, other), _bones_to_root(bones, bone)
     shared = next(index for index in down if index in up)
     above = up[: up.index(shared)]
     if above and split_side(bones[other].role)[1] == "Arm":
-        # An upper arm rotates about all axes, so it does not show where the trunk is.
+        # An upper arm rotates about all axes, so its pose does not show where the trunk is.
         return None
     if any(split_side(bones[bones[index].parent].role)[1] in LIMB_CHAINS for index in above):
         return None
@@ -173,7 +185,7 @@ def reach_constraint(bones: Sequence[Bone], bone: int, other: int) -> ReachConst
 
 
 def _bones_to_root(bones: Sequence[Bone], bone: int) -> list[int]:
-    """Return the bone and its ancestors in the graph."""
+    """Return the indices of the bone and its ancestors in the graph, the bone first."""
     chain = [bone]
     while bones[chain[-1]].parent >= 0:
         chain.append(bones[chain[-1]].parent)

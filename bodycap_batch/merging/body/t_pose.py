@@ -1,4 +1,4 @@
-"""Detection of a T-pose without axes or scale, and the joint priors that hold during it."""
+"""Detection of a T-pose without known axes or scale, and the joint priors during a T-pose."""
 
 from __future__ import annotations
 
@@ -14,47 +14,51 @@ from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
 
 _MIN_ARM_ANGLE_RAD = float(np.radians(140.0))
-"""Smallest angle between the two hands, seen from the trunk's camera. Evidence: none."""
+"""Minimum angle (radians) between the directions from the trunk's camera to the two hands. Evidence: none."""
 _MIN_SPAN_RATIO = 0.93
-"""Smallest distance of the hands as a ratio of the largest one in the capture. Evidence: none."""
+"""Minimum distance between the hands, as a ratio to the largest distance in the capture. Evidence: none."""
 _MIN_ARM_SPAN_RATIO = 0.75
-"""Smallest distance of the hands as a ratio of the expected one; the scale is provisional. Evidence: none."""
+"""Minimum distance between the hands, as a ratio to the expected distance. The expected distance is
+inaccurate, because the scale is provisional. Evidence: none."""
 _MAX_SPEED = 0.15
-"""Largest speed of the trunk and of the hands relative to it, in largest hand distances per second. Evidence:
-none."""
+"""Maximum speed of the trunk, and of the hands relative to the trunk. Its unit is the largest distance
+between the hands per second. Evidence: none."""
 _MIN_DURATION_S = 0.5
-"""Shortest T-pose in seconds: stretched arms in passing are not one. Evidence: none."""
+"""Minimum duration (seconds) of a T-pose. Arms that are stretched only in passing are no T-pose. Evidence:
+none."""
 _SPEED_HALF_WINDOW_NS = 1.5e8
-"""Half of the time, in nanoseconds, over which a speed is taken: noise averages out over 0.3 s."""
+"""Half of the duration (nanoseconds) over which a speed is computed. Noise averages out over 0.3 s."""
 _SHOULDER_WIDTH_M = 0.2
-"""Distance of the shoulders that is added to the arms' lengths, metres: less than any adult's."""
+"""Distance (metres) between the shoulders, which is added to the lengths of the arms. It is smaller than the
+shoulder width of any adult."""
 
 _SIGMA_DEG = {
     "Shoulder": (4.0, 4.0, 4.0), "Arm": (15.0, 6.0, 6.0), "ForeArm": (20.0, 6.0, 6.0),
     "Hand": (8.0, 8.0, 8.0), "Neck": (6.0, 6.0, 6.0), "Head": (8.0, 8.0, 8.0), "UpLeg": (8.0, 5.0, 5.0),
     "Leg": (6.0, 5.0, 6.0), "Foot": (8.0, 8.0, 8.0), "ToeBase": (5.0, 5.0, 8.0),
 }  # fmt: skip
-"""Sigmas of a person's T-pose in degrees, by part of the body, about the along, forward and flexion axes. The
-twist of the arms is largest: palms may face down or forward. Evidence: none."""
+"""Sigmas (degrees) of the joints in a person's T-pose, by part of the body, about the along, forward and
+flexion axes. The twist of the arms has the largest sigma, because palms may face down or forward. Evidence:
+none."""
 _TRUNK_SIGMA_DEG = (4.0, 4.0, 4.0)
-"""The same for the other bones."""
+"""Sigmas (degrees) of all other joints in a T-pose, about the along, forward and flexion axes."""
 
 
 def find_t_pose(
     bones: Sequence[Bone], tracks: Sequence[CameraTrack], span_map: float
 ) -> tuple[int, int] | None:
-    """Find the longest T-pose.
+    """Find the longest T-pose of a capture.
 
     In a T-pose, the hands lie on opposite sides of the trunk's camera. Their distance is about the largest
     in the capture, and they hardly move.
 
     Args:
         bones: The graph's bones.
-        tracks: Tracks without outliers, the trunk's first.
-        span_map: Rough distance of the two hands with the arms stretched out, map units.
+        tracks: Tracks without outliers, the track of the trunk's camera first.
+        span_map: Rough distance (map units) between the hands with the arms stretched out.
 
     Returns:
-        Its first and last common time in nanoseconds, or None.
+        First and last time of the T-pose on the common clock, nanoseconds; None without a T-pose.
     """
     by_role = {split_side(bones[track.bone].role): track for track in reversed(tracks)}
     hands = [by_role.get((side, "Hand")) or by_role.get((side, "ForeArm")) for side in ("Left", "Right")]
@@ -81,7 +85,7 @@ def find_t_pose(
 
 
 def _speed(points: FloatArray, times_ns: IntArray) -> FloatArray:
-    """Return the speed (T,), units per second, of points (T,3) over about 0.3 s."""
+    """Return the speed (T,), units per second, of points (T,3), computed over about 0.3 s."""
     half = max(1, round(_SPEED_HALF_WINDOW_NS / max(float(np.median(np.diff(times_ns))), 1.0)))
     index = np.arange(len(points))
     low, high = np.maximum(index - half, 0), np.minimum(index + half, len(points) - 1)
@@ -90,14 +94,14 @@ def _speed(points: FloatArray, times_ns: IntArray) -> FloatArray:
 
 
 def _longest_run(mask: BoolArray, times_ns: IntArray) -> tuple[int, int] | None:
-    """Return the first and last time of the longest run of a mask (T,), None if it is too short."""
+    """Return the first and last time of the longest run of True in a mask (T,); None if it is too short."""
     spans = [(int(times_ns[start]), int(times_ns[stop - 1])) for start, stop in runs(mask)]
     best = max(spans, key=lambda span: span[1] - span[0], default=(0, 0))
     return best if best[1] - best[0] >= _MIN_DURATION_S * 1e9 else None
 
 
 def arm_span(bones: Sequence[Bone], skeleton: SkeletonModel) -> float:
-    """Return the distance (m) of the wrists in a T-pose; an arm that the graph lacks counts nothing."""
+    """Return the distance (metres) of the wrists in a T-pose, without bones that are not in the graph."""
     index = {bone.role: bone for bone in bones}
     total = 0.0
     for side in ("Left", "Right"):
@@ -126,7 +130,7 @@ def with_t_pose_prior(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[B
 
 
 def _t_pose_rotation(skeleton: SkeletonModel, bone: Bone, bones: Sequence[Bone]) -> FloatArray:
-    """Return parent_from_bone (3,3) in a T-pose. The rig's zero pose may be another one."""
+    """Return parent_from_bone (3,3) in a T-pose. The rig's zero pose may be a different pose."""
     if bone.parent < 0:
         return np.eye(3)
     above, own = (_t_pose_orientation(skeleton, each.role) for each in (bones[bone.parent], bone))

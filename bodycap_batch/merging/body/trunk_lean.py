@@ -1,7 +1,7 @@
-"""The likelihood of a vertical from how the trunk leans over time.
+"""The likelihood of a vertical, from the tilt of the trunk (its lean) over time.
 
-People bend forward, seldom backward or sideways. So the distribution of the trunk's orientation shows which
-direction is up.
+People bend forward, and seldom backward or sideways. The distribution of the trunk's orientation therefore
+shows which direction is up.
 """
 
 from __future__ import annotations
@@ -18,21 +18,23 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
 
 _MODE_RADIUS_RAD = float(np.radians(15.0))
-"""Directions within this angle, in radians, belong to one mode: a trunk sways less about its usual direction
-in walking and standing. Evidence: none."""
+"""Maximum angle (radians) between directions that belong to one mode. In walking and standing, the angle
+between a trunk and its usual direction is smaller. Evidence: none."""
 _MAX_SAMPLES, _SPHERE_DIRECTIONS = 300, 1000
-"""Instants of a capture, and directions of the sphere, that are evaluated at most; they bound the time."""
+"""Maximum number of instants of a capture, and number of directions on the sphere, that are evaluated. They
+bound the computing time."""
 _UPRIGHT_SIGMA_DEG = 12.0
-"""Sigma of the lean of a person who stands or walks, in degrees: 5 degrees of systematic bias, the rest is
-the mount of the camera. Evidence: none."""
+"""Sigma (degrees) of the forward tilt of the trunk of a person who stands or walks. It contains 5 degrees of
+systematic bias; the rest is the error of the camera's mount. Evidence: none."""
 _LATERAL_SIGMA_DEG = 12.0
-"""The same for leaning sideways."""
+"""Sigma (degrees) of the sideways tilt of the trunk."""
 _UPRIGHT_SHARE, _FORWARD_SHARE, _BACKWARD_SHARE, _OUTLIER_SHARE = 0.57, 0.35, 0.07, 0.01
-"""Assumed ratios of the time that a trunk is upright, bends forward, reclines, or does anything else.
+"""Assumed fractions of the time in which a trunk is upright, bends forward, reclines, or does anything else.
 Evidence: none."""
 _FORWARD_SCALE_DEG, _BACKWARD_SCALE_DEG, _OUTLIER_HALF_RANGE_DEG = 60.0, 15.0, 180.0
-"""Scales of the exponential densities of the lean, degrees, and half of the range of the uniform one. Picking
-things up bends a trunk by a right angle and more; a chair lets it recline by 30 degrees. Evidence: none."""
+"""Scales (degrees) of the exponential densities of the forward and the backward tilt, and half of the range
+(degrees) of the uniform density of outliers. When a person picks things up, the trunk bends by a right angle
+and more. In a chair, the trunk reclines by up to 30 degrees. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,23 +42,30 @@ class TrunkOrientation:
     """The orientation of a body's trunk over time.
 
     Attributes:
-        axes: (N,3,3) its left, back and up directions as columns.
-        front_known: Whether left and back are known; otherwise only up counts.
+        axes: (N,3,3) left, back and up directions of the trunk as columns.
+        front_known: Whether left and back are known; otherwise only the up direction is used.
     """
 
     axes: FloatArray
     front_known: bool = True
 
     def modal_up(self) -> FloatArray:
-        """Return the trunk's most frequent up direction (3,): upright, if the person bends now and then."""
+        """Return the trunk's most frequent up direction (3,).
+
+        It is the upright direction if the person bends only now and then.
+        """
         return modal_direction(self.axes[:, :, 2])
 
     def mean_up(self) -> FloatArray:
-        """Return the trunk's mean up direction (3,): nearer to upright than the mode if it mostly bends."""
+        """Return the trunk's mean up direction (3,).
+
+        For a person who bends most of the time, the mean is nearer to upright than the most frequent
+        direction.
+        """
         return _normalised(self.axes[:, :, 2].mean(axis=0))
 
     def upright_up(self) -> FloatArray:
-        """Return the trunk's up direction (3,) when it is upright: leans from there lead forward."""
+        """Return the up direction (3,) of the upright trunk: the direction that best explains all tilts."""
         axes = _subsample(self.axes)
         candidates = np.vstack([axes[:, :, 2], self.modal_up(), self.mean_up()])
         best = candidates[int(np.argmin(self.negative_log_likelihood(candidates)))]
@@ -64,17 +73,18 @@ class TrunkOrientation:
         return _normalised(axes[near, :, 2].mean(axis=0)) if near.any() else best
 
     def negative_log_likelihood(self, ups: FloatArray) -> FloatArray:
-        """Return the mean negative log-likelihood (C,), in nats, of the lean for verticals `ups` (C,3).
+        """Return the mean negative log-likelihood (C,), in nats, of the tilts for verticals `ups` (C,3).
 
-        It is relative to that of a trunk without lean, which has about 0.
+        The values are relative to the value of a trunk without tilt, so that such a trunk has about 0.
         """
         return self._mean_nll(ups, _OUTLIER_SHARE)
 
     def posterior_spread_deg(self, up: FloatArray) -> float:
-        """Return the RMS error of `up` (3,), in degrees, if only the lean determines it.
+        """Return the RMS error (degrees) of the vertical `up` (3,), if it is based only on the trunk's tilt.
 
-        A constant lean does not show. All instants together are therefore worth one observation. Outliers are
-        ignored here, because they may be in any direction.
+        A constant tilt of the trunk cannot be distinguished from an error of the vertical. All instants
+        together therefore count as one observation. Outliers are ignored here, because they may be in any
+        direction.
         """
         ups = _fibonacci_sphere(_SPHERE_DIRECTIONS)
         nll = self._mean_nll(ups, 0.0)
@@ -93,7 +103,7 @@ class TrunkOrientation:
 
 
 def _pitch_nll(pitch_deg: FloatArray, outlier_share: float) -> FloatArray:
-    """Return the negative log-likelihood of leans, forward positive, relative to that of no lean."""
+    """Return the negative log-likelihood of tilts (forward positive) relative to that of no tilt."""
 
     def density(pitch: FloatArray) -> FloatArray:
         forward, backward = np.maximum(pitch, 0.0), np.maximum(-pitch, 0.0)
@@ -109,13 +119,13 @@ def _pitch_nll(pitch_deg: FloatArray, outlier_share: float) -> FloatArray:
 
 
 def _lateral_nll(side_deg: FloatArray, outlier_share: float) -> FloatArray:
-    """Return the negative log-likelihood of sideways leans relative to that of none."""
+    """Return the negative log-likelihood of sideways tilts relative to that of no sideways tilt."""
     density = (1.0 - outlier_share) * np.exp(-0.5 * (side_deg / _LATERAL_SIGMA_DEG) ** 2) + outlier_share
     return np.asarray(-np.log(density))
 
 
 def _fibonacci_sphere(count: int) -> FloatArray:
-    """Return evenly distributed directions (C,3): points of a spiral, a golden angle apart."""
+    """Return evenly distributed directions (C,3): points on a spiral at successive golden angles."""
     number = np.arange(count) + 0.5
     polar, azimuth = np.arccos(1.0 - 2.0 * number / count), np.pi * (1.0 + np.sqrt(5.0)) * number
     return np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1)
@@ -126,8 +136,8 @@ def trunk_orientation(
 ) -> TrunkOrientation:
     """Return the trunk's orientation from solved bones (T,B,4,4).
 
-    If the graph has no bone of the trunk, up is opposite to the mean direction of the limbs, which mostly
-    hang. The front is then unknown.
+    If the graph has no bone of the trunk, up is opposite to the mean direction of the limbs, because limbs
+    hang most of the time. The front is then unknown.
     """
     trunk = [i for i, bone in enumerate(bones) if not split_side(bone.role)[0]]
     limbs = [
@@ -143,9 +153,9 @@ def trunk_orientation(
 
 
 def trunk_orientation_from_prior(bones: Sequence[Bone], trunk: CameraTrack, mount: Mount) -> TrunkOrientation:
-    """Return the trunk's orientation in the map from a camera's path and its mount prior.
+    """Return the trunk's orientation in the map from the path of its camera and the mount prior.
 
-    Joints between the camera's bone and the first bone are taken to be in the rest pose.
+    The joints between the camera's bone and the first bone are assumed to be in the rest pose.
     """
     rest = np.eye(3)
     index = trunk.bone
@@ -159,8 +169,8 @@ def trunk_orientation_from_prior(bones: Sequence[Bone], trunk: CameraTrack, moun
 def modal_direction(directions: FloatArray) -> FloatArray:
     """Return the mean (3,) of the largest group of similar directions among (N,3).
 
-    It shows the upright trunk of a person who bends in between; the mean of all would lean half as far as the
-    bends.
+    For a person who bends in between, this is the direction of the upright trunk. The mean of all directions
+    would be tilted towards the bends.
     """
     sample = _subsample(directions)
     sample = sample / np.linalg.norm(sample, axis=1, keepdims=True)
@@ -169,12 +179,12 @@ def modal_direction(directions: FloatArray) -> FloatArray:
 
 
 def _subsample(items: FloatArray) -> FloatArray:
-    """Return up to 300 of the items (N,...), evenly spaced. The indices are rounded down."""
+    """Return up to 300 evenly spaced items (N,...). The indices of the items are rounded down."""
     return np.asarray(items[np.unique(np.linspace(0, len(items) - 1, _MAX_SAMPLES).astype(np.int64))])
 
 
 def _orthogonal_axes(left: FloatArray, up: FloatArray) -> FloatArray:
-    """Return left, back and up as columns (N,3,3) from approximately orthogonal left and up (N,3)."""
+    """Return left, back and up axes as columns (N,3,3), from nearly orthogonal left and up axes (N,3)."""
     up = up / np.linalg.norm(up, axis=1, keepdims=True)
     back = np.cross(up, left)
     back /= np.linalg.norm(back, axis=1, keepdims=True)

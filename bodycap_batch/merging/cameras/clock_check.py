@@ -1,4 +1,4 @@
-"""Check of the clock offsets: find cameras on limbs that move about the trunk too early or too late."""
+"""Check of the clock offsets: find limb cameras that move too early or too late relative to the trunk."""
 
 from __future__ import annotations
 
@@ -12,30 +12,31 @@ from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack, 
 from bodycap_batch.model.geometry import invert
 
 _SEARCH_STEP_S = 0.05
-"""Seconds between the shifts that are tried: a quarter of the accuracy that is reached."""
+"""Time (seconds) between two shifts that are tried. It is a quarter of the accuracy of the result."""
 _MAX_SHIFT_S = 3.0
-"""Largest shift in seconds that is tried. Evidence: none."""
+"""Maximum shift (seconds) that is tried. Evidence: none."""
 _MIN_OVERLAP_RATIO = 3.0
-"""The time that both cameras share must be this many times the largest shift. Evidence: none."""
+"""Minimum ratio of the time that both cameras share to the largest shift that is tried. Evidence: none."""
 _MAX_SAMPLES = 200
-"""Frames of the limb's camera that are compared at most; they bound the time of the search."""
+"""Maximum number of frames of the limb's camera that are compared. It bounds the time of the search."""
 _MIN_SAMPLES = 30
-"""Frames below which a scatter means nothing: one second at 30 fps. Evidence: none."""
+"""Minimum number of frames for a scatter: one second at 30 fps. With fewer frames, the scatter is not
+reliable."""
 _MIN_SHIFT_S = 0.25
-"""Smallest shift in seconds that makes a clock suspicious: right clocks gain most by shifts up to this one.
-Evidence: docs/decisions/merging.md."""
+"""Minimum shift (seconds) of a suspicious clock. Even with a correct clock, the best shift may be almost this
+large. Evidence: docs/decisions/merging.md."""
 _MAX_SCATTER_RATIO = 0.7
-"""Largest scatter with the shift, as a ratio of the scatter without, that makes a clock suspicious.
+"""Maximum ratio of the scatter with the shift to the scatter without a shift, for a suspicious clock.
 Evidence: docs/decisions/merging.md."""
 
 
 @dataclass(frozen=True, slots=True)
 class TimeShift:
-    """The shift of a camera's clock with the smallest scatter.
+    """The shift of a camera's clock that gives the smallest scatter.
 
     Attributes:
-        shift_s: To be added to the camera's times.
-        scatter_ratio: Scatter with the shift over the scatter without.
+        shift_s: Shift (seconds) to be added to the camera's times.
+        scatter_ratio: Ratio of the scatter with the shift to the scatter without a shift.
     """
 
     shift_s: float
@@ -46,17 +47,20 @@ def suspicious_clocks(tracks: Sequence[CameraTrack]) -> dict[str, dict[str, floa
     """Find cameras that move more rigidly with the body if their clock is shifted.
 
     In the axes of the trunk's camera, the position of a limb's camera varies with the movement of the limb.
-    With a wrong clock, it also varies with the movement of the whole body in the meantime.
+    With a wrong clock, this position also varies with the movement of the whole body during the clock's
+    error.
 
-    A straight walk does not reveal a wrong clock: it moves the limb by a constant. A swinging arm may then
-    accidentally follow the turns of the trunk at a wrong shift. Such a shift increases the distance between
-    the cameras, which the right one hardly does; so a shift must also decrease the distance.
+    A straight walk does not reveal a wrong clock, because it moves the limb's camera by a constant. At a
+    wrong shift, a swinging arm may then accidentally follow the rotations of the trunk. A wrong shift
+    increases the distance between the cameras; the correct shift hardly does. A shift is therefore accepted
+    only if it also decreases this distance.
 
     Args:
-        tracks: Tracks in one map, the trunk's first.
+        tracks: Tracks in one map, the track of the trunk's camera first.
 
     Returns:
-        By camera, ``shift_s`` to be added to its times, and ``scatter_left``, the ratio of the scatters.
+        By camera, ``shift_s`` to be added to its times (seconds), and ``scatter_left``, the ratio of the
+        scatters with and without the shift.
     """
     out = {}
     for limb in tracks[1:]:
@@ -72,10 +76,10 @@ def suspicious_clocks(tracks: Sequence[CameraTrack]) -> dict[str, dict[str, floa
 
 
 def best_time_shift(trunk: CameraTrack, limb: CameraTrack) -> TimeShift | None:
-    """Search the time shift of a limb's camera that makes its position in the trunk's axes scatter least.
+    """Find the time shift of a limb's camera that minimises the scatter of its position in the trunk's axes.
 
     Returns:
-        None if both cameras were localised together for too short a time.
+        The shift; None if the time in which both cameras were localised is too short.
     """
     start, end = (pick(trunk.times_ns[at], limb.times_ns[at]) for pick, at in ((max, 0), (min, -1)))
     max_shift_s = min(_MAX_SHIFT_S, 1e-9 * float(end - start) / _MIN_OVERLAP_RATIO)
@@ -112,6 +116,6 @@ def _median_distance(trunk: CameraTrack, limb: CameraTrack, shift_s: float) -> f
 
 
 def _positions_in_trunk(trunk: CameraTrack, limb: CameraTrack, shift_s: float) -> FloatArray:
-    """Return positions (N,3) of a limb's camera in the axes of the trunk's camera, its times shifted."""
+    """Return positions (N,3) of a limb's camera at shifted times in the axes of the trunk's camera."""
     poses, valid = trunk.poses_at(limb.times_ns + round(1e9 * shift_s), max_gap_ns=MAX_SAMPLE_GAP_NS)
     return np.asarray((invert(poses[valid]) @ limb.map_from_cam[valid])[:, :3, 3])

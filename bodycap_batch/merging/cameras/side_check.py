@@ -1,4 +1,4 @@
-"""Check of left and right: find cameras of limbs that stay on the other side of the trunk."""
+"""Check of left and right: find limb cameras that stay on the wrong side of the trunk."""
 
 from __future__ import annotations
 
@@ -12,32 +12,34 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import split_side
 
 _MIN_SAMPLES = 10
-"""Frames below which a camera's side is not judged. Evidence: none."""
+"""Minimum number of frames for a judgement of a camera's side. Evidence: none."""
 _SIDES = {"Right": 1.0, "Left": -1.0}
-"""Sign of the position along the axis to the right."""
+"""Sign of a limb's position along the axis to the right, by side of the body."""
 _MAX_FORWARD_COSINE = 0.8
-"""Largest cosine between the trunk's forward axis and the vertical at which the trunk shows where the body
-faces. Evidence: none."""
+"""Maximum cosine of the angle between the trunk's forward axis and the vertical. With a larger cosine, the
+trunk does not show where the body faces. Evidence: none."""
 _MIN_UP_COSINE = 0.5
-"""Smallest median cosine between the vertical and the trunk's up axis, as the mount prior implies it. Below,
-the prior is wrong or the person lies. Evidence: none."""
+"""Minimum median cosine of the angle between the vertical and the trunk's up axis. The mount prior implies
+this axis. With a smaller cosine, the prior is wrong or the person lies. Evidence: none."""
 _MIN_WRONG_RATIO = 0.8
-"""Smallest ratio of frames on the wrong side for a swap. Evidence: docs/decisions/merging.md."""
+"""Minimum fraction of frames on the wrong side for swapped sides. Evidence: docs/decisions/merging.md."""
 
 
 def swapped_sides(
     tracks: Sequence[CameraTrack], mounts: Mapping[str, Mount], up: FloatArray
 ) -> dict[str, float]:
-    """Find limb cameras that stay on the other side of the body, if all of them do.
+    """Find limb cameras that stay on the wrong side of the body, if all limb cameras do.
 
     Args:
-        tracks: Tracks in one map, the trunk's first.
-        mounts: Mount priors by camera. The prior of the first camera implies where the body faces.
-        up: (3,) the vertical in the map.
+        tracks: Tracks in one map, the track of the trunk's camera first.
+        mounts: Mount prior of each camera by camera name. The prior of the trunk's camera implies where the
+            body faces.
+        up: (3,) vertical in the map.
 
     Returns:
-        By camera, the ratio of frames on the wrong side. Empty if one limb is on its own side, or if the
-        first camera does not show where the body faces: it is on a limb, upside down, or the person lies.
+        By camera, the fraction of frames on the wrong side. The result is empty if a limb is on the correct
+        side, or if the first camera does not show where the body faces. This camera is then on a limb or
+        upside down, or the person lies.
     """
     trunk_mount = mounts[tracks[0].camera]
     joint = tracks[0].map_from_cam[:, :3, :3] @ trunk_mount.joint_from_cam[:3, :3].T

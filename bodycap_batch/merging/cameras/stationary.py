@@ -1,4 +1,4 @@
-"""Detection of stationary cameras: a camera on a table, or a frozen one, while others of its map move."""
+"""Detection of stationary cameras, such as a camera on a table, while other cameras of their map move."""
 
 from __future__ import annotations
 
@@ -13,20 +13,22 @@ from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 
 _MAX_DEVIATION_RATIO, _MAX_DEVIATION_RAD = 0.005, float(np.radians(0.3))
-"""A stationary camera deviates from its median position by less than the first value, as a ratio of the
-deviation of the camera of its map that moves most. It rotates by less than the second value (radians).
-Evidence: docs/decisions/merging.md."""
+"""First: maximum deviation of a stationary camera from its median position, as a ratio to the deviation of
+the camera that moves most in the map. Second: maximum rotation (radians) of a stationary camera. Evidence:
+docs/decisions/merging.md."""
 _MAX_NOISE_FACTOR = 2.0
-"""Noise widens both bounds by this factor at most, so that noisy poses alone exclude no moving camera."""
+"""Maximum factor by which noise widens both bounds. It keeps moving cameras with noisy poses from being
+excluded."""
 _WINDOW_FRAMES = 15
-"""Localised frames that are averaged: half a second at 30 fps. Noise is independent between frames, a
-movement of the body is not."""
+"""Number of localised frames that are averaged: half a second at 30 fps. Noise is independent between frames;
+a movement of the body is not."""
 _PERCENTILE, _PERCENTILE_SIGMAS = 90.0, 2.5
-"""Deviations are judged by this percentile. For Gaussian noise with one sigma on three axes, the 90th
-percentile of the norm is 2.5 sigmas (chi distribution with three degrees of freedom)."""
+"""Percentile of the deviations that is compared with the bounds, and its value in sigmas of the noise. For
+Gaussian noise with one sigma on three axes, the 90th percentile of the norm is 2.5 sigmas (chi distribution
+with three degrees of freedom)."""
 _MIN_DURATION_RATIO = 0.5
-"""Smallest localised time of a stationary camera, as a ratio of that of the camera localised longest: a
-person who stands still for a second shows nothing about the rest. Evidence: none."""
+"""Minimum localised time of a stationary camera, as a ratio to the longest localised time of all cameras. A
+person who stands still for a second gives no evidence about the rest of the time. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +36,11 @@ class _CameraPath:
     """The localised frames of one camera.
 
     Attributes:
-        gauge: Of the positions.
-        times_ns: (N,) common time.
-        centres: (N,3) positions, map units.
-        rotations: N orientations.
-        sigma_rad: Median rotation sigma per axis.
+        gauge: Name of the gauge of the positions.
+        times_ns: (N,) times on the common clock.
+        centres: (N,3) positions of the camera, map units.
+        rotations: N orientations of the camera.
+        sigma_rad: Median sigma of the rotation per axis, radians.
         sigma_map: Median sigma of the centre per axis, map units.
     """
 
@@ -50,7 +52,7 @@ class _CameraPath:
     sigma_map: float
 
     def deviations_during(self, first_ns: int, last_ns: int) -> FloatArray:
-        """Return the distances (M,) of the centres in a time span from their median; map units."""
+        """Return the distances (M,), map units, of the centres in a time span from their median."""
         inside = self.centres[(self.times_ns >= first_ns) & (self.times_ns <= last_ns)]
         return (
             np.asarray(np.linalg.norm(inside - np.median(inside, axis=0), axis=1)) if len(inside) else inside
@@ -58,11 +60,11 @@ class _CameraPath:
 
 
 def stationary_cameras(inputs: MergeInputs, trajectories: Sequence[Trajectory]) -> list[str]:
-    """Find cameras that stand still while another one of their map moves.
+    """Find cameras that stand still while another camera of their map moves.
 
     Args:
-        inputs: The clocks.
-        trajectories: Of cameras with at least half a second of localised frames.
+        inputs: Merge inputs, of which the clocks are used.
+        trajectories: Trajectories of the cameras with at least half a second of localised frames.
     """
     paths = {each.camera: _camera_path(inputs, each) for each in trajectories}
     seconds = {
@@ -98,7 +100,7 @@ def _keeps_orientation(path: _CameraPath) -> bool:
 
 
 def _keeps_position(path: _CameraPath, others: Iterable[_CameraPath]) -> bool:
-    """Return whether a camera keeps its position while another one of its map moves."""
+    """Return whether a camera keeps its position while another camera of its map moves."""
     span = int(path.times_ns.min()), int(path.times_ns.max())
     deviations = [other.deviations_during(*span) for other in others if other.gauge == path.gauge]
     largest = max(
@@ -109,12 +111,15 @@ def _keeps_position(path: _CameraPath, others: Iterable[_CameraPath]) -> bool:
 
 
 def _deviates_little(deviations: FloatArray, limit: float, sigma: float) -> bool:
-    """Return whether deviations (N,3) are below a limit in the mean of windows, and single ones up to noise.
+    """Return whether deviations (N,3) are below a limit.
+
+    Means over windows of frames must be below the limit. Single frames must be below a bound that allows for
+    the noise of one frame.
 
     Args:
-        deviations: From the mean or median, per frame.
-        limit: For a camera without noise.
-        sigma: Noise of one frame per axis.
+        deviations: (N,3) deviation of each frame from the mean or the median.
+        limit: Maximum deviation of a camera without noise.
+        sigma: Sigma of the noise of one frame per axis.
     """
     count = len(deviations) // _WINDOW_FRAMES
     windows = deviations[: count * _WINDOW_FRAMES].reshape(-1, _WINDOW_FRAMES, 3).mean(axis=1)

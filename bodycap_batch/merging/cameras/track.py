@@ -1,4 +1,4 @@
-"""The camera paths that merging works on: localised frames on the common clock, without gross errors."""
+"""The camera paths that merging uses: localised frames on the common clock, without gross errors."""
 
 from __future__ import annotations
 
@@ -14,27 +14,28 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_M
 
 OUTLIER_HALF_WINDOW = 6
-"""Frames on either side that a frame is compared with, 0.2 s at 30 fps. A quadratic follows a swinging hand
-to a few centimetres over that time. Evidence: none."""
+"""Number of frames on either side with which a frame is compared: 0.2 s at 30 fps. Over that time, a
+quadratic follows a swinging hand to a few centimetres. Evidence: none."""
 OUTLIER_LIMIT_M = 0.12
-"""Distance from the quadratic, in metres, above which a pose is wrong: several times a swing's deviation from
-it. Evidence: none."""
+"""Maximum distance (metres) of a pose from the quadratic. It is several times the deviation of a swinging
+hand from the quadratic; a pose at a larger distance is wrong. Evidence: none."""
 
 MIN_SIGMA_M, MIN_SIGMA_RAD = 0.004, float(np.radians(0.4))
-"""Smallest sigmas of a measured pose per axis, metres and radians. The covariance of PnP contains the image
+"""Minimum sigmas of a measured pose per axis (metres, radians). The covariance of PnP contains the image
 noise, but neither the error of the map nor the movement of the strap. Evidence: none."""
 
 _UNCALIBRATED_SIGMA_RAD, _UNCALIBRATED_SIGMA_M = 0.98 * NOMINAL_ERROR_RAD, 0.98 * NOMINAL_SIGMA_M
-"""A mount with both sigmas (radians, metres per axis) above these was not calibrated: its prior has hardly
-larger ones. One sigma alone says nothing: the posture's systematic bias alone gives a calibrated palm such a
-rotation sigma."""
+"""Minimum sigmas (radians, metres per axis) of a mount that counts as uncalibrated. The sigmas of its prior
+are hardly larger. A mount must reach both minimums: a calibrated palm may have such a rotation sigma, because
+of the posture's systematic bias alone."""
 
 
 MAX_SAMPLE_GAP_NS = 100_000_000
-"""Longest time between two frames, in nanoseconds, over which a pose is interpolated for the calibration and
-the checks: three intervals of frames at 30 fps. Evidence: none."""
+"""Maximum time (nanoseconds) between two frames for a pose to be interpolated between them, for the
+calibration and the checks. It is three frame intervals at 30 fps. Evidence: none."""
 MAX_COARSE_GAP_NS = 200_000_000
-"""The same for initial values and for the search for a T-pose, which need less accuracy. Evidence: none."""
+"""Maximum time (nanoseconds) between two frames for a pose to be interpolated between them, for initial
+values and for the search for a T-pose. These need less accuracy. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,12 +43,12 @@ class CameraTrack:
     """The localised frames of one camera.
 
     Attributes:
-        camera: Camera name.
-        bone: Index of the bone that carries the camera.
-        frames: (N,) indices into the trajectory.
-        times_ns: (N,) common time, increasing.
-        map_from_cam: (N,4,4) poses in the map's gauge.
-        sigma_rad: (N,) rotation sigma per axis.
+        camera: Name of the camera.
+        bone: Index of the bone that the camera is mounted on.
+        frames: (N,) indices of the frames in the trajectory.
+        times_ns: (N,) times on the common clock, increasing.
+        map_from_cam: (N,4,4) poses of the camera in the map's gauge.
+        sigma_rad: (N,) sigma of the rotation per axis, radians.
         sigma_map: (N,) sigma of the centre per axis, map units.
     """
 
@@ -74,7 +75,7 @@ class CameraTrack:
         """Return the track in another unit of length.
 
         Args:
-            scale: New units per present unit.
+            scale: Number of new units per present unit.
         """
         poses = self.map_from_cam.copy()
         poses[:, :3, 3] *= scale
@@ -83,16 +84,18 @@ class CameraTrack:
     def poses_at(self, times_ns: IntArray, *, max_gap_ns: int) -> tuple[FloatArray, BoolArray]:
         """Interpolate the poses between neighbouring frames.
 
-        `bodycap_batch.model.geometry.poses_at` returns the identity where there is no pose; here a pose is
-        needed there too, and a time at which there is a frame gets exactly the pose of that frame.
+        `bodycap_batch.model.geometry.poses_at` returns the identity at times without a pose. This method
+        returns a pose at every time. At the time of a frame, it returns exactly the pose of that frame.
 
         Args:
-            times_ns: (T,) common times.
-            max_gap_ns: Longest time between the two frames around a requested time.
+            times_ns: (T,) requested times on the common clock.
+            max_gap_ns: Maximum time between the two frames around a requested time for a valid pose.
 
         Returns:
-            Poses (T,4,4), and (T,) whether each is valid: inside the track and not in a longer gap. A pose
-            in a gap is interpolated over it; one outside the track is that of the first or last frame.
+            Poses (T,4,4), and (T,) whether each pose is valid. A pose is valid if its time is inside the
+            track, and if the two frames around it are at most `max_gap_ns` apart. An invalid pose inside the
+            track is interpolated too. A pose outside the track equals the pose of the first or the last
+            frame.
         """
         last = len(self.times_ns) - 1
         after = np.clip(np.searchsorted(self.times_ns, times_ns, side="left"), 0, last)
@@ -108,9 +111,9 @@ def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Camera
     """Return the localised frames of a trajectory on the common clock.
 
     Args:
-        inputs: The clocks, and the image rows that the poses belong to.
-        trajectory: Of one camera.
-        bone: Index of the bone that carries the camera.
+        inputs: Merge inputs, of which the clocks and the image rows of the poses are used.
+        trajectory: Trajectory of one camera.
+        bone: Index of the bone that the camera is mounted on.
     """
     frames = np.flatnonzero(trajectory.localised)
     rows = inputs.row_fraction.get(trajectory.camera)
@@ -131,7 +134,7 @@ def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Camera
 
 
 def transform_track(track: CameraTrack, target_from_map: Similarity) -> CameraTrack:
-    """Return the track in another frame of reference, such as another map's gauge."""
+    """Return the track in another frame of reference, such as the gauge of another map."""
     return replace(
         track,
         map_from_cam=target_from_map.apply_to_poses(track.map_from_cam),
@@ -143,8 +146,8 @@ def transform_trajectory(trajectory: Trajectory, target_from_map: Similarity, ga
     """Return the trajectory in another frame of reference.
 
     Args:
-        trajectory: Poses and covariances in their own gauge.
-        target_from_map: From that gauge.
+        trajectory: Trajectory with poses and covariances in its own gauge.
+        target_from_map: Similarity from the trajectory's gauge to the new frame of reference.
         gauge: Name of the new frame of reference.
     """
     unit = np.repeat([1.0, target_from_map.scale], 3)
@@ -162,7 +165,7 @@ def remove_outliers(track: CameraTrack, scale: float, fps: float) -> CameraTrack
     Args:
         track: The measured path.
         scale: Metres per map unit; a provisional value is accurate enough.
-        fps: Nominal rate of the camera.
+        fps: Nominal frame rate of the camera.
     """
     count = len(track.times_ns)
     steps = np.array([step for step in range(-OUTLIER_HALF_WINDOW, OUTLIER_HALF_WINDOW + 1) if step])
@@ -173,16 +176,16 @@ def remove_outliers(track: CameraTrack, scale: float, fps: float) -> CameraTrack
     valid &= np.abs(time) <= OUTLIER_HALF_WINDOW + 0.5
     centre = scale * (track.map_from_cam[index, :3, 3] - track.map_from_cam[:, None, :3, 3])
     predicted = _robust_quadratic(time / OUTLIER_HALF_WINDOW, centre, valid)
-    # At the end of an interval the quadratic extrapolates: a turn of the path looks like an error there.
+    # At the end of an interval, the quadratic extrapolates. A change of direction looks like an error there.
     inner = ((time < 0) & valid).sum(axis=1).clip(max=2) + ((time > 0) & valid).sum(axis=1).clip(max=2) == 4
     bad = (np.linalg.norm(predicted, axis=1) > OUTLIER_LIMIT_M) & inner & (valid.sum(axis=1) >= 6)
     return track.keep(~_runs_with_jumps(bad, scale * track.map_from_cam[:, :3, 3]))
 
 
 def _runs_with_jumps(bad: BoolArray, centre_m: FloatArray) -> BoolArray:
-    """Select the runs of bad frames (N,) in which the path jumps.
+    """Return the runs of bad frames (N,) in which the path jumps.
 
-    The path of a thrown arm leaves any quadratic, but it has no jump.
+    The path of a thrown arm deviates from any quadratic, but it does not jump.
     """
     jump = np.zeros(len(bad), dtype=bool)
     jump[1:-1] = np.linalg.norm(np.diff(centre_m, n=2, axis=0), axis=1) > OUTLIER_LIMIT_M
@@ -206,19 +209,20 @@ def _robust_quadratic(time: FloatArray, centre: FloatArray, valid: BoolArray) ->
 
 
 def is_uncalibrated(mount: Mount) -> bool:
-    """Return whether the calibration left a mount as uncertain as the prior by its name."""
+    """Return whether a mount is still as uncertain as the prior that the camera's name implies."""
     return mount.sigma_rad >= _UNCALIBRATED_SIGMA_RAD and mount.sigma_m >= _UNCALIBRATED_SIGMA_M
 
 
 def inflate_sigmas(track: CameraTrack, mount: Mount) -> CameraTrack:
     """Add the uncertainty of an uncalibrated mount to the sigmas of its track.
 
-    A camera that is never localised together with others keeps the mount that its name implies, known to 9°
-    and 2.9 cm per axis. With the millimetres of its own poses, it would bend the body to that guess.
+    A camera that is never localised together with other cameras keeps the mount that its name implies. The
+    sigmas of this mount are 9° and 2.9 cm per axis. The sigmas of the camera's poses are only millimetres.
+    With these alone, the track would bend the body to fit the inaccurate mount.
 
     Args:
-        track: Poses in metres.
-        mount: The solved mount.
+        track: Track of the camera, poses in metres.
+        mount: The solved mount of the camera.
     """
     if not is_uncalibrated(mount):
         return track
@@ -230,5 +234,5 @@ def inflate_sigmas(track: CameraTrack, mount: Mount) -> CameraTrack:
 
 
 def pick_evenly(pool: IntArray, count: int) -> IntArray:
-    """Return up to `count` items of a pool (N,), evenly spaced."""
+    """Return up to `count` evenly spaced items of a pool (N,)."""
     return np.asarray(pool[evenly_spaced(len(pool), count)])

@@ -12,23 +12,23 @@ from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.model.geometry import so3_log
 
 _MAX_PSD_RATIO = 100.0
-"""Largest factor on a power spectral density of `body.bones`: ten times the usual accelerations, beyond which
-a pose is wrong. Evidence: none."""
+"""Maximum factor on a power spectral density of `body.bones`. It stands for ten times the usual
+accelerations; poses with larger accelerations are wrong. Evidence: none."""
 
 
 def scale_motion_noise(bones: Sequence[Bone], tracks: Sequence[CameraTrack]) -> tuple[Bone, ...]:
-    """Increase the noise of the motion prior of bones that accelerate more than usual.
+    """Increase the noise of the motion prior for bones that accelerate more than usual.
 
-    For a power spectral density q and a frame interval h, the second difference of a path has the variance
-    2/3 q h³. Independent noise of the poses adds 6 σ². A bone without a camera takes the largest ratio of the
-    bones below it, because a limb swings as a whole.
+    For a power spectral density q of the acceleration and a frame interval h, the second difference of a path
+    has the variance 2/3 q h³. Independent noise of the poses with sigma σ adds 6 σ². A bone without a camera
+    takes the largest ratio of the bones below it, because a limb swings as a whole.
 
     Args:
         bones: The graph's bones.
         tracks: Tracks without outliers, poses in metres.
 
     Returns:
-        The bones with densities that are the usual ones or larger.
+        The bones. Each power spectral density is at least as large as its usual value.
     """
     ratio = np.ones((len(bones), 2))
     for track in tracks:

@@ -1,7 +1,8 @@
-"""Factors of the trunk's attitude from the posture: upright in walking, facing the direction of walking.
+"""Factors on the trunk's attitude from the posture: upright in walking, facing the direction of walking.
 
-Such knowledge is wrong by the same amount in every frame: a person who leans does so all the time. Each kind
-of factor therefore counts as one observation, however many frames it is applied to.
+Such knowledge is wrong by an equal amount in every frame, because a person with a tilted trunk keeps this
+tilt. All factors of one kind therefore count as one observation together, however many frames they are
+applied to.
 """
 
 from __future__ import annotations
@@ -17,16 +18,17 @@ from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.posture import Posture
 
 UPRIGHT_SIGMA_RAD, HEADING_SIGMA_RAD = float(np.radians(5.0)), float(np.radians(8.0))
-"""Sigmas, in radians, of a walker's mean chest about the vertical and about the direction of walking. They
-contain the person's systematic lean, and how the rig defines the axes of the chest. Evidence: none."""
+"""Sigmas (radians) of a walker's mean chest: tilt from the vertical, and angle to the direction of walking.
+They contain the person's systematic tilt of the trunk, and how the rig defines the axes of the chest.
+Evidence: none."""
 STANDING_SIGMA_RAD = float(np.radians(7.0))
-"""The same about the vertical for a chest at its highest in a capture without walking. A person who bends and
-lifts stands up in between. It contains the 5 degrees of a walker, and about as many for the bend that the
-height leaves undetermined."""
+"""Sigma (radians) of the tilt of a chest at its highest position, in a capture without walking. A person who
+bends and lifts things stands up in between. The sigma contains the 5 degrees of a walker, and about 5 degrees
+of bending that the height does not reveal."""
 _TRUNK = ("Spine1", "Spine", "Hips")
-"""Roles of the bones that the factors apply to."""
+"""Roles of the bones that the factors constrain."""
 _OWN_UP, _OWN_LEFT = gtsam.Unit3(np.array([0.0, 0.0, 1.0])), gtsam.Unit3(np.array([1.0, 0.0, 0.0]))
-"""Axes of a trunk bone in its own frame."""
+"""Up axis and left axis of a trunk bone in its own frame."""
 
 
 class AttitudeFactors:
@@ -34,7 +36,7 @@ class AttitudeFactors:
 
     Args:
         bones: The graph's bones.
-        posture: At the ticks of the graph.
+        posture: Posture at the ticks of the graph.
     """
 
     def __init__(self, bones: Sequence[Bone], posture: Posture) -> None:
@@ -47,7 +49,10 @@ class AttitudeFactors:
         self._heading = _noise_for_one_observation(HEADING_SIGMA_RAD, int(with_heading.sum()))
 
     def add(self, graph: Any, tick: int) -> None:
-        """Add the factors of one tick: the trunk's up, and its left at right angles to the way it walks."""
+        """Add the factors of one tick to a graph.
+
+        They align the trunk's up axis with the vertical, and its left axis across the direction of walking.
+        """
         posture = self._posture
         upright = posture.walking[tick] or posture.t_pose[tick]
         if posture.up is None or not (upright or posture.standing[tick]):
@@ -62,5 +67,5 @@ class AttitudeFactors:
 
 
 def _noise_for_one_observation(sigma: float, count: int) -> Any:
-    """Return the noise of each of `count` factors that together count as one observation of this sigma."""
+    """Return the noise of each of `count` factors that together count as one observation with `sigma`."""
     return gtsam.noiseModel.Isotropic.Sigma(2, sigma * float(np.sqrt(max(count, 1))))

@@ -1,4 +1,4 @@
-"""The uncertainty of the calibration as independent error modes: its square-root covariance."""
+"""The uncertainty of the calibration as independent error modes: columns of its square-root covariance."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class BodyModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorModes:
-    """M independent modes in which the calibration may be wrong, each scaled to one sigma.
+    """M independent error modes of the calibration, each scaled to one sigma.
 
     Attributes:
         mounts: By camera, (6,M) change of joint_from_cam: right perturbation, rotation first.
         log_scale: (M,) change of the logarithm of the metric scale.
-        rest: (B,3,M) rotation (rad) of each bone's rest pose, in the bone's own frame.
-        offsets_m: (B,3,M) change of each joint's centre in the parent's frame.
+        rest: (B,3,M) rotation (radians) of each bone's rest pose, in the bone's own frame.
+        offsets_m: (B,3,M) change of each joint's centre in the parent bone's frame.
     """
 
     mounts: Mapping[str, FloatArray]
@@ -51,7 +51,7 @@ class ErrorModes:
 
 
 def stack_modes(parts: Sequence[ErrorModes]) -> ErrorModes:
-    """Return the modes of several parts together, which are independent of each other."""
+    """Return the error modes of several parts together. The parts are independent of each other."""
     return ErrorModes(
         mounts={
             camera: np.concatenate([part.mounts[camera] for part in parts], axis=1)
@@ -70,17 +70,17 @@ def joint_residual_jacobian(
     world_from_bone: FloatArray,
     modes: ErrorModes,
 ) -> Any:
-    """Return the change (R,M), sparse, of the residuals of joints and hinges along each mode.
+    """Return the change (R,M), sparse, of the residuals of joints and hinges per error mode.
 
-    It has the sign of the right-hand side: the movement that compensates the change.
+    The change has the sign of the right-hand side. It is the movement that compensates the error mode.
 
     Args:
-        linear: Derivatives at the solution.
-        body: Bones and hinges.
+        linear: Linearised graph at the solution.
+        body: Bones and hinges of the graph.
         first_factor: Index of the first tick's first joint factor. Each tick adds its joints, then its
             hinges.
-        world_from_bone: (T,B,4,4) the solution.
-        modes: Of the calibration.
+        world_from_bone: (T,B,4,4) solved poses of the bones.
+        modes: Error modes of the calibration.
     """
     ticks = np.arange(len(world_from_bone))
     children = [index for index, bone in enumerate(body.bones) if bone.parent >= 0]
@@ -112,19 +112,20 @@ def joint_residual_jacobian(
 
 
 POSTURE_BIAS_SHARE = 0.5
-"""Ratio of a joint's everyday range that is a systematic bias over the whole capture; the rest varies within
-seconds. At one tick both parts count, but only the bias moves the mounts. Evidence: none."""
+"""Fraction of a joint's everyday range that is a systematic bias of the posture over the whole capture. The
+rest varies within seconds. At one tick, both parts contribute to the error; only the bias changes the mounts.
+Evidence: none."""
 
 
 def posture_bias_modes(
     bones: Sequence[Bone], cameras: Sequence[str], share: float | FloatArray
 ) -> ErrorModes:
-    """Return the modes in which joints may be held away from the rest pose.
+    """Return the error modes of joints that are held away from the rest pose.
 
     Args:
         bones: The graph's bones.
         cameras: Names of the cameras. Their mounts do not change.
-        share: Ratio of the joint's everyday range, one for all or (B,) by bone.
+        share: Fraction of the joint's everyday range: one value for all bones, or (B,) by bone.
     """
     shares = np.broadcast_to(share, len(bones))
     jointed = [index for index, bone in enumerate(bones) if bone.parent >= 0]
@@ -141,13 +142,13 @@ def posture_bias_modes(
 
 
 def map_error_modes(bones: Sequence[Bone], sigmas: Mapping[str, FloatArray]) -> ErrorModes:
-    """Return the modes of an error that all poses of a camera share for some time, as the error of a map is.
+    """Return the modes of an error that all poses of a camera share for some time, such as a map's error.
 
-    To the body, such an error is the same as a change of the camera's mount.
+    For the body, such an error has the effect of a change of the camera's mount.
 
     Args:
         bones: The graph's bones.
-        sigmas: By camera, (2,) sigmas of rotation (rad) and position (m) per axis.
+        sigmas: By camera, (2,) sigmas of rotation (radians) and position (metres) per axis.
     """
     count = 6 * len(sigmas)
     mounts = {camera: np.zeros((6, count)) for camera in sigmas}
@@ -158,7 +159,7 @@ def map_error_modes(bones: Sequence[Bone], sigmas: Mapping[str, FloatArray]) -> 
 
 
 def mount_perturbation(joint_from_cam: FloatArray, change: FloatArray) -> FloatArray:
-    """Return a change (4,4) of a mount as a right perturbation (6,), rotation first."""
+    """Return an additive change (4,4) of a mount as a right perturbation (6,), rotation first."""
     rotation = joint_from_cam[:3, :3].T @ change[:3, :3]
     rotation = 0.5 * (rotation - rotation.T)
     translation = joint_from_cam[:3, :3].T @ change[:3, 3]
@@ -166,12 +167,12 @@ def mount_perturbation(joint_from_cam: FloatArray, change: FloatArray) -> FloatA
 
 
 def scale_modes(bones: Sequence[Bone], sigma_log: float, slope: Mapping[str, FloatArray]) -> ErrorModes:
-    """Return the mode of the metric scale, with the mounts that follow it.
+    """Return the error mode of the metric scale, with the changes of the mounts that the scale causes.
 
     Args:
         bones: The graph's bones.
         sigma_log: Sigma of the scale's logarithm.
-        slope: By camera (6,), change of the mount per unit of log scale.
+        slope: By camera, (6,) change of the mount per unit of log scale.
     """
     return ErrorModes(
         mounts={camera: sigma_log * change[:, None] for camera, change in slope.items()},

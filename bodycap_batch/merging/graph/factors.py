@@ -1,6 +1,7 @@
-"""The factors of the graphs: joints, hinges, camera measurements and mounts, all from GTSAM's own C++.
+"""The factors of the graphs: joints, hinges, camera measurements and mounts. All are GTSAM's own C++ factors.
 
-Keys: ``b`` for a bone's pose at a tick, ``v`` for its velocity, ``m`` for the four points of a mount.
+Letters of the keys: ``b`` for a bone's pose at a tick, ``v`` for a bone's velocity at a tick, ``m`` for the
+four points of a mount.
 """
 
 from __future__ import annotations
@@ -17,34 +18,35 @@ from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, Hinge
 from bodycap_batch.model.geometry import nearest_rotation, skew
 
 MAX_BONES = 64
-"""Stride of a tick in the keys; a graph has at most this many bones."""
+"""Maximum number of bones of a graph. The keys of two successive ticks differ by this number."""
 GEMAN_MCCLURE_C = 6.0
-"""Scale of the robust loss in sigmas of a six-dimensional residual, which typically has a length of 2.4.
-Gross errors are removed before. Evidence: docs/decisions/merging.md."""
+"""Scale of the Geman-McClure loss, in sigmas of a six-dimensional residual. Such a residual typically has a
+length of 2.4 sigmas. Gross errors are removed before the graph is built. Evidence:
+docs/decisions/merging.md."""
 HINGE_SLACK_RATIO = 2.0
-"""Sigma of a hinge's distances over that of a joint's gap. Evidence: none."""
+"""Ratio of the sigma of a hinge's distances to the sigma of a joint's gap. Evidence: none."""
 _AXIS_WEIGHT = 0.1
-"""Information of a mount's axis point over that of its centre point. It is small, so that the rotation of the
-mount hardly depends on its translation."""
+"""Ratio of the information of a mount's axis point to the information of the mount's centre point. The ratio
+is small, so that the rotation of the mount hardly depends on its translation."""
 
 
 def bone_key(tick: int, bone: int) -> int:
-    """Return the key of a bone's pose."""
+    """Return the key of a bone's pose at a tick."""
     return int(gtsam.symbol("b", tick * MAX_BONES + bone))
 
 
 def velocity_key(tick: int, bone: int) -> int:
-    """Return the key of a bone's velocity, a 6-vector in the bone's own frame, rotation first."""
+    """Return the key of a bone's velocity at a tick, a 6-vector in the bone's frame, rotation first."""
     return int(gtsam.symbol("v", tick * MAX_BONES + bone))
 
 
 def mount_keys(camera: int) -> list[int]:
-    """Return the keys of a mount's centre point and three axis points, which are in the bone's frame."""
+    """Return the keys of a mount's points in the bone's frame: the centre point, then three axis points."""
     return [int(gtsam.symbol("m", 4 * camera + point)) for point in range(4)]
 
 
 class MotionState(NamedTuple):
-    """The keys of one bone's state at one time."""
+    """The keys of one bone's state (pose and velocity) at one time."""
 
     time_ns: int
     pose_key: int
@@ -53,51 +55,52 @@ class MotionState(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MountPoints:
-    """Four points fixed to a camera that together measure its pose.
+    """Four points, fixed to a camera, that together measure the camera's pose.
 
-    The centre point has the standard deviation ``sigma_m``. Each axis point has a tenth of its information,
-    at the distance from the centre at which the points measure the rotation to ``sigma_rad``.
+    The centre point has the standard deviation ``sigma_m``. Each axis point has a tenth of the centre point's
+    information. Its distance from the centre is such that the points measure the rotation with ``sigma_rad``.
 
     Attributes:
-        sigma_rad: Rotation sigma of the pose, per axis.
-        sigma_m: Position sigma of the pose, per axis.
+        sigma_rad: Sigma of the pose's rotation per axis, radians.
+        sigma_m: Sigma of the pose's position per axis, metres.
     """
 
     sigma_rad: float
     sigma_m: float
 
     AXIS_WHITENING_RATIO: ClassVar[float] = float(np.sqrt(_AXIS_WEIGHT))
-    """A shift in sigmas of an axis point over the same shift in sigmas of the centre point."""
+    """Ratio of an axis point's shift in sigmas to the centre point's shift in sigmas, for equal shifts in
+    metres."""
 
     @property
     def axis_sigma_m(self) -> float:
-        """Standard deviation of an axis point."""
+        """Standard deviation (metres) of an axis point per axis."""
         return float(self.sigma_m / np.sqrt(_AXIS_WEIGHT))
 
     @property
     def radius_m(self) -> float:
-        """Distance r of the axis points from the centre: the information of the rotation is 2 r² / σ²."""
+        """Distance r (metres) of the axis points from the centre. The rotation's information is 2 r² / σ²."""
         return float(self.axis_sigma_m / (np.sqrt(2.0) * self.sigma_rad))
 
     def x_in_cam(self) -> FloatArray:
-        """Return the points (4,3), the centre first."""
+        """Return the points (4,3) in the camera's frame, the centre point first."""
         return np.vstack([np.zeros(3), self.radius_m * np.eye(3)])
 
 
 def geman_mcclure(noise: Any) -> Any:
-    """Return a noise model with the Geman-McClure loss."""
+    """Return a GTSAM noise model that adds the Geman-McClure loss to `noise`."""
     kernel = gtsam.noiseModel.mEstimator.GemanMcClure.Create(GEMAN_MCCLURE_C)
     return gtsam.noiseModel.Robust.Create(kernel, noise)
 
 
 class JointFactors:
-    """The body's own factors: ball joints with a rotation prior, and hinges.
+    """The factors of the body itself: ball joints with a rotation prior, and hinges.
 
     Args:
         bones: The graph's bones.
-        hinges: Of the graph.
+        hinges: The graph's hinges.
         prior_scale: Factor on the sigmas of the rotation prior.
-        slack_m: Sigma of a joint's gap.
+        slack_m: Slack of a joint: sigma of its gap, metres.
     """
 
     def __init__(
@@ -124,7 +127,7 @@ class JointFactors:
         ]
 
     def add(self, graph: Any, tick: int) -> None:
-        """Add the factors of one tick to a graph."""
+        """Add the joint and hinge factors of one tick to a graph."""
         for index, bone in self._children:
             parent, child = bone_key(tick, bone.parent), bone_key(tick, index)
             graph.add(gtsam.BetweenFactorPose3(parent, child, self._rest[index], self._noise[index]))
@@ -144,14 +147,14 @@ def _joint_noise(bone: Bone, prior_scale: float, slack_m: float) -> Any:
 def add_mount_measurements(
     graph: Any, bones: Sequence[int], camera: int, world_from_cam: FloatArray, points: MountPoints
 ) -> None:
-    """Add the measured poses of a camera with an unknown mount.
+    """Add the measured poses of a camera whose mount is unknown.
 
     Args:
-        graph: Receives the factors.
+        graph: Graph that receives the factors.
         bones: N keys of the bone's poses.
-        camera: Index of the camera, for its mount's keys.
-        world_from_cam: (N,4,4) measured poses.
-        points: The points of the mount.
+        camera: Index of the camera; it determines the keys of the mount.
+        world_from_cam: (N,4,4) measured poses of the camera.
+        points: Points of the mount.
     """
     x_in_world = points.x_in_cam() @ world_from_cam[:, :3, :3].swapaxes(1, 2) + world_from_cam[:, None, :3, 3]
     sigmas = (points.sigma_m, points.axis_sigma_m, points.axis_sigma_m, points.axis_sigma_m)
@@ -174,24 +177,27 @@ def add_mount_prior(
     """Add the prior of a mount, from the camera's name or from the job.
 
     Args:
-        graph: Receives the factors.
-        camera: Index of the camera.
-        joint_from_cam: (4,4) the prior's mean.
-        points: The points of the mount.
-        sigma_rad: Of the rotation, per axis.
-        sigma_m: Of the position, per axis.
+        graph: Graph that receives the factors.
+        camera: Index of the camera; it determines the keys of the mount.
+        joint_from_cam: (4,4) mean of the prior.
+        points: Points of the mount.
+        sigma_rad: Sigma of the prior's rotation per axis, radians.
+        sigma_m: Sigma of the prior's position per axis, metres.
     """
     centre, *axes = mount_keys(camera)
     noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma_m)
     graph.add(gtsam.PriorFactorPoint3(centre, joint_from_cam[:3, 3], noise))
-    # Three differences of length r with noise σ measure the rotation to σ / (r √2).
+    # Three arms of length r, each with noise σ, measure the rotation with the sigma σ / (r √2).
     arm = gtsam.noiseModel.Isotropic.Sigma(3, points.radius_m * np.sqrt(2.0) * sigma_rad)
     for axis, key in enumerate(axes):
         graph.add(gtsam.BetweenFactorPoint3(centre, key, points.radius_m * joint_from_cam[:3, axis], arm))
 
 
 def mount_from_points(values: Any, camera: int, points: MountPoints) -> FloatArray:
-    """Fit joint_from_cam (4,4) to a mount's four points, the rotation about the centre point."""
+    """Fit joint_from_cam (4,4) to the four points of a mount.
+
+    The rotation is fitted to the axis points relative to the centre point.
+    """
     centre, *axes = (np.asarray(values.atPoint3(key)) for key in mount_keys(camera))
     rotation = nearest_rotation((np.array(axes) - centre).T)
     out = np.eye(4)
@@ -203,14 +209,15 @@ def mount_from_points(values: Any, camera: int, points: MountPoints) -> FloatArr
 
 
 def mount_jacobian(joint_from_cam: FloatArray, points: MountPoints) -> FloatArray:
-    """Return the derivatives (6,12) of a mount by its four points.
+    """Return the derivatives (6,12) of a mount with respect to the coordinates of its four points.
 
     Args:
-        joint_from_cam: (4,4) the mount.
-        points: The points of the mount.
+        joint_from_cam: (4,4) pose of the camera in the joint's frame.
+        points: Points of the mount.
 
     Returns:
-        From changes of the points' coordinates to the right perturbation of joint_from_cam, rotation first.
+        (6,12) matrix from changes of the points' coordinates to the right perturbation of joint_from_cam,
+        rotation first.
     """
     rotation, translation = np.zeros((3, 12)), np.zeros((3, 12))
     translation[:, :3] = np.eye(3)
@@ -220,21 +227,21 @@ def mount_jacobian(joint_from_cam: FloatArray, points: MountPoints) -> FloatArra
         rotation[:, :3] -= cross / (2.0 * points.radius_m**2)
         translation[:, 3 + 3 * axis : 6 + 3 * axis] = _AXIS_WEIGHT * np.eye(3)
     for axis in range(3):
-        # An axis point minus the rotated arm is a second measurement of the centre.
+        # An axis point minus the rotated arm is another measurement of the centre.
         translation += _AXIS_WEIGHT * skew(points.radius_m * joint_from_cam[:3, axis]) @ rotation
     translation /= 1.0 + 3.0 * _AXIS_WEIGHT
     return np.vstack([joint_from_cam[:3, :3].T @ rotation, joint_from_cam[:3, :3].T @ translation])
 
 
 def insert_mount_points(values: Any, camera: int, joint_from_cam: FloatArray, points: MountPoints) -> None:
-    """Insert a mount's four points into initial values."""
+    """Insert the four points of a mount into GTSAM's initial values."""
     x_in_joint = points.x_in_cam() @ joint_from_cam[:3, :3].T + joint_from_cam[:3, 3]
     for key, x in zip(mount_keys(camera), x_in_joint, strict=True):
         values.insert(key, x)
 
 
 def values_from_poses(poses: FloatArray) -> Any:
-    """Return GTSAM values with bone poses (T,B,4,4)."""
+    """Return GTSAM values that hold the poses (T,B,4,4) of the bones."""
     values = gtsam.Values()
     for tick in range(poses.shape[0]):
         for bone in range(poses.shape[1]):

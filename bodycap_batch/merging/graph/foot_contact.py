@@ -1,4 +1,4 @@
-"""Foot contacts: find the ticks at which a foot stands, and hold its ankle there."""
+"""Foot contacts: find the ticks at which a foot stands, and keep its ankle in place at these ticks."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions
 
 _HALF_WINDOW_S = 0.07
-"""Half of the time, in seconds, over which an ankle's speed is taken. At 30 Hz, 5 mm of noise are then 5 cm/s
-per axis."""
+"""Half of the duration (seconds) over which an ankle's speed is computed. At 30 Hz, 5 mm of noise then cause
+an error of 5 cm/s per axis."""
 _MAX_STANDING_SPEED_M_PER_S = 0.25
-"""Largest speed of a standing ankle, m/s. Evidence: docs/decisions/merging.md."""
+"""Maximum speed (m/s) of a standing ankle. Evidence: docs/decisions/merging.md."""
 _MAX_HEEL_RISE_M = 0.04
-"""Largest height of a standing ankle above its lowest position, metres: the heel rises by more before the
-foot leaves the floor. Evidence: none."""
+"""Maximum height (metres) of a standing ankle above its lowest position. The heel rises by more than this
+before the foot leaves the floor. Evidence: none."""
 _MIN_DURATION_S = 0.1
-"""Shortest contact in seconds. Evidence: none."""
+"""Minimum duration (seconds) of a contact. Evidence: none."""
 _FREE_ROTATION_SIGMA_RAD = 10.0
-"""Sigma of the rotation about a standing ankle, radians: it is not constrained."""
+"""Sigma (radians) of a foot's rotation about a standing ankle. It leaves the rotation unconstrained."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +37,12 @@ class FootContact:
     """The contacts of one foot with the floor.
 
     Attributes:
-        name: For the report.
+        name: Name of the foot in the report.
         joint: Index of the ankle in the skeleton.
-        bone: Index of the bone that carries the ankle.
-        ankle_m: (3,) the ankle in the bone's frame.
-        standing: (T,) whether the foot stands at a tick.
-        sigma_m: Sigma per axis of the ankle's movement from one standing tick to the next.
+        bone: Index of the bone with the camera, which holds the ankle.
+        ankle_m: (3,) position of the ankle in the bone's frame.
+        standing: (T,) whether the foot stands at each tick.
+        sigma_m: Sigma per axis of the ankle's movement from one standing tick to the next, metres.
     """
 
     name: str
@@ -56,7 +56,7 @@ class FootContact:
         """Add the factor that keeps the ankle in place from one standing tick to the next."""
         if not self.standing[tick : tick + 2].all() or tick + 1 >= len(self.standing):
             return
-        # The covariance is known at the ankle; the factor needs it at the origin of the bone.
+        # The covariance is known at the ankle. The factor needs the covariance at the origin of the bone.
         adjoint = gtsam.Pose3(make_transform(np.eye(3), self.ankle_m)).AdjointMap()
         covariance = (
             adjoint @ np.diag(np.repeat([_FREE_ROTATION_SIGMA_RAD, self.sigma_m], 3) ** 2) @ adjoint.T
@@ -76,25 +76,25 @@ def find_contacts(
     up: FloatArray,
     tick_times_ns: IntArray,
 ) -> tuple[FootContact, ...]:
-    """Find the ticks at which the measured ankle is slow and about as low as it ever gets.
+    """Find the ticks at which a foot stands: its measured ankle is slow and near its lowest height.
 
     Args:
         skeleton: The body.
         bones: The graph's bones.
         tracks: Tracks without outliers, poses in metres.
         mounts: joint_from_cam (4,4) by camera.
-        up: (3,) the vertical of the tracks' frame.
-        tick_times_ns: (T,) the timeline.
+        up: (3,) vertical in the frame of the tracks.
+        tick_times_ns: (T,) times of the timeline's ticks.
 
     Returns:
-        The contacts of each foot with a camera on shin or foot; none on a timeline of one tick.
+        The contacts of each foot with a camera on the shin or the foot; none for a timeline of one tick.
     """
     if len(tick_times_ns) < 2:
         return ()
     rest, out = rest_positions(skeleton), []
     for side in ("Left", "Right"):
         ankle = skeleton.index_of_role(side + "Foot")
-        # A camera on the foot is nearer to the ankle than one on the shin.
+        # A camera on the foot is nearer to the ankle than a camera on the shin.
         for role in (side + "Foot", side + "Leg"):
             track = next((each for each in tracks if bones[each.bone].role == role), None)
             if track is None or ankle is None:
@@ -114,10 +114,10 @@ def _contact_ticks(centre: FloatArray, measured: BoolArray, height: FloatArray, 
     """Return the ticks (T,) at which an ankle stands.
 
     Args:
-        centre: (T,3) of the ankle, metres.
-        measured: (T,) whether it was measured.
-        height: (T,) of the ankle along up, metres.
-        tick_s: Interval of the ticks.
+        centre: (T,3) positions of the ankle, metres.
+        measured: (T,) whether a camera measured the ankle.
+        height: (T,) heights of the ankle along up, metres.
+        tick_s: Interval between ticks, seconds.
     """
     if not measured.any():
         return measured
@@ -125,7 +125,7 @@ def _contact_ticks(centre: FloatArray, measured: BoolArray, height: FloatArray, 
     steps = np.arange(-half, half + 1)
     index = np.clip(np.arange(len(centre))[:, None] + steps, 0, len(centre) - 1)
     weight = measured[index] * (np.arange(len(centre))[:, None] + steps == index)
-    # The speed is the slope of a line through the ticks around.
+    # The speed is the slope of a line through the positions at the neighbouring ticks.
     count = np.maximum(weight.sum(axis=1), 1)
     away = steps - (weight * steps).sum(axis=1)[:, None] / count[:, None]
     squares = np.maximum((weight * away**2).sum(axis=1), 1e-9) * tick_s
@@ -134,7 +134,7 @@ def _contact_ticks(centre: FloatArray, measured: BoolArray, height: FloatArray, 
     rest &= height < np.percentile(height[measured], 5.0) + _MAX_HEEL_RISE_M
     out = np.zeros_like(rest)
     for start, stop in runs(rest):
-        # During its first and last tick the foot comes down or peels off.
+        # At the first and the last tick of a contact, the foot comes down or lifts off.
         if (stop - start) * tick_s >= _MIN_DURATION_S:
             out[start + 1 : stop - 1] = True
     return np.asarray(out, dtype=np.bool_)
@@ -146,9 +146,9 @@ def contacts_in_window(
     """Return the contacts in a window of the timeline.
 
     Args:
-        contacts: Of the whole timeline.
-        tick_times_ns: (T,) the timeline.
-        ticks: (N,) the times of the window's ticks.
+        contacts: Contacts of each foot on the whole timeline.
+        tick_times_ns: (T,) times of the timeline's ticks.
+        ticks: (N,) times of the window's ticks.
     """
     first = int(np.searchsorted(tick_times_ns, ticks[0]))
     return tuple(replace(each, standing=each.standing[first : first + len(ticks)]) for each in contacts)
@@ -157,12 +157,12 @@ def contacts_in_window(
 def contact_statistics(
     contacts: Sequence[FootContact], world_from_bone: FloatArray, fps: float
 ) -> dict[str, dict[str, float]]:
-    """Return how often each foot stands, and how fast it slides meanwhile, as plain JSON values.
+    """Return how often each foot stands, and how fast it slides while it stands, as plain JSON values.
 
     Args:
-        contacts: Of the whole timeline.
-        world_from_bone: (T,B,4,4) the solved poses.
-        fps: Rate of the ticks.
+        contacts: Contacts of each foot on the whole timeline.
+        world_from_bone: (T,B,4,4) solved poses of the bones.
+        fps: Number of ticks per second.
     """
     out = {}
     for each in contacts:
@@ -177,12 +177,12 @@ def contact_statistics(
 
 
 def standing_joints(contacts: Sequence[FootContact], ticks: int, joints: int) -> BoolArray | None:
-    """Return (T,J) whether the foot of an ankle stands; None if no foot has a camera on it.
+    """Return whether each joint is an ankle whose foot stands (T,J); None if `contacts` is empty.
 
     Args:
-        contacts: Of the whole timeline.
-        ticks: Number of ticks T.
-        joints: Number of joints J.
+        contacts: Contacts of each foot on the whole timeline.
+        ticks: Number T of ticks.
+        joints: Number J of joints.
     """
     if not contacts:
         return None

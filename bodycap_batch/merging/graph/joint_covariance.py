@@ -19,7 +19,8 @@ from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 from bodycap_batch.model.geometry import invert, se3_adjoint
 
 _MODES_PER_SOLVE = 48
-"""Error modes that are propagated at once: those of eleven cameras together would take gigabytes."""
+"""Number of error modes that are propagated at the same time. All modes of eleven cameras together would need
+gigabytes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,15 +28,15 @@ class SolvedGraph:
     """A motion graph at its solution.
 
     Attributes:
-        graph: The factors. The measurements come first, track by track.
-        values: The solution.
-        body: Bones and hinges.
-        tick_times_ns: (T,) the timeline.
-        chains: The states of each bone, in the order of time.
-        tracks: The measurements, poses in metres.
+        graph: Factors of the graph. The measurements come first, track by track.
+        values: Values of all variables at the solution.
+        body: Bones and hinges of the graph.
+        tick_times_ns: (T,) times of the timeline's ticks.
+        chains: States of each bone, in the order of time.
+        tracks: Measurements of each camera, poses in metres.
         measured_keys: By camera, the key of the bone's pose at each measurement.
-        mounts: joint_from_cam (4,4) by camera, which were held fixed.
-        first_joint: Index of the first joint factor.
+        mounts: joint_from_cam (4,4) by camera. The solver held the mounts fixed.
+        first_joint: Index of the first joint factor in the graph.
     """
 
     graph: Any
@@ -55,20 +56,22 @@ def joint_covariance(
     error_modes: ErrorModes,
     begin: Callable[[str], None] = lambda _: None,
 ) -> FloatArray:
-    """Return the covariance (T,B,3,3), m², of each bone's joint centre minus the first bone's.
+    """Return the covariance (T,B,3,3), m², of each bone's joint centre relative to the first bone's.
 
-    It is the sum of two parts. The marginal covariance of the graph contains the noise of the measurements.
-    The calibration, which was held fixed, adds J Σ Jᵀ: Σ is given by its error modes, each propagated to the
-    joints.
+    The covariance is the sum of two parts. The first part is the marginal covariance of the graph, which
+    contains the noise of the measurements. The second part is J Σ Jᵀ, the effect of the calibration, which
+    the solver held fixed. Σ is the covariance of the calibration, given by its error modes. The function
+    propagates each error mode to the joints.
 
     Args:
-        solved: The graph.
-        world_from_bone: (T,B,4,4) its solution.
-        error_modes: Of the calibration.
-        begin: Called with the name of each part of the computation, before which freed memory is released.
+        solved: The graph at its solution.
+        world_from_bone: (T,B,4,4) solved poses of the bones.
+        error_modes: Error modes of the calibration.
+        begin: Called with the name of each part of the computation before the part starts. The call may
+            release freed memory.
 
     Returns:
-        In the axes of the solution. NaN if the equations of the graph are singular.
+        The covariance in the axes of the solution; NaN if the equations of the graph are singular.
     """
     begin("joint covariances")
     linear = linearise(solved.graph, solved.values)
@@ -91,7 +94,7 @@ def joint_covariance(
     out = np.zeros((ticks, count, 3, 3))
 
     def jacobian_at(tick: int) -> FloatArray:
-        """Return the derivatives (B-1,3,n) of joint centres minus the first bone's by the tick's states."""
+        """Return the derivatives (B-1,3,n) of relative joint centres with respect to a tick's states."""
         first = [
             int(position[linear.columns[bone_key(tick, bone)]]) - int(bounds[tick]) for bone in range(count)
         ]
@@ -116,11 +119,11 @@ def joint_covariance(
 
 
 class _TickColumns(NamedTuple):
-    """The columns of the graph in the order of the ticks.
+    """The columns of the graph's Jacobian in the order of the ticks.
 
     Attributes:
-        order: (C,) columns tick by tick. A state between two ticks belongs to the earlier one.
-        bounds: (T+1,) where each tick begins in `order`.
+        order: (C,) column indices, tick by tick. A state between two ticks belongs to the earlier tick.
+        bounds: (T+1,) start of each tick's columns in `order`, and C at the end.
     """
 
     order: IntArray
@@ -145,7 +148,7 @@ def _columns_by_tick(solved: SolvedGraph, linear: LinearisedGraph) -> _TickColum
 def _measurement_residual_jacobian(
     solved: SolvedGraph, linear: LinearisedGraph, error_modes: ErrorModes
 ) -> Any:
-    """Return the change (R,M), sparse, of the measurements' residuals along each mode of mounts and scale."""
+    """Return the change (R,M), sparse, of the measurements' residuals per mode of mounts and scale."""
     out = sparse.csr_matrix((linear.matrix.shape[0], len(error_modes.log_scale)))
     middle = np.concatenate([track.map_from_cam[:, :3, 3] for track in solved.tracks]).mean(axis=0)
     first = 0
@@ -169,13 +172,13 @@ def skeleton_covariance(
     """Return the covariance of all joints of the skeleton in rotated axes.
 
     Args:
-        rotation: (3,3) to the new axes.
+        rotation: (3,3) rotation from the old axes to the new axes.
         bones: The graph's bones.
-        covariance: (T,B,3,3) of the bones; None if it was not computed.
+        covariance: (T,B,3,3) covariances of the bones' joint centres; None if they were not computed.
         joints: Number J of joints of the skeleton.
 
     Returns:
-        (T,J,3,3), NaN for joints without a bone in the graph; None without a covariance.
+        (T,J,3,3) covariances, NaN for joints without a bone in the graph; None if `covariance` is None.
     """
     if covariance is None:
         return None
@@ -190,9 +193,10 @@ def sigma_percentiles(
     """Return percentiles of the joints' sigmas per axis by role, separately for observed and filled ticks.
 
     Args:
-        roles: J roles of the joints.
-        covariance: (T,J,3,3), NaN for joints that were not solved; None if it was not computed.
-        observed: (T,J) whether cameras measured the joint.
+        roles: Roles of the J joints.
+        covariance: (T,J,3,3) covariances of the joints' centres, NaN for joints that were not solved; None if
+            they were not computed.
+        observed: (T,J) whether cameras measured each joint at each tick. The other ticks are filled.
     """
     out: dict[str, dict[str, dict[str, float]]] = {}
     if covariance is None:

@@ -1,4 +1,4 @@
-"""Soft limits of distances: elbows and knees, the reach of arms, and where the palms of a walker hang."""
+"""Soft limits of distances: elbows and knees, the reach of arms, and the position of a walker's palms."""
 
 from __future__ import annotations
 
@@ -17,29 +17,31 @@ from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions, split_side
 
 _REACH_SIGMA_M = 0.05
-"""Sigma in metres of a distance outside its bounds. Evidence: none."""
+"""Sigma (metres) of a distance outside its bounds. Evidence: none."""
 _HINGE_SIGMA_M = 0.02
-"""The same for elbows and knees. Evidence: none."""
+"""Sigma (metres) of a distance outside its bounds, for elbows and knees. Evidence: none."""
 _SHOULDER_MOTION_M = 0.05
-"""Distance in metres that a shoulder's centre moves on the trunk when the clavicle rotates by 15 to 20°."""
+"""Distance (metres) that the centre of a shoulder moves relative to the trunk when the clavicle rotates by 15
+to 20°."""
 _ANCHOR_DISTANCE_M = 1.0
-"""Distance in metres of the points that bound height and side: far enough that spheres are nearly planes."""
+"""Distance (metres) from a shoulder to the points that bound the height and the side of a palm. At this
+distance, spheres about the points are nearly planes."""
 _MAX_CROSSING_M = 0.1
-"""Distance in metres by which a walking palm may cross the middle of the body. Evidence: none."""
+"""Maximum distance (metres) of a walker's palm beyond the middle of the body. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
 class DistanceLimit:
-    """Bounds of the distance of a bone's joint from a point of another bone.
+    """Bounds on the distance of a bone's joint from a point on another bone.
 
     Attributes:
-        name: For the report.
-        base: Index of the bone that carries the point.
+        name: Name of the limit in the report.
+        base: Index of the base bone, which holds the point.
         bone: Index of the bone with the joint.
-        anchor_m: (3,) the point, in the frame of the base bone.
-        low_m: Smallest distance.
-        high_m: Largest distance.
-        sigma_m: Sigma of the distance outside the bounds.
+        anchor_m: (3,) position of the point in the base bone's frame.
+        low_m: Minimum distance, metres.
+        high_m: Maximum distance, metres.
+        sigma_m: Sigma of the distance outside the bounds, metres.
     """
 
     name: str
@@ -51,7 +53,7 @@ class DistanceLimit:
     sigma_m: float = _REACH_SIGMA_M
 
     def add(self, graph: Any, tick: int) -> None:
-        """Add the factor of one tick: no cost inside the bounds, a quadratic one outside."""
+        """Add the factor of one tick. Its cost is zero inside the bounds and quadratic outside."""
         middle, half = 0.5 * (self.low_m + self.high_m), 0.5 * (self.high_m - self.low_m)
         dead_zone = gtsam.noiseModel.mEstimator.L2WithDeadZone.Create(half / self.sigma_m)
         noise = gtsam.noiseModel.Robust.Create(dead_zone, gtsam.noiseModel.Isotropic.Sigma(1, self.sigma_m))
@@ -60,7 +62,7 @@ class DistanceLimit:
         graph.add(gtsam.RangeFactorWithTransformPose3(*keys, middle, noise, anchor))
 
     def violation_m(self, world_from_bone: FloatArray) -> FloatArray:
-        """Return how far (T,) solved poses (T,B,4,4) are outside the bounds, in metres."""
+        """Return how far (T,), metres, solved poses (T,B,4,4) violate the bounds; 0 inside the bounds."""
         base = world_from_bone[:, self.base]
         anchor = np.einsum("tij,j->ti", base[:, :3, :3], self.anchor_m) + base[:, :3, 3]
         distance = np.linalg.norm(world_from_bone[:, self.bone, :3, 3] - anchor, axis=1)
@@ -82,7 +84,7 @@ def hinge_limits(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Distan
     """Return limits that keep elbows and knees from bending backward.
 
     The far end of the lower bone must be near enough to a point on the side to which the joint bends. The
-    hinge keeps it in the plane of bending.
+    hinge keeps this far end in the plane of bending.
     """
     limits = []
     for hinge in hinges(skeleton, tuple(bones)):
@@ -91,7 +93,7 @@ def hinge_limits(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Distan
         joint = hinge.anchors_m.mean(axis=0)
         length = float(np.linalg.norm(bones[hinge.following].offset_m))
         name = f"{side} {'elbow' if part == 'Arm' else 'knee'} not overstretched"
-        # A straight limb has this distance from the point; a bent one is nearer.
+        # The end of a straight limb has this distance from the point; the end of a bent limb is nearer.
         straight_m = float(np.hypot(HINGE_ARM_M, length))
         anchor = joint + HINGE_ARM_M * forward
         limits.append(
@@ -101,7 +103,10 @@ def hinge_limits(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Distan
 
 
 def arm_reach_limits(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[DistanceLimit, ...]:
-    """Return limits that keep palms within an arm's length of the shoulder, as the chest's pose places it."""
+    """Return limits that keep each palm within an arm's length of its shoulder.
+
+    The position of the shoulder follows from the pose of the chest.
+    """
     index = {bone.role: position for position, bone in enumerate(bones)}
     chest = index.get("Spine1")
     rest, limits = rest_positions(skeleton), []
@@ -119,7 +124,7 @@ def arm_reach_limits(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Di
 def activity_limits(
     skeleton: SkeletonModel, bones: Sequence[Bone], activity: Activity
 ) -> tuple[DistanceLimit, ...]:
-    """Return the further limits of an activity; ``generic`` has none."""
+    """Return the additional limits of an activity; ``generic`` has none."""
     index = {bone.role: position for position, bone in enumerate(bones)}
     chest = index.get("Spine1")
     if activity != "walk" or chest is None:

@@ -1,4 +1,4 @@
-"""Joint priors widened by the variation of the posture in a capture."""
+"""Joint priors that are widened by the variation of the posture in a capture."""
 
 from __future__ import annotations
 
@@ -14,27 +14,28 @@ from bodycap_batch.model.geometry import so3_log
 from bodycap_batch.model.skeleton import SkeletonModel
 
 GESTURE_DURATION_S = 4.0
-"""Time in seconds that a gesture lasts: postures within it are correlated. Evidence: none."""
+"""Duration (seconds) of a gesture. Postures within one gesture are correlated. Evidence: none."""
 
 
 def widen_joint_priors(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray, times_ns: IntArray
 ) -> tuple[Bone, ...]:
-    """Widen the rotation priors of joints by what a capture accidentally shows.
+    """Widen the rotation priors of joints by the accidental choice of gestures in a capture.
 
-    A joint's mean over a capture differs from the rest pose for two reasons. One is the person's systematic
-    bias, a ratio of the joint's everyday range. The other is the choice of gestures: it contributes their
-    variation divided by the root of their number.
+    The mean rotation of a joint over a capture differs from the rest pose for two reasons. The first is the
+    person's systematic bias, a fraction of the joint's everyday range. The second is the choice of gestures.
+    It contributes the standard deviation of the rotations, divided by the square root of the number of
+    gestures.
 
-    If the mean is nevertheless farther away, although the prior attracts it, the range is set to that
-    deviation. An example is arms that lift all the time. One draw of a normal distribution is most likely if
-    sigma equals the draw.
+    Sometimes the mean differs even more, although the prior attracts it. An example is a person who lifts the
+    arms all the time. The range is then widened until the bias equals this difference, because one draw of a
+    normal distribution is most likely if sigma equals the draw.
 
     Args:
         skeleton: The body.
         bones: The graph's bones.
-        world_from_bone: (K,B,4,4) poses solved at sampled ticks, none of them in a T-pose.
-        times_ns: (K,) the ticks, increasing.
+        world_from_bone: (K,B,4,4) solved poses at sampled ticks. No tick is part of a T-pose.
+        times_ns: (K,) times of the ticks, increasing.
     """
     few = 1.0 / _gesture_count(times_ns)
     out = []
@@ -54,12 +55,12 @@ def widen_joint_priors(
 
 
 def samples_per_gesture(times_ns: IntArray) -> float:
-    """Return the mean number of ticks (K,) in one gesture, 1 or more."""
+    """Return the mean number of ticks per gesture for ticks at times (K,); at least 1."""
     return max(1.0, len(times_ns) / _gesture_count(times_ns))
 
 
 def _gesture_count(times_ns: IntArray) -> float:
-    """Return the number of gestures in the time span of ticks (K,) that contain a tick."""
+    """Return the number of gestures in the time span of ticks (K,), without gestures that have no tick."""
     duration_ns = round(1e9 * GESTURE_DURATION_S)
     since_ns = times_ns - times_ns[0]
     with_tick = float(len(np.unique(since_ns // duration_ns)))

@@ -14,12 +14,12 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class LinearisedGraph:
-    """A graph's whitened Jacobian at a solution, robust weights included.
+    """The whitened Jacobian of a graph at a solution, with robust weights.
 
     Attributes:
-        matrix: (R,C) sparse, by row (CSR).
-        columns: First column of each key.
-        first_row: (F+1,) first row of each factor, and the number of rows last.
+        matrix: (R,C) sparse Jacobian, stored by row (CSR).
+        columns: By key, the index of the key's first column.
+        first_row: (F+1,) index of each factor's first row, and the number of rows at the end.
         rhs: (R,) right-hand side: the negative residuals.
     """
 
@@ -29,12 +29,12 @@ class LinearisedGraph:
     rhs: FloatArray
 
     def pose_jacobians(self, factors: IntArray, height: int, keys: Sequence[int]) -> FloatArray:
-        """Return the derivatives (N,height,6) of factors by one pose each.
+        """Return the derivatives (N,height,6) of N factors, each with respect to one pose.
 
         Args:
-            factors: (N,) indices of factors.
+            factors: (N,) indices of the factors.
             height: Number of rows of each factor.
-            keys: N keys of poses.
+            keys: N keys of the poses.
         """
         rows = (self.first_row[factors][:, None] + np.arange(height)).ravel()
         start = np.array([self.columns[key] for key in keys], dtype=np.int64)
@@ -47,11 +47,11 @@ class LinearisedGraph:
         return out
 
     def sparse_rows(self, factors: IntArray, values: FloatArray) -> Any:
-        """Return rows (R,M), sparse, that have values at some factors and are zero elsewhere.
+        """Return a sparse matrix (R,M) that has values in the rows of some factors and is zero elsewhere.
 
         Args:
-            factors: (N,) indices of factors.
-            values: (N,height,M) the rows of these factors.
+            factors: (N,) indices of the factors.
+            values: (N,height,M) values in the rows of these factors.
         """
         count, height, width = values.shape
         row = np.repeat((self.first_row[factors][:, None] + np.arange(height)).ravel(), width)

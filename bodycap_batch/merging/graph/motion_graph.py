@@ -37,12 +37,12 @@ from bodycap_batch.model.geometry import interpolate_pose, invert, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel
 
 ON_TICK_TOLERANCE_NS = 1_000_000
-"""Largest distance of a measurement from a tick, in nanoseconds, at which it measures the state of the tick:
-in a millisecond, a hand at 3 m/s moves 3 mm."""
+"""Maximum time (nanoseconds) between a measurement and a tick at which the measurement belongs to the tick's
+state. In a millisecond, a hand at 3 m/s moves 3 mm."""
 
 _TOLERANCE = 1e-4
-"""Relative decrease of the error below which the solver stops. Convergence is quadratic: after a step that
-lowers the error by less, joints move by less than 0.1 mm."""
+"""Minimum relative decrease of the error per step. The solver stops after a smaller decrease. Convergence is
+quadratic: after such a step, joints move by less than 0.1 mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +50,9 @@ class MeasurementResiduals:
     """The differences between the measured and the solved poses of one camera.
 
     Attributes:
-        distance_m: (N,) between the centres.
-        angle_rad: (N,) between the orientations.
-        weights: (N,) robust weights.
+        distance_m: (N,) distances between the measured and the solved centres.
+        angle_rad: (N,) angles between the measured and the solved orientations.
+        weights: (N,) robust weights of the measurements.
     """
 
     distance_m: FloatArray
@@ -65,15 +65,15 @@ class MotionSolution:
     """The solved motion.
 
     Attributes:
-        world_from_bone: (T,B,4,4) at each tick.
-        residual_m: By camera, (N,) distance of each measured centre from the solved one.
-        residual_rad: By camera, (N,) angle between the measured and the solved orientation.
-        weights: By camera, (N,) robust weight of each measurement, 1 if it has its full weight.
+        world_from_bone: (T,B,4,4) pose of each bone at each tick.
+        residual_m: By camera, (N,) distance between each measured centre and the solved centre.
+        residual_rad: By camera, (N,) angle between each measured orientation and the solved orientation.
+        weights: By camera, (N,) robust weight of each measurement; 1 is the full weight.
         world_from_cam: By camera, (N,4,4) solved pose at each measurement, from bone and mount.
         iterations: Number of iterations of the optimiser.
-        errors: Half the sum of squares by kind of factor.
-        joint_covariance: (T,B,3,3), m², of each bone's joint centre minus the first bone's; None if it was
-            not computed.
+        errors: By kind of factor, half the sum of the squared residuals.
+        joint_covariance: (T,B,3,3) covariance, m², of each bone's joint centre relative to the first bone's;
+            None if it was not computed.
     """
 
     world_from_bone: FloatArray
@@ -87,22 +87,22 @@ class MotionSolution:
 
 
 class SolverProgress(Protocol):
-    """Reports the progress of the optimisation, and stops it when asked."""
+    """Callback that reports the progress of the optimisation. It may raise to stop the optimisation."""
 
     def __call__(self, what: str = "", /) -> None:
-        """Count an iteration; with a name, report that another part of the computation begins."""
+        """Report an iteration; with a name, report that the part of the computation with this name starts."""
 
 
 class MotionGraph:
-    """The factor graph of a timeline, or of a window of one.
+    """The factor graph of a timeline, or of one window of a timeline.
 
-    A measurement that is not on a tick gets a state of its own in the chain of its bone. GTSAM's
-    ``WnoaInterpFactorPose3`` would interpolate without that state, but it crashes with robust noise.
+    A measurement between ticks gets a separate state in the chain of its bone. GTSAM's
+    ``WnoaInterpFactorPose3`` would interpolate without such a state, but it crashes with robust noise.
 
     Args:
         skeleton: The body.
         bones: The graph's bones.
-        tick_times_ns: (T,) the timeline.
+        tick_times_ns: (T,) times of the timeline's ticks.
         tracks: Tracks without outliers, poses in metres.
         mounts: joint_from_cam (4,4) by camera.
         limits: Soft limits of distances, and foot contacts.
@@ -130,7 +130,7 @@ class MotionGraph:
 
     @property
     def graph(self) -> Any:
-        """The factors: measurements, smoothness, joints, limits."""
+        """Factors of the graph: measurements, smoothness, joints, limits."""
         return self._graph
 
     def solve(
@@ -142,7 +142,8 @@ class MotionGraph:
             iterations: Maximum number of iterations.
             step: Called after each iteration, and with the name of each part of the computation; may raise to
                 stop.
-            error_modes: Of the calibration. Without them, the covariance of the joints is not computed.
+            error_modes: Error modes of the calibration. Without them, the covariance of the joints is not
+                computed.
         """
         if error_modes is not None:
             step("solving")
@@ -162,10 +163,10 @@ class MotionGraph:
         return replace(solution, joint_covariance=covariance)
 
     def solved_graph(self, values: Any) -> SolvedGraph:
-        """Return what the covariance needs of the graph.
+        """Return the graph at a solution, for the computation of the covariance.
 
         Args:
-            values: A solution.
+            values: Values of all variables at the solution.
         """
         return SolvedGraph(
             graph=self._graph,
@@ -180,7 +181,7 @@ class MotionGraph:
         )
 
     def _node_keys(self) -> list[dict[int, tuple[int, int]]]:
-        """Return for each bone the pose and velocity keys of its states at the ticks, by time."""
+        """Return for each bone, by tick time, the pose key and the velocity key of the bone's state."""
         ticks = self._times.tolist()
         return [
             {time: (bone_key(tick, bone), velocity_key(tick, bone)) for tick, time in enumerate(ticks)}
@@ -198,7 +199,7 @@ class MotionGraph:
             for time, pose, noise in zip(track.times_ns.tolist(), poses, noises, strict=True):
                 state_time = self._nearest_tick(time)
                 if abs(state_time - time) > ON_TICK_TOLERANCE_NS:
-                    # Cameras of one bone share a state: the equations of two very close states are singular.
+                    # Cameras of one bone share a state: two very close states make the equations singular.
                     state_time = _merge_state_time(times_off_ticks[track.bone], time)
                     if state_time not in nodes[track.bone]:
                         index = count_off_ticks[track.bone] * MAX_BONES + track.bone
@@ -248,7 +249,7 @@ class MotionGraph:
         measured = {}
         for track in reversed(self._tracks):
             poses, valid = track.poses_at(self._times, max_gap_ns=MAX_COARSE_GAP_NS)
-            # If all frames are far apart, the poses between them are interpolated nevertheless.
+            # If all frames are far apart, no pose is valid. The poses are then interpolated nevertheless.
             filled = fill_gaps(poses, valid) if valid.any() else poses
             measured[track.bone] = filled @ invert(self._mounts[track.camera])
         poses = pose_bones(self._skeleton, self._bones, measured)
@@ -286,11 +287,11 @@ class MotionGraph:
 
 
 def measurement_residuals(track: CameraTrack, world_from_cam: FloatArray) -> MeasurementResiduals:
-    """Compare the measured poses of a track with solved ones.
+    """Compare the measured poses of a track with the solved poses.
 
     Args:
         track: N measurements, poses in metres.
-        world_from_cam: (N,4,4) the solved poses.
+        world_from_cam: (N,4,4) solved poses of the camera.
     """
     measured_from_solved = invert(track.map_from_cam) @ world_from_cam
     half = np.linalg.cholesky(camera_covariance(track))
@@ -303,11 +304,13 @@ def measurement_residuals(track: CameraTrack, world_from_cam: FloatArray) -> Mea
 
 
 def _merge_state_time(times: dict[int, int], time_ns: int) -> int:
-    """Return the time of a state within `ON_TICK_TOLERANCE_NS`, else the given time, which is then added.
+    """Return the time of a state that is within `ON_TICK_TOLERANCE_NS` of a measurement.
+
+    If there is no such state, add the time of the measurement to `times` and return it.
 
     Args:
-        times: Times of a bone's states off the ticks, by multiple of the tolerance.
-        time_ns: Of a measurement.
+        times: Times of a bone's states between ticks. The keys are the times divided by the tolerance.
+        time_ns: Time of the measurement.
     """
     cell = time_ns // ON_TICK_TOLERANCE_NS
     near = [times[index] for index in (cell - 1, cell, cell + 1) if index in times]
@@ -324,19 +327,22 @@ def camera_covariance(track: CameraTrack) -> FloatArray:
 
 
 def _measurement_noises(track: CameraTrack, joint_from_cam: FloatArray) -> list[Any]:
-    """Return the noise of the bone's pose at each measurement: the camera's, propagated through the mount."""
+    """Return the noise of the bone's pose at each measurement.
+
+    It is the noise of the camera's pose, propagated through the mount.
+    """
     adjoint = gtsam.Pose3(joint_from_cam).AdjointMap()
     covariance = adjoint @ camera_covariance(track) @ adjoint.T
     return [gtsam.noiseModel.Gaussian.Covariance(each) for each in covariance]
 
 
 def _pose_error(pose: FloatArray) -> FloatArray:
-    """Return rotation vectors and translations (N,6) of small poses (N,4,4)."""
+    """Return rotation vectors and translations (N,6) of poses (N,4,4) near the identity."""
     return np.hstack([so3_log(pose[:, :3, :3]), pose[:, :3, 3]])
 
 
 def _geman_mcclure_weight(norm: FloatArray) -> FloatArray:
-    """Return the robust weight of residuals with the given norm in sigmas."""
+    """Return the robust weights of residuals with the given norms in sigmas."""
     squared = GEMAN_MCCLURE_C**2
     return np.asarray((squared / (squared + norm**2)) ** 2)
 
@@ -344,10 +350,10 @@ def _geman_mcclure_weight(norm: FloatArray) -> FloatArray:
 def _initial_states(
     poses: FloatArray, tick_s: FloatArray, state_s: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Interpolate poses, and take velocities from their differences.
+    """Interpolate poses at the times of states, and compute velocities from pose differences.
 
     Args:
-        poses: (T,4,4) at the ticks.
+        poses: (T,4,4) poses at the ticks.
         tick_s: (T,) times of the ticks in seconds.
         state_s: (N,) times of the states in seconds.
 
@@ -365,7 +371,7 @@ def _initial_states(
 
 
 def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, FloatArray]:
-    """Return by role the distance (T,), metres, of each bone's joint from its place on the parent."""
+    """Return by role the distance (T,), metres, of each bone's joint from its place on the parent bone."""
     out = {}
     for index, bone in enumerate(bones):
         if bone.parent >= 0:
@@ -377,7 +383,10 @@ def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, 
 def hinge_deviations(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray
 ) -> dict[str, FloatArray]:
-    """Return by role the distance (T,), metres, of each hinged bone's end from the plane of its hinge."""
+    """Return by role the distance (T,), metres, of the bone after each hinge from the hinge's plane.
+
+    That bone follows the lower bone of the hinge. The distance is measured from its joint to the plane.
+    """
     out = {}
     for hinge in hinges(skeleton, tuple(bones)):
         axis = hinge.anchors_m[0] - hinge.anchors_m.mean(axis=0)

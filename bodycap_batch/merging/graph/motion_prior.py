@@ -13,11 +13,12 @@ from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.graph.factors import MotionState
 
 _VELOCITY_SIGMA = np.array([8.0, 8.0, 8.0, 3.0, 3.0, 3.0])
-"""Sigmas (rad/s, m/s) of a weak prior on a bone's first and last velocity, where the motion prior has only
-one neighbour. Evidence: none."""
+"""Sigmas (rad/s, m/s) of a weak prior on a bone's first and last velocity. At these states, the motion prior
+has only one neighbour. Evidence: none."""
 _REST_VELOCITY_SIGMA = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
-"""The same before the first and after the last measurement of all cameras. It makes the body rest there,
-which would otherwise keep its last velocity. Evidence: none."""
+"""Sigmas (rad/s, m/s) of a prior on a bone's velocities before the first and after the last measurement of
+all cameras. The prior makes the body rest there. Without the prior, the body would keep its last velocity.
+Evidence: none."""
 
 
 def add_motion_prior(

@@ -8,8 +8,9 @@ from typing import Any
 import gtsam
 
 _MIN_DAMPING = 1e-5
-"""Smallest damping (lambda) of Levenberg-Marquardt. Damping grows tenfold until the error falls, and each
-attempt is a solve. Near the solution no damping lowers the error, so a smaller start only adds attempts."""
+"""Minimum damping (lambda) of Levenberg-Marquardt. The optimiser increases the damping tenfold until the
+error falls, and each attempt needs a solve. Near the solution, no damping lowers the error. A smaller minimum
+would only add attempts."""
 
 
 def levenberg_marquardt(
@@ -27,12 +28,13 @@ def levenberg_marquardt(
         graph: The factors.
         values: The initial values.
         iterations: Maximum number of iterations.
-        last: Keys that are eliminated last, such as a calibration shared by all ticks.
+        last: Keys of variables that are eliminated last, such as a calibration shared by all ticks.
         step: Called after each iteration; may raise to stop.
-        tolerance: Stop at a relative decrease of the error below this.
+        tolerance: Minimum relative decrease of the error per iteration. The optimiser stops after a smaller
+            decrease.
 
     Returns:
-        The solution and the number of iterations.
+        The solution and the number of iterations done.
     """
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(iterations)
@@ -56,7 +58,7 @@ def gauss_newton_then_lm(
 ) -> tuple[Any, int]:
     """Minimise the error by Gauss-Newton while each step lowers it, then by Levenberg-Marquardt.
 
-    A Gauss-Newton step takes two thirds of the time of a damped one, because damping adds a factor for each
+    A Gauss-Newton step takes two thirds of the time of a damped step, because damping adds a factor for each
     state.
 
     Args:
@@ -64,10 +66,11 @@ def gauss_newton_then_lm(
         values: The initial values, near the solution.
         iterations: Maximum number of iterations.
         step: Called after each iteration; may raise to stop.
-        tolerance: Stop at a relative decrease of the error below this.
+        tolerance: Minimum relative decrease of the error per iteration. The optimiser stops after a smaller
+            decrease.
 
     Returns:
-        The solution and the number of iterations.
+        The solution and the number of iterations done.
     """
     optimizer = gtsam.GaussNewtonOptimizer(graph, values, gtsam.GaussNewtonParams())
     error = optimizer.error()
@@ -80,10 +83,10 @@ def gauss_newton_then_lm(
         step()
         decrease = error - optimizer.error()
         if decrease >= 0.0:
-            # `optimizer.values()` refers to memory of the optimiser that its next step overwrites.
+            # `optimizer.values()` refers to memory of the optimiser that the next step overwrites.
             values = gtsam.Values(optimizer.values())
         if abs(decrease) <= tolerance * max(error, 1e-9):
-            # With robust weights, full steps may end at an error slightly above the smallest one.
+            # With robust weights, full steps may end at an error slightly above the minimum.
             return values, count
         if not decrease >= 0.0:
             break

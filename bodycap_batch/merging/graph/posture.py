@@ -1,4 +1,4 @@
-"""The posture as it is known before anything is solved: walking, standing or a T-pose, and the way ahead."""
+"""Knowledge about the posture before the motion is solved: walking, standing or a T-pose, and direction."""
 
 from __future__ import annotations
 
@@ -10,48 +10,54 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_sp
 from bodycap_batch.merging.cameras.track import CameraTrack
 
 MIN_WALKING_SPEED_M_PER_S = 0.5
-"""Smallest horizontal speed of the trunk in walking, m/s. Evidence: none."""
+"""Minimum horizontal speed (m/s) of the trunk in walking. Evidence: none."""
 _STEP_NS = 500_000_000
-"""Time, in nanoseconds, over which the velocity is taken: about one step, within which the trunk sways."""
+"""Duration (nanoseconds) over which the velocity is computed. It is about one step; within a step, the trunk
+sways."""
 _HIGHEST_PERCENTILE, _LOW_PERCENTILE = 95.0, 25.0
-"""Percentiles of the trunk's height that stand for its highest and for a low position. Evidence: none."""
+"""Percentiles of the trunk's height that are used as its highest position and as a low position. Evidence:
+none."""
 _STANDING_DROP_M = 0.02
-"""Distance in metres below its highest position at which a chest still counts as upright. A chest half a
-metre above the hips then bends by 16 degrees."""
+"""Maximum distance (metres) of an upright chest below its highest position. A chest half a metre above the
+hips is 2 cm lower if the trunk bends by 16 degrees."""
 _MIN_WALKING_SHARE = 0.125
-"""Smallest ratio of walking ticks in a capture that counts as a walk. Fewer are steps aside during other
-work, mostly bent. Evidence: none."""
+"""Minimum fraction of walking ticks in a capture that is treated as a walk. With a smaller fraction, the
+steps are steps aside during other work, mostly with a bent trunk. Evidence: none."""
 _BENT_DROP_M = 0.12
-"""Distance in metres below its usual walking height at which a chest is bent, or the knees are: in walking it
-moves by 5 cm."""
+"""Maximum distance (metres) of an upright chest below its usual height in walking. In a lower position, the
+trunk or the knees are bent. In normal walking, the chest's height varies by 5 cm."""
 _MAX_HEADING_CHANGE_RAD = float(np.radians(35.0))
-"""Largest deviation, in radians, from the usual angle between heading and path of a person who walks forward.
-Evidence: none."""
+"""Maximum deviation (radians) of the angle between heading and path from its usual value, for a person who
+walks forward. Evidence: none."""
 _BOUNCE_M = 0.03
-"""Half of the rise and fall of a walking trunk in metres, which is 4 to 5 cm from lowest to highest."""
+"""Scale (metres) of the vertical deviations of a walking trunk from its mean height. Its height varies by 4
+to 5 cm from the lowest to the highest position."""
 _MIN_LEVEL_SHARE = 0.6
-"""Smallest ratio of a path that must lie on one level for a vertical from the path. Evidence: none."""
+"""Minimum fraction of a path's points that must lie in one horizontal plane, for a vertical from the path.
+Evidence: none."""
 _MIN_LEVEL_POINTS = 30
-"""The same as a number of points. Evidence: none."""
+"""Minimum number of a path's points that must lie in one horizontal plane, for a vertical from the path.
+Evidence: none."""
 _MIN_PATH_WIDTH_M = 0.3
-"""Smallest standard deviation of a path across its main direction, in metres. At 0.3 m, ten steps with a
-bounce of 2 cm tilt the plane by a degree."""
+"""Minimum standard deviation (metres) of a path across its main direction. At 0.3 m, ten steps with a bounce
+of 2 cm tilt the fitted plane by one degree."""
 _MAX_BODY_ANGLE_RAD = float(np.radians(30.0))
-"""Largest angle, in radians, between the path's vertical and the body's. Evidence: none."""
+"""Maximum angle (radians) between the path's vertical and the body's vertical. Evidence: none."""
 _MAX_SAMPLES = 300
-"""Instants at which the speed is evaluated at most; they bound the time."""
+"""Maximum number of instants at which the speed is evaluated. It bounds the computing time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Posture:
-    """What is known of the posture at K sampled ticks.
+    """Knowledge about the posture at K sampled ticks.
 
     Attributes:
-        up: (3,) the vertical in the map; None if only the body itself shows it.
-        walking: (K,) whether the person walks forward.
-        walking_direction: (K,3) horizontal direction of walking, NaN elsewhere.
+        up: (3,) vertical in the map; None if only the body itself shows the vertical.
+        walking: (K,) whether the person walks.
+        walking_direction: (K,3) horizontal direction of walking; NaN where the person does not walk forward.
         t_pose: (K,) whether the person holds a T-pose.
-        standing: (K,) whether a person who does not walk is as upright as ever in the capture.
+        standing: (K,) whether the trunk is as upright as ever in the capture. It is False for all ticks if
+            the person walks in the capture.
     """
 
     up: FloatArray | None
@@ -62,7 +68,7 @@ class Posture:
 
     @staticmethod
     def unknown(count: int) -> Posture:
-        """Return a posture of `count` ticks without any knowledge."""
+        """Return a posture about which nothing is known, for `count` ticks."""
         none = np.zeros(count, dtype=bool)
         return Posture(
             up=None, walking=none, walking_direction=np.full((count, 3), np.nan), t_pose=none, standing=none
@@ -75,10 +81,10 @@ def find_posture(
     """Detect walking, standing and the T-pose at sampled times.
 
     Args:
-        track: The trunk's camera, metres; a provisional scale is accurate enough.
-        times_ns: (K,) the sampled times.
-        up: (3,) the vertical in the map, or None.
-        t_pose_ns: First and last time of a T-pose.
+        track: Track of the trunk's camera in metres; a provisional scale is accurate enough.
+        times_ns: (K,) sampled times.
+        up: (3,) vertical in the map; None if it is unknown.
+        t_pose_ns: First and last time of a T-pose; None without a T-pose.
     """
     posture = Posture.unknown(len(times_ns))
     if t_pose_ns is not None:
@@ -112,7 +118,11 @@ def find_posture(
 
 
 def is_mostly_walking(track: CameraTrack) -> bool:
-    """Return whether a trunk's camera (metres) has walking speed for more than half of the time."""
+    """Return whether the trunk's camera moves at walking speed for more than half of the time.
+
+    Args:
+        track: Track of the trunk's camera in metres.
+    """
     times_ns = track.times_ns[evenly_spaced(len(track.times_ns), _MAX_SAMPLES)]
     half_step = _STEP_NS // 2
     before, after = (track.poses_at(times_ns + sign * half_step, max_gap_ns=_STEP_NS) for sign in (-1, 1))
@@ -121,21 +131,27 @@ def is_mostly_walking(track: CameraTrack) -> bool:
 
 
 def _standing_ticks(track: CameraTrack, height_m: FloatArray, up: FloatArray) -> BoolArray:
-    """Return whether heights (K,) are about the largest of the trunk's path, if it rises and falls at all.
+    """Return at which ticks (K,) the trunk is near its maximum height, if its height varies enough.
 
-    The trunk of a person who sits or leans on something is never upright, whatever its height.
+    If the height hardly varies, the person may sit or lean on something all the time. No tick is then treated
+    as standing.
+
+    Args:
+        track: Track of the trunk's camera in metres.
+        height_m: (K,) heights of the camera along up.
+        up: (3,) vertical in the map.
     """
     low, highest = np.percentile(track.map_from_cam[:, :3, 3] @ up, [_LOW_PERCENTILE, _HIGHEST_PERCENTILE])
     return np.asarray((height_m > highest - _STANDING_DROP_M) & (highest - low > _BENT_DROP_M))
 
 
 def _faces_walking_direction(rotation: FloatArray, direction: FloatArray, up: FloatArray) -> BoolArray:
-    """Return whether a camera's heading has its usual angle to the direction of walking.
+    """Return at which ticks (T,) the camera's heading has its usual angle to the direction of walking.
 
     Args:
-        rotation: (T,3,3) map_from_cam.
-        direction: (T,3) of walking, NaN where unknown.
-        up: (3,) the vertical in the map.
+        rotation: (T,3,3) rotations map_from_cam.
+        direction: (T,3) directions of walking, NaN where unknown.
+        up: (3,) vertical in the map.
     """
     level = rotation - up[:, None] * np.einsum("i,tij->tj", up, rotation)[:, None, :]
     axis = level[:, :, int(np.argmax(np.linalg.norm(level, axis=1).mean(axis=0)))]
@@ -150,14 +166,15 @@ def _faces_walking_direction(rotation: FloatArray, direction: FloatArray, up: Fl
 
 
 def vertical_from_path(path_m: FloatArray, body_up: FloatArray) -> FloatArray | None:
-    """Estimate the vertical from a trunk's path: walking is level, except for the bounce of the steps.
+    """Estimate the vertical from a trunk's path. A walk is horizontal, except for the bounce of the steps.
 
     Args:
-        path_m: (N,3) metres.
+        path_m: (N,3) positions of the trunk, metres.
         body_up: (3,) approximate vertical from the body.
 
     Returns:
-        Up (3,), or None if the path is too narrow, not level enough, or far from the body's vertical.
+        The up direction (3,); None if the path is too narrow, not horizontal enough, or too far from the
+        body's vertical.
     """
     weight = np.ones(len(path_m))
     normal = np.asarray(body_up, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""The solution of long timelines in overlapping windows, so that memory does not grow with their length."""
+"""Solves long timelines in overlapping windows, so that the memory does not grow with the length."""
 
 from __future__ import annotations
 
@@ -19,27 +19,29 @@ from bodycap_batch.merging.graph.motion_graph import (
 from bodycap_batch.model.geometry import interpolate_pose
 
 WINDOW_TICKS = 500
-"""Ticks of a window without its overlaps. Evidence: docs/decisions/merging.md."""
+"""Usual number of ticks of a window without its overlaps. Evidence: docs/decisions/merging.md."""
 OVERLAP_S = 3.0
-"""Seconds that a window extends on either side. Two solutions of the same ticks differ by what lies outside
-their windows; its influence ends after three seconds of measurements. Evidence: none."""
+"""Time (seconds) by which a window is extended before its first tick and after its last tick. Two windows
+solve the ticks of their overlap differently, because each of them lacks the measurements outside itself. The
+influence of these measurements ends after three seconds. Evidence: none."""
 _PREFERRED_OVERLAPS, _MIN_OVERLAPS = 4.0, 2.0
-"""Length of a window at a high rate, in overlaps: with four, a tick is solved 1.5 times; with two, twice."""
+"""Preferred and minimum length of a window at a high rate, as multiples of `OVERLAP_S`. With four overlaps,
+each tick is solved 1.5 times on average; with two, twice."""
 _MAX_WINDOW_BYTES = 5e8
-"""Memory of a window with its overlaps, unless it is shorter than `_MIN_OVERLAPS` overlaps then."""
+"""Maximum memory (bytes) of a window with its overlaps. A window of the minimum length may need more."""
 _STATE_BYTES = 25e3
-"""Memory of one tick for each bone, and for each camera with frames between the ticks. Evidence:
+"""Memory (bytes) of one tick for each bone, and for each camera with frames between the ticks. Evidence:
 docs/decisions/merging.md."""
 _MIN_WINDOW_TICKS = 300
-"""Smallest number of ticks of a window without its overlaps. Evidence: none."""
+"""Minimum number of ticks of a window without its overlaps. Evidence: none."""
 _BLEND_S = 1.0
-"""Seconds before and after a boundary over which one solution changes into the next. Two seconds of overlap
-remain outside. Evidence: docs/decisions/merging.md."""
+"""Time (seconds) before and after a boundary in which the poses change gradually from one window's solution
+to the next. The other two seconds of each overlap are not used. Evidence: docs/decisions/merging.md."""
 _MAX_BOUNDARY_SHIFT = 0.25
-"""Ratio of a window's length by which its boundary may move to where more cameras are localised. Evidence:
-none."""
+"""Maximum shift of a window's boundary, as a fraction of the window's length. The boundary moves to where
+more cameras are localised. Evidence: none."""
 MAX_ITERATIONS = 20
-"""Largest number of iterations of the optimiser for one window. Evidence: none."""
+"""Maximum number of iterations of the optimiser for one window. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +49,9 @@ class WindowSolution:
     """The solution of one window.
 
     Attributes:
-        solution: With the overlaps.
-        first: First tick of the window without its overlaps.
-        low: First tick of the solution.
+        solution: Solution of the window with its overlaps.
+        first: Index of the window's first tick without its overlaps.
+        low: Index of the solution's first tick, with the overlaps.
     """
 
     solution: MotionSolution
@@ -69,12 +71,13 @@ def solve_windows(
     """Solve a timeline, in windows if it is long.
 
     Args:
-        build: Makes the graph of a window from its ticks and tracks.
-        tick_times_ns: (T,) the timeline.
+        build: Makes the graph of a window from the times of its ticks and from its tracks.
+        tick_times_ns: (T,) times of the timeline's ticks.
         tracks: Tracks without outliers, poses in metres.
         step: Called after each iteration, and with the name of each part of the work; may raise to stop.
-        window_ticks: Largest number of ticks of a window, without its overlaps.
-        error_modes: Of the calibration. Without them, the covariance of the joints is not computed.
+        window_ticks: Maximum number of ticks of a window without its overlaps, before its boundaries move.
+        error_modes: Error modes of the calibration. Without them, the covariance of the joints is not
+            computed.
     """
     parts: list[WindowSolution] = []
     for first, last in split_timeline(tick_times_ns, tracks, window_ticks):
@@ -87,12 +90,12 @@ def solve_windows(
 
 
 def with_overlap(tick_times_ns: IntArray, first: int, last: int) -> tuple[int, int]:
-    """Return the first tick of a window with its overlaps, and the one after the last.
+    """Return the first tick of a window with its overlaps, and the index after the last tick.
 
     Args:
-        tick_times_ns: (T,) the timeline.
-        first: First tick of the window without overlaps.
-        last: The one after its last.
+        tick_times_ns: (T,) times of the timeline's ticks.
+        first: Index of the window's first tick without overlaps.
+        last: Index after the window's last tick without overlaps.
     """
     overlap_ns = round(OVERLAP_S * 1e9)
     low = int(np.searchsorted(tick_times_ns, tick_times_ns[first] - overlap_ns))
@@ -101,15 +104,15 @@ def with_overlap(tick_times_ns: IntArray, first: int, last: int) -> tuple[int, i
 
 
 def max_window_ticks(bones: int, tracks: Sequence[CameraTrack], tick_times_ns: IntArray) -> int:
-    """Return the largest number of ticks of a window without its overlaps.
+    """Return the maximum number of ticks of a window without its overlaps.
 
-    At high rates it is larger than `WINDOW_TICKS`, so that the overlaps do not cost more than the windows.
-    Many bones and cameras make it smaller, so that the memory stays bounded.
+    At high rates, this number is larger than `WINDOW_TICKS`, so that the overlaps do not need more work than
+    the windows. With many bones and cameras, this number is smaller, so that the memory stays bounded.
 
     Args:
         bones: Number of bones of the graph.
-        tracks: Of the cameras.
-        tick_times_ns: (T,) the timeline.
+        tracks: Tracks of the cameras.
+        tick_times_ns: (T,) times of the timeline's ticks.
     """
     ticks_per_s = 1e9 / float(np.median(np.diff(tick_times_ns))) if len(tick_times_ns) > 1 else 1.0
     overlap = OVERLAP_S * ticks_per_s
@@ -123,11 +126,17 @@ def split_timeline(
 ) -> list[tuple[int, int]]:
     """Split the ticks into windows of about equal length that each contain measurements.
 
-    The boundaries lie where most cameras are localised: inside a gap, neither window would contain both ends
-    of the gap. A window gets longer by that than `window_ticks`, by a quarter at most.
+    The boundaries lie where most cameras are localised. If a boundary were in a time without poses, neither
+    window would contain the poses at both ends of this time. A window therefore gets longer than
+    `window_ticks`, by at most a quarter.
+
+    Args:
+        tick_times_ns: (T,) times of the timeline's ticks.
+        tracks: Tracks of the cameras.
+        window_ticks: Maximum number of ticks of a window before its boundaries move.
 
     Returns:
-        First tick of each window, and the one after the last.
+        Index of the first tick of each window, and index after its last tick.
     """
     count = len(tick_times_ns)
     times = np.sort(np.concatenate([track.times_ns for track in tracks]))
@@ -145,7 +154,10 @@ def split_timeline(
 
 
 def _boundaries(tick_times_ns: IntArray, tracks: Sequence[CameraTrack], parts: int) -> list[int]:
-    """Return the end of each window: near the even split, where most cameras are localised."""
+    """Return the index after each window's last tick.
+
+    The boundaries lie where most cameras are localised, near the boundaries of windows of equal length.
+    """
     count = len(tick_times_ns)
     even = np.linspace(0, count, parts + 1).round().astype(int)
     max_shift = int(_MAX_BOUNDARY_SHIFT * count / parts)
@@ -159,13 +171,13 @@ def _boundaries(tick_times_ns: IntArray, tracks: Sequence[CameraTrack], parts: i
 
 
 def _localised_cameras_near(tick_times_ns: IntArray, tracks: Sequence[CameraTrack]) -> FloatArray:
-    """Return (T,) the mean number of localised cameras over the time of blending about each tick."""
+    """Return the mean number (T,) of localised cameras within `_BLEND_S` of each tick."""
     cameras = np.zeros(len(tick_times_ns))
     for track in tracks:
         after = np.searchsorted(track.times_ns, tick_times_ns)
         inside = (after > 0) & (after < len(track.times_ns))
         interval = np.diff(track.times_ns)
-        # The usual interval of a slow camera is not a gap.
+        # The usual interval between the frames of a slow camera is not a time without poses.
         max_gap = max(MAX_SAMPLE_GAP_NS, 2.0 * float(np.median(interval))) if len(interval) else 0.0
         cameras[inside] += interval[after[inside] - 1] <= max_gap
     total = np.concatenate([[0.0], np.cumsum(cameras)])
@@ -176,7 +188,7 @@ def _localised_cameras_near(tick_times_ns: IntArray, tracks: Sequence[CameraTrac
 
 
 def _time_span(tick_times_ns: IntArray, first: int, last: int) -> tuple[int, int]:
-    """Return the times of the first tick and of the one after the last, unbounded at the timeline's ends."""
+    """Return the time of tick `first` and of tick `last`, unbounded at the ends of the timeline."""
     low = int(tick_times_ns[first]) if first > 0 else -(2**62)
     high = int(tick_times_ns[last]) if last < len(tick_times_ns) else 2**62
     return low, high
@@ -188,7 +200,7 @@ def _clip_track(track: CameraTrack, tick_times_ns: IntArray, first: int, last: i
 
 
 def _blend_weight(times_ns: IntArray, boundary_ns: int) -> FloatArray:
-    """Return the weight (N,) of the later window at times about a boundary: a smooth step from 0 to 1."""
+    """Return the weight (N,) of the later window at times (N,) near a boundary: a smooth step from 0 to 1."""
     x = np.clip(0.5 + 0.5e-9 * (times_ns - boundary_ns) / _BLEND_S, 0.0, 1.0)
     return np.asarray(x * x * (3.0 - 2.0 * x))
 
@@ -196,7 +208,7 @@ def _blend_weight(times_ns: IntArray, boundary_ns: int) -> FloatArray:
 def _blend_windows(
     parts: Sequence[WindowSolution], tick_times_ns: IntArray, tracks: Sequence[CameraTrack]
 ) -> MotionSolution:
-    """Join the solutions of the windows; each changes into the next one about the boundary."""
+    """Join the solutions of the windows. Near each boundary, blend from one solution to the next."""
     start = parts[0].solution
     poses, covariance = start.world_from_bone, start.joint_covariance
     cameras = {track.camera: np.zeros((0, 4, 4)) for track in tracks} | dict(start.world_from_cam)
@@ -219,12 +231,13 @@ def _blend_windows(
 
 
 def _blend_poses(before: FloatArray, after: FloatArray, weight: FloatArray) -> FloatArray:
-    """Join poses of two windows, interpolated in their overlap.
+    """Join the poses of two windows, and interpolate between them in their overlap.
 
     Args:
-        before: (M,...,4,4).
-        after: (N,...,4,4); its first S poses have the times of the last S of `before`.
-        weight: (S,) of `after`.
+        before: (M,...,4,4) poses of the earlier window.
+        after: (N,...,4,4) poses of the later window. Its first S poses have the times of the last S poses of
+            `before`.
+        weight: (S,) weights of the poses of `after` in the overlap.
     """
     overlap = len(weight)
     alpha = weight.reshape(-1, *[1] * (before.ndim - 3))
@@ -239,7 +252,7 @@ def _assemble(
     covariance: FloatArray | None,
     cameras: dict[str, FloatArray],
 ) -> MotionSolution:
-    """Make one solution of blended poses, with the measurements' residuals from these."""
+    """Make one solution from the blended poses, and compute the residuals of the measurements."""
     errors: dict[str, float] = {}
     for part in parts:
         for kind, error in part.solution.errors.items():

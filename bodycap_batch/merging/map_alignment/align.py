@@ -1,9 +1,9 @@
-"""Alignment of maps that share no view, through the body that carried their cameras.
+"""Alignment of maps that share no view, through the body that wore their cameras.
 
-A joint's centre is the same point of both segments that meet there, whichever maps their cameras are in. So
-the body's calibration determines the similarity of each further map, as additional unknowns. Initial values
-come from the path of the body, which all cameras share once their swinging is averaged out, and from the rest
-pose.
+The centre of a joint is one point of both segments that meet there, even if the segments' cameras are in
+different maps. The body's calibration therefore determines the similarity of each further map, as additional
+unknowns. Initial values come from the rest pose and from the path of the body. All cameras share this path
+once the swing of the limbs is averaged out.
 """
 
 from __future__ import annotations
@@ -48,34 +48,37 @@ from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 
 MAX_SIGMA_M = 0.06
-"""Largest position sigma per axis, in metres, of the cameras of a map that is used. Evidence: none."""
+"""Maximum position sigma per axis (metres) of the cameras of a map that is used. Evidence: none."""
 _MAX_SAMPLES = 240
-"""Instants at which the cameras are sampled at most; they bound the time. Evidence: none."""
+"""Maximum number of instants at which the cameras are sampled. It bounds the computing time. Evidence:
+none."""
 _REACH_SIGMA = 0.05
-"""Sigma of the logarithm of the scale from the limbs' reach: walking elbows keep 15 to 30 degrees of flexion.
-It is needed because, with separate maps, errors of mounts and scale can compensate each other."""
+"""Sigma of the scale's logarithm from the limbs' reach: walking elbows keep 15 to 30 degrees of flexion. This
+source of the scale is needed with separate maps, because errors of mounts and scale can then compensate each
+other."""
 _SEPARATE_MAPS_SIGMA = 0.15
-"""The same if no map contains cameras of both the trunk and the end of a limb: mounts are wrong by a tenth of
-half an arm. Evidence: docs/decisions/merging.md."""
-_UNOBSERVABLE_SIGMA = 0.4
-"""The same if the scale rests on that alone, or on two cameras near each other. Evidence:
+"""Sigma of the scale's logarithm from the limbs' reach, if no map contains cameras of both the trunk and the
+end of a limb. The error of a mount is then about a tenth of half an arm's length. Evidence:
 docs/decisions/merging.md."""
+_UNOBSERVABLE_SIGMA = 0.4
+"""Sigma of the scale's logarithm from the limbs' reach, if the scale is based only on this reach or on two
+cameras near each other. Evidence: docs/decisions/merging.md."""
 _MAX_STRAIN = 2.0
-"""Largest difference, in sigmas, between that scale and the solved one. Above it, the body does not determine
-the maps. Evidence: none."""
+"""Maximum difference, in sigmas, between the log scale from the limbs' reach and the solved log scale. With a
+larger difference, the body does not determine the maps. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlignedMap:
-    """A further map in the main one.
+    """The alignment of a further map with the main map.
 
     Attributes:
-        gauge: Of the further map.
-        cameras: Its cameras.
-        main_from_gauge: The similarity between the maps.
-        sigma_rad: Sigma of the map's rotation, per axis.
-        sigma_m: Sigma of its cameras' positions, per axis.
-        reason: Why it is not used; None if it is.
+        gauge: Gauge of the further map.
+        cameras: Names of the further map's cameras.
+        main_from_gauge: Similarity from the further map to the main map.
+        sigma_rad: Sigma of the map's rotation per axis, radians.
+        sigma_m: Sigma of the positions of the map's cameras per axis, metres.
+        reason: Reason why the map is not used; None if it is used.
     """
 
     gauge: str
@@ -91,10 +94,10 @@ class UsableCameras:
     """The cameras that can be used together.
 
     Attributes:
-        trajectories: In the gauge of the main map, the trunk's first.
-        main_from_gauge: By gauge, the similarity of each used map.
+        trajectories: Trajectories in the gauge of the main map, the trajectory of the trunk's camera first.
+        main_from_gauge: By gauge of each used map, the similarity to the main map.
         sigmas: By camera of a further map, the sigmas of the map's alignment.
-        unused: By camera, why it is not used.
+        unused: By camera that is not used, the reason.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -120,14 +123,14 @@ def align_cameras(
     step: Callable[[], None],
     options: MergeOptions | None = None,
 ) -> UsableCameras:
-    """Transform the cameras of further maps into the main one, as far as the body determines the maps.
+    """Transform the cameras of further maps into the main map, if the body determines their similarities.
 
     Args:
-        inputs: Skeleton, mounts and clocks.
-        main: The main map's cameras, the trunk's first.
-        further: Cameras of other maps.
+        inputs: Merge inputs, of which the skeleton, mounts and clocks are used.
+        main: Trajectories of the main map's cameras, the trajectory of the trunk's camera first.
+        further: Trajectories of the cameras of other maps.
         step: Called after each iteration; may raise to stop.
-        options: What the job states about the scale.
+        options: Merge options, of which ``known_distance`` and ``marker_board`` are used.
     """
     identity = Similarity(1.0, np.eye(3), np.zeros(3))
     if not further:
@@ -178,14 +181,15 @@ def _align_all(
     """Align all further maps together, or each alone if that fails.
 
     Args:
-        inputs: Skeleton and mounts.
-        options: What the job states about the scale.
-        bones: The graph's bones, those of all cameras.
-        tracks: By gauge; the main map's first, with the trunk's camera first. Maps that fail are removed.
+        inputs: Merge inputs, of which the skeleton and mounts are used.
+        options: Merge options, of which ``known_distance`` and ``marker_board`` are used.
+        bones: The graph's bones, for all cameras.
+        tracks: By gauge, the tracks of each map. The main map is first, with the trunk's camera first. The
+            function removes maps that it cannot align.
         step: Called after each iteration; may raise to stop.
 
     Returns:
-        The aligned maps, and by camera why its map could not be aligned.
+        The aligned maps, and by camera the reason why its map could not be aligned.
     """
     (main, (trunk, *_)), *others = tracks.items()
     unused: dict[str, str] = {}
@@ -207,7 +211,7 @@ def _align_all(
         if len(tracks) == 2:
             exclude(next(name for name in tracks if name != main), error.message)
             return (), unused
-    # One map that fits no person makes the others fail, too. So each map is aligned alone.
+    # One map that fits no person makes the alignment of all maps fail. So each map is aligned alone.
     found: tuple[AlignedMap, ...] = ()
     for gauge in [name for name in tracks if name != main]:
         try:
@@ -218,7 +222,7 @@ def _align_all(
 
 
 def _exclusion_reason(gauge: str, trunk_camera: str, main_gauge: str, why: str) -> str:
-    """Return the message for a camera of a map that could not be aligned with the trunk's."""
+    """Return the message for a camera whose map could not be aligned with the trunk's map."""
     return (
         f"its map {gauge} shares no view with {trunk_camera}'s {main_gauge}, "
         f"and the body cannot place it: {why}"
@@ -227,12 +231,12 @@ def _exclusion_reason(gauge: str, trunk_camera: str, main_gauge: str, why: str) 
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """What is known before the alignment is refined.
+    """Knowledge before the alignment is refined.
 
     Attributes:
-        inputs: With the trunk's camera rolled as it was worn.
+        inputs: Merge inputs, with the mount of the trunk's camera rolled to the camera's real roll.
         alignment: Initial similarities and scale.
-        up: The vertical in the main map, if it is known.
+        up: The vertical in the main map; None if it is unknown.
     """
 
     inputs: MergeInputs
@@ -259,7 +263,7 @@ def _initialise(
 
 
 def _require_one_scale(strain: float, reach_sigma: float) -> None:
-    """Raise if the scale from the limbs' reach and the solved one disagree by too many sigmas."""
+    """Raise if the scale from the limbs' reach and the solved scale differ by too many sigmas."""
     if strain > _MAX_STRAIN:
         raise EstimationError(
             f"the limbs' reach and the way the cameras move disagree on the scale by "
@@ -279,18 +283,18 @@ def align_maps(
     tracks: Mapping[str, Sequence[CameraTrack]],
     step: Callable[[], None],
 ) -> tuple[AlignedMap, ...]:
-    """Estimate the similarities of further maps to the main one.
+    """Estimate the similarities of further maps to the main map.
 
     Args:
-        inputs: Skeleton and mounts.
-        options: What the job states about the scale.
-        bones: The graph's bones, those of all cameras.
-        tracks: By gauge; the main map's first, with the trunk's camera first.
+        inputs: Merge inputs, of which the skeleton and mounts are used.
+        options: Merge options, of which ``known_distance`` and ``marker_board`` are used.
+        bones: The graph's bones, for all cameras.
+        tracks: By gauge, the tracks of each map. The main map is first, with the trunk's camera first.
         step: Called after each iteration; may raise to stop.
 
     Raises:
-        EstimationError: The cameras' distances or movements fit no person, or they were hardly localised at
-            the same time.
+        EstimationError: The cameras' distances or movements fit no person, or too few frames of different
+            cameras were localised at the same time.
     """
     (main_gauge, main), *others = tracks.items()
     stated = stated_constraints(inputs, options, main_gauge)
@@ -312,7 +316,7 @@ def align_maps(
         calibration, list(names.values()), provisional, reach_sigma=reach_sigma, stated=stated.scales
     )
     problem.solve()
-    # If the job states the scale, reach and movement may disagree.
+    # If the job gives the scale, the limbs' reach and the movement may disagree.
     if not stated.scales:
         _require_one_scale(abs(problem.scale_residual()), reach_sigma)
         points = map_points_of(inputs, together[0].camera)

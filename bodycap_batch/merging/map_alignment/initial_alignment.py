@@ -1,4 +1,4 @@
-"""The initial alignment of maps without common views, from the shared path of the body and its rest pose."""
+"""The initial alignment of maps that share no view, from the path of the body and its rest pose."""
 
 from __future__ import annotations
 
@@ -26,22 +26,24 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import split_side
 
 _SMOOTHING_S = 0.75
-"""Half of the time, in seconds, over which paths are averaged: walking swings the arms once in about a
-second."""
+"""Half of the duration (seconds) over which paths are averaged. The average removes the swing of a walker's
+arms, which lasts about a second."""
 _REST_POSE_WEIGHT = 0.06
-"""Weight of the rest pose's orientation relative to the shape of the path, both normalised. It makes 20
-degrees equal to 15 cm on a walk of metres. Evidence: none."""
+"""Weight of the rest pose's orientation relative to the shape of the path, both normalised. With this weight,
+20 degrees count as much as 15 cm on a walk of a few metres. Evidence: none."""
 _MIN_COMMON_S = 4.0
-"""Smallest time in seconds that two cameras must share: four strides, because a shorter path has no shape."""
+"""Minimum time (seconds) that two cameras must share. It is about four strides; a shorter path has no
+shape."""
 _MIN_INSTANTS = 3
-"""Smallest number of points of the shared path: three fix a rotation."""
+"""Minimum number of points of the shared path. Three points determine a rotation."""
 _MIN_COMMON_FRAMES = 10
-"""Smallest number of frames of both cameras at the same time. Evidence: none."""
+"""Minimum number of frames in which both cameras are localised at the same time. Evidence: none."""
 _MAX_SCALE_SIGMA = 0.25
-"""Largest sigma of the logarithm of the scale, from the uncertainty of the mounts, at which the scale counts
-as observable. Evidence: docs/decisions/merging.md."""
+"""Maximum sigma of the scale's logarithm for an observable scale. The sigma comes from the uncertainty of the
+mounts. Evidence: docs/decisions/merging.md."""
 _ITERATIONS = 3
-"""Alternations of initial similarities and metric scale. The first one has no scale."""
+"""Number of times that the initial similarities and the metric scale are estimated in turn. The first
+similarities are estimated without a scale."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +51,8 @@ class InitialAlignment:
     """The initial similarities of further maps.
 
     Attributes:
-        main_from_gauge: By gauge of the further maps.
-        metres_per_unit: Scale of the main map.
+        main_from_gauge: By gauge of a further map, the similarity from this map to the main map.
+        metres_per_unit: Scale of the main map, metres per map unit.
         scale_observable: Whether distances that do not depend on the rest pose determine the scale well.
         one_map_spans_a_limb: Whether one map contains cameras of the trunk and of the end of a limb. The
             scale then does not depend on the alignment.
@@ -68,17 +70,18 @@ def align_maps_initially(
     others: Sequence[tuple[str, Sequence[CameraTrack]]],
     mounts: Mapping[str, Mount],
 ) -> InitialAlignment:
-    """Estimate the similarities of further maps and the metric scale alternately.
+    """Estimate the similarities of further maps and the metric scale in turn.
 
-    The shoulder-hand distance across two maps carries no scale information: the alignment itself places the
-    hand at the length of the arm in the rest pose. The smaller the scale, the less the swinging adds to it.
-    The distance of a trunk and a head in separate maps is that of the rest pose at every scale, too.
+    Some distances between cameras in different maps carry no information about the scale. An example is the
+    distance between shoulder and hand: the alignment itself places the hand at the length of the arm in the
+    rest pose. The smaller the scale, the less the swing of the arm adds to this distance. Another example is
+    the distance between trunk and head: it equals the distance in the rest pose at every scale.
 
     Args:
         bones: The graph's bones.
-        main: The main map's tracks, the trunk's first.
+        main: Tracks of the main map, the track of the trunk's camera first.
         others: Gauge and tracks of each further map.
-        mounts: By camera.
+        mounts: Mount of each camera by camera name.
 
     Raises:
         EstimationError: Nothing determines the scale, or the cameras' distances fit no person.
@@ -102,7 +105,7 @@ def align_maps_initially(
 
 
 def _one_map_spans_a_limb(bones: Sequence[Bone], groups: Sequence[Sequence[CameraTrack]]) -> bool:
-    """Return whether a map contains cameras of the trunk and of a limb below the upper arm or thigh."""
+    """Return whether one map contains cameras of the trunk and of a limb below the upper arm or thigh."""
     roles = [[split_side(bones[track.bone].role) for track in group] for group in groups]
     near = ("Shoulder", "Arm", "UpLeg")
     return any(
@@ -113,11 +116,12 @@ def _one_map_spans_a_limb(bones: Sequence[Bone], groups: Sequence[Sequence[Camer
 
 @dataclass(frozen=True, slots=True)
 class _ScaleInformation:
-    """What the distances between cameras reveal about the scale.
+    """Information about the scale from the distances between cameras.
 
     Attributes:
-        uninformative: Cameras with a kinematic neighbour in another map, at a distance without information.
-        sigma_log: Sigma of the scale's logarithm from the other distances; infinite without any.
+        uninformative: Names of cameras with a kinematic neighbour in another map, if the distance between
+            both cameras carries no information.
+        sigma_log: Sigma of the scale's logarithm from all other distances; infinite without such distances.
     """
 
     uninformative: set[str]
@@ -129,8 +133,9 @@ def _scale_information(
 ) -> _ScaleInformation:
     """Return how well the distances between cameras determine the scale.
 
-    Across maps, only a limb bone that swings about a joint of its neighbour's bone carries information. The
-    amount depends on the distance between the two cameras, and on the uncertainty of their mounts.
+    A distance between cameras in different maps carries information only if the limb bone swings about a
+    joint of its neighbour's bone. The amount depends on the distance between the two cameras, and on the
+    uncertainty of their mounts.
 
     Raises:
         EstimationError: No distance carries information, and a camera that hardly swings is in a separate
@@ -166,17 +171,17 @@ def align_map(
     mounts: Mapping[str, Mount],
     metres_per_unit: float,
 ) -> Similarity:
-    """Estimate the similarity of a further map to the main one from smoothed paths and the rest pose.
+    """Estimate the similarity of a further map to the main map, from smoothed paths and the rest pose.
 
     Args:
         bones: The graph's bones.
-        main: The trunk's camera in the main map.
-        group: The further map's cameras.
-        mounts: By camera.
-        metres_per_unit: Scale of the main map, infinite if it is unknown.
+        main: Track of the trunk's camera in the main map.
+        group: Tracks of the further map's cameras.
+        mounts: Mount of each camera by camera name.
+        metres_per_unit: Scale of the main map, metres per map unit; infinite if it is unknown.
 
     Returns:
-        main_from_gauge of the further map.
+        The similarity main_from_gauge of the further map.
     """
     at_ns = _instants(main)
     pairs, rotations = [], []
@@ -203,10 +208,10 @@ def align_map(
 
 
 def require_common_time(main: CameraTrack, group: Sequence[CameraTrack]) -> None:
-    """Check that some camera of a further map was localised for a few seconds together with the trunk's.
+    """Check that a camera of a further map was localised for a few seconds together with the trunk's camera.
 
     Raises:
-        EstimationError: None was.
+        EstimationError: No camera of the further map was.
     """
     at_ns = _instants(main)
     main_known = np.isfinite(_smoothed_path(main, at_ns)[:, 0])
@@ -225,12 +230,15 @@ def require_common_time(main: CameraTrack, group: Sequence[CameraTrack]) -> None
 
 
 def _instants(track: CameraTrack) -> IntArray:
-    """Return about four times per second at which a track was localised."""
+    """Return times (N,), about four per second, at which a track was localised."""
     return track.times_ns[:: max(1, round(0.25e9 / float(np.median(np.diff(track.times_ns)))))]
 
 
 def _smoothed_path(track: CameraTrack, at_ns: IntArray) -> FloatArray:
-    """Return mean positions (N,3) of a track about given times (N,), NaN if half of the frames are lost."""
+    """Return the mean positions (N,3) of a track around given times (N,).
+
+    The position is NaN if at most half of the usual number of frames around a time is localised.
+    """
     total = np.vstack([np.zeros(3), np.cumsum(track.map_from_cam[:, :3, 3], axis=0)])
     half_ns = round(_SMOOTHING_S * 1e9)
     low, high = (np.searchsorted(track.times_ns, at_ns + sign * half_ns) for sign in (-1, 1))
@@ -241,7 +249,7 @@ def _smoothed_path(track: CameraTrack, at_ns: IntArray) -> FloatArray:
 
 
 def _rest_pose(bones: Sequence[Bone], mount: Mount, bone: int) -> FloatArray:
-    """Return the pose (4,4) of a camera in the first bone's frame while the body is in the rest pose."""
+    """Return the pose (4,4) of a camera in the first bone's frame, with the body in the rest pose."""
     pose, current = np.array(mount.joint_from_cam), bone
     while bones[current].parent >= 0:
         pose = make_transform(bones[current].mean_rotation, bones[current].offset_m) @ pose

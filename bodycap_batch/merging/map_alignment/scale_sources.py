@@ -1,4 +1,4 @@
-"""Sources of the main map's scale besides the limbs, before further maps are aligned with it."""
+"""Sources of the main map's scale other than the limbs, for the alignment of further maps."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from bodycap_batch.model.geometry import Similarity, invert
 from bodycap_batch.model.merge_data import MergeInputs
 
 _MAX_SAMPLES = 240
-"""Instants at which the posture is evaluated at most; they bound the time."""
+"""Maximum number of instants at which the posture is evaluated. It bounds the computing time."""
 
 
 @dataclass(frozen=True, slots=True)
 class StatedConstraints:
-    """What the job states about one map.
+    """Scales and verticals of one map that are given in the job.
 
     Attributes:
-        scales: From a known distance or a marker board in the map.
-        verticals: From a marker board of known placement.
+        scales: Scales from a known distance or a marker board in the map.
+        verticals: Verticals from a marker board of known placement.
     """
 
     scales: tuple[ScaleSource, ...] = ()
@@ -39,18 +39,18 @@ class StatedConstraints:
 
 
 def stated_constraints(inputs: MergeInputs, options: MergeOptions, gauge: str) -> StatedConstraints:
-    """Return what the job states about one map alone.
+    """Return the scales and verticals that the job gives for one map alone.
 
-    What concerns another map is used later, when all maps are aligned.
+    Scales and verticals for other maps are used later, after all maps are aligned.
 
     Args:
-        inputs: The trajectories and the views of the board.
-        options: ``known_distance`` and ``marker_board``.
-        gauge: Of the map.
+        inputs: Merge inputs, of which the trajectories and the views of the board are used.
+        options: Merge options, of which ``known_distance`` and ``marker_board`` are used.
+        gauge: Gauge of the map.
     """
     own_map = {gauge: Similarity(1.0, np.eye(3), np.zeros(3))}
     distance, board = None, None
-    # The errors here concern other maps. They are reported when all maps are aligned.
+    # Errors here concern other maps. They are reported after all maps are aligned.
     with suppress(EstimationError):
         distance = known_distance(inputs.trajectories, options.known_distance, own_map)
     with suppress(EstimationError):
@@ -66,17 +66,18 @@ def scale_from_walked_floor(
 ) -> ScaleSource | None:
     """Return the scale from the height of the walking trunk above the floor.
 
-    Only walking counts, because a person who sits or squats is not as tall.
+    Only walking is used, because a person who sits or squats is less tall.
 
     Args:
-        inputs: The body and its mounts' priors.
-        track: The trunk's camera, map units.
-        up: The vertical, if it is known.
-        body: An approximate scale with its sigma.
-        points: (P,3) of the trunk's map, map units.
+        inputs: Merge inputs, of which the skeleton and the mount priors are used.
+        track: Track of the trunk's camera, map units.
+        up: The vertical; None if it is unknown.
+        body: Approximate scale from the body, with its sigma.
+        points: (P,3) points of the trunk's map, map units.
 
     Returns:
-        None if the person does not walk, or if no floor is found beside the path.
+        The scale; None if the vertical is unknown, if the person does not walk, or if the floor beside the
+        path gives no usable scale.
     """
     mount = inputs.mount_of(track.camera)
     joint = inputs.skeleton.index_of_role(mount.role)

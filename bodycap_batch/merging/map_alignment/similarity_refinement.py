@@ -1,4 +1,4 @@
-"""Refinement of the similarities of further maps, by Gauss-Newton over the body's calibration."""
+"""Refinement of the similarities of further maps, by Gauss-Newton steps on the body's calibration."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.geometry import Similarity, so3_exp
 
 _SLACK_SCHEDULE = (16.0, 4.0, 1.0)
-"""Factors on the slack of the joints, one solve after the other. With a large slack, an initial error of a
-decimetre has its full weight, and is not taken for a gross error."""
+"""Factors on the slack of the joints, one for each successive solve. With a large slack, an initial error of
+a decimetre keeps its full weight, and is not treated as a gross error."""
 _MAX_STEPS = 8
-"""Largest number of steps of one descent. Evidence: none."""
+"""Maximum number of steps of one descent. Evidence: none."""
 _CONVERGED = 1e-3
-"""Relative change of the cost below which a step is the last. Evidence: none."""
+"""Minimum relative change of the cost per step. A step with a smaller change is the last step. Evidence:
+none."""
 
 
 class AlignmentSigma(NamedTuple):
     """The uncertainty of a map's alignment.
 
     Attributes:
-        rotation_rad: Sigma of the map's rotation, per axis.
-        position_m: Sigma of its cameras' positions, per axis.
+        rotation_rad: Sigma of the map's rotation per axis, radians.
+        position_m: Sigma of the positions of the map's cameras per axis, metres.
     """
 
     rotation_rad: float
@@ -47,8 +48,8 @@ class _Step:
     """A Gauss-Newton step for G further maps.
 
     Attributes:
-        change: (1 + 7 G) of the log scale, and of each map's rotation, log scale and translation.
-        covariance: (1 + 7 G, 1 + 7 G) of the same.
+        change: (1 + 7 G,) change of the log scale, and of each map's rotation, log scale and translation.
+        covariance: (1 + 7 G, 1 + 7 G) covariance of `change`.
     """
 
     change: FloatArray
@@ -56,14 +57,14 @@ class _Step:
 
 
 class MapAlignmentProblem:
-    """The similarities of further maps as unknowns of a calibration; all its other unknowns are eliminated.
+    """A calibration with the similarities of further maps as unknowns. All other unknowns are eliminated.
 
     Args:
-        calibration: With all maps at their initial similarities.
-        groups: The cameras of each further map.
+        calibration: Graph of the calibration, with all maps at their initial similarities.
+        groups: Names of the cameras of each further map.
         scale: Provisional scale, metres per unit of the main map.
-        reach_sigma: Sigma of its logarithm.
-        stated: Scales from the job.
+        reach_sigma: Sigma of the logarithm of the provisional scale.
+        stated: Scales given in the job.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class MapAlignmentProblem:
         self._covariance = np.zeros((0, 0))
 
     def solve(self) -> None:
-        """Move the maps until the cost no longer falls, with smaller and smaller slack of the joints."""
+        """Move the maps until the cost no longer decreases, while the slack of the joints decreases."""
         for slack in _SLACK_SCHEDULE:
             self._calibration.slack_factor = slack
             self._descend()
@@ -146,7 +147,7 @@ class MapAlignmentProblem:
         return centres, centres.mean(axis=0)
 
     def _step(self, damping: float) -> _Step:
-        """Return the step that lowers the cost.
+        """Return the Gauss-Newton step that lowers the cost, with its covariance.
 
         Args:
             damping: Relative increase of the diagonal of the normal equations.
@@ -163,7 +164,7 @@ class MapAlignmentProblem:
             np.append(mounts.row_types, np.full(len(source_rows), RowType.PRIOR))
         ]
         gain = _solve_normal_equations(normal, influence.T)
-        # A systematic bias of the posture changes mounts and maps alike.
+        # A systematic bias of the posture changes both mounts and maps.
         by_bias = (mounts.posture_bias_jacobian().T @ gain[:, : -len(source_rows)].T).T
         covariance = (gain * variance) @ gain.T + by_bias @ by_bias.T
         free = np.arange(len(normal) - count, len(normal))
@@ -172,7 +173,12 @@ class MapAlignmentProblem:
         return _Step(np.asarray(change, dtype=np.float64), np.asarray(covariance[-count:, -count:]))
 
     def _linearised(self) -> tuple[LinearisedCalibration, FloatArray]:
-        """Return the derivatives by bones and mounts, and those (R,1 + 7 G) by log scale and maps."""
+        """Linearise the calibration.
+
+        Returns:
+            The linearised calibration with derivatives with respect to bones and mounts, and the derivatives
+            (R,1 + 7 G) with respect to the log scale and the maps.
+        """
         mounts = self._calibration.linearised()
         derivatives = -measurement_jacobian(self._calibration, mounts.linear, self._directions())
         derivatives[:, 0] -= scale_jacobian(self._calibration, mounts)
@@ -182,17 +188,17 @@ class MapAlignmentProblem:
         return self._calibration.solve(self._scale) + 0.5 * float((self._source_residuals() ** 2).sum())
 
     def scale_residual(self) -> float:
-        """Return the difference of the log scale from that of the limbs' reach, in sigmas."""
+        """Return the difference of the log scale from the log scale of the limbs' reach, in sigmas."""
         return float(self._source_residuals()[0])
 
     def _source_residuals(self) -> FloatArray:
-        """Return the difference (S,) of the log scale from that of each source, in sigmas."""
+        """Return the difference (S,) of the log scale from the log scale of each source, in sigmas."""
         return np.array([np.log(self._scale / each.scale) / each.sigma_log for each in self._sources])
 
     def _directions(self) -> FloatArray:
-        """Return the movement (C,K,P,6) of each camera's pose by each of P unknowns.
+        """Return the movement (C,K,P,6) of each camera's pose per unit of each of P unknowns.
 
-        It is a rotation (rad) and a translation (m) in the axes of the main map.
+        A movement is a rotation (radians) and a translation (metres) in the axes of the main map.
         """
         samples = self._calibration.samples
         centres = self._scale * samples.map_from_cam[..., :3, 3]
@@ -210,7 +216,7 @@ class MapAlignmentProblem:
         return out
 
     def _apply(self, change: FloatArray) -> None:
-        """Move the samples by a step, and add it to the corrections of the maps."""
+        """Move the samples by a step, and apply the step to the corrections of the maps."""
         samples = self._calibration.samples
         poses = samples.map_from_cam.copy()
         for index, members in enumerate(self._members):
@@ -228,7 +234,7 @@ def _solve_normal_equations(normal: FloatArray, right: FloatArray) -> FloatArray
     """Solve the normal equations of the alignment.
 
     Raises:
-        EstimationError: They are singular.
+        EstimationError: The equations are singular.
     """
     try:
         return np.asarray(np.linalg.solve(normal, right), dtype=np.float64)

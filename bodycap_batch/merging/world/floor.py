@@ -1,4 +1,4 @@
-"""The height of the floor, from the points of the map, the feet, or the height of the standing body."""
+"""The height of the floor, from the points of the map, from the feet, or from the standing body."""
 
 from __future__ import annotations
 
@@ -13,35 +13,39 @@ from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions
 
 WALKING_HEIGHT_RATIO = 0.97
-"""Mean height of the trunk in walking over its standing height. Evidence: docs/decisions/merging.md."""
+"""Ratio of the trunk's mean height while walking to its standing height. Evidence:
+docs/decisions/merging.md."""
 
 SLAB_M = 0.03
-"""Thickness in metres of a horizontal slab in which points are counted, and half of that of a floor.
-Evidence: none."""
+"""Thickness (metres) of a horizontal slab in which points are counted. The slab of a found floor is twice as
+thick. Evidence: none."""
 _MIN_POINTS = 100
-"""Points of a map below which its floor is not searched in all of them. Evidence: none."""
+"""Minimum number of map points for a search for the floor among all of them. Evidence: none."""
 _MIN_FLOOR_POINTS = 30
-"""Smallest number of points in the slab of a floor. Evidence: none."""
+"""Minimum number of points in the slab of a floor. Evidence: none."""
 _MIN_FLOOR_RATIO = 3.0
-"""Smallest number of points in the slab of a floor over the median of all slabs: the points of other things
-are spread evenly over the heights. Evidence: none."""
+"""Minimum ratio of the number of points in the slab of a floor to the median number in all slabs. The points
+of other objects are spread evenly over the heights. Evidence: none."""
 _MAX_BELOW_RATIO = 0.2
-"""Largest number of points below a floor over those in it. Below a surface that stands on the floor, the
-points of the floor are more. Evidence: none."""
+"""Maximum ratio of the number of points below a floor to the number of points in its slab. A surface that
+stands on the floor, such as a table, has the many points of the floor below it. Evidence: none."""
 _SEARCH_RATIO = 0.25
-"""Largest distance of the floor from its height by the body, over the trunk's height. Evidence: none."""
+"""Maximum distance of the floor from its expected height, as a ratio to the trunk's standing height. The body
+gives the expected height. Evidence: none."""
 _PATH_DISTANCE_M = 0.8
-"""Largest horizontal distance of a point from the walked path, metres: there is floor there. Evidence:
-none."""
+"""Maximum horizontal distance (metres) of a point from the walked path. Within this distance, the person
+walked on the floor. Evidence: none."""
 _MIN_PATH_POINTS = 5
-"""Smallest number of points near the path in the slab of a floor. Evidence: none."""
+"""Minimum number of points near the path in the slab of a floor. Evidence: none."""
 _MIN_PATH_SHARE = 0.5
-"""The same as a ratio of all points near the path at possible heights. Evidence: none."""
+"""Minimum number of points in the slab of a floor, as a fraction of all points near the path at possible
+heights of the floor. Evidence: none."""
 _LEGLESS_HIP_M = 0.9
-"""Height of the hips in metres of a skeleton without legs and without a height of its own."""
+"""Height (metres) of the hips of a skeleton without legs, if its zero pose does not give this height."""
 _ANKLE_OVER_LEG = 0.039 / 0.491
-"""Height of the ankle over the length of the leg, for skeletons whose feet end at the ankle. Source: R.
-Drillis, R. Contini, "Body segment parameters", 1966."""
+"""Minimum ratio of the ankle's height above the sole to the length of the leg. It gives the height of the
+ankle for skeletons whose feet end at the ankle. Source: R. Drillis, R. Contini, "Body segment parameters",
+1966."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +53,9 @@ class Floor:
     """The floor.
 
     Attributes:
-        height_m: Along up.
-        source: "map", "feet" or "standing hip height".
-        support: Number of map points in it.
+        height_m: Height of the floor along up, metres.
+        source: Origin of the height: "map", "feet" or "standing hip height".
+        support: Number of map points in the slab of the floor; 0 if the height does not come from the map.
     """
 
     height_m: float
@@ -64,9 +68,9 @@ class LegLengths:
     """The vertical lengths of a straight leg, in metres.
 
     Attributes:
-        hip_drop_m: From the root down to the hip joint in the zero pose.
-        leg_m: Thigh and shin together.
-        ankle_height_m: Ankle above the sole.
+        hip_drop_m: Vertical distance from the root down to the hip joint in the zero pose.
+        leg_m: Length of the thigh plus length of the shin.
+        ankle_height_m: Height of the ankle above the sole.
     """
 
     hip_drop_m: float
@@ -74,24 +78,25 @@ class LegLengths:
     ankle_height_m: float
 
     def root_height_m(self) -> float:
-        """Return the height of the root above the sole."""
+        """Return the height (metres) of the root above the sole."""
         return self.hip_drop_m + self.leg_m + self.ankle_height_m
 
 
 def floor_from_points(heights_m: FloatArray, up: Vertical, expected_m: float, standing_m: float) -> Floor:
-    """Find the floor among the heights (P,) of the map's points.
+    """Find the floor among the heights of the map's points.
 
-    The floor is a slab with many points, near the soles of the standing body, with few points below it. It is
-    searched only if the map itself gave the vertical: a tilt of two degrees spreads it over a decimetre.
+    The floor is a slab with many points near the soles of the standing body, and few points below the slab.
+    The function searches it only if the vertical comes from the map: a tilt of two degrees spreads the points
+    of a floor over a decimetre.
 
     Args:
-        heights_m: Along up.
+        heights_m: (P,) heights of the map's points along up, metres.
         up: The vertical.
-        expected_m: Height of the soles by the body alone.
-        standing_m: Height of a trunk joint above the soles; limits the search.
+        expected_m: Height of the soles according to the body, metres.
+        standing_m: Height (metres) of a trunk joint above the soles. It limits the search.
 
     Returns:
-        The floor of the map, or else the one at the expected height.
+        The floor that was found in the map; otherwise a floor at the expected height.
     """
     if up.source == "map" and len(heights_m) >= _MIN_POINTS:
         reach = _SEARCH_RATIO * standing_m
@@ -113,13 +118,14 @@ def floor_beside_path(
 
     Args:
         points_m: (P,3) map points in the solved frame.
-        path_m: (N,3) path of the trunk.
-        up: The vertical. It must come from the map: a tilt of two degrees spreads a floor over a decimetre.
-        expected_m: Height of the soles by the body alone.
-        standing_m: Height of a trunk joint above the soles; limits the search.
+        path_m: (N,3) positions of the trunk in the solved frame.
+        up: The vertical. It must come from the map, because a tilt of two degrees spreads the points of a
+            floor over a decimetre.
+        expected_m: Height of the soles according to the body, metres.
+        standing_m: Height (metres) of a trunk joint above the soles. It limits the search.
 
     Returns:
-        None if too few points lie on one level.
+        The floor; None if the vertical does not come from the map, or if too few points lie at one height.
     """
     if up.source != "map" or not len(points_m):
         return None
@@ -138,15 +144,17 @@ def floor_beside_path(
 
 
 def floor_from_feet(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolArray) -> Floor | None:
-    """Return the floor at the lowest soles, by the 2nd percentile of the ankles' heights.
+    """Return the floor at the height of the lowest soles.
+
+    The 2nd percentile of the ankles' heights over time gives the lowest position of the ankles.
 
     Args:
         skeleton: The body.
-        world_from_joint: (T,J,4,4), z up.
-        solved: (J,) whether a joint was solved.
+        world_from_joint: (T,J,4,4) poses of the joints, z up.
+        solved: (J,) whether each joint was solved.
 
     Returns:
-        None if no ankle was solved.
+        The floor; None if no ankle was solved, or if the skeleton has no complete leg.
     """
     ankles = [skeleton.index_of_role(side + "Foot") for side in ("Left", "Right")]
     heights = [world_from_joint[:, ankle, 2, 3] for ankle in ankles if ankle is not None and solved[ankle]]
@@ -158,7 +166,7 @@ def floor_from_feet(skeleton: SkeletonModel, world_from_joint: FloatArray, solve
 
 
 def leg_lengths(skeleton: SkeletonModel) -> list[LegLengths]:
-    """Return the lengths of each leg of a skeleton that has hip, knee and ankle."""
+    """Return the lengths of each leg for which the skeleton has a hip, a knee and an ankle."""
     out = []
     rest = rest_positions(skeleton)
     for side in ("Left", "Right"):
@@ -180,10 +188,10 @@ def leg_lengths(skeleton: SkeletonModel) -> list[LegLengths]:
 
 
 def standing_height(skeleton: SkeletonModel, joint: int) -> float:
-    """Return the height (m) of a trunk joint above the soles with straight legs.
+    """Return the height (metres) of a trunk joint above the soles of a person with straight legs.
 
-    The lengths of the bones are added up, because the zero pose of a rig may spread the legs and have its
-    root at any height.
+    The height is the sum of the lengths of the bones. The zero pose of a rig does not give this height,
+    because its legs may be spread and its root may be at any height.
     """
     rest = rest_positions(skeleton)
     above_root = float(rest[joint][2] - rest[0][2])

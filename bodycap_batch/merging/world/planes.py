@@ -1,4 +1,4 @@
-"""The large planes of the map: walls, floor, ceiling. Their vertical is more accurate than the body's."""
+"""The large planes of the map: walls, floor, ceiling. They give a more accurate vertical than the body."""
 
 from __future__ import annotations
 
@@ -12,33 +12,37 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import so3_exp
 
 PLANE_HALF_THICKNESS_M = 0.02
-"""Largest distance in metres of a plane's points from it. Evidence: none."""
+"""Maximum distance (metres) of a point from its plane. Evidence: none."""
 _MIN_POINTS = 100
-"""Points of a map below which no planes are searched. Evidence: none."""
+"""Minimum number of map points for a search for planes. Evidence: none."""
 _MIN_PLANE_POINTS = 25
-"""Smallest number of points of a plane. Evidence: none."""
+"""Minimum number of points of a plane. Evidence: none."""
 _MIN_PLANE_SHARE = 0.03
-"""The same as a ratio of all points. Evidence: none."""
+"""Minimum number of points of a plane, as a fraction of all points. Evidence: none."""
 _MAX_PLANES = 10
-"""Planes that are searched at most. Evidence: none."""
+"""Maximum number of planes that are searched. Evidence: none."""
 _HYPOTHESES = 600
-"""RANSAC hypotheses for each plane. Evidence: none."""
+"""Number of RANSAC hypotheses for each plane. Evidence: none."""
 _HYPOTHESES_AT_ONCE = 32
-"""Hypotheses whose distances from all points are in memory at the same time. Evidence:
+"""Number of hypotheses that are compared with all points at the same time. It bounds the memory. Evidence:
 docs/decisions/merging.md."""
 _NEIGHBOUR_RADIUS_M = 1.5
-"""Largest distance in metres between the points of a hypothesis: neighbours often lie on one plane."""
+"""Maximum distance (metres) from the first point of a hypothesis to its two other points. Neighbouring points
+often lie on the same plane."""
 _MAX_POINTS = 20_000
-"""Points that are used at most; the map of a long capture has hundreds of thousands."""
+"""Maximum number of points that are used. The map of a long capture has hundreds of thousands of points."""
 TILT_LIMIT_DEG = 20.0
-"""Largest angle in degrees between the vertical and the body's: three sigmas of a chest's lean and of the
-error of its mount."""
+"""Maximum angle (degrees) between the vertical and the body's up direction. It is three sigmas of the tilt of
+a chest and of the error of its camera's mount."""
 BENT_TILT_LIMIT_DEG = 35.0
-"""The same for a person who bends most of the time. At 45 degrees, a wall could be taken for the floor."""
+"""Maximum angle (degrees) between the vertical and the up direction of a person who bends most of the time.
+At 45 degrees, a wall could be mistaken for the floor."""
 _AGREEMENT_DEG = 1.0
-"""Largest angle in degrees by which a plane that agrees with a vertical may be neither level nor upright."""
+"""Maximum misalignment (degrees) of a plane that agrees with a vertical. The misalignment is the angle by
+which the plane deviates from horizontal or from vertical, whichever is smaller."""
 _MIN_INFORMATION_SHARE = 0.12
-"""Smallest ratio of the planes' points that must determine each of the two tilts. Evidence: none."""
+"""Minimum information about each of the two tilts of the vertical, as a fraction of the number of points of
+all planes. Each point counts as one unit for the tilts that its plane determines. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +50,9 @@ class Plane:
     """A plane of the map.
 
     Attributes:
-        normal: (3,) unit vector.
-        offset_m: ``normal @ x`` of its points.
-        count: Number of points within `PLANE_HALF_THICKNESS_M`.
+        normal: (3,) unit normal of the plane.
+        offset_m: Signed distance of the plane from the origin: ``normal @ x`` for each point x of the plane.
+        count: Number of map points within `PLANE_HALF_THICKNESS_M` of the plane.
     """
 
     normal: FloatArray
@@ -61,8 +65,9 @@ class PlaneVertical:
     """A vertical to which planes of the map are parallel or perpendicular.
 
     Attributes:
-        up: (3,) unit vector.
-        inlier_share: Ratio of the planes' points that belong to planes within `_AGREEMENT_DEG`.
+        up: (3,) unit vector that points up.
+        inlier_share: Fraction of the planes' points that belong to planes with a misalignment of less than
+            `_AGREEMENT_DEG`.
     """
 
     up: FloatArray
@@ -70,11 +75,11 @@ class PlaneVertical:
 
 
 def find_planes(points_m: FloatArray, rng: np.random.Generator) -> list[Plane]:
-    """Find planes one after the other, those with most points first.
+    """Find planes one after the other. Each time, find the plane with the most remaining points.
 
     Args:
-        points_m: (P,3).
-        rng: Draws the hypotheses: a point and two of its neighbours.
+        points_m: (P,3) map points, metres.
+        rng: Random generator that draws the hypotheses. A hypothesis is a point and two of its neighbours.
 
     Source: M. A. Fischler, R. C. Bolles, "Random sample consensus", Communications of the ACM 24, 1981.
     """
@@ -95,7 +100,15 @@ def find_planes(points_m: FloatArray, rng: np.random.Generator) -> list[Plane]:
 
 
 def _largest_plane(points: FloatArray, rng: np.random.Generator) -> Plane | None:
-    """Return the plane with most points (P,3) by RANSAC, refined to them; None without three neighbours."""
+    """Find the plane with the most points by RANSAC, and refine it by a fit to these points.
+
+    Args:
+        points: (P,3) points, metres.
+        rng: Random generator that draws the hypotheses.
+
+    Returns:
+        The plane; None if no three neighbouring points determine a plane with at least four points.
+    """
     tree = cKDTree(points)
     seeds = rng.integers(len(points), size=_HYPOTHESES)
     groups = (np.array(tree.query_ball_point(point, _NEIGHBOUR_RADIUS_M)) for point in points[seeds])
@@ -143,15 +156,15 @@ def _largest_plane(points: FloatArray, rng: np.random.Generator) -> Plane | None
 def vertical_from_planes(
     planes: Sequence[Plane], body_up: FloatArray, limit_deg: float
 ) -> PlaneVertical | None:
-    """Return the direction near the body's up that most planes are parallel or perpendicular to.
+    """Find the direction near the body's up direction that most planes are parallel or perpendicular to.
 
     Args:
-        planes: From `find_planes`.
-        body_up: (3,) centre of the search.
-        limit_deg: Radius of the search.
+        planes: Planes of the map, from `find_planes`.
+        body_up: (3,) up direction of the body, the centre of the search.
+        limit_deg: Radius of the search in degrees.
 
     Returns:
-        None if the planes that agree do not determine both tilts.
+        The vertical; None if there are no planes, or if the planes that agree do not determine both tilts.
     """
     if not planes:
         return None
@@ -175,10 +188,10 @@ def vertical_from_planes(
 
 
 def misalignment_deg(cosine: FloatArray) -> FloatArray:
-    """Return the angle (degrees) by which planes are neither level nor upright.
+    """Return how far (degrees) each plane deviates from horizontal or from vertical, whichever is smaller.
 
     Args:
-        cosine: Of the angle between each normal and the vertical.
+        cosine: Cosine of the angle between each plane's normal and the vertical.
     """
     angle = np.degrees(np.arccos(np.clip(np.abs(cosine), 0.0, 1.0)))
     return np.asarray(np.minimum(angle, 90.0 - angle))
@@ -188,10 +201,10 @@ def _fixes_both_tilts(normals: FloatArray, counts: FloatArray, up: FloatArray, t
     """Return whether planes determine both tilts of a vertical.
 
     Args:
-        normals: (N,3) of the planes that agree with it.
-        counts: (N,) their points.
+        normals: (N,3) normals of the planes that agree with the vertical.
+        counts: (N,) numbers of points of these planes.
         up: (3,) the vertical.
-        total: Points of all planes.
+        total: Number of points of all planes, including planes that do not agree.
     """
     information = np.zeros((3, 3))
     for normal, count in zip(normals, counts, strict=True):

@@ -1,7 +1,7 @@
-"""The vertical: hypotheses from the map, the walk, the body and the job are weighed against each other.
+"""The vertical in the solved frame, selected from hypotheses of the map, the walk, the body and the job.
 
-Each hypothesis has a negative log-likelihood (nats) of everything that is observed, if it were right. The
-terms are set by hand.
+For each hypothesis, the module computes the negative log-likelihood (nats) of all observations, on the
+assumption that the hypothesis is right. The constants of this sum are set by hand.
 """
 
 from __future__ import annotations
@@ -25,40 +25,47 @@ from bodycap_batch.merging.world.planes import (
 )
 
 _LEAN_SAMPLES = 3.0
-"""Number of independent observations that the lean of a whole capture is worth: the posture's systematic bias
-is the same in all of them. Evidence: none."""
+"""Weight of the trunk's tilt (its lean) over a whole capture, as a number of independent observations. The
+number is small because the posture's systematic bias is equal at all instants. Evidence: none."""
 _PLANE_SHARE_NATS = 6.0
-"""Cost in nats of a vertical that none of the planes' points agree with. Evidence: none."""
+"""Cost (nats) of a vertical from planes if no point of the planes agrees with it. The cost is proportional
+to the fraction of points that do not agree. Evidence: none."""
 _WALK_NATS, _BODY_NATS = 1.5, 12.0
-"""Cost in nats of a vertical from the walk, and from the body's lean alone. A vertical from planes is
-preferred to these if it agrees with the body as well. Evidence: none."""
+"""Costs (nats) of a vertical from the walk, and of a vertical that is based only on the tilt of the trunk.
+Because of these costs, a vertical from planes is preferred if it also agrees with the body. Evidence:
+none."""
 _SCENE_NATS = 4.0
-"""Cost in nats of a trunk that moves farther up and down than its standing height, as on stairs; and of a
-scene with points below its floor. Evidence: none."""
+"""Cost (nats) of a vertical along which the trunk moves up and down by more than its standing height, as on
+stairs. A vertical with map points below the floor has an equal cost. Evidence: none."""
 _FLOOR_NATS = 2.0
-"""Gain in nats of a level plane where the floor must be. Evidence: none."""
+"""Gain (nats) of a vertical for which the map has a horizontal plane at the expected height of the floor.
+Evidence: none."""
 _FLOOR_TOLERANCE, _MAX_SHARE_BELOW = 0.35, 0.02
-"""Largest error of the floor's height, over the trunk's height, because of a rough scale or bent knees; and
-largest ratio of wrong points below the floor. Evidence: none."""
+"""First: maximum error of the floor's height, as a ratio to the trunk's standing height. It allows for a
+rough scale and for bent knees. Second: maximum fraction of map points below the floor; such points are wrong.
+Evidence: none."""
 _MIN_MARGIN_NATS = 3.0
-"""Smallest difference in nats to the next best direction that determines the vertical: odds of twenty to
-one."""
+"""Minimum difference (nats) between the negative log-likelihoods of the best rival and the vertical. With a
+smaller difference, the vertical is not determined. Three nats are odds of twenty to one."""
 _STATED_SIGMAS = 3.0
-"""Largest angle, in sigmas, at which planes agree with a stated vertical."""
+"""Maximum angle between a vertical given in the job and a vertical from planes that replaces it. Its unit is
+the sigma of the given vertical."""
 _DISTINCT_DEG = 20.0
-"""Angle in degrees above which another direction is a rival, and not an error of the same one. Evidence:
-none."""
+"""Minimum angle (degrees) between the vertical and a rival. A smaller angle is an error of the same vertical.
+Evidence: none."""
 _SEARCH_DEG = 5.0
-"""Radius in degrees of the search about a normal, or about a direction parallel to two planes. Evidence:
-none."""
+"""Radius (degrees) of the search about a plane's normal, or about a direction that is parallel to two planes.
+Evidence: none."""
 _SAME_DEG, _MAX_FLOOR_TILT_DEG = 1.0, 5.0
-"""Angle in degrees within which a direction was searched already; and largest tilt of a floor. Evidence:
-none."""
+"""First: minimum angle (degrees) between a new start of the search and all directions that were found before.
+Second: maximum angle (degrees) between a floor and the horizontal plane. Evidence: none."""
 _MIN_PLANE_SIGMA_DEG, _WALK_SIGMA_DEG, _BODY_SIGMA_DEG = 0.7, 2.0, 15.0
-"""Sigmas in degrees. Planes: docs/decisions/merging.md. A walk's ground and bounce are level to two degrees.
-A rotation of the camera's mount looks like a lean of the body."""
+"""Sigmas (degrees). First: minimum sigma of a vertical from planes. Second: sigma of a vertical from the
+walk. Third: minimum sigma of a vertical from the body of a walker. Planes: docs/decisions/merging.md. The
+path of a walking trunk is horizontal to two degrees. A rotation of the camera's mount looks like a tilt of
+the body."""
 _PLANE_SIGMA_LIMIT_DEG = 1.5
-"""Largest angle in degrees of the planes from which the sigma of a vertical is computed. Evidence: none."""
+"""Maximum misalignment (degrees) of a plane that is used for the sigma of a vertical. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,11 +73,13 @@ class VerticalHypothesis:
     """A direction that may be the vertical.
 
     Attributes:
-        source: "map" (its planes), "walk", "body" or "marker board".
-        up: (3,) in the solved frame.
-        sigma_deg: Its error, if it is the right one of several directions.
-        share: Ratio of the planes' points that agree; 0 if it does not come from planes.
-        negative_log_likelihood: Of everything observed if it is right, nats.
+        source: Origin of the direction: "map" (planes of the map), "walk", "body" or "marker board".
+        up: (3,) unit vector in the solved frame.
+        sigma_deg: Sigma (degrees) of the direction, if this hypothesis is the right one.
+        share: Fraction of the planes' points that agree with the direction; 0 if the direction does not come
+            from planes.
+        negative_log_likelihood: Negative log-likelihood (nats) of all observations, if this hypothesis is
+            right.
     """
 
     source: str
@@ -85,15 +94,17 @@ class Vertical:
     """The vertical in the solved frame.
 
     Attributes:
-        up: (3,).
-        source: Of the hypothesis.
-        body_off_deg: Angle to the upright body; None if the vertical comes from the body.
-        plane_share: Ratio of the planes' points that agree with it.
-        sigma_deg: Its error.
-        alternatives: The best hypothesis of each other source, and the best rival.
-        negative_log_likelihood: Of everything observed, nats.
+        up: (3,) unit vector that points up.
+        source: Origin of the selected hypothesis.
+        body_off_deg: Angle (degrees) to the up direction of the upright body; None if the vertical comes from
+            the body.
+        plane_share: Fraction of the planes' points that agree with the vertical.
+        sigma_deg: Sigma (degrees) of the vertical.
+        alternatives: Best hypothesis of each other source, and the best rival.
+        negative_log_likelihood: Negative log-likelihood (nats) of all observations.
         margin_nats: Negative log-likelihood of the best rival minus that of the vertical; None without a
-            rival. If the job states the vertical, only stated directions are rivals.
+            rival. A rival is a hypothesis with a clearly different direction that does not come from the
+            body. If the job gives verticals, only these are rivals.
     """
 
     up: FloatArray
@@ -106,24 +117,31 @@ class Vertical:
     margin_nats: float | None = None
 
     def is_determined(self) -> bool:
-        """Return whether the best rival is clearly less likely, and a constant lean would have shown."""
+        """Return whether the observations determine the vertical.
+
+        The best rival must be clearly less likely. A vertical that comes from the body must have a small
+        sigma.
+        """
         if self.rests_on_lean_only():
             return False
         return self.margin_nats is None or self.margin_nats >= _MIN_MARGIN_NATS
 
     def rests_on_lean_only(self) -> bool:
-        """Return whether it comes from a lean alone that may have been the same all the time."""
+        """Return whether the vertical is based only on the tilt of the trunk and has a large sigma.
+
+        A constant tilt of the trunk cannot be distinguished from an error of the vertical.
+        """
         return self.source == "body" and self.sigma_deg > _DISTINCT_DEG
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneContext:
-    """The map around a trunk, and its path.
+    """The map around a trunk, and the path of the trunk.
 
     Attributes:
         points_m: (P,3) map points in the solved frame.
-        path_m: (N,3) path of the trunk's camera.
-        standing_m: Height of the trunk's joint above the soles of the standing person.
+        path_m: (N,3) positions of the trunk's camera in the solved frame.
+        standing_m: Height (metres) of the trunk's joint above the soles of the standing person.
         walks: Whether the person walks most of the time.
     """
 
@@ -139,18 +157,19 @@ def estimate_vertical(
     rng: np.random.Generator,
     stated: Sequence[VerticalHypothesis] = (),
 ) -> Vertical:
-    """Select the most likely vertical among those of the planes, the walk, the body and the job.
+    """Select the most likely vertical among hypotheses from the planes, the walk, the body and the job.
 
-    A room's planes leave six directions or more. Three observations show which of them is up: how the trunk
-    leans (forward, seldom backward or sideways), how far it rises and falls, and whether there is a floor
-    where it must be.
+    The planes of a room are compatible with six or more directions. Three observations show which direction
+    is up. The first is the tilt of the trunk: often forward, seldom backward or sideways. The second is how
+    far the trunk rises and falls. The third is whether the map has a floor at the expected height.
 
     Args:
-        body: The trunk over time.
-        scene: The map and the trunk's path.
-        rng: Draws the hypotheses of the planes.
-        stated: From the job. The most likely of them is selected, whatever the others say, and replaced by
-            that of planes that agree with it.
+        body: Orientation of the trunk over time.
+        scene: The map and the path of the trunk.
+        rng: Random generator for the search for planes.
+        stated: Verticals given in the job. If there are any, the most likely of them is selected, even if
+            another hypothesis is more likely. A vertical from planes that agrees with the selected vertical
+            replaces it.
     """
     planes = find_planes(scene.points_m, rng)
     hints = [body.modal_up(), body.mean_up(), body.upright_up()]
@@ -197,8 +216,8 @@ def _cost(hypothesis: VerticalHypothesis) -> float:
 def _select(hypotheses: Sequence[VerticalHypothesis], stated: Collection[str]) -> VerticalHypothesis:
     """Return the hypothesis with the lowest negative log-likelihood.
 
-    If the job states the vertical, choose among the stated ones, and take the direction of map planes that
-    agree within 3 sigma.
+    If the job gives verticals, only these are candidates. A hypothesis from planes that agrees with the best
+    candidate within 3 sigma then replaces this candidate.
     """
     best = min((each for each in hypotheses if not stated or each.source in stated), key=_cost)
     agreeing = [
@@ -219,8 +238,9 @@ def _vertical_from_hypotheses(
 
     Args:
         selected: The most likely hypothesis.
-        hypotheses: All of them.
-        stated: Sources of the stated ones; only these are rivals then.
+        hypotheses: All hypotheses, including the selected one.
+        stated: Sources of the verticals given in the job. If there are any, only hypotheses from these
+            sources are rivals.
         upright: (3,) up direction of the upright body.
     """
     best: dict[str, VerticalHypothesis] = {}
@@ -250,11 +270,12 @@ def _vertical_from_hypotheses(
 
 
 def _hypotheses_from_planes(planes: Sequence[Plane], hints: Sequence[FloatArray]) -> list[VerticalHypothesis]:
-    """Return all directions to which most planes are parallel or perpendicular.
+    """Return the directions that many planes are parallel or perpendicular to, without duplicates.
 
     Args:
-        planes: Of the map.
-        hints: Up directions of the body, where the search starts besides the planes' own normals.
+        planes: Planes of the map.
+        hints: Up directions of the body. The search starts from these directions, from the planes' normals,
+            and from the directions that are parallel to two planes.
     """
     normals = [plane.normal for plane in planes]
     level = [np.cross(a, b) for i, a in enumerate(normals) for b in normals[:i]]
@@ -281,17 +302,18 @@ def _hypotheses_from_planes(planes: Sequence[Plane], hints: Sequence[FloatArray]
 
 
 def _plane_sigma_deg(planes: Sequence[Plane], up: FloatArray) -> float:
-    """Return the sigma (degrees) of a vertical from the planes that nearly agree with it."""
+    """Return the sigma (degrees) of a vertical, from the misalignments of the planes that nearly agree."""
     off = misalignment_deg(np.array([float(plane.normal @ up) for plane in planes]))
     near = off[off < _PLANE_SIGMA_LIMIT_DEG]
     return float(np.hypot(_MIN_PLANE_SIGMA_DEG, np.sqrt((near**2).sum()) / max(len(near) - 1, 1)))
 
 
 def _body_sigma_deg(body: TrunkOrientation, up: FloatArray, walks: bool) -> float:
-    """Return the sigma (degrees) of a vertical from the body alone.
+    """Return the sigma (degrees) of a vertical that is based only on the body.
 
-    A person who walks is upright. The sigma then contains a rotation of the camera's mount, which looks like
-    a lean, and half of the trunk's movement. A person who sits, stands or works may lean all the time.
+    A walking person is upright. The sigma then consists of a rotation of the camera's mount, which looks like
+    a tilt of the trunk, and of half of the trunk's RMS tilt. A person who sits, stands or works may tilt the
+    trunk all the time. The sigma is then the spread of the verticals that the tilts allow.
     """
     if not walks:
         return body.posterior_spread_deg(up)
@@ -300,7 +322,7 @@ def _body_sigma_deg(body: TrunkOrientation, up: FloatArray, walks: bool) -> floa
 
 
 def _scene_penalty(up: FloatArray, planes: Sequence[Plane], scene: SceneContext) -> float:
-    """Return the negative log-likelihood (nats) of the room and of the path through it for a vertical."""
+    """Return the negative log-likelihood (nats) of the map and of the trunk's path, given a vertical."""
     heights = scene.path_m @ up
     low, high = np.percentile(heights, [2.0, 98.0])
     nats = _SCENE_NATS if high - low > scene.standing_m else 0.0

@@ -1,4 +1,4 @@
-"""The transform from the solved frame (metres, arbitrary axes) to the world."""
+"""The rigid transform from the solved frame (metres, arbitrary axes) to the world."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import Similarity, so3_exp
 
 MIN_MOVING_SPEED_M_PER_S = 0.4
-"""Smallest horizontal speed, m/s, of a person who moves on. Evidence: none."""
+"""Minimum horizontal speed (m/s) at which the body is treated as moving. Evidence: none."""
 
 
 def rotation_to_z_up(up: FloatArray) -> FloatArray:
@@ -22,12 +22,15 @@ def rotation_to_z_up(up: FloatArray) -> FloatArray:
 
 
 def initial_heading(forward: FloatArray, centre_m: FloatArray, fps: float) -> float:
-    """Return the body's mean heading over the first second in which it moves, in radians from +x towards +y.
+    """Return the body's mean heading over its first moving second, in radians from +x towards +y.
+
+    The first moving second starts when the body first moves horizontally. If the body never moves, this
+    second starts at tick 0.
 
     Args:
-        forward: (T,3) the body's forward direction, z up.
-        centre_m: (T,3) its position.
-        fps: Ticks per second.
+        forward: (T,3) forward directions of the body, z up.
+        centre_m: (T,3) positions of the body, metres.
+        fps: Number of ticks per second.
     """
     window, stride = max(round(fps), 1), max(round(0.25 * fps), 1)
     start = 0
@@ -45,10 +48,12 @@ def world_from_solved_frame(
     """Return the rigid transform from the solved frame to the world.
 
     Args:
-        rotation: (3,3) that makes up +z.
-        hips_m: (3,) hips at tick 0, after `rotation`; they come to lie above the origin.
-        floor_m: Height of the floor, after `rotation`; becomes z = 0.
-        heading_rad: Heading of the first moving second, after `rotation`; becomes −y.
+        rotation: (3,3) rotation of the solved frame that makes up +z.
+        hips_m: (3,) position of the hips at tick 0, after `rotation`. In the world, this position is above
+            the origin.
+        floor_m: Height of the floor in metres, after `rotation`. In the world, the floor is at z = 0.
+        heading_rad: Heading of the body in its first moving second, after `rotation`. In the world, this
+            heading is −y.
     """
     yaw = Rotation.from_euler("z", -0.5 * np.pi - heading_rad).as_matrix()
     origin = np.array([hips_m[0], hips_m[1], floor_m])
