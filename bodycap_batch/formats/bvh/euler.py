@@ -1,4 +1,4 @@
-"""Intrinsic Euler angles in any order of the axes, with conversion to angles that are continuous over time."""
+"""Convert between rotations and intrinsic Euler angles in any order of the axes, continuous over time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from bodycap_batch.core.arrays import FloatArray
 
 _GIMBAL_LOCK_COSINE = 1e-7
 """Minimum cosine of the second angle. With a smaller cosine, the rotation is treated as gimbal lock.
-Derivation: the errors of the first and the third angle are 1e-16 divided by this cosine, which is 1e-9 rad."""
+Derivation: the errors of the first and the third angle are 1e-16 divided by the cosine. At this minimum, they
+are 1e-9 rad."""
 
 _FULL_TURN_RAD = 2.0 * np.pi
 """Angle of a full turn, radians."""
@@ -79,8 +80,8 @@ def _principal_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     Returns:
         The angles (...,3), radians, and the gimbal lock (...). The gimbal lock is sign(b) for a rotation in
-        gimbal lock, and 0 for any other rotation. In gimbal lock, the first angle is that of the rotation
-        with c = 0.
+        gimbal lock, and 0 for any other rotation. In gimbal lock, the first number is not a but the sum
+        c + sign(b) · a, and the third number is 0.
     """
     cos_b = np.hypot(rotation[..., 0, 0], rotation[..., 0, 1])
     b = np.arctan2(rotation[..., 0, 2], cos_b)
@@ -126,7 +127,7 @@ def _split_locked_sum(angles: FloatArray, locked: FloatArray, previous: FloatArr
     because adding π to a and c changes the sum only by full turns.
 
     Args:
-        angles: (J,3) angles of this tick, radians.
+        angles: (J,3) triples of this tick, radians, from `_principal_angles` or equivalent.
         locked: (J,) gimbal lock from `_principal_angles`.
         previous: (J,3) angles of the previous tick, radians.
 

@@ -19,7 +19,7 @@ _HINT = (
     "that has bpy, or to a blender executable"
 )
 _TIMEOUT_S = 3600.0
-"""Maximum duration, seconds, of a run of Blender. Evidence: none; the limit only ends a process that hangs."""
+"""Maximum duration of a run of Blender, seconds. Evidence: none; it only ends a process that hangs."""
 
 _START_TEST = "import bpy"
 """Python statement that fails if Blender does not start."""

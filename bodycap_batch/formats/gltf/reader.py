@@ -101,7 +101,7 @@ def _read_skeleton(document: Any, name: str, joint_of_node: dict[int, int]) -> S
 
 
 def _read_accessor(document: Any, accessor: int) -> FloatArray:
-    """Return the values (N, width) of the accessor with this index, where width is its number of components."""
+    """Return the values (N, number of components) of the accessor with this index."""
     entry = document.accessors[accessor]
     view = document.bufferViews[entry.bufferView]
     values = np.frombuffer(
