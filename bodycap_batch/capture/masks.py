@@ -22,7 +22,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> BoolArray:
     """Read a mask image that is white where the room is visible.
 
     Args:
-        path: Path of the mask image. It may have any size, but its aspect ratio must be that of the picture.
+        path: Path of the mask image. It may have any size, with the aspect ratio of the picture.
         size: Width and height of the picture, pixels.
 
     Returns:

@@ -100,8 +100,8 @@ def work_size(
     Args:
         shown_size: Width and height that a player shows, in square pixels.
         work_px: Maximum length of the long side of the work size, pixels.
-        turned_size: Width and height that a player shows, in stored pixels. Neither side of the work size is
-            larger. None if the stored pixels are square.
+        turned_size: Width and height that a player shows, in stored pixels. The work size is not
+            larger than this size. None if the stored pixels are square.
 
     Returns:
         The width and height, pixels.
@@ -148,7 +148,7 @@ def _same_aspect(calibration: Calibration, width: int, height: int) -> bool:
 
 
 def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Camera:
-    """Return guessed intrinsics at the work size, which mapping refines.
+    """Return an initial guess of the intrinsics at the work size. Mapping refines this guess.
 
     Args:
         video: The video.

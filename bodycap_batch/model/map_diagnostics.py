@@ -42,7 +42,7 @@ class MapDiagnostics:
             of both groups are kept, because it is unknown which group is mirrored.
         flipped_cameras: Names of the cameras that were excluded because their images are mirrored.
         excluded_from_pair: Names of the excluded cameras that belong to the user's initial image pair. If
-            there is one, the pair was not used.
+            there are any, the pair was not used.
         misfit_factors: By camera name, the ratio of the focal length that fits the map to the given focal
             length. It contains only cameras whose given intrinsics the map contradicts. None before the
             check.

@@ -151,7 +151,7 @@ def mean_rotation(rotations: FloatArray) -> FloatArray:
 
 
 def match_instants(first_ns: IntArray, second_ns: IntArray) -> IntArray:
-    """Find the frames of a first camera that were exposed at the same instants as those of a second camera.
+    """Find for each frame of a second camera the frame of a first camera at the same instant.
 
     Args:
         first_ns: (F,) common times of the first camera's frames, nanoseconds, increasing.

@@ -181,7 +181,7 @@ class Trajectory:
         times_ns: (N,) timestamp of each frame on the clock of the camera, nanoseconds.
         gauge_from_cam: (N,4,4) camera poses in the gauge; NaN for lost frames.
         covariance: (N,6,6) covariance of each pose in the axes of the camera: rotation (rad) first, then
-            translation (unit of the gauge). It is the covariance of a right perturbation, like that of
+            translation (unit of the gauge). It is the covariance of a right perturbation, as in
             GTSAM's Pose3. NaN for lost frames.
         status: (N,) status of each frame.
         inliers: (N,) number of PnP inliers of each frame.
