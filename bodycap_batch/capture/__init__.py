@@ -1,4 +1,4 @@
-"""The videos of a capture: cameras, timestamps and decoded frames."""
+"""The videos of a capture: cameras, frame times and decoded frames."""
 
 from bodycap_batch.capture.cameras import Capture, CaptureCamera
 from bodycap_batch.capture.kept import FrameCandidate, FrameKeeper, KeptFrames

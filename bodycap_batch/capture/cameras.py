@@ -1,4 +1,7 @@
-"""The cameras of a capture: frames with common times, decoded at the work size."""
+"""The cameras of a capture: frames with common times, decoded at the work size.
+
+The work size is the image size that all stages work at.
+"""
 
 from __future__ import annotations
 
@@ -27,32 +30,39 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _MIN_KEPT_RATIO = 0.75
-"""Least ratio of requested frames with a stored copy for these copies to be read. With many other frames in
-between, the video is decoded from end to end in any case. Evidence: none."""
+"""Minimum fraction of the requested frames that must have a stored copy for the copies to be read. With fewer
+copies, all requested frames are decoded from the video, because nearly the whole video must then be decoded
+in any case. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaptureCamera:
     """One camera of a capture.
 
+    The chapters are the successive video files of one recording. The joined video contains all chapters.
+
     Attributes:
         name: Name of the camera in every result.
-        chapters: Its video files in order.
-        camera: Camera model at the work size, COLMAP's pixel origin.
-        calibrated: False if the intrinsics are a guess that mapping refines.
-        frame_numbers: (N,) numbers of the used frames in the joined video, from 0.
-        times_ns: (N,) their times on the camera's own clock, increasing.
-        nominal_fps: Frame rate stated by the container.
-        offset_s: Common time = camera time + offset_s.
-        rolling_shutter_s: Readout time, from the exposure of the first row to that of the last.
-        rolling_shutter_known: False if the job does not state it: mapping then estimates it.
-        may_be_sideways: True if the sensor's rows may run along the image columns. If the readout time is
-            known, `camera.sideways` says whether they do; otherwise mapping finds out.
-        notes: Findings for the user: gaps and overlaps of chapters, dropped frames.
-        videos: Frame index of each chapter.
-        mask: (H,W) at the work size, True where the room is visible; None if it is visible everywhere.
-        kept: Frames that are read from a copy at the work size instead of the video.
-        threads: Threads of the decoder. 0: those of the environment's OMP_NUM_THREADS, or all processors.
+        chapters: Paths of the chapters, in the order of the recording.
+        camera: Intrinsics at the work size, with COLMAP's pixel origin.
+        calibrated: False if the intrinsics are an initial guess that mapping refines.
+        frame_numbers: (N,) numbers of the frames in use, counted from 0 in the joined video.
+        times_ns: (N,) time of each frame in use on the clock of the camera, nanoseconds, increasing.
+        nominal_fps: Frame rate given by the container, frames per second.
+        offset_s: Seconds to add to the camera time to get the common time.
+        rolling_shutter_s: Readout time: seconds from the exposure of the first row to the exposure of the
+            last row.
+        rolling_shutter_known: False if the readout time is not given in the job. Mapping then estimates the
+            readout time.
+        may_be_sideways: True if the rows of the sensor may be the columns of the image. If the readout time
+            is known, `camera.sideways` is already correct. Otherwise mapping determines the direction.
+        notes: Notes for the user about gaps and overlaps between chapters.
+        videos: Video file of each chapter, with the list of its frames.
+        mask: (H,W) mask at the work size, True where the room is visible; None if the room is visible
+            everywhere.
+        kept: Copies of frames at the work size, which are read instead of the video; None without copies.
+        threads: Number of threads of the decoder. 0 stands for the environment variable OMP_NUM_THREADS; if
+            it is not set, for all processors.
     """
 
     name: str
@@ -80,11 +90,18 @@ class CaptureCamera:
             raise ValueError("frame numbers and times must increase")
 
     def common_times_ns(self) -> IntArray:
-        """Return the frame times (N,) on the common clock."""
+        """Return the frame times (N,) on the common clock, nanoseconds."""
         return np.asarray(self.times_ns + round(self.offset_s * 1e9), dtype=np.int64)
 
     def is_unmasked(self, px: npt.NDArray[Any]) -> BoolArray:
-        """Return which pixels (N,2), COLMAP origin, the mask leaves visible."""
+        """Find the pixels at which the room is visible.
+
+        Args:
+            px: (N,2) pixels at the work size, with COLMAP's origin.
+
+        Returns:
+            A mask (N,) that is True where the camera's mask is True. It is True everywhere without a mask.
+        """
         if self.mask is None:
             return np.ones(len(px), dtype=bool)
         column = np.clip(px[:, 0].astype(int), 0, self.mask.shape[1] - 1)
@@ -92,7 +109,10 @@ class CaptureCamera:
         return np.asarray(self.mask[row, column])
 
     def key_indices(self) -> IntArray:
-        """Return the indices into `frame_numbers` of frames that decode without their neighbours."""
+        """Return the indices into `frame_numbers` of the codec's key frames.
+
+        The decoder can start at a key frame, because a key frame does not depend on earlier frames.
+        """
         numbers: list[IntArray] = []
         first = 0
         for video in self.videos:
@@ -102,14 +122,14 @@ class CaptureCamera:
         return np.asarray(np.flatnonzero(keys), dtype=np.int64)
 
     def grey_frames(self, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, Image]]:
-        """Yield grey frames (H,W) uint8 at the work size, decoded ahead in a thread.
+        """Decode successive frames as grey images at the work size. A thread decodes the next frames ahead.
 
         Args:
             start: First index into `frame_numbers`.
-            stop: One past the last index; all frames by default.
+            stop: Index after the last index; None for the end of the video.
 
         Yields:
-            The index and the image.
+            The index into `frame_numbers`, and the image (H,W) uint8.
 
         Raises:
             CaptureError: A frame cannot be decoded.
@@ -120,14 +140,14 @@ class CaptureCamera:
     def read(
         self, indices: Sequence[int] | IntArray, *, colour: bool = False
     ) -> Generator[tuple[int, Image], None, None]:
-        """Decode some frames, grey (H,W) or RGB (H,W,3) uint8, at the work size.
+        """Decode selected frames at the work size. A thread decodes the next frames ahead.
 
         Args:
-            indices: Increasing indices into `frame_numbers`.
-            colour: RGB instead of grey.
+            indices: (K,) increasing indices into `frame_numbers`.
+            colour: True for RGB images, False for grey images.
 
         Yields:
-            The index and the image.
+            The index into `frame_numbers`, and the image: (H,W,3) for RGB or (H,W) for grey, uint8.
 
         Raises:
             CaptureError: A frame cannot be decoded.
@@ -141,7 +161,9 @@ class CaptureCamera:
         return prefetch(self._decode(chosen, colour=colour), self.threads)
 
     def frame_candidates(self) -> Generator[FrameCandidate, None, None]:
-        """Yield all frames in a form in which they can be kept, decoded ahead in a thread.
+        """Decode all frames at the work size, in a form that can be stored as a copy.
+
+        A thread decodes the next frames ahead.
 
         Raises:
             CaptureError: A frame cannot be decoded.
@@ -150,7 +172,7 @@ class CaptureCamera:
 
     @property
     def should_keep_all(self) -> bool:
-        """True if the videos are so large that keeping all frames at the work size saves time."""
+        """True if the videos are so large that storing copies of all frames saves time."""
         size = (self.camera.width_px, self.camera.height_px)
         return any(should_keep_all(video.stored_size, size) for video in self.videos)
 
@@ -160,7 +182,7 @@ class CaptureCamera:
         indices = np.arange(len(self.frame_numbers), dtype=np.int64)
         for index, frame, video in self._frames(indices):
             if keep_all:
-                # Only the reduced planes are held: they are far smaller than the frame.
+                # Only the reduced planes are held in memory, because they are far smaller than the frame.
                 planes = work_planes(frame, video.orientation, size)
                 yield FrameCandidate(index, grey_from_planes(planes, size), partial(_identity, planes))
             else:
@@ -168,7 +190,7 @@ class CaptureCamera:
                 yield FrameCandidate(index, grey, partial(work_planes, frame, video.orientation, size))
 
     def _decode(self, indices: IntArray, *, colour: bool) -> Generator[tuple[int, Image], None, None]:
-        """Yield frames from their kept copy or from the video."""
+        """Yield the index and the image of each frame, from the stored copy or from the video."""
         size = (self.camera.width_px, self.camera.height_px)
         is_kept = np.zeros(len(indices), dtype=bool) if self.kept is None else self.kept.holds(indices)
         kept_images: Iterator[Image] = iter(())
@@ -181,7 +203,7 @@ class CaptureCamera:
             if from_copy:
                 try:
                     image = next(kept_images)
-                except CaptureError as error:  # the video still has the frame
+                except CaptureError as error:  # the frame can still be decoded from the video
                     logger.warning("%s: read from the video, since its kept copy fails: %s", self.name, error)
                     yield from replace(self, kept=None)._decode(indices[position:], colour=colour)
                     return
@@ -191,7 +213,14 @@ class CaptureCamera:
                 yield index, work_image(frame, video.orientation, size, colour=colour)
 
     def _frames(self, indices: IntArray) -> Generator[tuple[int, VideoFrame, VideoFile], None, None]:
-        """Yield the index, the decoded frame and the video of each requested frame."""
+        """Decode the requested frames from the videos.
+
+        Args:
+            indices: (K,) increasing indices into `frame_numbers`.
+
+        Yields:
+            The index into `frame_numbers`, the decoded frame, and the video file of its chapter.
+        """
         first = 0
         for video in self.videos:
             numbers = self.frame_numbers[indices] - first
@@ -206,12 +235,16 @@ class CaptureCamera:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Capture:
-    """The cameras of one recording, on one common clock."""
+    """The cameras of one recording. All cameras are related to one common clock."""
 
     cameras: tuple[CaptureCamera, ...]
 
     def camera(self, name: str) -> CaptureCamera:
-        """Return the camera with a name; raise KeyError if there is none."""
+        """Return the camera with this name.
+
+        Raises:
+            KeyError: There is no camera with this name.
+        """
         for camera in self.cameras:
             if camera.name == name:
                 return camera
@@ -219,5 +252,5 @@ class Capture:
 
 
 def _identity(planes: tuple[Planes, Colours]) -> tuple[Planes, Colours]:
-    """Return the planes: the counterpart of `work_planes` for planes that exist already."""
+    """Return the planes unchanged. This replaces `work_planes` if the planes were already computed."""
     return planes

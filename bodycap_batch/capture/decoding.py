@@ -1,4 +1,4 @@
-"""Decode frames of a video by index, and seek over frames that are not needed."""
+"""Decode frames of a video by index, and seek past frames that are not needed."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ if TYPE_CHECKING:
 
 
 def decode_frames(video: VideoFile, indices: IntArray, threads: int = 0) -> Iterator[tuple[int, VideoFrame]]:
-    """Decode the frames with these increasing indices.
+    """Decode the frames with the given indices.
 
-    Frames between them that no other frame depends on (most B-frames of H.264) are skipped.
+    The frames between the requested frames are skipped if no other frame depends on them. In H.264, these are
+    most B-frames.
 
     Args:
         video: The video.
         indices: (N,) increasing frame indices.
-        threads: Threads of the decoder, as in `open_stream`.
+        threads: Number of threads of the decoder, as in `open_stream`.
 
     Yields:
-        The index and the frame.
+        The index and the decoded frame.
 
     Raises:
         CaptureError: A frame cannot be decoded.
@@ -41,7 +42,8 @@ def decode_frames(video: VideoFile, indices: IntArray, threads: int = 0) -> Iter
         for index in map(int, indices):
             frame = frame_decoder.advance(index)
             if frame is None and not frame_decoder.sequential:
-                # Some containers seek badly (MPEG program streams): decode everything from the start.
+                # Seeking does not work well in some containers (MPEG program streams). Then all frames are
+                # decoded from the start of the video.
                 frame_decoder.close()
                 frame_decoder = _ForwardDecoder(video, None, threads)
                 frame = frame_decoder.advance(index)
@@ -59,7 +61,10 @@ def decode_frames(video: VideoFile, indices: IntArray, threads: int = 0) -> Iter
 
 
 def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
-    """Return the first frame that decodes, and whether the codec reorders frames.
+    """Decode the first frame that can be decoded.
+
+    Returns:
+        The frame, and True if the codec stores the frames in another order than the order of presentation.
 
     Raises:
         CaptureError: No frame can be decoded.
@@ -79,12 +84,13 @@ def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
 
 
 def open_stream(container: InputContainer, video: VideoFile, threads: int = 0) -> VideoStream:
-    """Return the video's stream with its decoder set up.
+    """Return the video stream of an opened file, with its decoder configured.
 
     Args:
         container: The opened file.
         video: The video.
-        threads: Threads of the decoder. 0: those of the environment's OMP_NUM_THREADS, or all processors.
+        threads: Number of threads of the decoder. 0 stands for the environment variable OMP_NUM_THREADS; if
+            it is not set, for all processors.
     """
     stream = video_stream(container, video.path)
     stream.thread_type = "AUTO"
@@ -93,16 +99,17 @@ def open_stream(container: InputContainer, video: VideoFile, threads: int = 0) -
 
 
 class _ForwardDecoder:
-    """Decodes a video forwards only.
+    """Decoder of a video in the forward direction only.
 
     Args:
         video: The video.
-        indices: The frames that will be requested; others may be skipped. None: all frames are decoded.
-        threads: Threads of the decoder, as in `open_stream`.
+        indices: (N,) indices of the frames that will be requested. Other frames may be skipped. None to
+            decode all frames.
+        threads: Number of threads of the decoder, as in `open_stream`.
 
     Attributes:
-        position: Index of the last decoded frame, −1 before the first.
-        sequential: True if every frame is decoded, without seeking.
+        position: Index of the last decoded frame; −1 before the first frame.
+        sequential: True if all frames are decoded, without seeking.
     """
 
     def __init__(self, video: VideoFile, indices: IntArray | None, threads: int) -> None:
@@ -111,8 +118,8 @@ class _ForwardDecoder:
         self._video = video
         self._container = open_container(video.path)
         self._stream = open_stream(self._container, video, threads)
-        # The halves of an interlaced frame may come one by one. AV1's decoder loses the first frame if it
-        # skips.
+        # Frames are skipped only in H.264 that is not interlaced. The two halves of an interlaced frame may
+        # be in separate packets, and the decoder of AV1 loses the first frame if it skips frames.
         may_skip = indices is not None and not self.sequential and not video.is_interlaced
         may_skip = may_skip and self._stream.codec_context.name == "h264"
         self._needed_pts = frozenset(video.pts[indices].tolist()) if may_skip else None
@@ -124,7 +131,11 @@ class _ForwardDecoder:
         self._container.close()
 
     def advance(self, index: int) -> VideoFrame | None:
-        """Decode up to a frame and return it; None if the video does not deliver it."""
+        """Decode up to the frame with this index.
+
+        Returns:
+            The frame, or None if the decoder does not return a frame with exactly this index.
+        """
         if not self.sequential:
             key_frames = self._key_index[: int(np.searchsorted(self._key_index, index, side="right"))]
             if len(key_frames) and key_frames[-1] > self.position + 1:
@@ -142,12 +153,15 @@ class _ForwardDecoder:
         return None
 
     def _seek(self, index: int) -> None:
-        """Go to a key frame, or to an earlier one if the container cannot do better."""
+        """Seek to the key frame with this index, or to an earlier key frame if the container is inexact."""
         self._container.seek(int(self._video.pts[index]), stream=self._stream, backward=True)
         self._frames = self._decoded()
 
     def _decoded(self) -> Iterator[VideoFrame]:
-        """Yield frames in the order of presentation, from here on; skipped frames may be missing."""
+        """Yield the decoded frames from the current position on, in the order of presentation.
+
+        Frames that may be skipped can be missing.
+        """
         for packet in self._container.demux(self._stream):
             if self._needed_pts is not None:
                 needed = packet.pts is None or packet.pts in self._needed_pts

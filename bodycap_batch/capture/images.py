@@ -1,4 +1,4 @@
-"""Convert a decoded frame to an image at the work size."""
+"""Convert a decoded frame to an image at the work size, the image size that all stages work at."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ if TYPE_CHECKING:
 
 Image = npt.NDArray[np.uint8]
 Planes = npt.NDArray[np.uint8]
-"""Luma and halved chroma (1.5·H,W), sides even."""
+"""Planes (1.5·H,W) of an image with even sides: luma, then both chroma planes at half resolution."""
 Colours = tuple[int, int]
-"""Range and matrix of luma and chroma, in FFmpeg's numbers."""
+"""Colour range and colour matrix of luma and chroma, as numbers of FFmpeg."""
 
 _LUMA_FORMATS = frozenset(
     f"{family}{layout}" for family in ("yuv", "yuvj") for layout in ("420p", "422p", "444p", "440p", "411p")
 ) | {"nv12", "nv21", "nv16", "gray"}
-"""Formats with 8-bit luma as their first plane, which is used directly."""
+"""Pixel formats whose first plane is the luma with 8 bits. This plane is used as the grey image."""
 _FULL_RANGE = 2
-"""FFmpeg's number of the full colour range."""
+"""FFmpeg's number for the full colour range."""
 _STUDIO_TO_FULL = np.clip(np.round((np.arange(256) - 16.0) * (255.0 / 219.0)), 0, 255).astype(np.uint8)
-"""Table from studio range to full range (ITU-R BT.601: black 16, white 235)."""
+"""Look-up table from luma in studio range to luma in full range. Source: ITU-R BT.601, in which black is 16
+and white is 235."""
 
 
 def work_image(
@@ -36,14 +37,18 @@ def work_image(
     colour: bool,
     shown: tuple[int, int] | None = None,
 ) -> Image:
-    """Return an upright image at the work size: grey (H,W) or RGB (H,W,3), full range, contiguous.
+    """Convert a decoded frame to an upright image at the work size.
 
     Args:
         frame: The decoded frame.
-        orientation: Its display matrix.
-        size: Width and height of the result.
-        colour: RGB instead of grey.
-        shown: Width and height of the part of the frame that holds the image, if it was padded to even sides.
+        orientation: Display matrix of the frame.
+        size: Width and height of the result, pixels.
+        colour: True for an RGB image, False for a grey image.
+        shown: Width and height, pixels, of the image in a frame that was padded to even sides. None if the
+            frame is not padded.
+
+    Returns:
+        The image in full range, contiguous: (H,W,3) for RGB or (H,W) for grey.
     """
     width, height = shown or (frame.width, frame.height)
     if colour or frame.format.name not in _LUMA_FORMATS:
@@ -54,7 +59,12 @@ def work_image(
 
 
 def grey_from_planes(planes: tuple[Planes, Colours], size: tuple[int, int]) -> Image:
-    """Return the grey image (H,W), full range, of planes from `work_planes`."""
+    """Return the grey image (H,W) of planes from `work_planes`, in full range.
+
+    Args:
+        planes: The planes, with their colour range and colour matrix.
+        size: Width and height of the image without padding, pixels.
+    """
     luma = np.ascontiguousarray(planes[0][: size[1], : size[0]])
     return luma if planes[1][0] == _FULL_RANGE else _expand_range(luma)
 
@@ -67,24 +77,25 @@ def _expand_range(luma: Image) -> Image:
 
 
 def work_planes(frame: VideoFrame, orientation: Orientation, size: tuple[int, int]) -> tuple[Planes, Colours]:
-    """Return luma and halved chroma, upright, padded to even sides, in the frame's own range.
+    """Convert a decoded frame to upright planes at the work size, padded to even sides.
 
-    At the frame's own size, and if it has 8 bits and halved chroma (4:2:0), the planes are unchanged. In
-    other formats the luma is correct to one level.
+    The planes keep the colour range of the frame. They contain exactly the values of the frame if the frame
+    has the work size, 8 bits and chroma at half resolution (4:2:0). For other formats, the luma is correct to
+    one level.
 
     Args:
         frame: The decoded frame.
-        orientation: Its display matrix.
-        size: Width and height of the result, before padding.
+        orientation: Display matrix of the frame.
+        size: Width and height of the result before padding, pixels.
 
     Returns:
-        The planes, and their range and matrix.
+        The planes, with their colour range and colour matrix.
     """
     is_full = _is_full_range(frame)
     colours = (_FULL_RANGE if is_full else int(frame.color_range), int(frame.colorspace))
     if frame.format.name not in ("yuv420p", "yuvj420p"):
-        # Without an explicit range FFmpeg converts grey, and formats that are full-range by name, to studio
-        # range.
+        # Without an explicit target range, FFmpeg would convert grey frames to studio range. The same applies
+        # to formats whose name implies full range.
         frame = frame.reformat(format="yuv420p", dst_color_range=_FULL_RANGE if is_full else None)
     half_size = ((size[0] + 1) // 2, (size[1] + 1) // 2)
     luma = _resize_upright(_plane_array(frame, 0), orientation, size)
@@ -102,25 +113,25 @@ def _is_full_range(frame: VideoFrame) -> bool:
 
 
 def _plane_array(frame: VideoFrame, number: int) -> Image:
-    """Return a view of a plane without the padding of its rows."""
+    """Return a view of one plane of a frame, without the padding at the ends of the rows."""
     plane = frame.planes[number]
     rows = np.asarray(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)
     return rows[: plane.height, : plane.width]
 
 
 def _resize_upright(image: Image, orientation: Orientation, size: tuple[int, int]) -> Image:
-    """Turn an image upright and resize it."""
+    """Rotate and mirror an image to its upright orientation, and resize the image."""
     upright = turn_upright(image, orientation)
     if (upright.shape[1], upright.shape[0]) == size:
         return np.array(upright, order="C")
     import cv2
 
-    # Averaging over the source pixels keeps edges in place and aliases least.
+    # The mean over the source pixels (INTER_AREA) keeps edges in place and has the least aliasing.
     return np.asarray(cv2.resize(np.ascontiguousarray(upright), size, interpolation=cv2.INTER_AREA))
 
 
 def turn_upright(image: npt.NDArray[np.uint8], orientation: Orientation) -> npt.NDArray[np.uint8]:
-    """Turn a stored image (H,W) or (H,W,3) as a player shows it."""
+    """Rotate and mirror a stored image (H,W) or (H,W,3) to the orientation that a player shows."""
     (m00, m01), (m10, m11) = orientation
     if m00:
         sign_x, sign_y = m00, m11

@@ -28,29 +28,32 @@ if TYPE_CHECKING:
 
 
 _MAX_SECONDS = 4e9
-"""Seconds: later than any Unix time of a recording, and far from the end of 64-bit nanoseconds."""
+"""Maximum absolute value, seconds, of a timestamp. Derivation: the limit is later than the Unix time of any
+recording, and far below the largest number of nanoseconds in 64 bits."""
 _MIN_PIXEL_ASPECT = Fraction(2, 5)
-"""Least plausible pixel aspect, and the inverse of the largest. Origin: HDV and AVCHD have 4:3; television
-and anamorphic lenses lie between 1:2 and 2:1."""
+"""Minimum plausible pixel aspect, width over height. The maximum is the inverse of this value. Origin: HDV
+and AVCHD have 4:3; television and anamorphic lenses have pixel aspects between 1:2 and 2:1."""
 _SQUARE_TOLERANCE = 0.004
-"""Pixel aspects this near to 1 count as square. Origin: sizes are rounded to even numbers, and resampling
-would blur each image for less than a pixel."""
+"""Maximum difference between 1 and the pixel aspect of a pixel that is treated as square. Origin: image sizes
+are rounded to even numbers. Resampling would blur every image to correct less than one pixel."""
 
 
 def index_video(path: Path, threads: int = 0) -> VideoFile:
-    """List a video's frames without decoding them; one frame is decoded for its size and orientation.
+    """List the frames of a video. Only one frame is decoded, to read its size and orientation.
 
     Args:
-        path: The video file.
-        threads: Threads of the decoder, as in `open_stream`.
+        path: Path of the video file.
+        threads: Number of threads of the decoder, as in `open_stream`.
 
     Raises:
-        CaptureError: There is no video stream, there are no frames, or the file ends before its index says.
+        CaptureError: There is no video stream, there are no frames, the timestamps are implausible, or the
+            file contains fewer frames than its index lists.
     """
     with open_container(path) as container:
         stream = video_stream(container, path)
         container_format = container.format.name
-        # MP4 lists every packet of the file. The list is read first, because demuxing adds to it.
+        # An MP4 file has an index of all packets. The length of the index is read before demuxing, because
+        # demuxing adds entries to the index.
         expected = len(stream.index_entries) if "mp4" in container_format else 0
         pts, key_pts, end = _scan_packets(path, container, stream, expected)
         metadata = {**container.metadata, **stream.metadata}
@@ -77,7 +80,18 @@ def index_video(path: Path, threads: int = 0) -> VideoFile:
 def _scan_packets(
     path: Path, container: InputContainer, stream: Any, expected: int
 ) -> tuple[IntArray, IntArray, int]:
-    """Return the timestamps of all frames, those of the key frames, and the end of the last frame."""
+    """Read the timestamps of all packets of a video stream.
+
+    Args:
+        path: Path of the video file, for error messages.
+        container: The opened file.
+        stream: The video stream.
+        expected: Minimum number of packets; a smaller number means that the file is truncated.
+
+    Returns:
+        The timestamps of all frames, the timestamps of the key frames, and the end time of the last frame.
+        All are in units of the stream's time base.
+    """
     import av
 
     pts: list[int] = []
@@ -110,7 +124,7 @@ def _scan_packets(
 
 
 def _nominal_fps(pts: IntArray, time_base: Fraction, rate: Fraction | None) -> float:
-    """Return the container's frame rate, or that of the median frame interval if it states none."""
+    """Return the frame rate of the container; without one, the inverse of the median frame interval."""
     if rate:
         return float(rate)
     steps = np.diff(pts)
@@ -118,14 +132,17 @@ def _nominal_fps(pts: IntArray, time_base: Fraction, rate: Fraction | None) -> f
 
 
 def _pixel_aspect(stated: Fraction | None) -> Fraction:
-    """Return the width of a stored pixel over its height; 1 if the stated value is missing or implausible."""
+    """Return the pixel aspect: the width of a stored pixel over its height.
+
+    It is 1 if the value in the file is missing, implausible or nearly 1.
+    """
     aspect = Fraction(stated or 1)
     is_plausible = _MIN_PIXEL_ASPECT <= aspect <= 1 / _MIN_PIXEL_ASPECT
     return aspect if is_plausible and abs(aspect - 1) > _SQUARE_TOLERANCE else Fraction(1)
 
 
 def _creation_time(metadata: dict[str, str]) -> float | None:
-    """Return the creation time as Unix seconds; None if it is missing or from an unset clock."""
+    """Return the creation time in Unix seconds; None if it is missing, or if the clock was not set."""
     text = metadata.get("creation_time", "")
     try:
         stamp = datetime.fromisoformat(text.replace("Z", "+00:00"))
@@ -137,7 +154,10 @@ def _creation_time(metadata: dict[str, str]) -> float | None:
 
 
 def _focal_35mm(metadata: dict[str, str]) -> float | None:
-    """Return the 35 mm equivalent focal length that phones write; None if it is missing."""
+    """Return the 35 mm equivalent focal length, millimetres, from the metadata of a phone.
+
+    It is None if the metadata do not contain a plausible value.
+    """
     for key, text in metadata.items():
         if key.lower().endswith("focal_length.35mm_equivalent"):
             with contextlib.suppress(ValueError):
@@ -147,9 +167,10 @@ def _focal_35mm(metadata: dict[str, str]) -> float | None:
 
 
 def _with_first_frame(video: VideoFile, container_format: str, threads: int) -> VideoFile:
-    """Set the size and orientation from a decoded frame, because the container may state others.
+    """Return the video with size and orientation taken from a decoded frame.
 
-    Frames before the first that decodes are left out (a stream cut inside a group of pictures).
+    The values in the container may be wrong. Frames before the first frame that can be decoded are removed
+    from the list. Such frames exist if the stream was cut between two key frames.
     """
     frame, reordered = first_frame(video, threads)
     video = replace(

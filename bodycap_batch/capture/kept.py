@@ -1,4 +1,7 @@
-"""Keep frames at the work size, so that their video need not be decoded again."""
+"""Store copies of frames at the work size, so that the video need not be decoded again.
+
+The work size is the image size that all stages work at. A frame with a stored copy is called a kept frame.
+"""
 
 from __future__ import annotations
 
@@ -18,30 +21,33 @@ from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
 from bodycap_batch.formats.mp4 import TIME_BASE_HZ, Quality, VideoWriter
 
 KEPT_NAME = "kept"
-"""Name of the bundle in a keyframe artefact, and of the video beside it."""
+"""Name of the stored `KeptFrames` in a keyframe artefact, and name of the video file with the copies."""
 _FPS = 30
-"""Nominal frame rate; frames are identified by their number."""
+"""Nominal frame rate, Hz, of the video with the copies. It has no meaning, because frames are identified by
+their number."""
 _FRAME_TICKS = TIME_BASE_HZ // _FPS
-"""Time between two frames, in units of the video's time base."""
+"""Time between two frames of the video with the copies, in units of its time base."""
 _LARGE_RATIO = 2.0
-"""Ratio of the video's pixels to those at the work size, from which on all frames are kept. Decoding the
-video again then costs more than writing and reading the copies. Evidence: docs/decisions/capture.md."""
+"""Minimum ratio of the number of pixels in a frame of the video to the number of pixels at the work size for
+all frames to be kept. With a larger ratio, decoding the video again costs more than writing and reading the
+copies. Evidence: docs/decisions/capture.md."""
 _GROUP_FRAMES = 12
-"""Frames from one key frame of the copy to the next, if all frames are kept. Evidence: none."""
+"""Number of frames from one codec key frame to the next (GOP length), if all frames are kept. Evidence:
+none."""
 _IDENTITY_ORIENTATION = ((1, 0), (0, 1))
 """Display matrix of an image that is stored upright."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeptFrames:
-    """Frames of a camera in a video of their own.
+    """The kept frames of a camera, stored in a separate video.
 
     Attributes:
-        path: The video.
-        frames: (K,) their indices in the camera, increasing.
-        width_px: Width of the frames, the camera's work size.
-        height_px: Height of the frames.
-        group: Frames from one key frame to the next.
+        path: Path of the video with the copies.
+        frames: (K,) indices of the kept frames among the frames of the camera, increasing.
+        width_px: Width of the copies at the camera's work size, pixels.
+        height_px: Height of the copies at the camera's work size, pixels.
+        group: Number of frames from one codec key frame to the next (GOP length).
     """
 
     path: Path
@@ -54,19 +60,22 @@ class KeptFrames:
         set_array(self, "frames", (len(self.frames),), np.int64)
 
     def holds(self, indices: IntArray) -> BoolArray:
-        """Return which frames of the camera (N,) are kept."""
+        """Return a mask (N,) that is True for the camera's frames (N,) that are kept."""
         return np.isin(indices, self.frames)
 
     def read(
         self, indices: IntArray, size: tuple[int, int], *, colour: bool, threads: int = 0
     ) -> Generator[Image, None, None]:
-        """Decode kept frames, grey (H,W) or RGB (H,W,3), at (width, height).
+        """Decode kept frames.
 
         Args:
-            indices: Increasing indices in the camera.
-            size: Width and height of the result.
-            colour: RGB instead of grey.
-            threads: Threads of the decoder, as in `open_stream`.
+            indices: (N,) increasing indices among the frames of the camera. All these frames must be kept.
+            size: Width and height of the returned images, pixels.
+            colour: True for RGB images, False for grey images.
+            threads: Number of threads of the decoder, as in `open_stream`.
+
+        Yields:
+            The image of each frame: (H,W,3) for RGB or (H,W) for grey.
 
         Raises:
             CaptureError: A frame cannot be decoded.
@@ -76,7 +85,7 @@ class KeptFrames:
             yield work_image(frame, _IDENTITY_ORIENTATION, size, colour=colour, shown=stored_size)
 
     def _video(self) -> VideoFile:
-        """Return the frame index of the copy."""
+        """Return the video with the copies, with the list of its frames."""
         pts = np.arange(len(self.frames), dtype=np.int64) * _FRAME_TICKS
         return VideoFile(
             path=self.path,
@@ -92,12 +101,13 @@ class KeptFrames:
 
 @dataclass(frozen=True, slots=True)
 class FrameCandidate:
-    """A frame that may be kept.
+    """A decoded frame that may be kept.
 
     Attributes:
-        index: Its index in the camera.
-        grey: (H,W) at the work size.
-        planes: Makes its luma and chroma, with their range and matrix.
+        index: Index among the frames of the camera.
+        grey: (H,W) grey image at the work size.
+        planes: Function that returns the luma and chroma planes of the frame, with their colour range and
+            colour matrix.
     """
 
     index: int
@@ -106,23 +116,28 @@ class FrameCandidate:
 
 
 def should_keep_all(stored_size: tuple[int, int], work_size: tuple[int, int]) -> bool:
-    """Return True if a video is so large that all of its frames are kept, with a small loss.
+    """Return True if a video is so large that all its frames are kept.
 
-    Of other videos only the keyframes are kept, because only these are read more than twice. The copy is
-    lossless for 8 bits and 4:2:0 chroma, and correct to one grey level otherwise.
+    If all frames are kept, their compression has small losses. For a smaller video, only the keyframes are
+    kept, because only the keyframes are read more than twice. The copies of keyframes are lossless for frames
+    with 8 bits and 4:2:0 chroma. For other formats, the luma of these copies is correct to one grey level.
+
+    Args:
+        stored_size: Width and height of the frames in the video, pixels.
+        work_size: Width and height of the copies, pixels.
     """
     return stored_size[0] * stored_size[1] >= _LARGE_RATIO * work_size[0] * work_size[1]
 
 
 @dataclass(slots=True)
 class FrameKeeper:
-    """Writes the kept frames of one camera; a context manager.
+    """Context manager that writes the kept frames of one camera.
 
     Attributes:
-        folder: An existing folder.
-        width_px: Width of the frames.
-        height_px: Height of the frames.
-        keep_all: True if all frames are kept, not only keyframes.
+        folder: Existing folder for the video with the copies.
+        width_px: Width of the frames at the work size, pixels.
+        height_px: Height of the frames at the work size, pixels.
+        keep_all: True if all frames are kept; False if only the keyframes are kept.
     """
 
     folder: Path
@@ -134,17 +149,17 @@ class FrameKeeper:
     _writer: VideoWriter | None = None
 
     def add_frame(self, shot: FrameCandidate) -> None:
-        """Keep a frame if all frames are kept."""
+        """Write a frame if `keep_all` is True; otherwise do nothing."""
         if self.keep_all:
             self._add(shot)
 
     def add_keyframe(self, shot: FrameCandidate) -> None:
-        """Keep a keyframe, unless all frames are kept in any case."""
+        """Write a keyframe if `keep_all` is False; otherwise do nothing, because `add_frame` writes it."""
         if not self.keep_all:
             self._add(shot)
 
     def kept_frames(self) -> KeptFrames | None:
-        """Return the kept frames once the keeper is closed; None if there are none."""
+        """Return the kept frames; None if no frame was kept. Call this after the context has ended."""
         if not self._frames:
             return None
         return KeptFrames(
@@ -166,7 +181,7 @@ class FrameKeeper:
             size = (planes.shape[1], planes.shape[0] * 2 // 3)
             quality: Quality = "near" if self.keep_all else "exact"
             self._writer = VideoWriter(self._path, _FPS, size, quality, colours)
-        if colours == self._colours:  # frames of a chapter with another colour range are read from the video
+        if colours == self._colours:  # a chapter with another colour range is read from the video
             self._writer.add_planes(planes)
             self._frames.append(shot.index)
 

@@ -1,4 +1,4 @@
-"""Read the image that marks the part of a camera's picture that shows the room."""
+"""Read a mask image, which marks the part of a camera's picture where the room is visible."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.core.errors import CaptureError
 
 _WHITE_LEVEL = 128
-"""Grey level from which on a pixel counts as white."""
+"""Minimum grey level of a pixel that is treated as white."""
 _ASPECT_TOLERANCE = 0.01
-"""Largest relative difference of the aspects of mask and picture. Origin: sizes rounded to even numbers.
-Evidence: none."""
+"""Maximum relative difference between the aspect ratios of mask and picture. Origin: image sizes are rounded
+to even numbers. Evidence: none."""
 _MIN_WHITE_RATIO = 0.05
-"""Least ratio of white pixels. Evidence: none."""
+"""Minimum fraction of the pixels of a mask that are white. Evidence: none."""
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> BoolArray:
     """Read a mask image that is white where the room is visible.
 
     Args:
-        path: The image, of any size with the aspect of the picture.
-        size: Width and height of the picture.
+        path: Path of the mask image. It may have any size, with the aspect ratio of the picture.
+        size: Width and height of the picture, pixels.
 
     Returns:
-        (H,W), read-only.
+        (H,W) mask, read-only, that is True where the room is visible.
 
     Raises:
-        CaptureError: The mask is missing, no image, of another aspect, or leaves almost nothing visible.
+        CaptureError: The mask is missing, is not an image, has another aspect ratio than the picture, or is
+            almost completely black.
     """
     import cv2
 

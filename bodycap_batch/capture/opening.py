@@ -1,4 +1,7 @@
-"""Open the videos of a capture: frame times on the common clock, intrinsics at the work size."""
+"""Open the videos of a capture: list their frames, compute frame times and intrinsics.
+
+The intrinsics are computed at the work size, which is the image size that all stages work at.
+"""
 
 from __future__ import annotations
 
@@ -18,20 +21,22 @@ from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera, with_two_focal_lengths
 
 _GUESSED_FOV_DEG = 70.0
-"""Degrees along the long side: the widest common lens of webcams and phones. Mapping refines it."""
+"""Assumed field of view, degrees, along the long side of the image, if it is unknown. It is the field of view
+of the widest common lenses of webcams and phones. Mapping refines this value."""
 _FULL_FRAME_MM = 36.0
-"""Millimetres: width of a 35 mm film frame, by definition of the equivalent focal length."""
+"""Width of a 35 mm film frame, millimetres. The definition of the 35 mm equivalent focal length uses this
+width."""
 _ASPECT_TOLERANCE = 0.004
-"""Largest relative difference of two aspects. Origin: one pixel of 640×480, because encoders round sizes to
-even numbers."""
+"""Maximum relative difference between two aspect ratios that are treated as equal. Origin: one pixel in an
+image of 640×480, because encoders round image sizes to even numbers."""
 
 
 def open_capture(spec: CaptureConfig, threads: int = 0) -> Capture:
-    """Index every video of a resolved capture block, without decoding.
+    """Open all videos of a capture and list their frames. The frames are not decoded.
 
     Args:
-        spec: The capture block of a job from `load_job`.
-        threads: Threads of the decoders, as in `CaptureCamera`.
+        spec: The capture block of a job, as returned by `load_job`.
+        threads: Number of threads of each decoder, as in `CaptureCamera`.
 
     Raises:
         CaptureError: A video, its timestamps or its calibration cannot be used, or there is no frame between
@@ -41,7 +46,16 @@ def open_capture(spec: CaptureConfig, threads: int = 0) -> Capture:
 
 
 def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> CaptureCamera:
-    """Index the videos of one camera; see `open_capture`."""
+    """Open the videos of one camera and list their frames.
+
+    Args:
+        spec: The capture block of a job, as returned by `load_job`.
+        config: The block of this camera.
+        threads: Number of threads of the decoder, as in `CaptureCamera`.
+
+    Raises:
+        CaptureError: As for `open_capture`.
+    """
     videos = tuple(index_video(path, threads) for path in config.video)
     _check_one_format(videos)
     timeline = join_chapters(videos, config.timestamps)
@@ -68,8 +82,8 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         offset_s=offset_s,
         rolling_shutter_s=_shown_rolling_shutter_s(config.rolling_shutter_s or 0.0, videos[0]),
         rolling_shutter_known=config.rolling_shutter_s is not None,
-        # Sensors are wider than tall: a tall picture was turned, at the latest by the person who cut the
-        # video.
+        # Sensors are wider than they are high. Therefore a picture that is higher than wide was rotated by
+        # 90°, by the camera or by the person who edited the video.
         may_be_sideways=_is_quarter_turned(videos[0]) or camera.height_px > camera.width_px,
         notes=timeline.notes,
         videos=videos,
@@ -81,12 +95,16 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
 def work_size(
     shown_size: tuple[int, int], work_px: int, turned_size: tuple[int, int] | None = None
 ) -> tuple[int, int]:
-    """Return the size that frames are worked at: the long side is at most `work_px`, never enlarged.
+    """Return the work size of a video. Frames are never enlarged to the work size.
 
     Args:
-        shown_size: Width and height as a player shows them, in square pixels.
-        work_px: The longest side.
-        turned_size: The same in stored pixels, if these are not square: neither side is enlarged.
+        shown_size: Width and height that a player shows, in square pixels.
+        work_px: Maximum length of the long side of the work size, pixels.
+        turned_size: Width and height that a player shows, in stored pixels. The work size is not
+            larger than this size. None if the stored pixels are square.
+
+    Returns:
+        The width and height, pixels.
     """
     stored = turned_size or shown_size
     scale = min(
@@ -97,12 +115,13 @@ def work_size(
 
 
 def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Camera:
-    """Scale a calibration to the work size.
+    """Return the intrinsics of a calibration at the work size.
 
-    A calibration made on stored pixels that are not square is stretched as the images are.
+    If the calibration was made with stored pixels that are not square, it is stretched in the same way as the
+    images.
 
     Raises:
-        CaptureError: The calibration has another aspect than the video.
+        CaptureError: The aspect ratio of the calibration differs from the aspect ratio of the video.
     """
     width, height = video.shown_size
     if not any(_same_aspect(calibration, *size) for size in (video.shown_size, video.turned_size)):
@@ -124,14 +143,19 @@ def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Cam
 
 
 def _same_aspect(calibration: Calibration, width: int, height: int) -> bool:
-    """Return True if a calibration has the aspect of a size."""
+    """Return True if a calibration has the same aspect ratio as an image of this width and height."""
     return abs(width * calibration.height / (height * calibration.width) - 1.0) <= _ASPECT_TOLERANCE
 
 
 def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Camera:
-    """Return a first guess for mapping to refine.
+    """Return an initial guess of the intrinsics at the work size. Mapping refines this guess.
 
-    The field of view is the stated one, the one of the metadata, or a typical one, in this order.
+    Args:
+        video: The video.
+        work_px: Maximum length of the long side of the work size, pixels.
+        fov_deg: Field of view along the long side that is given in the job, degrees. If it is None, the focal
+            length in the metadata of the video is used. Without such metadata, a typical field of view is
+            used.
     """
     width, height = work_size(video.shown_size, work_px, video.turned_size)
     long_side = max(width, height)
@@ -146,20 +170,21 @@ def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Cam
 
 
 def _is_quarter_turned(video: VideoFile) -> bool:
-    """Return True if a player turns the video by a quarter, so that stored rows are shown as columns."""
+    """Return True if a player rotates the video by 90°, so that stored rows are shown as columns."""
     return not video.orientation[1][1]
 
 
 def _shown_rolling_shutter_s(rolling_shutter_s: float, video: VideoFile) -> float:
-    """Return the readout time along the rows (or columns) as shown.
+    """Return the readout time in the direction of the shown rows, or columns for a video rotated by 90°.
 
-    It is negative for a sensor that is upside down.
+    It is negative if the sensor reads the shown image in the opposite direction, as for a sensor that is
+    mounted upside down.
     """
     return rolling_shutter_s * (video.orientation[1][1] or video.orientation[0][1])
 
 
 def _check_one_format(videos: tuple[VideoFile, ...]) -> None:
-    """Raise an error if the chapters differ in size."""
+    """Raise `CaptureError` if the chapters have different image sizes."""
     for video in videos[1:]:
         if video.shown_size != videos[0].shown_size:
             raise CaptureError(
@@ -171,7 +196,7 @@ def _check_one_format(videos: tuple[VideoFile, ...]) -> None:
 
 
 def _in_time_range(times_ns: IntArray, offset_s: float, spec: CaptureConfig) -> BoolArray:
-    """Return which frames (N,) lie between start_s and end_s on the common clock."""
+    """Return a mask (N,) that is True for frames between start_s and end_s on the common clock."""
     common = times_ns + round(offset_s * 1e9)
     is_inside = np.ones(len(common), dtype=bool)
     if spec.start_s is not None:
@@ -184,7 +209,7 @@ def _in_time_range(times_ns: IntArray, offset_s: float, spec: CaptureConfig) -> 
 def _no_frames_error(
     spec: CaptureConfig, config: CameraConfig, times_ns: IntArray, offset_s: float
 ) -> CaptureError:
-    """Return the error for a camera without frames between start_s and end_s."""
+    """Return the error for a camera that has no frame between start_s and end_s."""
     first, last = times_ns[0] / 1e9 + offset_s, times_ns[-1] / 1e9 + offset_s
     return CaptureError(
         f"camera {config.name} has no frame between start_s and end_s: it runs from {first:.2f} s to "

@@ -1,4 +1,4 @@
-"""Run a generator ahead of its consumer, in one thread with a bounded queue."""
+"""Produce the items of a generator in a thread, before the consumer requests them."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ from typing import TypeVar
 Item = TypeVar("Item")
 
 _QUEUE_LENGTH = 4
-"""Items made ahead. It bounds the memory."""
+"""Number of items that are produced before they are requested. The limit bounds the memory."""
 
 
 def prefetch(
     source: Generator[Item, None, None], threads: int = 0, ahead: int = _QUEUE_LENGTH
 ) -> Generator[Item, None, None]:
-    """Yield the items of `source` while a thread makes the next `ahead` items.
+    """Yield the items of `source` while a thread produces the next items.
 
-    Decoding and resizing release the interpreter's lock, so they overlap with the consumer's work. The thread
-    starts with the first requested item and ends with the generator, even with an abandoned one. An error of
-    the source is raised in place of its item.
+    Decoding and resizing release Python's interpreter lock, so they run in parallel with the consumer. The
+    thread starts when the first item is requested. It ends when this generator ends or is closed. If the
+    source raises an error, the error is raised in place of the item.
 
     Args:
-        source: The generator.
-        threads: Threads of the task. With one thread, each item is made when it is requested.
-        ahead: Items made ahead.
+        source: Generator of the items.
+        threads: Number of threads that the task may use. With one thread, each item is produced only when it
+            is requested.
+        ahead: Number of items that are produced before they are requested.
     """
     if threads == 1:
         yield from source

@@ -1,4 +1,7 @@
-"""Times of a camera's frames: from the container or from sidecar files, chapters joined."""
+"""Compute the times of a camera's frames, and join the times of successive chapters.
+
+The times come from the container of each video, or from sidecar files: text files of timestamps.
+"""
 
 from __future__ import annotations
 
@@ -16,22 +19,24 @@ from bodycap_batch.core.errors import CaptureError
 _NS = 1_000_000_000
 """Nanoseconds per second."""
 _MAX_BYTES = 256 << 20
-"""Bytes: largest sidecar file that is read."""
+"""Maximum size, bytes, of a sidecar file that is read."""
 _CLOCK_RESOLUTION_NS = 2 * _NS
-"""Nanoseconds: exactness of creation times. They are whole seconds, and cameras record the start of writing,
-not of the exposure."""
+"""Maximum error, nanoseconds, of the time between the creation times of two files. Creation times are whole
+seconds. In addition, cameras record the start of writing instead of the start of the exposure."""
 _MAX_ABS_NS = 1 << 62
-"""Nanoseconds, about 146 years: sums of times and offsets stay inside int64."""
+"""Maximum absolute value, nanoseconds, of a timestamp; about 146 years. With this limit, sums of times and
+offsets fit into 64 bits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timeline:
-    """Frame times of one camera's joined chapters.
+    """The frame times of the joined chapters of one camera.
 
     Attributes:
-        times_ns: (N,) time of every frame on the camera's own clock.
-        usable: (N,) False for frames that a later chapter repeats.
-        notes: Gaps and overlaps found.
+        times_ns: (N,) time of every frame on the clock of the camera, nanoseconds.
+        usable: (N,) False for a frame that is not later than all earlier frames, because a chapter repeats
+            the end of the previous chapter.
+        notes: Notes for the user about gaps and overlaps between chapters.
     """
 
     times_ns: IntArray
@@ -40,14 +45,16 @@ class Timeline:
 
 
 def read_timestamps(path: Path) -> IntArray:
-    """Read a sidecar file: seconds, one line per frame; empty lines and ``#`` comments are skipped.
+    """Read a sidecar file, which contains the time in seconds of one frame on each line.
+
+    Empty lines and comments, which start with ``#``, are ignored.
 
     Returns:
-        (N,) nanoseconds.
+        (N,) times, nanoseconds.
 
     Raises:
-        CaptureError: The file is unreadable, or a line is not a number or does not increase. The error names
-            the line.
+        CaptureError: The file cannot be read, a line is not a number, or a time is not later than the
+            previous time. The error names the line.
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
@@ -75,7 +82,10 @@ def read_timestamps(path: Path) -> IntArray:
 
 
 def _parse_seconds(text: str, path: Path, line: int) -> int:
-    """Return seconds as exact nanoseconds: a float64 of Unix time resolves only 200 ns."""
+    """Convert a text with seconds to nanoseconds, exactly.
+
+    A float64 is not used, because its resolution for Unix times is only 200 ns.
+    """
     try:
         value = Decimal(text)
         if value.is_finite() and abs(value.adjusted()) < 12 and abs(value * _NS) < _MAX_ABS_NS:
@@ -88,11 +98,15 @@ def _parse_seconds(text: str, path: Path, line: int) -> int:
 
 
 def join_chapters(videos: tuple[VideoFile, ...], sidecars: tuple[Path, ...]) -> Timeline:
-    """Put the frames of all chapters on the camera's clock.
+    """Compute the times of the frames of all chapters on the clock of the camera.
 
-    Sidecar files have priority: one for all chapters, or one for each. Without them the exact timestamps of
-    the containers are used. Chapters that start again at zero follow each other without a gap, unless their
-    creation times show that more than two seconds are missing.
+    Sidecar files have priority over the containers. Without sidecar files, the timestamps of the containers
+    are used. If the timestamps of a chapter start again at zero, the chapter follows the previous chapter
+    without a gap. There is a gap only if the creation times show that more than two seconds are missing.
+
+    Args:
+        videos: The chapters in the order of the recording.
+        sidecars: One sidecar file for all chapters, one sidecar file for each chapter, or none.
 
     Raises:
         CaptureError: A sidecar file does not match its video.
@@ -107,7 +121,7 @@ def join_chapters(videos: tuple[VideoFile, ...], sidecars: tuple[Path, ...]) -> 
 
 
 def _sidecar_times(path: Path, frames: int) -> IntArray:
-    """Read a sidecar file and check its number of lines."""
+    """Read a sidecar file and check that it has one time for each frame."""
     times = read_timestamps(path)
     if len(times) != frames:
         raise CaptureError(
@@ -119,7 +133,11 @@ def _sidecar_times(path: Path, frames: int) -> IntArray:
 
 
 def _container_times(videos: tuple[VideoFile, ...]) -> list[IntArray]:
-    """Return the times of each chapter, moved behind the previous chapter if it starts again at zero."""
+    """Return the frame times of each chapter from the containers.
+
+    If the timestamps of a chapter start again at zero, the chapter is moved to the end of the previous
+    chapter.
+    """
     parts = [videos[0].times_ns()]
     for before, video in itertools.pairwise(videos):
         own, start = video.times_ns(), int(parts[-1][0])
@@ -134,7 +152,10 @@ def _container_times(videos: tuple[VideoFile, ...]) -> list[IntArray]:
 
 
 def _missing_between_ns(before: VideoFile, video: VideoFile) -> int:
-    """Return the time lost between two chapters according to their creation times; 0 if these are unknown."""
+    """Return the time that is missing between two chapters, according to their creation times.
+
+    It is 0 if the creation times are unknown, or if the difference is within their error.
+    """
     if before.created_s is None or video.created_s is None:
         return 0
     gap = round((video.created_s - before.created_s) * _NS) - before.duration_ns
@@ -142,7 +163,7 @@ def _missing_between_ns(before: VideoFile, video: VideoFile) -> int:
 
 
 def _join_parts(videos: tuple[VideoFile, ...], parts: list[IntArray]) -> Timeline:
-    """Concatenate chapters; frames that are not later than all earlier frames are not usable."""
+    """Join the frame times of all chapters, and find the usable frames, gaps and overlaps."""
     times = np.concatenate(parts)
     latest = np.maximum.accumulate(times)
     usable = np.ones(len(times), dtype=bool)

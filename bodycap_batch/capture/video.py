@@ -1,4 +1,4 @@
-"""One video file: its frames, their times, and how it is opened."""
+"""A video file: the list of its frames and their times, and functions to open the file."""
 
 from __future__ import annotations
 
@@ -19,33 +19,35 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 Orientation = tuple[tuple[int, int], tuple[int, int]]
-"""Signed permutation matrix, shown = orientation · stored, x right and y down."""
+"""Signed permutation matrix that converts stored to shown coordinates: shown = orientation · stored, with x
+to the right and y down."""
 
 COPY_AGAIN = "copy it again from the camera's card, or leave this camera out"
 """Hint for a damaged file."""
 MAY_READ = "let the user who runs this read the file and enter its folders (chmod)"
-"""Hint for a file without permission to read."""
+"""Hint for a file that the user has no permission to read."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VideoFile:
-    """The video stream of one container, demuxed once.
+    """The video stream of one file, with the list of its frames.
 
     Attributes:
-        path: The file.
-        pts: (N,) presentation timestamps of the frames in `time_base` units, increasing.
-        key_pts: (K,) timestamps of the frames from which decoding can start.
-        time_base: Seconds per unit.
-        fps: Nominal frame rate of the container.
-        duration_ns: From the first frame to the end of the last.
-        stored_size: Width and height as coded, before the display rotation.
-        orientation: (2,2) integers, display matrix: shown = orientation · stored (y down).
-        created_s: Creation time in the metadata, Unix seconds.
-        focal_35mm: 35 mm equivalent focal length in the metadata.
-        is_counted: True if the decoder returns no timestamps (AVI with B-frames): frames are counted from the
-            start and are evenly spaced.
-        is_interlaced: True if a frame holds two half pictures of different times.
-        pixel_aspect: Width of a stored pixel over its height; 4/3 if 1440 columns are shown as 1920.
+        path: Path of the file.
+        pts: (N,) presentation timestamps of the frames in units of `time_base`, increasing.
+        key_pts: (K,) presentation timestamps of the codec's key frames, at which decoding can start.
+        time_base: Seconds per unit of the timestamps.
+        fps: Nominal frame rate of the container, frames per second.
+        duration_ns: Nanoseconds from the start of the first frame to the end of the last frame.
+        stored_size: Width and height of the stored frames, before the display rotation, in stored pixels.
+        orientation: (2,2) display matrix of integers: shown = orientation · stored, with y down.
+        created_s: Creation time from the metadata, Unix seconds; None if it is unknown.
+        focal_35mm: 35 mm equivalent focal length from the metadata, millimetres; None if it is unknown.
+        is_counted: True if the decoder returns no timestamps (AVI with B-frames). Frames are then identified
+            by counting them from the start.
+        is_interlaced: True if a frame contains two half pictures of different times.
+        pixel_aspect: Width of a stored pixel over its height. For example, it is 4/3 if 1440 stored columns
+            are shown as 1920 columns.
     """
 
     path: Path
@@ -78,7 +80,7 @@ class VideoFile:
         return (width, height) if self.orientation[0][0] else (height, width)
 
     def times_ns(self) -> IntArray:
-        """Return the timestamps (N,) in nanoseconds, exact to half a nanosecond."""
+        """Return the timestamps (N,) in nanoseconds, rounded to the nearest nanosecond."""
         top, bottom = self.time_base.numerator * 1_000_000_000, self.time_base.denominator
         exact = [(2 * value * top + bottom) // (2 * bottom) for value in self.pts.tolist()]
         return np.array(exact, dtype=np.int64)
@@ -114,10 +116,10 @@ def open_container(path: Path) -> InputContainer:
 
 
 def video_stream(container: InputContainer, path: Path) -> VideoStream:
-    """Return the stream with the camera's pictures, not a cover picture.
+    """Return the stream with the camera's pictures. Streams that contain only a cover picture are ignored.
 
     Raises:
-        CaptureError: There is no such stream, or no decoder for it.
+        CaptureError: There is no such stream, or there is no decoder for the stream.
     """
     import av
 
@@ -133,12 +135,16 @@ def video_stream(container: InputContainer, path: Path) -> VideoStream:
 
 
 def error_reason(error: Exception) -> str:
-    """Return the message of a library's error in a few words."""
+    """Return a short message for an error of a library."""
     return str(getattr(error, "strerror", "") or error)
 
 
 def orientation_from_frame(frame: VideoFrame) -> Orientation:
-    """Round the display matrix to a quarter turn or mirror: shown = matrix · stored, y down."""
+    """Return the orientation that is nearest to the display matrix of a frame.
+
+    Such an orientation is a rotation by a multiple of 90°, with or without mirroring. Without a display
+    matrix, it is the identity.
+    """
     side_data: Any = frame.side_data.get("DISPLAYMATRIX")
     if side_data is None:
         return (1, 0), (0, 1)

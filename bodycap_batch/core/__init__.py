@@ -1,1 +1,1 @@
-"""What every package builds on: errors, checked arrays, progress events and the context of a stage."""
+"""Foundations that every package uses: errors, checked arrays, progress events, the context of a stage."""

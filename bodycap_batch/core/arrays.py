@@ -1,4 +1,4 @@
-"""Checked, read-only arrays for the frozen data types."""
+"""Checked, read-only arrays for the fields of frozen dataclasses."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ def frozen_array(
 ) -> npt.NDArray[Any]:
     """Return `value` as a read-only array of the given dtype and shape.
 
-    The data are copied, unless `value` is already a read-only array that owns its data.
+    If `value` is a read-only array that owns its data, it is returned without a copy. Otherwise the data are
+    copied.
 
     Args:
-        value: Anything that numpy converts to an array.
+        value: Any value that numpy can convert to an array.
         name: Name of the field, for the error message.
-        shape: Expected shape; None accepts any length.
-        dtype: Target dtype.
-        finite: Whether NaN and infinity are refused.
+        shape: Expected shape. None in place of a length accepts any length of this axis.
+        dtype: Type of the elements of the returned array.
+        finite: True to refuse NaN and infinity.
 
     Raises:
         ValueError: The shape differs, or a value is not finite.
@@ -47,9 +48,10 @@ def frozen_array(
 
 
 def _is_frozen(value: npt.ArrayLike, dtype: npt.DTypeLike) -> TypeGuard[npt.NDArray[Any]]:
-    """Return whether `value` can be shared: read-only, contiguous and no view of another array.
+    """Return True if `value` can be used without a copy.
 
-    Sharing matters because the arrays of a long recording take hundreds of megabytes.
+    It must be read-only and contiguous, have the dtype, and own its data. Copies are avoided because the
+    arrays of a long recording take hundreds of megabytes.
     """
     if not isinstance(value, np.ndarray) or value.dtype != dtype:
         return False
@@ -66,22 +68,22 @@ def set_array(
 ) -> None:
     """Check the array field `name` of a frozen dataclass and make it read-only.
 
-    Call this in ``__post_init__``. Arguments and errors are those of `frozen_array`.
+    Call this function in ``__post_init__``. See `frozen_array` for the other arguments and for the errors.
     """
     value = frozen_array(getattr(owner, name), name=name, shape=shape, dtype=dtype, finite=finite)
     object.__setattr__(owner, name, value)
 
 
 def runs(mask: BoolArray) -> list[tuple[int, int]]:
-    """Return the maximal runs [start, stop) of true values in a mask (N,), in order."""
+    """Return the longest possible runs [start, stop) of successive True values in a mask (N,), in order."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def evenly_spaced(count: int, limit: int) -> IntArray:
-    """Return up to `limit` different, evenly spaced indices of `count` items.
+    """Return at most `limit` evenly spaced indices of `count` items, without repetitions.
 
-    The first and the last item are included; with a limit of one, only the first.
+    The indices include the first and the last item. If the limit is one, they include only the first item.
     """
     if count <= 0:
         return np.zeros(0, dtype=np.int64)

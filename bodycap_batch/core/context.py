@@ -1,6 +1,6 @@
-"""What a stage may use besides its inputs and options.
+"""The resources and callbacks that a stage may use in addition to its inputs and options.
 
-The context never affects a result, so it is no part of the key of a stored artefact.
+They never affect a result. Therefore they are not a part of the key of a stored artefact.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ class StageContext:
     """Resources and callbacks of one run of a stage.
 
     Attributes:
-        work_dir: Folder for temporary files, used by this run only.
-        threads: Number of threads that the stage may use.
-        progress: Callback ``progress(done, total, what)``; `what` is the unit, for example ``frames``.
-        cancelled: Callback that returns True as soon as the stage should stop.
+        work_dir: Folder for temporary files. Only this run uses the folder.
+        threads: Maximum number of threads that the stage may use.
+        progress: Callback ``progress(done, total, what)``. `done` and `total` are numbers of units, and
+            `what` is the name of the unit, for example ``frames``.
+        cancelled: Callback that returns True if the stage should stop.
     """
 
     work_dir: Path
@@ -37,6 +38,6 @@ class StageContext:
     cancelled: Callable[[], bool] = field(default=_not_cancelled)
 
     def check_cancelled(self) -> None:
-        """Raise `Cancelled` if the stage should stop. Long loops call this at every step."""
+        """Raise `Cancelled` if the stage should stop. Long loops call this method at every step."""
         if self.cancelled():
             raise Cancelled("stopped on request")

@@ -1,6 +1,6 @@
-"""The errors that are reported to users, each with an exit code and a hint.
+"""The errors that are reported to users. Each error has an exit code, and it can have a hint.
 
-Only these errors are expected. Any other exception is a bug and ends the program with `EXIT_BUG`.
+Any exception of another type is a bug. It ends the program with the exit code `EXIT_BUG`.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 
 EXIT_OK = 0
-"""Exit code of success."""
+"""Exit code after success."""
 EXIT_BUG = 70
-"""Exit code of an unexpected exception. Source: EX_SOFTWARE of sysexits.h."""
+"""Exit code after an unexpected exception. Source: EX_SOFTWARE of sysexits.h."""
 
 EXIT_CANCELLED = 130
 """Exit code after a stop on request. Source: shells report 128 + SIGINT (2)."""
@@ -20,11 +20,11 @@ class BodycapError(Exception):
     """Base class of the errors that a user can understand and correct.
 
     Args:
-        message: What is wrong, in one sentence.
+        message: Description of the problem, in one sentence.
         path: File that the error concerns.
-        line: Line in that file, counted from 1.
-        field: Field of the job file, with dots (``capture.cameras.0.video``).
-        hint: What the user can do.
+        line: Number of the line in this file, counted from 1.
+        field: Name of the field in the job file, with dots (``capture.cameras.0.video``).
+        hint: Advice on what the user can do.
     """
 
     exit_code = EXIT_BUG
@@ -52,7 +52,7 @@ class BodycapError(Exception):
         return f"{text}\n  hint: {self.hint}" if self.hint else text
 
     def to_dict(self) -> dict[str, str | int | None]:
-        """Return the error as plain JSON values; `error_from_dict` restores it in another process."""
+        """Return the error as plain JSON values. `error_from_dict` restores the error in another process."""
         return {
             "type": type(self).__name__,
             "message": self.message,
@@ -65,13 +65,13 @@ class BodycapError(Exception):
 
 
 class JobError(BodycapError):
-    """The job file, the command line or a file named there is wrong."""
+    """The job file, the command line, or a file that the job file or the command line names is wrong."""
 
     exit_code = 2
 
 
 class CaptureError(BodycapError):
-    """Videos, calibration or timestamps cannot be used."""
+    """A video, a calibration or a file of timestamps cannot be used."""
 
     exit_code = 3
 
@@ -104,7 +104,7 @@ _ERROR_TYPES = {
 
 
 def error_from_dict(data: dict[str, str | int | None]) -> BodycapError:
-    """Restore an error from the values of `BodycapError.to_dict`; an unknown type gives a `BodycapError`."""
+    """Restore an error from the values of `BodycapError.to_dict`. An unknown type gives a `BodycapError`."""
     cls = _ERROR_TYPES.get(str(data.get("type")), BodycapError)
     line = data.get("line")
     return cls(

@@ -8,10 +8,11 @@ import gc
 
 
 def release_memory() -> None:
-    """Return the memory that this process has freed to the operating system.
+    """Return to the operating system the memory that this process has freed.
 
-    glibc keeps freed memory, which raises the peak of the next step. Other C libraries have no
-    ``malloc_trim``; there only Python's garbage collector runs. Evidence: docs/decisions/export.md.
+    glibc keeps freed memory, and this increases the peak memory of the next step. Other C libraries have no
+    ``malloc_trim``. With such a library, only Python's garbage collector runs. Evidence:
+    docs/decisions/export.md.
     """
     gc.collect()
     with contextlib.suppress(OSError, AttributeError):

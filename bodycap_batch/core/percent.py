@@ -1,17 +1,20 @@
-"""Fractions as percentages in text."""
+"""Format fractions as percentages."""
 
 from __future__ import annotations
 
 
 def format_percent(fraction: float, digits: int = 0) -> str:
-    """Return a fraction as a rounded percentage; only 1 gives 100 % and only 0 gives 0 %.
+    """Format a fraction as a rounded percentage.
+
+    A fraction between 0 and 1 never gives 0 % or 100 %. With one decimal, 0.9996 gives ``99.9%``, and 0.0004
+    gives ``0.1%``.
 
     Args:
-        fraction: The value, 1 for 100 %. Values below 0 and above 1 are rounded as usual.
+        fraction: The fraction; 1 is 100 %. Values below 0 and above 1 are rounded as usual.
         digits: Number of decimals.
 
     Returns:
-        The text: with one decimal, 0.9996 gives ``99.9%`` and 0.0004 gives ``0.1%``.
+        The percentage as text.
     """
     step = 10.0**-digits
     value = 100.0 * fraction

@@ -14,15 +14,15 @@ class Event:
     """One progress event of a job.
 
     Attributes:
-        kind: What happened. A task started, progressed, finished, was reused from the store, failed or was
-            stopped; or the event is a note for the user.
+        kind: Kind of the event. A task started, made progress, finished, was reused from the store, failed
+            or was stopped, or the event is a note for the user.
         stage: Stage name.
         camera: Camera name; "" if the stage concerns all cameras.
         done: Number of finished units.
-        total: Number of units; 0 if unknown.
-        what: Name of the unit (``frames``, ``pairs`` …) or the text of a note.
-        seconds: Duration of a finished task.
-        round: Number of the round in which the map is extended, counted from 0.
+        total: Number of all units; 0 if the number is unknown.
+        what: Name of the unit (``frames``, ``pairs`` …), or the text of a note.
+        seconds: Duration of a finished task, seconds.
+        round: Number of the round of map extension, counted from 0.
     """
 
     kind: Kind
@@ -36,7 +36,7 @@ class Event:
 
     @property
     def label(self) -> str:
-        """Stage, camera and round in one text."""
+        """Text that names the stage, the camera and the round."""
         return task_label(self.stage, self.camera, self.round)
 
     def to_dict(self) -> dict[str, Any]:
@@ -45,7 +45,7 @@ class Event:
 
 
 def task_label(stage: str, camera: str = "", map_round: int = 0) -> str:
-    """Return stage, camera and round in one text; the first round is not mentioned."""
+    """Return a text that names the stage, the camera and the round. The first round is not mentioned."""
     round_text = f"(round {map_round})" if map_round else ""
     return " ".join(part for part in (stage, camera, round_text) if part)
 

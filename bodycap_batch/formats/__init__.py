@@ -1,1 +1,1 @@
-"""Readers and writers of file formats; each module handles the axes and units of its format."""
+"""Readers and writers of file formats. Each module converts the axes and units of one format."""

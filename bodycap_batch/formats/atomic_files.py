@@ -1,4 +1,4 @@
-"""Write files atomically: a reader sees either the old or the complete new file."""
+"""Write files atomically: a reader sees either the old file or the complete new file."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ def store_error_from_os_error(error: OSError, path: Path) -> StoreError:
 
 @contextmanager
 def atomic_replacement(path: Path) -> Iterator[Path]:
-    """Yield a temporary file in the folder of `path`, and rename it to `path` if the block succeeds.
+    """Yield the path of a temporary file, and rename the file to `path` if the block succeeds.
 
-    The temporary file has the same suffix, because libraries choose the format by it. After a failure it is
-    deleted, and an existing file at `path` is unchanged.
+    The temporary file is in the folder of `path`. It has the suffix of `path`, because libraries choose the
+    format by the suffix. After a failure, the temporary file is deleted, and an existing file at `path` is
+    unchanged.
 
     Raises:
         StoreError: The file cannot be written, for example because the disk is full.
@@ -54,7 +55,7 @@ def atomic_replacement(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a UTF-8 text file with LF line ends atomically.
+    """Write a text file atomically, in UTF-8 and with LF line ends.
 
     Raises:
         StoreError: The file cannot be written.

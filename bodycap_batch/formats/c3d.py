@@ -1,4 +1,4 @@
-"""C3D files: joint centres as labelled points in millimetres, in the axes of the world (Z up, facing −Y)."""
+"""C3D files: joint centres as labelled points in millimetres, in world axes (Z up, facing −Y)."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ _MM_PER_M = 1000.0
 """Millimetres per metre."""
 
 _TOLERANCE_M = 1e-5
-"""Metres. Largest accepted change of a coordinate when the file is read back. Derivation: the format has
-single precision, 1 µm at a distance of 10 m."""
+"""Maximum difference, metres, between a coordinate that is read back and the coordinate that was written.
+Derivation: the format has single precision, which is 1 µm at a distance of 10 m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LabelledPoints:
-    """The positions of N labelled points at T times, in the world.
+    """The positions of N labelled points in the world at T times.
 
     Attributes:
-        names: (N,) labels.
+        names: (N,) labels of the points.
         fps: Frames per second.
-        x_in_world_m: (T,N,3) positions in metres.
+        x_in_world_m: (T,N,3) positions of the points in the world, metres.
     """
 
     names: tuple[str, ...]
@@ -38,13 +38,13 @@ class LabelledPoints:
 
 
 def write_c3d(path: Path, points: LabelledPoints) -> Path:
-    """Write points as a C3D file, read the file back and compare.
+    """Write points as a C3D file, read the file back and compare the points.
 
     Returns:
-        The path.
+        The path of the file.
 
     Raises:
-        StoreError: The file cannot be written, or its points differ from the given ones.
+        StoreError: The file cannot be written, or the points that are read back differ from the given points.
     """
     import ezc3d
 
@@ -73,10 +73,10 @@ def write_c3d(path: Path, points: LabelledPoints) -> Path:
 
 
 def read_c3d(path: Path) -> LabelledPoints:
-    """Read the points of a C3D file with millimetres as its unit.
+    """Read the points of a C3D file whose unit is the millimetre.
 
     Raises:
-        JobError: The file is missing, or is no C3D file.
+        JobError: The file is missing, or it is not a C3D file.
     """
     import ezc3d
 

@@ -1,4 +1,7 @@
-"""COLMAP's binary sparse model, which COLMAP, Blender add-ons, nerfstudio and splatting tools read."""
+"""Write a map as COLMAP's binary sparse model.
+
+COLMAP, add-ons for Blender, nerfstudio and tools for Gaussian splatting read this format.
+"""
 
 from __future__ import annotations
 
@@ -28,19 +31,20 @@ _COLMAP_MODEL_IDS = {
     "RADIAL_FISHEYE": 9,
     "THIN_PRISM_FISHEYE": 10,
 }
-"""Number of each camera model in the binary format. Source: COLMAP, sensor/models.h."""
+"""Identification number of each camera model in the binary format. Source: COLMAP, sensor/models.h."""
 
 _POINT2D = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
-"""One 2D point of an image in images.bin."""
+"""Type of one 2D point of an image in images.bin: pixel position, and id of the 3D point."""
 
 _TRACK = np.dtype([("image", "<i4"), ("index", "<i4")])
-"""One element of a point's track in points3D.bin: image id and index among the 2D points of that image."""
+"""Type of one element of a 3D point's track in points3D.bin: the id of an image, and the index among the 2D
+points of this image."""
 
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
 
 def image_name(camera: str, frame_number: int) -> str:
-    """Return the image name of a keyframe: the camera as folder, the frame number in the video as file."""
+    """Return the image name of a keyframe: the camera is the folder, the frame number is the file name."""
     return f"{camera}/{frame_number:06d}.png"
 
 
@@ -52,19 +56,19 @@ def write_colmap_model(
 ) -> tuple[Path, ...]:
     """Write a map as cameras.bin, images.bin and points3D.bin.
 
-    The 2D points of an image are only those that were triangulated. Ids start at 1. Cameras are ordered by
-    name, images by camera and frame, points as in the map.
+    The images contain only 2D points that observe a 3D point of the map. Ids start at 1. Cameras are ordered
+    by name, and images by camera and frame. Points have the order of the map.
 
     Args:
-        folder: Folder of the model.
+        folder: Folder for the files of the model.
         scene: The map.
-        target_from_map: Transform of the model into another frame of reference, usually the world; None for
+        target_from_map: Similarity from the map to another frame of reference, usually the world. None for
             the identity.
-        frame_numbers: By camera, the frame number in the video of each frame index, for the image names.
-            Cameras without an entry use the index.
+        frame_numbers: By camera name, the number in the video of each frame index. Image names contain these
+            numbers. For a camera without an entry, image names contain the frame index.
 
     Returns:
-        The written files.
+        The paths of the written files.
 
     Raises:
         StoreError: A file cannot be written.
@@ -104,7 +108,7 @@ def write_colmap_model(
 
 
 def _encode_cameras(cameras: list[tuple[int, Camera]]) -> bytes:
-    """Return the content of cameras.bin for pairs of id and camera."""
+    """Return the content of cameras.bin for pairs of camera id and camera."""
     parts = [struct.pack("<Q", len(cameras))]
     for index, camera in cameras:
         parts.append(
@@ -120,7 +124,7 @@ def _encode_observations(scene: Map, by_image: IntArray, starts: IntArray) -> li
     Args:
         scene: The map.
         by_image: (M,) indices of the map's observations, ordered by image.
-        starts: (K+1,) index in `by_image` at which each image begins.
+        starts: (K+1,) position in `by_image` at which each image begins, followed by M.
     """
     table = np.empty(len(by_image), dtype=_POINT2D)
     table["x"], table["y"] = scene.obs_px[by_image].T
@@ -131,7 +135,14 @@ def _encode_observations(scene: Map, by_image: IntArray, starts: IntArray) -> li
 def _encode_images(
     cam_from_target: FloatArray, camera_ids: list[int], image_names: list[str], points2d: list[bytes]
 ) -> bytes:
-    """Return the content of images.bin for poses (K,4,4) and, per image, camera id, name and 2D points."""
+    """Return the content of images.bin.
+
+    Args:
+        cam_from_target: (K,4,4) pose of each image: the transform from the target frame to the camera.
+        camera_ids: (K,) camera id of each image.
+        image_names: (K,) name of each image.
+        points2d: (K,) encoded 2D points of each image.
+    """
     quats = np.roll(quat_xyzw_from_rotation(cam_from_target[:, :3, :3]), 1, axis=-1)
     parts = [struct.pack("<Q", len(image_names))]
     for index, name in enumerate(image_names):
@@ -149,10 +160,10 @@ def _encode_points(
 
     Args:
         scene: The map.
-        positions: (P,3) points in the target frame.
+        positions: (P,3) positions of the map's points in the target frame.
         by_image: (M,) indices of the map's observations, ordered by image.
-        images: (M,) image id of each of these observations.
-        starts: (K+1,) index in `by_image` at which each image begins.
+        images: (M,) image id of each observation, in the order of `by_image`.
+        starts: (K+1,) position in `by_image` at which each image begins, followed by M.
     """
     track = np.empty(len(by_image), dtype=_TRACK)
     track["image"] = images

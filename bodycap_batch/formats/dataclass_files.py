@@ -1,8 +1,8 @@
 """Store frozen dataclasses as ``<name>.json`` (structure and scalars) and ``<name>.npz`` (arrays).
 
-The types of the fields determine the format. Supported are arrays, scalars, enums, paths, tuples, mappings
-and dataclasses of these. A class with ``to_dict`` and ``from_dict`` is stored as plain values. Pickle is not
-used, and equal values give equal bytes.
+The declared types of the fields determine the format. The supported types are arrays, scalars, enums, paths,
+tuples, mappings, and dataclasses of these types. A class with ``to_dict`` and ``from_dict`` is stored as
+plain JSON values. Pickle is not used. Equal values give equal bytes.
 """
 
 from __future__ import annotations
@@ -27,17 +27,18 @@ T = TypeVar("T")
 Arrays = dict[str, np.ndarray[Any, Any]]
 
 _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-"""Date of every zip entry: the earliest that the zip format can hold. It is constant so that equal arrays
-give equal bytes."""
+"""Date of every zip entry: the earliest date that the zip format supports. The date is constant, so that
+equal arrays give equal bytes."""
 
 
 def write_dataclass(value: Any, folder: Path, name: str) -> None:
     """Write a dataclass instance as ``<name>.json`` and, if it contains arrays, ``<name>.npz``.
 
     Args:
-        value: The instance. Its paths must lie below `folder` and are stored relative to it.
+        value: The instance. Paths in the instance must be below `folder`, and are stored relative to
+            `folder`.
         folder: Existing folder for the files.
-        name: File name without suffix.
+        name: Name of the files without suffix.
     """
     arrays: Arrays = {}
     encoded = _encode(value, type(value), _Location(folder, arrays))
@@ -49,10 +50,10 @@ def write_dataclass(value: Any, folder: Path, name: str) -> None:
 
 
 def read_dataclass(cls: type[T], folder: Path, name: str) -> T:
-    """Read an instance that `write_dataclass` has written.
+    """Read a dataclass instance that `write_dataclass` has written.
 
     Raises:
-        StoreError: A file is missing or damaged, or contains another type.
+        StoreError: A file is missing or damaged, or contains an instance of another class.
     """
     path = folder / f"{name}.json"
     try:
@@ -68,7 +69,7 @@ def read_dataclass(cls: type[T], folder: Path, name: str) -> T:
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
-    """Write arrays as an uncompressed .npz file. Its bytes depend only on names and arrays."""
+    """Write arrays as an uncompressed .npz file. The bytes of the file depend only on names and arrays."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
             buffer = io.BytesIO()
@@ -77,19 +78,19 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
 
 
 def read_npz(path: Path) -> Arrays:
-    """Read all arrays of a .npz file; pickled objects are refused."""
+    """Read all arrays of a .npz file. Pickled objects are refused."""
     with np.load(path, allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Location:
-    """Position of a value in the stored instance.
+    """The position of a value in the stored instance.
 
     Attributes:
-        folder: Folder that stored paths are relative to.
-        arrays: All arrays of the instance, by name.
-        name: Dotted name of the value, "" for the instance itself.
+        folder: Folder that the stored paths are relative to.
+        arrays: By dotted name, all arrays of the instance.
+        name: Dotted name of the value; "" for the instance itself.
     """
 
     folder: Path
@@ -97,13 +98,13 @@ class _Location:
     name: str = ""
 
     def inner(self, part: object) -> _Location:
-        """Return the position of a field or an element of this value."""
+        """Return the position of a field or an element of the value at this position."""
         name = f"{self.name}.{part}" if self.name else str(part)
         return dataclasses.replace(self, name=name)
 
 
 def _encode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911 - one return per kind of type
-    """Return a value of type `hint` as JSON values, and add its arrays to the location."""
+    """Convert a value of type `hint` to JSON values, and add its arrays to `location.arrays`."""
     hint = _strip_none(hint)
     origin = typing.get_origin(hint) or hint
     if value is None:
@@ -133,7 +134,7 @@ def _encode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911
 
 
 def _decode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911 - one case a kind of type
-    """Return the value of type `hint` that `_encode` has encoded."""
+    """Convert JSON values from `_encode` back to a value of type `hint`."""
     hint = _strip_none(hint)
     origin = typing.get_origin(hint) or hint
     if value is None:
@@ -160,7 +161,7 @@ def _decode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911
 
 
 def _strip_none(hint: Any) -> Any:
-    """Return X for ``X | None``, Any for other unions, and other hints unchanged."""
+    """Return X for the type hint ``X | None``, Any for another union, and any other type hint unchanged."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
         return kinds[0] if len(kinds) == 1 else Any
@@ -174,7 +175,7 @@ def _element_hints(hint: Any, count: int) -> tuple[Any, ...]:
 
 
 def _json_value(value: Any) -> Any:
-    """Return a value without a declared type as JSON values; NaN and infinity become null."""
+    """Convert a value without a declared type to JSON values. NaN and infinity become null."""
     if isinstance(value, Mapping):
         return {str(key): _json_value(part) for key, part in value.items()}
     if isinstance(value, (list, tuple)):

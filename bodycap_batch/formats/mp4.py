@@ -1,4 +1,4 @@
-"""Write H.264 video as MP4 files, which browsers and video editors play."""
+"""Write H.264 video as MP4 files. Browsers and video editors can play these files."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
 TIME_BASE_HZ = 15360
-"""Ticks per second of the time stamps. Derivation: a multiple of the usual rates 24, 30, 60 and 120 Hz;
-FFmpeg's default for 30 Hz."""
+"""Number of timestamp units per second. Derivation: a multiple of the usual frame rates 24, 30, 60 and 120
+Hz, and FFmpeg's default for 30 Hz."""
 
 _FAST_X264_PARAMS = "bframes=0:rc-lookahead=0:weightp=0:8x8dct=0"
 """Options of x264 for fast encoding: no look-ahead, no weighted prediction, no large transforms. Evidence:
@@ -27,15 +27,16 @@ docs/decisions/formats.md."""
 _ENCODER_OPTIONS = {
     "high": {"crf": "16", "preset": "superfast"},
     "lossless": {"crf": "0", "preset": "ultrafast"},
-    # A group of one picture: every frame can be decoded without others.
+    # With g = 1 (GOP length 1), every frame is a key frame, which can be decoded without other frames.
     "exact": {"qp": "0", "preset": "ultrafast", "g": "1"},
     "near": {"crf": "12", "preset": "ultrafast", "g": "12"},
     "small": {"crf": "27", "preset": "superfast", "x264-params": _FAST_X264_PARAMS},
 }
-"""Encoder options of each quality (`VideoWriter`)."""
+"""Options of the encoder for each quality of `VideoWriter`."""
 
 _CONTAINER_OPTIONS = {"small": {"movflags": "+faststart"}}
-"""Puts the index at the start of the file, so that a web page can play it while it loads."""
+"""Options of the MP4 container for each quality. The option puts the index at the start of the file, so that
+a web page can play the video while it loads."""
 
 Quality = Literal["high", "lossless", "exact", "near", "small"]
 _STUDIO_RANGE_CHROMA = np.round((np.arange(256) - 128.0) * (224.0 / 255.0) + 128.0).astype(np.uint8)
@@ -45,16 +46,17 @@ _STUDIO_RANGE_CHROMA = np.round((np.arange(256) - 128.0) * (224.0 / 255.0) + 128
 class VideoWriter:
     """Writer of an MP4 file with H.264 video.
 
-    It uses one encoder thread, so that the same frames give the same bytes.
+    The encoder uses one thread, so that equal frames give equal bytes.
 
     Args:
-        path: The file.
+        path: Path of the file.
         fps: Frames per second.
-        size: Width and height of the images in pixels.
-        quality: "high"; "lossless", except for the chroma, which has half the resolution; "exact", which is
-            lossless and lets every frame be decoded alone; "near", with hardly visible losses; or "small".
+        size: Width and height of the images, pixels.
+        quality: Quality of the video. "high": good quality. "lossless": no losses, except that the chroma has
+            half the resolution. "exact": like "lossless", and every frame can be decoded without other
+            frames. "near": hardly visible losses. "small": small file.
         colours: Colour range and colour matrix of the images given to `add_planes`, as numbers of FFmpeg.
-            They are stored in the file.
+            They are stored in the file. None if they are not stored.
 
     Raises:
         StoreError: The file cannot be written.
@@ -89,16 +91,18 @@ class VideoWriter:
         self._count = 0
 
     def add(self, image: npt.NDArray[np.uint8]) -> None:
-        """Append an RGB image (H,W,3)."""
+        """Append an RGB image (H,W,3) to the video."""
         if self._quality == "small":
             self.add_planes(yuv420_from_rgb(image))
         else:
             self._add(self._av.VideoFrame.from_ndarray(image, format="rgb24"))
 
     def add_planes(self, planes: npt.NDArray[np.uint8]) -> None:
-        """Append an image as planes (1.5·H,W): luma, then both chroma planes at half resolution.
+        """Append an image, given as planes, to the video.
 
-        The values must be in the colour range that is stored in the file.
+        Args:
+            planes: (1.5·H,W) luma, then both chroma planes at half resolution. The values must be in the
+                colour range that is stored in the file.
         """
         self._add(self._av.VideoFrame.from_ndarray(planes, format="yuv420p"))
 
@@ -116,7 +120,7 @@ class VideoWriter:
             raise self._failure(error) from error
 
     def _failure(self, error: Exception) -> StoreError:
-        """Return the typed error for an error of the encoder or the disk."""
+        """Convert an error of the encoder or of the disk to a `StoreError`."""
         if isinstance(error, OSError):
             return store_error_from_os_error(error, self._path)
         return StoreError(f"cannot write the video: {error}", path=self._path, hint="check the disk")
@@ -137,9 +141,15 @@ class VideoWriter:
 
 
 def yuv420_from_rgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Convert an RGB image (H,W,3) of even width and height to YUV 4:2:0 planes (1.5·H,W) in studio range.
+    """Convert an RGB image to YUV 4:2:0 planes in studio range.
 
-    This is faster than FFmpeg's conversion. Evidence: docs/decisions/formats.md.
+    This conversion is faster than FFmpeg's conversion. Evidence: docs/decisions/formats.md.
+
+    Args:
+        image: (H,W,3) RGB image. Width and height must be even.
+
+    Returns:
+        The planes (1.5·H,W): luma, then both chroma planes at half resolution.
 
     Source: ITU-R BT.601.
     """
@@ -148,8 +158,8 @@ def yuv420_from_rgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     height, width = image.shape[:2]
     planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)
     half = cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    # cvtColor takes the chroma of one pixel of four, which makes thin coloured lines flicker. The mean of the
-    # four pixels does not.
+    # cvtColor uses the chroma of only one of four pixels. Then thin coloured lines flicker. Therefore the
+    # chroma is replaced by the chroma of the mean of the four pixels.
     _, red, blue = cv2.split(cv2.cvtColor(half, cv2.COLOR_RGB2YCrCb))
     for plane, chroma in zip(planes[height:].reshape(2, -1), (blue, red), strict=True):
         plane[:] = cv2.LUT(chroma, _STUDIO_RANGE_CHROMA).ravel()

@@ -1,10 +1,11 @@
 """Import Open3D without its Plotly drawing functions, which take most of the import time.
 
-``import open3d`` imports dash and plotly for ``open3d.visualization.draw_plotly``. They take three quarters
-of the import time, and this project does not use them. Open3D has no switch to leave them out. Therefore
-`load_open3d` puts a placeholder for that one module into ``sys.modules`` before the import. This is a
-monkeypatch of a third-party package; it is confined to this module. If a drawing function is called
-nevertheless, the placeholder imports the real module, so Open3D still works completely.
+``import open3d`` imports the packages dash and plotly for the module ``open3d.visualization.draw_plotly``.
+These packages take three quarters of the import time, and this project does not use them. Open3D has no
+option to skip them. Therefore `load_open3d` puts a placeholder for ``draw_plotly`` into ``sys.modules``
+before the import. This is a monkeypatch of a third-party package. No other module of this project does this.
+If a drawing function is called nevertheless, the placeholder imports the real module. Therefore all functions
+of Open3D still work.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from types import ModuleType
 from typing import Any
 
 _PLOTLY_MODULE = "open3d.visualization.draw_plotly"
-"""The module that the placeholder replaces."""
+"""Name of the module that the placeholder replaces."""
 
 
 class _LazyModule(ModuleType):
-    """A placeholder for a module. Each of its functions imports the real module when it is called."""
+    """A placeholder for a module. A call of any of its functions imports the real module."""
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("__"):
@@ -35,9 +36,9 @@ class _LazyModule(ModuleType):
 
 
 def load_open3d() -> Any:
-    """Import and return Open3D, with `_PLOTLY_MODULE` replaced by a placeholder.
+    """Import and return Open3D. The module `_PLOTLY_MODULE` is replaced by a placeholder.
 
-    If Open3D is already imported, it is returned as it is.
+    If Open3D is already imported, it is returned unchanged.
     """
     if "open3d" not in sys.modules:
         sys.modules[_PLOTLY_MODULE] = _LazyModule(_PLOTLY_MODULE)

@@ -1,4 +1,4 @@
-"""File formats that need a library outside the base installation."""
+"""Check the libraries of file formats that need more than the base installation."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from importlib.util import find_spec
 from bodycap_batch.core.errors import JobError
 
 _LIBRARY_MODULES = {"usd": "pxr", "c3d": "ezc3d"}
-"""The module that each format imports."""
+"""By name of the format, the Python module that the format needs."""
 
 
 def require_libraries(formats: Iterable[str]) -> None:
     """Check that the libraries of all formats are installed.
 
-    A job calls this first, so that a missing library is reported before anything is computed.
+    A job calls this function first, so that a missing library is reported before the computation starts.
 
     Args:
-        formats: The formats of the job (`export.formats`).
+        formats: Names of the formats of the job (`export.formats`).
 
     Raises:
-        JobError: A library is missing; the hint says how to install it.
+        JobError: A library is missing. The hint explains how to install the library.
     """
     for name in formats:
         if name in _LIBRARY_MODULES and find_spec(_LIBRARY_MODULES[name]) is None:

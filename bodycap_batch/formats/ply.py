@@ -1,4 +1,4 @@
-"""PLY files: a coloured point cloud that contains the camera paths as dense series of points."""
+"""PLY files: a coloured point cloud, to which the paths of the cameras are added as dense points."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ Colors = npt.NDArray[np.uint8]
 
 
 _VERTEX_BYTES = 3 * 8 + 3
-"""Bytes per point: three doubles and three colour bytes."""
+"""Number of bytes per point: three doubles for the position and three bytes for the colour."""
 
 _HEADER_BYTES = 512
-"""Bytes. Upper limit of the size of the header. Derivation: Open3D's header has fewer than 300 bytes."""
+"""Maximum size of the header, bytes. Derivation: Open3D's header has fewer than 300 bytes."""
 
 _MAX_SAMPLES_PER_STEP = 100
-"""Largest number of samples between two camera centres, so that a wrong pose does not make the file huge.
-Evidence: none."""
+"""Maximum number of points between two successive camera centres. With this limit, a wrong pose does not make
+the file huge. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointCloud:
-    """P coloured points.
+    """A cloud of P coloured points.
 
     Attributes:
-        points: (P,3) points.
-        colors: (P,3) colours, uint8 RGB.
+        points: (P,3) positions of the points.
+        colors: (P,3) colours of the points, uint8 RGB.
     """
 
     points: FloatArray
@@ -53,14 +53,18 @@ def add_camera_paths(
     spacing: float,
     colours: Mapping[str, Colour] | None = None,
 ) -> PointCloud:
-    """Return the point cloud with the path of each camera added as a series of points.
+    """Add the path of each camera to a point cloud, as a series of points.
 
     Args:
-        cloud: The points of the map.
-        paths: By camera name, (N,3) camera centres in time order; NaN for a lost frame.
-        spacing: Largest distance between two points of a path, in the unit of the cloud.
-        colours: By camera name, the colour of each path. Without it, colours are assigned to the cameras of
-            `paths`; give it if the job has more cameras.
+        cloud: The point cloud of the map.
+        paths: By camera name, (N,3) camera centres in the order of time, in the frame and unit of the cloud;
+            NaN for a lost frame.
+        spacing: Maximum distance between two neighbouring points of a path, in the unit of the cloud.
+        colours: By camera name, the colour of the path. None to assign colours to the cameras of `paths`. If
+            the job has other cameras too, the colours must be given, so that they are the same in all files.
+
+    Returns:
+        The point cloud with the paths.
     """
     points, colors = [cloud.points], [cloud.colors]
     colours = colours or camera_colours(paths)
@@ -72,9 +76,14 @@ def add_camera_paths(
 
 
 def _sample_polyline(path: FloatArray, spacing: float) -> FloatArray:
-    """Return points along a path (N,3): all its vertices, and samples at most `spacing` apart between them.
+    """Return points along a path: all finite vertices, and further points between successive vertices.
 
-    Gaps of the path (NaN) are not filled.
+    Neighbouring points have at most the distance `spacing`, but there are at most `_MAX_SAMPLES_PER_STEP`
+    points between two vertices. Gaps in the path (NaN) are not filled.
+
+    Args:
+        path: (N,3) vertices of the path; NaN in a gap.
+        spacing: Maximum distance between neighbouring points, in the unit of the path.
     """
     out = []
     for start, end in pairwise(path):
@@ -89,18 +98,19 @@ def _sample_polyline(path: FloatArray, spacing: float) -> FloatArray:
 
 
 def write_ply(path: Path, cloud: PointCloud) -> None:
-    """Write a binary PLY file with Open3D, read it back and compare.
+    """Write a binary PLY file with Open3D, read the file back and compare the point clouds.
 
     Raises:
-        StoreError: The file cannot be written, or it differs from the given point cloud.
+        StoreError: The file cannot be written, or the point cloud that is read back differs from the given
+            point cloud.
     """
     open3d = load_open3d()
     content = open3d.geometry.PointCloud()
     content.points = open3d.utility.Vector3dVector(cloud.points.copy())
     content.colors = open3d.utility.Vector3dVector(cloud.colors / 255.0)
     with atomic_replacement(path) as temporary:
-        # Open3D reports a full disk without a reason and with many lines. Reserving the space first gives the
-        # error of the operating system.
+        # If the disk is full, Open3D prints many lines without the reason. Therefore a file of sufficient
+        # size is written first. If the disk is full, this raises the error of the operating system.
         temporary.write_bytes(bytes(_HEADER_BYTES + _VERTEX_BYTES * len(cloud.points)))
         if not open3d.io.write_point_cloud(temporary, content, write_ascii=False):
             hint = "check that the disk is not full"
@@ -113,7 +123,7 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
 
 
 def read_ply(path: Path) -> PointCloud:
-    """Read the points and colours of a PLY file; a file without colours gives black points."""
+    """Read the points and colours of a PLY file. If the file has no colours, the points are black."""
     open3d = load_open3d()
     content = open3d.io.read_point_cloud(path)
     points = np.asarray(content.points, dtype=np.float64)

@@ -1,4 +1,7 @@
-"""The mesh of a stick figure, for formats whose viewers show no bones: one slim octahedron per bone."""
+"""The mesh of a stick figure, with one slim octahedron per bone.
+
+File formats whose viewers do not show bones need such a mesh.
+"""
 
 from __future__ import annotations
 
@@ -11,32 +14,39 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.model.skeleton import SkeletonModel, rest_pose
 
 _WAIST_RATIO = 0.15
-"""Ratio. Position of the largest width along the bone. Evidence: none; a matter of looks."""
+"""Position of the octahedron's largest width, as a fraction of the length of the bone from its start.
+Evidence: none; it only affects the appearance."""
 
 _MIN_BONE_M = 1e-4
-"""Metres. Shorter bones have no mesh. Evidence: none; far below any bone that can be seen."""
+"""Minimum length, metres, of a bone that gets an octahedron. Evidence: none; the limit is far below the
+length of any visible bone."""
 
 _HALF_WIDTH_RATIO = 0.08
-"""Ratio of half the width to the length of the bone. Evidence: none; a matter of looks."""
+"""Ratio of half the width of the octahedron to the length of the bone. Evidence: none; it only affects the
+appearance."""
 
 _HALF_WIDTH_RANGE_M = (0.008, 0.03)
-"""Metres. Limits of half the width. Evidence: none; a matter of looks."""
+"""Minimum and maximum of half the width of the octahedron, metres. Evidence: none; they only affect the
+appearance."""
 
 _FACES = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [5, 1, 2], [5, 2, 3], [5, 3, 4], [5, 4, 1]])
 
 
-"""Corners of the eight triangles of an octahedron, counter-clockwise from outside (`_spindle_corners`)."""
+"""Corner indices (`_spindle_corners`) of the eight triangles of an octahedron, counter-clockwise as seen from
+outside."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickFigure:
-    """A triangle mesh with V vertices and F faces in world axes, bound to a skeleton in its rest pose.
+    """A triangle mesh with V vertices and F faces, in world axes.
+
+    The mesh is given in the rest pose of a skeleton, and each vertex is bound to a joint.
 
     Attributes:
-        vertices_m: (V,3) vertices in metres.
-        normals: (V,3) unit normals of the flat faces.
-        faces: (F,3) vertex indices, counter-clockwise from outside.
-        joints: (V,) index of the joint that moves each vertex.
+        vertices_m: (V,3) vertices, metres.
+        normals: (V,3) unit normal of the flat face that each vertex belongs to.
+        faces: (F,3) vertex indices of the triangles, counter-clockwise as seen from outside.
+        joints: (V,) index of the joint that each vertex moves with.
     """
 
     vertices_m: FloatArray
@@ -46,9 +56,10 @@ class StickFigure:
 
 
 def make_stick_figure(skeleton: SkeletonModel) -> StickFigure:
-    """Return a mesh with one octahedron from each joint to each of its children and to its end.
+    """Return the mesh of a stick figure.
 
-    Bones without length have no octahedron.
+    The mesh contains an octahedron from each joint to each child of the joint, and to the far end of a bone
+    without children. Bones without length have no octahedron.
 
     Raises:
         ValueError: No bone has a length.
@@ -73,7 +84,14 @@ def make_stick_figure(skeleton: SkeletonModel) -> StickFigure:
 
 
 def _iterate_bones(skeleton: SkeletonModel, rest: FloatArray) -> Iterator[tuple[int, FloatArray]]:
-    """Yield the joint and the far end (3,) of each bone; a root on the floor has no bone."""
+    """Yield the joint and the far end (3,) of each bone in the rest pose, in the world.
+
+    A root on the floor has no bone.
+
+    Args:
+        skeleton: The skeleton, with J joints.
+        rest: (J,4,4) joint poses in the rest pose, in the world.
+    """
     on_floor = len(skeleton.joints) > 1 and skeleton.roles[:2] == ("", "Hips")
     for joint, parent in enumerate(skeleton.parents.tolist()):
         end = skeleton.end_offsets_m[joint]
@@ -86,7 +104,7 @@ def _iterate_bones(skeleton: SkeletonModel, rest: FloatArray) -> Iterator[tuple[
 
 
 def _spindle_corners(start: FloatArray, end: FloatArray) -> FloatArray:
-    """Return the corners (6,3) of a slim octahedron: its start, four around its waist, its end."""
+    """Return the corners (6,3) of a slim octahedron: start, four corners at the largest width, end."""
     along = end - start
     length = float(np.linalg.norm(along))
     along = along / length

@@ -1,4 +1,4 @@
-"""TRC, the marker format of OpenSim: joint centres in millimetres with X forward, Y up and Z to the right."""
+"""TRC files, the marker format of OpenSim: joint centres in millimetres, X forward, Y up, Z to the right."""
 
 from __future__ import annotations
 
@@ -13,17 +13,20 @@ from bodycap_batch.formats.c3d import LabelledPoints
 _FILE_FROM_WORLD: FloatArray = frozen_array(
     [[0, -1, 0], [0, 0, 1], [-1, 0, 0]], name="file_from_world", shape=(3, 3)
 )
-"""Axes of the file from those of the world (Z up, facing −Y, left +X)."""
+"""Rotation from world axes (Z up, facing −Y, left +X) to file axes (X forward, Y up, Z to the right)."""
 
 _MM_PER_M = 1000.0
 """Millimetres per metre."""
 
 
 def write_trc(path: Path, points: LabelledPoints) -> Path:
-    """Write points as a TRC file. Times start at 0; coordinates have three decimals, which is one micrometre.
+    """Write points as a TRC file.
+
+    The times in the file start at 0. The coordinates have three decimals, so the resolution is one
+    micrometre.
 
     Returns:
-        The path.
+        The path of the file.
 
     Raises:
         StoreError: The file cannot be written.

@@ -1,6 +1,6 @@
 """TUM trajectory files: one line ``timestamp tx ty tz qx qy qz qw`` per pose.
 
-The timestamp is in seconds, and the pose is world_from_camera.
+The timestamp is in seconds. The translation and the quaternion are the pose world_from_camera.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class TimedPoses:
     """N poses in the order of time.
 
     Attributes:
-        times_ns: (N,) times, increasing.
-        world_from_cam: (N,4,4) poses.
+        times_ns: (N,) times, nanoseconds, increasing.
+        world_from_cam: (N,4,4) poses of the camera in the world.
     """
 
     times_ns: IntArray
@@ -45,14 +45,14 @@ class TimedPoses:
 
 
 def read_tum(path: Path | str) -> TimedPoses:
-    """Read a trajectory.
+    """Read the poses of a TUM trajectory file.
 
-    The file may have comments, a header line, commas or tabs between the numbers, and CRLF line ends. Lines
-    are sorted by time; of lines with the same time, the first is used. A file with comments only has no
-    poses, as for a camera without localised frames.
+    The file may have comments, a header line, commas or tabs between the numbers, and CRLF line ends. The
+    poses are sorted by time. If several lines have the same time, only the first of these lines is used. A
+    file that contains only comments gives no poses. Such a file belongs to a camera without localised frames.
 
     Raises:
-        JobError: The file is missing, malformed or empty. The error names the line.
+        JobError: The file is missing, malformed or empty. The error for a malformed line names the line.
     """
     path = Path(path)
     times: list[int] = []
@@ -81,7 +81,7 @@ def read_tum(path: Path | str) -> TimedPoses:
 
 
 def _parse_line(path: Path, number: int, words: list[str]) -> tuple[int, list[float]]:
-    """Return the time in nanoseconds and the seven numbers of one line."""
+    """Return the time in nanoseconds and the seven numbers of the pose of one line."""
     if len(words) != 8:
         message = f"{len(words)} columns, expected 8"
         raise JobError(message, path=path, line=number, hint=f"a line holds: {_COLUMNS}")
@@ -103,10 +103,13 @@ def _parse_line(path: Path, number: int, words: list[str]) -> tuple[int, list[fl
 
 
 def write_tum(path: Path, poses: TimedPoses, comments: Sequence[str] = ()) -> None:
-    """Write a trajectory with nine decimals, which are nanoseconds and nanometres.
+    """Write a TUM trajectory file.
+
+    All numbers have nine decimals, so the resolution is one nanosecond and one billionth of the unit of
+    length.
 
     Args:
-        path: The file; it is replaced atomically.
+        path: Path of the file, which is replaced atomically.
         poses: The poses.
         comments: Comment lines for the top of the file, without ``#``.
 

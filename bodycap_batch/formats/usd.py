@@ -1,4 +1,4 @@
-"""USD files: a skeleton, its animation and a skinned stick figure, in metres and the axes of the world."""
+"""USD files: a skeleton, its animation and a skinned stick figure, in metres and in world axes."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 _BODY_PATH, _SKELETON_PATH, _FIGURE_PATH = "/Body", "/Body/Skeleton", "/Body/Figure"
 _MOTION_PATH = "/Body/Skeleton/Motion"
 _FIGURE_COLOR_RGB = (0.86, 0.39, 0.10)
-"""Colour of the stick figure, 0 to 1."""
+"""Colour of the stick figure, RGB, 0 to 1."""
 
 _EXTENT_MARGIN_M = 0.3
-"""Metres. Added around the joint centres for the extent of the figure. Derivation: head, hands and feet reach
-beyond their joints by less than this."""
+"""Margin, metres, around the joint centres in the extent (bounding box) of the figure. Derivation: the
+distance between the ends of head, hands and feet and their joints is smaller than this margin."""
 
 
 def write_usd(path: Path, motion: Motion) -> Path:
-    """Write a motion as a skinned, animated stick figure. Time codes are frame numbers from 0.
+    """Write a motion as a skinned, animated stick figure.
 
-    The mesh is bound to the joints in the T-pose. Joint tokens are paths of names that USD allows
-    (``mixamorig_Hips``); the original names are in ``jointNames``. Translations, rotations and scales are
-    written for every frame.
+    The time codes are frame numbers, counted from 0. The mesh is bound to the joints in the T-pose. The joint
+    tokens are paths of names that USD allows (``mixamorig_Hips``). The original names are stored in
+    ``jointNames``. Translations, rotations and scales are written for every frame.
 
     Args:
-        path: The file (``.usd``, ``.usda``, ``.usdc``); it is replaced atomically.
+        path: Path of the file (``.usd``, ``.usda``, ``.usdc``), which is replaced atomically.
         motion: The motion, in world axes and metres.
 
     Returns:
-        The path.
+        The path of the file.
 
     Raises:
         StoreError: The file cannot be written.
@@ -70,7 +70,7 @@ def write_usd(path: Path, motion: Motion) -> Path:
 
 
 def _joint_tokens(skeleton: SkeletonModel) -> list[str]:
-    """Return a unique path for each joint, made of names that USD allows."""
+    """Return a unique joint path for each joint. The names in the path are names that USD allows."""
     from pxr import Tf
 
     out: list[str] = []
@@ -85,14 +85,14 @@ def _joint_tokens(skeleton: SkeletonModel) -> list[str]:
 
 
 def _usd_matrices(poses: FloatArray) -> Any:
-    """Convert poses (J,4,4) to USD matrices, which multiply row vectors."""
+    """Convert poses (J,4,4) to USD matrices, which are transposed because they multiply row vectors."""
     from pxr import Gf, Vt
 
     return Vt.Matrix4dArray([Gf.Matrix4d(*pose.T.reshape(-1).tolist()) for pose in poses])
 
 
 def _define_skeleton(stage: Any, model: SkeletonModel, tokens: list[str]) -> Any:
-    """Add the skeleton with its T-pose as rest and bind pose to the stage, and return it."""
+    """Add the skeleton to the stage and return it. Its rest pose and its bind pose are the T-pose."""
     from pxr import UsdSkel
 
     rest = rest_pose(model)
@@ -106,7 +106,7 @@ def _define_skeleton(stage: Any, model: SkeletonModel, tokens: list[str]) -> Any
 
 
 def _define_animation(stage: Any, motion: Motion, tokens: list[str]) -> Any:
-    """Add the animation of all joints to the stage, and return it."""
+    """Add the animation of all joints to the stage and return it."""
     from pxr import Gf, UsdSkel, Vt
 
     animation = UsdSkel.Animation.Define(stage, _MOTION_PATH)
@@ -129,7 +129,7 @@ def _define_animation(stage: Any, motion: Motion, tokens: list[str]) -> Any:
 
 
 def _define_figure(stage: Any, figure: StickFigure, skeleton: Any) -> None:
-    """Add the mesh to the stage. Every vertex is bound to one joint with weight 1."""
+    """Add the mesh of the stick figure to the stage. Each vertex is bound to one joint with weight 1."""
     from pxr import Gf, UsdGeom, UsdSkel, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, _FIGURE_PATH)
@@ -157,10 +157,11 @@ def _define_figure(stage: Any, figure: StickFigure, skeleton: Any) -> None:
 def read_usd(path: Path) -> Motion:
     """Read the animated skeleton of a file that `write_usd` has written.
 
-    The rest pose of the file becomes the T-pose; in the zero pose all rotations are the identity.
+    The rest pose of the file becomes the T-pose of the skeleton. In the zero pose, all rotations are the
+    identity.
 
     Raises:
-        JobError: The file is no USD stage with a skeleton and its animation.
+        JobError: The file is not a USD stage with a skeleton and its animation.
     """
     from pxr import Tf, Usd, UsdSkel
 

@@ -1,10 +1,12 @@
 """Solver for symmetric positive definite block-tridiagonal systems, with the marginals of the inverse.
 
-Such systems are the normal equations of problems along time: the unknowns of one block are coupled with each
-other and with those of the next block only. Time and memory grow linearly with the number of blocks.
+Such systems are the normal equations of estimation problems along time. The unknowns of one block are coupled
+only with each other and with the unknowns of the two neighbouring blocks. Time
+and memory grow linearly with the number of blocks.
 
-Source: block-tridiagonal Cholesky factorisation. Its way back for the inverse is the smoother of H. E. Rauch,
-F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", AIAA Journal 3, 1965.
+Source: block-tridiagonal Cholesky factorisation. The backward pass that computes the inverse is the smoother
+of H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", AIAA
+Journal 3, 1965.
 """
 
 from __future__ import annotations
@@ -18,8 +20,8 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 from bodycap_batch.core.arrays import FloatArray, IntArray
 
 _FACTOR_BYTES = 1e7
-"""Memory, in bytes, of the factors that are kept: those of 50 ticks with nine bones. With three times as
-much, the solver took 20 MB more and was not faster."""
+"""Maximum memory, bytes, for the factors that are kept. It is enough for the factors of 50 ticks with nine
+bones. With three times this memory, the solver took 20 MB more and was not faster."""
 
 
 class _BlockRow(NamedTuple):
@@ -27,7 +29,7 @@ class _BlockRow(NamedTuple):
 
     Attributes:
         diagonal: (n,n) block on the diagonal.
-        coupling: (n,m) block right of it; m is 0 in the last row.
+        coupling: (n,m) block to the right of the diagonal block; m is 0 in the last row.
     """
 
     diagonal: FloatArray
@@ -38,8 +40,8 @@ class _Factor(NamedTuple):
     """One row of blocks of the Cholesky factor.
 
     Attributes:
-        lower: (n,n) lower triangular.
-        link: (n,m) coupling with the next block, divided by `lower`.
+        lower: (n,n) lower triangular factor of the block on the diagonal.
+        link: (n,m) coupling with the next block, multiplied from the left by the inverse of `lower`.
     """
 
     lower: FloatArray
@@ -49,7 +51,7 @@ class _Factor(NamedTuple):
 def _cholesky(matrix: FloatArray) -> FloatArray:
     """Return the lower Cholesky factor of a small matrix.
 
-    It calls LAPACK itself, because numpy's wrapper takes longer than the factorisation.
+    The function calls LAPACK directly, because numpy's wrapper takes longer than the factorisation.
 
     Raises:
         LinAlgError: The matrix is not positive definite.
@@ -62,7 +64,16 @@ def _cholesky(matrix: FloatArray) -> FloatArray:
 
 
 def _solve_triangular(lower: FloatArray, rhs: FloatArray, *, transposed: bool = False) -> FloatArray:
-    """Solve with a lower triangular matrix, or with its transpose."""
+    """Solve a linear system whose matrix is lower triangular, or the transpose of a lower triangular matrix.
+
+    Args:
+        lower: (n,n) lower triangular matrix.
+        rhs: (n,M) right-hand sides.
+        transposed: True to solve with the transpose of `lower`.
+
+    Returns:
+        The solution (n,M).
+    """
     if not rhs.size:
         return np.zeros_like(rhs)
     solution: FloatArray = dtrtrs(lower, rhs, 1, int(transposed))[0]
@@ -72,15 +83,16 @@ def _solve_triangular(lower: FloatArray, rhs: FloatArray, *, transposed: bool = 
 class BlockTridiagonal:
     """A symmetric positive definite block-tridiagonal matrix, factorised.
 
-    The factors are dense, even if the matrix is sparse. Of a long one, only the factors of some successive
-    blocks are kept; those of others are computed again when they are needed.
+    The factors are dense, even if the matrix is sparse. For a large matrix, only the factors of one segment
+    of successive blocks are kept. The factors of the other segments are computed again when they are needed.
 
     Args:
-        block_row: Returns the blocks of a row by its number.
-        bounds: (K+1,) first unknown of each block in the order of the blocks, and the number of unknowns.
-        order: (C,) the unknown of the caller at each position in the order of the blocks; None if they are
-            the same.
-        factor_bytes: Memory of the factors that are kept.
+        block_row: Function that returns the blocks of a row, given the number of the row.
+        bounds: (K+1,) index of the first unknown of each block in the order of the blocks, followed by the
+            number of unknowns.
+        order: (C,) index that the caller gives to each unknown, in the order of the blocks. None if the
+            caller uses the order of the blocks.
+        factor_bytes: Maximum memory, bytes, for the factors that are kept.
 
     Raises:
         LinAlgError: The matrix is not positive definite.
@@ -95,7 +107,7 @@ class BlockTridiagonal:
     ) -> None:
         self._block_row, self._order, self._bounds = block_row, order, bounds.tolist()
         count = len(self._bounds) - 1
-        # A block's factor and its link to the next block, eight bytes each number.
+        # Each block has a factor and a link to the next block; each number takes eight bytes.
         block_bytes = max(16.0 * float(np.square(np.diff(bounds)).max(initial=1)), 1.0)
         step = max(1, int(min(factor_bytes / block_bytes, count)))
         self._segments = [range(first, min(first + step, count)) for first in range(0, count, step)]
@@ -112,10 +124,10 @@ class BlockTridiagonal:
         """Factorise a sparse matrix.
 
         Args:
-            matrix: (C,C) scipy sparse, symmetric.
-            order: (C,) its columns, block by block.
-            bounds: (K+1,) where each block begins in `order`, and C.
-            factor_bytes: Memory of the factors that are kept.
+            matrix: (C,C) symmetric matrix, scipy sparse.
+            order: (C,) column indices of the matrix, block by block.
+            bounds: (K+1,) position in `order` at which each block begins, followed by C.
+            factor_bytes: Maximum memory, bytes, for the factors that are kept.
         """
         ordered = matrix.tocsr()[order].tocsc()[:, order].tocsr()
         edges = bounds.tolist()
@@ -133,8 +145,8 @@ class BlockTridiagonal:
         """Factorise a matrix of K blocks of equal size.
 
         Args:
-            diagonal: (K,n,n) the blocks on the diagonal.
-            coupling: (K-1,n,n) the blocks right of them.
+            diagonal: (K,n,n) blocks on the diagonal.
+            coupling: (K-1,n,n) blocks to the right of the diagonal blocks.
         """
         count, size = diagonal.shape[:2]
         last = np.zeros((size, 0))
@@ -145,10 +157,10 @@ class BlockTridiagonal:
         return cls(block_row, size * np.arange(count + 1), factor_bytes=np.inf)
 
     def solve(self, rhs: FloatArray) -> list[FloatArray]:
-        """Solve for right-hand sides.
+        """Solve the system for M right-hand sides.
 
         Args:
-            rhs: (C,M) in the caller's order.
+            rhs: (C,M) right-hand sides, with the unknowns in the caller's order.
 
         Returns:
             The solution (n,M) of each block.
@@ -173,10 +185,13 @@ class BlockTridiagonal:
         return solution[::-1]
 
     def marginals(self, read: Callable[[int, FloatArray], None]) -> None:
-        """Compute the blocks on the diagonal of the inverse, such as the marginal covariances of states.
+        """Compute the blocks on the diagonal of the inverse matrix.
+
+        If the matrix is the information matrix of states, these blocks are the marginal covariances.
 
         Args:
-            read: Called with the number of each block and its (n,n) part of the inverse, the last one first.
+            read: Function that is called once for each block, with the number of the block and the (n,n)
+                block of the inverse. The last block comes first.
         """
         later: FloatArray | None = None
         identity = np.eye(int(np.diff(self._bounds).max(initial=0)))
@@ -192,18 +207,22 @@ class BlockTridiagonal:
             read(block, later)
 
     def _factors_backward(self) -> Iterator[_Factor]:
-        """Yield the factor of each block, the last block's first."""
+        """Yield the factor of each block, starting with the last block."""
         for number in range(len(self._segments) - 1, -1, -1):
             yield from self._segment_factors(number)[::-1]
 
     def _segment_factors(self, number: int) -> list[_Factor]:
-        """Return the factors of a segment, computed again if they were not kept."""
+        """Return the factors of a segment; compute the factors again if they were not kept."""
         if number != self._kept_segment:
             self._factorise(number)
         return self._factors
 
     def _factorise(self, number: int) -> FloatArray | None:
-        """Compute the factors of a segment; return what the Schur complement subtracts from the next one."""
+        """Compute the factors of a segment and keep them.
+
+        Returns:
+            The matrix that the Schur complement subtracts from the first diagonal block of the next segment.
+        """
         self._kept_segment, self._factors = number, []
         update = self._schur_updates[number]
         for block in self._segments[number]:

@@ -1,6 +1,6 @@
-"""The intrinsics of a camera: projection and its inverse.
+"""The intrinsics of a camera: projection and inverse projection.
 
-Pixels follow COLMAP: the centre of the first pixel is (0.5, 0.5).
+Pixel coordinates follow COLMAP: the centre of the first pixel is at (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 CV2_PIXEL_OFFSET_PX = 0.5
-"""Pixels: COLMAP's coordinates are OpenCV's plus this. OpenCV puts (0, 0) at the centre of the first
-pixel."""
+"""Offset, pixels, that converts OpenCV's pixel coordinates to COLMAP's when it is added. OpenCV puts (0, 0)
+at the centre of the first pixel."""
 
 _FOCAL_INDICES = {
     "SIMPLE_PINHOLE": (0,),
@@ -32,7 +32,8 @@ _FOCAL_INDICES = {
     "THIN_PRISM_FISHEYE": (0, 1),
     "FOV": (0, 1),
 }
-"""Index of each focal length in the parameters of a COLMAP camera model. Source: COLMAP, sensor/models.h."""
+"""Indices of the focal lengths among the parameters of each COLMAP camera model. Source: COLMAP,
+sensor/models.h."""
 
 _PARAM_COUNT = {
     "SIMPLE_PINHOLE": 3,
@@ -50,7 +51,8 @@ _PARAM_COUNT = {
 """Number of parameters of each COLMAP camera model. Source: COLMAP, sensor/models.h."""
 
 _MIN_DEPTH = 1e-9
-"""Unit of the points. Points at a smaller depth have no projection. Derivation: avoids a division by zero."""
+"""Minimum depth of a point that is projected, in the unit of the points. Derivation: the limit avoids a
+division by zero."""
 
 CAMERA_MODELS = tuple(_PARAM_COUNT)
 
@@ -72,10 +74,10 @@ class Camera:
         model: Name of the COLMAP camera model.
         width_px: Image width.
         height_px: Image height.
-        params: Parameters of the model in COLMAP's order, in pixels with COLMAP's origin.
-        refine: Whether the parameters are only an initial guess that mapping may refine.
-        sideways: Whether the sensor's rows are the image's columns, as for a phone that was held upright.
-            Only the rolling-shutter correction uses it.
+        params: Parameters of the model in COLMAP's order. Lengths are in pixels with COLMAP's origin.
+        refine: True if the parameters are only an initial guess that mapping may refine.
+        sideways: True if the rows of the sensor are the columns of the image, as for a phone that was held
+            upright. Only the rolling-shutter correction uses this value.
     """
 
     model: str
@@ -94,7 +96,7 @@ class Camera:
 
     @property
     def focal_px(self) -> float:
-        """Focal length in pixels, the mean of both axes."""
+        """Focal length in pixels; the mean of the two axes if the model has two focal lengths."""
         return float(np.mean([self.params[i] for i in _FOCAL_INDICES[self.model]]))
 
     @property
@@ -112,7 +114,14 @@ class Camera:
         )
 
     def project(self, x_in_cam: FloatArray) -> FloatArray:
-        """Project points (N,3) in the camera frame to pixels (N,2); points behind the camera give NaN."""
+        """Project points from the camera frame to the image.
+
+        Args:
+            x_in_cam: (N,3) points in the camera frame.
+
+        Returns:
+            The pixels (N,2); NaN for a point behind the camera.
+        """
         points = np.asarray(x_in_cam, dtype=np.float64).reshape(-1, 3)
         out = np.full((len(points), 2), np.nan)
         front = points[:, 2] > _MIN_DEPTH
@@ -121,9 +130,14 @@ class Camera:
         return out
 
     def unproject(self, px: FloatArray) -> FloatArray:
-        """Return the rays (N,2) of pixels (N,2) as undistorted image coordinates at depth 1.
+        """Return the viewing rays of pixels.
 
-        A pixel for which the camera model has no inverse gives NaN.
+        Args:
+            px: (N,2) pixels.
+
+        Returns:
+            The points (N,2) of the rays at depth 1: undistorted image coordinates. NaN for a pixel for which
+            the camera model has no inverse.
         """
         pixels = np.ascontiguousarray(px, dtype=np.float64).reshape(-1, 2)
         if len(pixels) == 0:
@@ -133,7 +147,8 @@ class Camera:
     def scaled(self, width_px: int, height_px: int) -> Camera:
         """Return the intrinsics of the same camera at another image size.
 
-        The result is exact because COLMAP's pixel coordinates start at the corner of the image.
+        Scaling is exact because COLMAP's pixel coordinates start at the corner of the image. The exception is
+        a model with one focal length and different scale factors in width and height: their mean is used.
         """
         scale_x, scale_y = width_px / self.width_px, height_px / self.height_px
         params = self.params.copy()
@@ -155,13 +170,15 @@ _TWO_FOCAL_MODEL = {
     "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", 1),
     "RADIAL_FISHEYE": ("OPENCV_FISHEYE", 2),
 }
-"""For each model with one focal length: a model with two, and the number of distortion parameters to copy."""
+"""For each camera model with one focal length: the corresponding model with two focal lengths, and the number
+of distortion parameters that both models share."""
 
 
 def with_two_focal_lengths(camera: Camera) -> Camera:
-    """Return the same intrinsics with one focal length per axis.
+    """Return the same intrinsics in a camera model that has a separate focal length for each axis.
 
-    Only such a camera can be scaled by different factors in width and height.
+    Only such a camera can be scaled exactly by different factors in width and height. A model without a
+    counterpart with two focal lengths is returned unchanged.
     """
     if camera.model not in _TWO_FOCAL_MODEL:
         return camera

@@ -1,8 +1,8 @@
 """Rotations, rigid transforms and similarities on arrays.
 
 A transform is named ``target_from_source``. It is a 4×4 float64 matrix that multiplies column vectors.
-Quaternions are in the order x, y, z, w. scipy is imported inside the functions because its import takes a
-second, which ``bodycap --help`` and finished jobs do not need.
+Quaternions are in the order x, y, z, w. scipy is imported inside the functions because the import takes a
+second. ``bodycap --help`` and finished jobs do not need scipy.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 def make_transform(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> FloatArray:
     """Combine rotations (...,3,3) and translations (...,3) to rigid transforms (...,4,4).
 
-    The leading axes are broadcast against each other.
+    The leading axes of rotations and translations are broadcast against each other.
     """
     rotation = np.asarray(rotation, dtype=np.float64)
     translation = np.asarray(translation, dtype=np.float64)
@@ -38,11 +38,11 @@ def invert(target_from_source: FloatArray) -> FloatArray:
 
 
 def transform_points(target_from_source: FloatArray, x_in_source: FloatArray) -> FloatArray:
-    """Return points in the target frame.
+    """Transform points from the source frame to the target frame.
 
     Args:
-        target_from_source: One transform (4,4) for all points, or one per point (N,4,4).
-        x_in_source: Points (...,3) for one transform, else (N,3).
+        target_from_source: One transform (4,4) for all points, or one transform per point (N,4,4).
+        x_in_source: Points in the source frame: (...,3) for one transform, (N,3) for one transform per point.
     """
     rotated = np.einsum("...ij,...j->...i", target_from_source[..., :3, :3], x_in_source)
     return np.asarray(rotated + target_from_source[..., :3, 3])
@@ -71,7 +71,7 @@ def continuous_quat_xyzw(rotation: FloatArray) -> FloatArray:
 
 
 def rotation_from_quat_xyzw(quat_xyzw: npt.ArrayLike) -> FloatArray:
-    """Convert quaternions (...,4) of any norm but zero to rotations (...,3,3)."""
+    """Convert quaternions (...,4) to rotations (...,3,3). The norm may have any value except zero."""
     from scipy.spatial.transform import Rotation
 
     quat = np.asarray(quat_xyzw, dtype=np.float64)
@@ -118,7 +118,7 @@ def nearest_rotation(matrix: FloatArray) -> FloatArray:
 
 
 def skew(vector: FloatArray) -> FloatArray:
-    """Return the matrices (...,3,3) for which ``skew(v) @ w`` is the cross product v × w."""
+    """Return the skew-symmetric matrices (...,3,3) of vectors (...,3): ``skew(v) @ w`` is v × w."""
     x, y, z = (vector[..., axis] for axis in range(3))
     zero = np.zeros_like(x)
     rows = [zero, -z, y, z, zero, -x, -y, x, zero]
@@ -126,12 +126,12 @@ def skew(vector: FloatArray) -> FloatArray:
 
 
 def se3_adjoint(target_from_source: FloatArray) -> FloatArray:
-    """Return the adjoints (...,6,6) of rigid transforms, with rotation before translation.
+    """Return the adjoint matrices Ad (...,6,6) of rigid transforms (...,4,4).
 
-    A small motion ξ = (rotation, translation) of the source frame in its own axes equals the motion Ad ξ in
-    the axes of the target frame.
+    A motion is a vector of six numbers, with rotation before translation. A small motion ξ in the axes of the
+    source frame equals the motion Ad ξ in the axes of the target frame.
 
-    Source: T. Barfoot, "State estimation for robotics", 2017, which puts translation before rotation.
+    Source: T. Barfoot, "State estimation for robotics", 2017. The book puts translation before rotation.
     """
     rotation = target_from_source[..., :3, :3]
     out = np.zeros((*rotation.shape[:-2], 6, 6))
@@ -144,9 +144,10 @@ def interpolate_pose(start: FloatArray, end: FloatArray, alpha: npt.ArrayLike) -
     """Interpolate between rigid transforms (...,4,4): rotations by slerp, translations linearly.
 
     Args:
-        start: target_from_source for alpha 0.
-        end: target_from_source for alpha 1.
-        alpha: Fraction of the way from start to end, broadcast against the leading axes.
+        start: (...,4,4) transforms target_from_source at alpha 0.
+        end: (...,4,4) transforms target_from_source at alpha 1.
+        alpha: Fractions of the way from `start` to `end`, 0 to 1. They are broadcast against the leading axes
+            of the transforms.
     """
     weight = np.asarray(alpha, dtype=np.float64)[..., None]
     delta = so3_log(np.swapaxes(start[..., :3, :3], -1, -2) @ end[..., :3, :3])
@@ -158,18 +159,21 @@ def interpolate_pose(start: FloatArray, end: FloatArray, alpha: npt.ArrayLike) -
 def poses_at(
     times_ns: IntArray, poses: FloatArray, at_ns: IntArray, *, max_gap_ns: int, snap_ns: int = 0
 ) -> tuple[FloatArray, BoolArray]:
-    """Interpolate timed poses at given times, each between its two neighbours in time.
+    """Interpolate timed poses at the requested times, between the previous and the next given pose.
 
     Args:
-        times_ns: (N,) times of the poses, increasing.
-        poses: (N,4,4) poses.
-        at_ns: (M,) times to interpolate at.
-        max_gap_ns: Largest time between two neighbours. In a longer gap no pose is found.
-        snap_ns: If the nearest pose is at most this far away in time, it is found in any case, even in a gap
-            and outside the range of `times_ns`.
+        times_ns: (N,) times of the given poses, increasing.
+        poses: (N,4,4) given poses.
+        at_ns: (M,) requested times.
+        max_gap_ns: Maximum time between two neighbouring poses. The poses are not interpolated over a longer
+            time.
+        snap_ns: Maximum time between a requested time and the nearest given pose for the nearest pose to be
+            returned where interpolation is impossible: in a gap that is too long, and outside the range of
+            `times_ns`.
 
     Returns:
-        (M,4,4) interpolated poses, the identity if none is found, and a mask (M,) of the poses found.
+        The poses (M,4,4) at the requested times, the identity if there is no pose, and a mask (M,) that is
+        True where there is a pose.
     """
     out = np.tile(np.eye(4), (len(at_ns), 1, 1))
     if len(times_ns) == 0:
@@ -194,9 +198,9 @@ class Similarity:
     """A similarity transform: x_in_target = scale · rotation · x_in_source + translation.
 
     Attributes:
-        scale: Scale factor, target unit per source unit.
+        scale: Scale factor, in target units per source unit.
         rotation: (3,3) rotation.
-        translation: (3,) translation, target unit.
+        translation: (3,) translation, in target units.
     """
 
     scale: float
@@ -204,18 +208,21 @@ class Similarity:
     translation: FloatArray
 
     def apply(self, x_in_source: FloatArray) -> FloatArray:
-        """Return points (...,3) in the target frame."""
+        """Transform points (...,3) from the source frame to the target frame."""
         return np.asarray(self.scale * x_in_source @ self.rotation.T + self.translation)
 
     def apply_to_poses(self, source_from_body: FloatArray) -> FloatArray:
-        """Return target_from_body (...,4,4): rotations are rotated, positions are transformed as points."""
+        """Convert poses source_from_body (...,4,4) to poses target_from_body (...,4,4).
+
+        The orientations are rotated, and the positions are transformed like points.
+        """
         return make_transform(
             self.rotation @ source_from_body[..., :3, :3],
             self.apply(source_from_body[..., :3, 3]),
         )
 
     def after(self, first: Similarity) -> Similarity:
-        """Return the composition that applies `first` and then this transform."""
+        """Return the composition that applies `first`, and then this transform."""
         return Similarity(
             self.scale * first.scale, self.rotation @ first.rotation, self.apply(first.translation)
         )
@@ -227,12 +234,12 @@ class Similarity:
 
 
 def align_points(x_in_source: FloatArray, x_in_target: FloatArray, *, with_scale: bool = True) -> Similarity:
-    """Estimate target_from_source by least squares from corresponding points (N,3).
+    """Estimate the similarity target_from_source by least squares from corresponding points.
 
     Args:
         x_in_source: (N,3) points in the source frame, N ≥ 3.
-        x_in_target: (N,3) the same points in the target frame.
-        with_scale: Whether the scale is estimated; if not, it is 1 and the transform is rigid.
+        x_in_target: (N,3) coordinates of the same points in the target frame.
+        with_scale: True to estimate the scale. Otherwise the scale is 1, and the transform is rigid.
 
     Raises:
         ValueError: There are fewer than three points, the shapes differ, or all source points coincide.

@@ -1,4 +1,4 @@
-"""What mapping reports on a map to later steps, other stages and the report."""
+"""The diagnostics of a map: what mapping passes to its later steps, to other stages and to the report."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ CameraGroups = tuple[tuple[str, ...], tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True)
 class RefinedIntrinsics:
-    """Intrinsics that a map refined.
+    """The intrinsics of a camera that were refined together with a map.
 
     Attributes:
         model: COLMAP's name of the camera model.
-        params: Its parameters in COLMAP's order.
+        params: Parameters of the camera model in COLMAP's order.
     """
 
     model: str
@@ -35,19 +35,23 @@ class RefinedIntrinsics:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapDiagnostics:
-    """What mapping reports on a map, with a typed field for everything that other code reads.
+    """The diagnostics of a map, with a typed field for every entry of the log that other code reads.
 
     Attributes:
-        undecided_groups: Groups of cameras that see mirror images of each other, all kept.
-        flipped_cameras: Cameras that were left out because their picture is flipped.
-        excluded_from_pair: Cameras of the user's initial pair that were left out; the pair was not used.
-        misfit_factors: By camera name, the focal length that fits relative to the given one, if the map
-            contradicts the given intrinsics. None before the check.
-        recalibrated: Cameras whose given intrinsics were replaced by refined ones.
-        refined_intrinsics: The refined intrinsics of these cameras.
-        extensions: One entry for the log for each extension of the map.
-        reach: Entries for the log on the distances between cameras; None if they were not checked.
-        details: All entries of the log in their order, those of the other fields included.
+        undecided_groups: Pairs of camera groups whose images are mirrored relative to each other. All cameras
+            of both groups are kept, because it is unknown which group is mirrored.
+        flipped_cameras: Names of the cameras that were excluded because their images are mirrored.
+        excluded_from_pair: Names of the excluded cameras that belong to the user's initial image pair. If
+            there are any, the pair was not used.
+        misfit_factors: By camera name, the ratio of the focal length that fits the map to the given focal
+            length. It contains only cameras whose given intrinsics the map contradicts. None before the
+            check.
+        recalibrated: Names of the cameras whose given intrinsics were replaced by refined intrinsics.
+        refined_intrinsics: By camera name, the refined intrinsics of the recalibrated cameras.
+        extensions: For each extension of the map, the entry that describes the extension in the log.
+        reach: Result of the check of the distances between cameras, as entries of the log. None if the
+            distances were not checked.
+        details: All entries of the log in the order of the log, including the entries of the other fields.
     """
 
     undecided_groups: tuple[CameraGroups, ...] = ()
@@ -62,7 +66,11 @@ class MapDiagnostics:
 
     @staticmethod
     def from_log(log: Mapping[str, Any]) -> MapDiagnostics:
-        """Read the diagnostics from a log, as stored with the map or under ``mapping`` in metrics.json."""
+        """Read the diagnostics from a log.
+
+        Args:
+            log: The log that is stored with the map, or the value of ``mapping`` in ``metrics.json``.
+        """
         return MapDiagnostics(
             undecided_groups=tuple(_groups(groups) for groups in log.get(_UNDECIDED_GROUPS, ())),
             flipped_cameras=tuple(log.get(_FLIPPED_CAMERAS, ())),
@@ -79,7 +87,11 @@ class MapDiagnostics:
         )
 
     def to_log(self) -> dict[str, Any]:
-        """Return the log: the details, with new entries for the fields that are set."""
+        """Return the log.
+
+        The log contains all entries of `details`. For each other field that has a value, the entry is added
+        or replaced.
+        """
         log = dict(self.details)
         if self.undecided_groups:
             log[_UNDECIDED_GROUPS] = [[list(one), list(other)] for one, other in self.undecided_groups]
@@ -107,6 +119,6 @@ class MapDiagnostics:
 
 
 def _groups(groups: Sequence[Sequence[str]]) -> CameraGroups:
-    """Return two groups of cameras as tuples."""
+    """Convert two lists of camera names to tuples."""
     one, other = groups
     return tuple(one), tuple(other)

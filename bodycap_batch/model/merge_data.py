@@ -1,4 +1,4 @@
-"""Inputs and result of the merging stage, shared with export and the pipeline."""
+"""The inputs and the result of the merging stage. Export and the pipeline use them too."""
 
 from __future__ import annotations
 
@@ -18,30 +18,35 @@ from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 Activity = Literal["walk", "generic"]
 
 _STANDING_SPEED_M_PER_S = 0.05
-"""Sigma of the speed of a standing foot's ankle at `_STANDING_RATE_HZ`. The shin rolls over the foot.
+"""Sigma, m/s, of the speed of the ankle of a standing foot, on a timeline of `_STANDING_RATE_HZ`.
 
-Evidence: none.
+The sigma is not zero, because the shin rolls over the standing foot and moves the ankle. Evidence: none.
 """
 _STANDING_RATE_HZ = 30.0
-"""Rate of the timeline for which `_STANDING_SPEED_M_PER_S` holds."""
+"""Rate, Hz, of the timeline for which `_STANDING_SPEED_M_PER_S` holds."""
 
 
 def standing_sigma_m(fps: float) -> float:
-    """Return the sigma of a standing ankle's movement from tick to tick, metres.
+    """Return the sigma, metres, of the movement of a standing foot's ankle from one tick to the next.
 
-    It falls with the square root of the rate per tick. Over a second, a foot is held as firmly at every rate.
+    The sigma is proportional to 1 / √fps. Therefore the sigma of the movement in one second does not depend
+    on the rate.
+
+    Args:
+        fps: Ticks per second of the timeline.
     """
     return _STANDING_SPEED_M_PER_S / math.sqrt(_STANDING_RATE_HZ * fps)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraClock:
-    """How a camera's timestamps are related to the common clock.
+    """The relation between a camera's timestamps and the common clock.
 
     Attributes:
-        nominal_fps: Nominal frame rate of the camera. Dropped frames do not change it.
-        offset_s: Common time = camera time + offset.
-        rolling_shutter_s: Time from the exposure of the first row to that of the last row.
+        nominal_fps: Nominal frame rate of the camera, frames per second. Dropped frames do not change the
+            nominal frame rate.
+        offset_s: Seconds to add to the camera time to get the common time.
+        rolling_shutter_s: Seconds from the exposure of the first image row to the exposure of the last row.
     """
 
     nominal_fps: float
@@ -53,12 +58,12 @@ class CameraClock:
             raise ValueError(f"nominal_fps must be positive, not {self.nominal_fps}")
 
     def common_times_ns(self, times_ns: IntArray, row_fraction: FloatArray | None = None) -> IntArray:
-        """Return the common time (N,) of poses.
+        """Return the common times (N,) at which poses hold, nanoseconds.
 
         Args:
-            times_ns: (N,) camera time of each frame.
-            row_fraction: (N,) mean image row of the pose's observations, over the image height. Without it,
-                the pose is that of the middle row; the exposure of this row is the frame time.
+            times_ns: (N,) camera time of each frame, nanoseconds. The middle row is exposed at this time.
+            row_fraction: (N,) mean image row of the observations behind each pose, as a fraction of the image
+                height. None if each pose holds at the exposure of the middle row.
         """
         shift_s = np.full(len(times_ns), self.offset_s)
         if row_fraction is not None:
@@ -68,14 +73,15 @@ class CameraClock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardView:
-    """A marker board in one keyframe.
+    """An observation of a marker board in one keyframe.
 
     Attributes:
         camera: Camera name.
-        frame: Index of the frame in the camera's trajectory.
-        board_m: (N,3) corners on the board, metres, z = 0.
-        rays: (N,2) observations of the corners, undistorted, at depth 1.
-        cam_from_board: (4,4) pose of the board from this view alone, metres.
+        frame: Index of the keyframe in the camera's trajectory.
+        board_m: (N,3) corners in the frame of the board, metres; z is 0.
+        rays: (N,2) observed corners as undistorted image coordinates at depth 1.
+        cam_from_board: (4,4) pose of the board in the camera frame, metres, estimated from this keyframe
+            only.
     """
 
     camera: str
@@ -90,17 +96,21 @@ class MergeInputs:
     """The inputs of the merging stage.
 
     Attributes:
-        trajectories: One per camera, each in the gauge of the map it was solved in.
-        clocks: By camera name.
-        skeleton: Zero pose, metres: a preset scaled to the height, or the user's own file.
-        mounts: One per camera, the prior: the nominal pose with a large sigma, or the job's with a small one.
-        skeleton_is_measured: True if the skeleton is the subject's own. It then determines the metric scale.
-        height_m: The subject's stature; None if it is not given.
-        activity: ``walk`` adds the soft rules of walking.
-        map_points: By gauge, (P,3) points of the map. Planes and the floor are found in them.
-        row_fraction: By camera, (N,) mean row of the observations of each pose over the image height (NaN if
-            not localised). The poses of a missing camera are those of the middle row.
-        board_views: Views of the job's marker board in keyframes.
+        trajectories: One trajectory per camera, in the gauge of the map in which the camera was localised.
+        clocks: By camera name, the clock of the camera.
+        skeleton: The skeleton in its zero pose, metres: a preset scaled to the stature, or the user's file.
+        mounts: One mount per camera, used as the prior: the nominal pose with a large sigma, or the pose
+            given in the job with a small sigma.
+        skeleton_is_measured: True if the bone lengths are those of the subject. The skeleton then determines
+            the metric scale.
+        height_m: Stature of the subject, metres; None if it is not given.
+        activity: ``walk`` adds the soft rules of walking; ``generic`` adds no rules.
+        map_points: By gauge, the (P,3) points of the map in this gauge. Planes and the floor are found in
+            these points.
+        row_fraction: By camera name, (N,) mean image row of the observations behind each pose, as a fraction
+            of the image height; NaN if the frame is not localised. The poses of a camera without an entry
+            hold at the exposure of the middle row.
+        board_views: Observations of the job's marker board in keyframes.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -128,27 +138,30 @@ class MergeInputs:
         return next(mount for mount in self.mounts if mount.camera == camera)
 
     def mount_by_camera(self) -> dict[str, Mount]:
-        """Return the mount priors by camera."""
+        """Return the mount priors by camera name."""
         return {mount.camera: mount for mount in self.mounts}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolvedBody:
-    """The body as the factor graph solved it, in the world (metres, z up). Its joints have slack.
+    """The solution of the factor graph for the body, in the world (metres, z up).
+
+    The joints have slack: the ends of two bones that meet at a joint can be millimetres apart.
 
     Attributes:
         skeleton: The skeleton that was solved, with J joints.
         fps: Ticks per second.
-        start_ns: Common time of tick 0.
-        graph_world_from_joint: (T,J,4,4) a pose for every joint: the graph's if ``solved`` (its joints have
-            millimetres of slack), else the rest rotation relative to the parent.
+        start_ns: Common time of tick 0, nanoseconds.
+        graph_world_from_joint: (T,J,4,4) pose of every joint in the world. For a joint with ``solved``, it is
+            the solution of the graph. Any other joint has its rest rotation relative to the parent.
         solved: (J,) True if the joint was a variable of the graph.
-        observed: (T,J) True if cameras measured the joint at that tick.
-        trajectories: The trajectories of the cameras in use, gauge "world", covariance of the measurements in
-            metres, centres as solved with the body (`MergeOptions.camera_paths`). Poses that proved to be
-            gross errors are removed, with the status POSE_JUMP.
-        mounts: The solved mounts with their sigmas.
-        standing: (T,J) True if a foot stands on its ankle, this joint. None if foot contact was not detected.
+        observed: (T,J) True if cameras measured the joint at the tick.
+        trajectories: The trajectories of the cameras in use, in the gauge "world". The covariances are those
+            of the measurements, in metres. The camera centres were solved together with the body
+            (`MergeOptions.camera_paths`). Poses with gross errors are removed and have the status POSE_JUMP.
+        mounts: The solved mounts, with their sigmas.
+        standing: (T,J) True if the joint is the ankle of a foot that stands at the tick. None if foot contact
+            was not detected.
     """
 
     skeleton: SkeletonModel
@@ -170,28 +183,29 @@ class SolvedBody:
             set_array(self, "standing", (ticks, joints), np.bool_)
 
     def times_ns(self) -> IntArray:
-        """Return the common time (T,) of each tick."""
+        """Return the common time (T,) of each tick, nanoseconds."""
         ticks = np.arange(len(self.graph_world_from_joint))
         return np.asarray(self.start_ns + np.round(ticks * (1e9 / self.fps)), dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergeResult(SolvedBody):
-    """The body and the cameras in the world (metres, z up).
+    """The result of the merging stage: the body and the cameras in the world (metres, z up).
 
-    Every output shows `motion`: the page, the video and all files. The graph's poses are kept for figures
-    about the solution itself.
+    Every output contains `motion`: the page, the video and all files. The poses of the graph are kept only
+    for figures that describe the solution of the graph.
 
     Attributes:
-        motion: The motion of the rigid skeleton that is nearest to the graph's solution.
-        projection_gap: JSON values: how far `motion` is from the graph's joints and from the cameras, and how
-            fast standing feet slide in it.
-        world_from_map: By gauge; a gauge whose place is unknown is missing.
-        unused_cameras: Cameras whose map could not be linked to the body, with the reason.
-        report: Sources, values, residuals and doubts. It is stored as plain values.
-        joint_covariance_m2: (T,J,3,3) covariance of each joint's centre minus the centre of the first solved
-            joint, world axes: measurement noise, mounts and scale together; not the world's own axes. NaN if
-            the joint was not solved.
+        motion: The motion of the skeleton with rigid bones that is nearest to the solution of the graph.
+        projection_gap: Differences between `motion` and the solution of the graph, as JSON values: distances
+            from the joints of the graph, distances from the cameras, and the sliding speed of standing feet.
+        world_from_map: By gauge, the similarity from the map to the world. A gauge with an unknown similarity
+            has no entry.
+        unused_cameras: By name of a camera whose map could not be linked to the body, the reason.
+        report: Sources, values, residuals and doubts. It is stored as plain JSON values.
+        joint_covariance_m2: (T,J,3,3) covariance, in world axes, of the vector from the centre of the first
+            solved joint to the centre of each joint. It contains the errors of measurements, mounts and
+            scale, but not the error of the world axes. NaN if the joint was not solved.
     """
 
     motion: Motion
@@ -202,7 +216,8 @@ class MergeResult(SolvedBody):
     joint_covariance_m2: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        # With slots, the decorator makes a new class, which super() without arguments does not know.
+        # With slots=True, the dataclass decorator makes a new class. super() without arguments would refer to
+        # the original class and fail.
         SolvedBody.__post_init__(self)
         if self.motion.local_rotation.shape[:2] != self.observed.shape:
             raise ValueError("motion: its ticks and joints are not those of the graph")
@@ -210,9 +225,9 @@ class MergeResult(SolvedBody):
             set_array(self, "joint_covariance_m2", (*self.observed.shape, 3, 3), finite=False)
 
     def joint_sigma_m(self) -> FloatArray:
-        """Return the sigma (T,J) per axis of each joint's centre relative to the first solved one's, metres.
+        """Return the sigmas (T,J) of the joint positions relative to the first solved joint.
 
-        It is NaN if the joint was not solved.
+        They are in metres per axis, and NaN for a joint that was not solved.
         """
         if self.joint_covariance_m2 is None:
             return np.full(self.observed.shape, np.nan)

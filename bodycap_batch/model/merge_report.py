@@ -1,6 +1,6 @@
-"""The report of the merging stage: sources, values, residuals and doubts, typed.
+"""The types of the merging stage's report: sources, values, residuals and doubts.
 
-The names of the fields are the keys of the stored result and of ``merge`` in ``metrics.json``.
+The names of the fields are the keys in the stored result, and the keys of ``merge`` in ``metrics.json``.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 _OMIT_NONE = {"omit_none": True}
-"""Metadata of a field that has no key if it is None."""
+"""Metadata of a field that is omitted from the plain values if the field is None."""
 _EMPTY_IF_NONE = {"empty_if_none": True}
-"""Metadata of a field that is an empty mapping if it is None."""
+"""Metadata of a field that becomes an empty mapping in the plain values if the field is None."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Percentiles:
-    """Median and 95th percentile of some values."""
+    """The median and the 95th percentile of a set of values."""
 
     p50: float
     p95: float
@@ -32,11 +32,11 @@ class ScaleSourceReport:
     """One source of the metric scale.
 
     Attributes:
-        name: Its name.
-        metres_per_map_unit: Its scale.
-        relative_sigma: Sigma of the logarithm of the scale.
-        off: Logarithm of its scale over the scale that was taken.
-        used: False if it was rejected, or replaced by a better one.
+        name: Name of the source.
+        metres_per_map_unit: Scale from this source, metres per map unit.
+        relative_sigma: Sigma of the logarithm of this scale.
+        off: Logarithm of the ratio of this scale to the selected scale.
+        used: False if the source was rejected, or replaced by a better source.
     """
 
     name: str
@@ -48,12 +48,12 @@ class ScaleSourceReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BodyScaleReport:
-    """The scale from the bones alone.
+    """The metric scale that follows from the bone lengths only.
 
     Attributes:
-        metres_per_map_unit: The scale.
-        relative_sigma: Sigma of its logarithm.
-        costs: (scale, cost) of every solution of the calibration graph.
+        metres_per_map_unit: The scale, metres per map unit.
+        relative_sigma: Sigma of the logarithm of the scale.
+        costs: Pairs (scale, cost), one pair for each scale for which the calibration graph was solved.
     """
 
     metres_per_map_unit: float
@@ -63,12 +63,12 @@ class BodyScaleReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LimbScalesReport:
-    """The scale of each limb alone.
+    """The metric scales from single limbs.
 
     Attributes:
-        alone: The scales.
-        chi2: Chi-square of the scales about their mean.
-        degrees_of_freedom: Of the chi-square.
+        alone: For each limb, the scale that follows from this limb only.
+        chi2: Chi-square of these scales about their mean.
+        degrees_of_freedom: Number of degrees of freedom of the chi-square.
     """
 
     alone: tuple[ScaleSourceReport, ...]
@@ -81,16 +81,17 @@ class ScaleReport:
     """The metric scale.
 
     Attributes:
-        source: Names of the sources in use.
-        metres_per_map_unit: The scale that was taken.
-        relative_sigma: Sigma of its logarithm.
-        sources: All sources.
-        chi2: Chi-square of all sources about their mean.
-        degrees_of_freedom: Of the chi-square.
-        body_alone: The scale from the bones alone.
-        trunk_over_floor_m: Height of the reference camera's joint over the floor; None if no floor was found.
-        known_to: A sentence on the uncertainty, with advice.
-        limbs: The scale of each limb alone; None if there are fewer than two limbs.
+        source: Names of the sources in use, joined in one text.
+        metres_per_map_unit: The selected scale, metres per map unit.
+        relative_sigma: Sigma of the logarithm of the selected scale.
+        sources: All sources of the scale, used or not.
+        chi2: Chi-square of the scales of the sources about their mean.
+        degrees_of_freedom: Number of degrees of freedom of the chi-square.
+        body_alone: The scale that follows from the bone lengths only.
+        trunk_over_floor_m: Height of the reference camera's joint above the floor, metres; None if no floor
+            was found.
+        known_to: Sentence about the uncertainty of the scale, with advice.
+        limbs: The scales from single limbs; None if fewer than two limbs can be used.
     """
 
     source: str
@@ -107,7 +108,7 @@ class ScaleReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TPoseReport:
-    """The time of a T-pose, seconds from tick 0."""
+    """The start and the end of a T-pose, seconds after tick 0."""
 
     from_s: float
     to_s: float
@@ -115,13 +116,14 @@ class TPoseReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OtherVerticalReport:
-    """A vertical that was not taken.
+    """A candidate for the vertical that was not selected.
 
     Attributes:
-        name: Its source.
-        off_deg: Angle to the vertical that was taken.
-        sigma_deg: Its uncertainty.
-        less_likely_nats: Negative log-likelihood beyond that of the vertical that was taken.
+        name: Source of this candidate.
+        off_deg: Angle between this candidate and the selected vertical, degrees.
+        sigma_deg: Sigma of this candidate, degrees.
+        less_likely_nats: Negative log-likelihood of this candidate minus the negative log-likelihood of the
+            selected vertical, nats.
     """
 
     name: str
@@ -135,12 +137,13 @@ class VerticalReport:
     """The vertical.
 
     Attributes:
-        source: Its source.
-        sigma_deg: Its uncertainty.
-        body_off_deg: Angle to the vertical from the body alone; None if that was taken.
-        plane_points_share: Part of the planes' points that agree with it, 0 to 1.
-        others: Verticals of other sources.
-        known_to: A sentence on the uncertainty, with advice.
+        source: Source of the selected vertical.
+        sigma_deg: Sigma of the selected vertical, degrees.
+        body_off_deg: Angle between the selected vertical and the vertical from the body, degrees. None if the
+            vertical from the body was selected.
+        plane_points_share: Fraction of the planes' points that agree with the selected vertical, 0 to 1.
+        others: Candidates from other sources, which were not selected.
+        known_to: Sentence about the uncertainty of the vertical, with advice.
     """
 
     source: str
@@ -156,8 +159,8 @@ class FloorReport:
     """The floor.
 
     Attributes:
-        source: Its source.
-        points: Number of map points in it.
+        source: Source of the floor.
+        points: Number of map points that support the floor.
     """
 
     source: str
@@ -166,11 +169,12 @@ class FloorReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunnerUpRollReport:
-    """The best roll that was not taken.
+    """The second best roll of a camera in its mount.
 
     Attributes:
-        roll_deg: The roll.
-        half_squared_sigmas_more: Half the sum of squares beyond that of the roll that was taken.
+        roll_deg: The second best roll, degrees.
+        half_squared_sigmas_more: Cost of this roll minus the cost of the selected roll. The cost is half the
+            sum of squared residuals, each divided by its sigma.
     """
 
     roll_deg: float
@@ -182,15 +186,15 @@ class MountReport:
     """A solved mount.
 
     Attributes:
-        role: Anatomical name of the bone.
-        roll_deg: The roll that was taken; None if it was not searched.
-        roll_runner_up: The best other roll; None if the roll was not searched.
-        joint_from_cam: (4,4) pose of the camera in the joint's frame.
-        sigma_deg: Uncertainty of the rotation, per axis.
-        sigma_m: Uncertainty of the position, per axis.
-        from_prior_deg: Angle to the prior.
-        from_prior_m: Distance from the prior.
-        known_to: A sentence on the uncertainty, with advice.
+        role: Anatomical name of the bone that the camera is mounted on.
+        roll_deg: The selected roll, degrees; None if the roll was not searched.
+        roll_runner_up: The second best roll; None if the roll was not searched.
+        joint_from_cam: (4,4) pose of the camera in the frame of the joint, metres.
+        sigma_deg: Sigma of the rotation, degrees per axis.
+        sigma_m: Sigma of the position, metres per axis.
+        from_prior_deg: Angle between the solved rotation and the prior rotation, degrees.
+        from_prior_m: Distance between the solved position and the prior position, metres.
+        known_to: Sentence about the uncertainty of the mount, with advice.
     """
 
     role: str
@@ -210,11 +214,11 @@ class CameraReport:
 
     Attributes:
         measurements: Number of poses in use.
-        dropped_as_gross_errors: Number of poses that were dropped.
+        dropped_as_gross_errors: Number of poses that were removed as gross errors.
         down_weighted: Number of poses with a robust weight below a quarter.
-        residual_m: Distance of the measured centre from the solved one.
-        residual_deg: Angle of the measured rotation to the solved one.
-        longest_gap_s: Longest time without a measurement.
+        residual_m: Percentiles of the distance between the measured and the solved camera centre, metres.
+        residual_deg: Percentiles of the angle between the measured and the solved rotation, degrees.
+        longest_gap_s: Longest time without a measurement, seconds.
     """
 
     measurements: int
@@ -230,10 +234,11 @@ class ClockReport:
     """A camera with a suspicious clock.
 
     Attributes:
-        shift_s: Time to add to its timestamps.
-        scatter_left: Part of the scatter of its positions on the body that remains after the shift, 0 to 1.
-        offset_s: The clock offset that includes the shift.
-        says: A sentence for the user.
+        shift_s: Seconds to add to the camera's timestamps for the best fit.
+        scatter_left: Ratio of the scatter of the camera's positions relative to the trunk after the shift to
+            the scatter before the shift, 0 to 1.
+        offset_s: Clock offset that includes the shift, seconds.
+        says: Sentence about the clock for the user.
     """
 
     shift_s: float
@@ -244,11 +249,11 @@ class ClockReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwappedSidesReport:
-    """Limbs' cameras that stay on the other side of the body.
+    """The cameras on limbs that are on the wrong side of the body.
 
     Attributes:
-        cameras: By camera, the part of its time on the wrong side, 0 to 1.
-        says: A sentence for the user.
+        cameras: By camera name, the fraction of its time that the camera is on the wrong side, 0 to 1.
+        says: Sentence about these cameras for the user.
     """
 
     cameras: Mapping[str, float]
@@ -257,7 +262,7 @@ class SwappedSidesReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlignedCameraReport:
-    """The uncertainty of an aligned map's pose, per axis."""
+    """The sigmas of the pose of an aligned map: degrees and metres, per axis."""
 
     sigma_deg: float
     sigma_m: float
@@ -268,8 +273,9 @@ class HingeReport:
     """A hinge that the motion violates.
 
     Attributes:
-        sigma_m: Sigma by which the far end of the bone below leaves the hinge's plane.
-        known_to: A sentence on the violation, with advice.
+        sigma_m: Sigma, metres, of the distance between the hinge's plane and the far end of the bone below
+            the hinge.
+        known_to: Sentence about the violation, with advice.
     """
 
     sigma_m: float
@@ -282,8 +288,8 @@ class ActivityReport:
 
     Attributes:
         name: Name of the activity.
-        rules_active: By rule, the part of the ticks at which it is violated, 0 to 1.
-        rules_pressed_m: By rule, by how much it is violated at these ticks.
+        rules_active: By name of the rule, the fraction of the ticks at which the rule is violated, 0 to 1.
+        rules_pressed_m: By name of the rule, percentiles of the violation at these ticks, metres.
     """
 
     name: str
@@ -299,7 +305,7 @@ class SolverReport:
         ticks: Number of ticks.
         bones: Number of bones.
         iterations: Number of iterations.
-        half_squared_error: By kind of factor, half the sum of squares.
+        half_squared_error: By kind of factor, half the sum of squared residuals, each divided by its sigma.
     """
 
     ticks: int
@@ -314,21 +320,25 @@ class MergeReport:
 
     Attributes:
         scale: The metric scale.
-        t_pose: The T-pose; None without one.
+        t_pose: The T-pose; None if no T-pose was found.
         up: The vertical.
         floor: The floor.
-        mounts: By camera, its solved mount.
-        cameras: By camera, its measurements.
-        doubted_clocks: By camera, a clock that seems wrong.
-        exchanged_sides: Cameras that seem to be on the wrong side; None if there are none.
-        unused_cameras: By camera that is no part of the body, the reason.
-        joined_cameras: By camera of an aligned map, the uncertainty of its map's pose.
-        joint_gap_m: By role, the gap of the joint.
-        joint_sigma_m: By role, then ``observed`` or ``filled``, the sigma of the joint's centre per axis.
-        hinge_off_plane_m: By role, the distance of a hinged bone's far end from the hinge's plane.
-        loose_hinges: By role, a hinge that the motion violates.
-        activity: The soft rules.
-        foot_contact: By foot, how often it stands and how fast it slides meanwhile.
+        mounts: By camera name, the solved mount.
+        cameras: By camera name, the measurements of the camera.
+        doubted_clocks: By camera name, the clock of a camera whose clock seems wrong.
+        exchanged_sides: Cameras that seem to be on the wrong side of the body; None if there are none.
+        unused_cameras: By name of a camera whose map could not be linked to the body, the reason.
+        joined_cameras: By name of a camera in an aligned map, the uncertainty of the map's pose.
+        joint_gap_m: By role of a joint, percentiles of its gap: the distance, metres, between the ends of the
+            two bones that meet at the joint.
+        joint_sigma_m: By role of a joint, then by ``observed`` or ``filled``, percentiles of the sigma of the
+            joint's centre, metres per axis.
+        hinge_off_plane_m: By role of the joint at the far end of the bone below a hinge, percentiles of the
+            distance, metres, of this joint from the hinge's plane.
+        loose_hinges: By role of the bone below a hinge, the violation of the hinge. Hinges that the motion
+            does not violate have no entry.
+        activity: The soft rules of the activity.
+        foot_contact: By foot, figures on how often the foot stands and how fast the standing foot slides.
         solver: The solution of the motion graph.
     """
 
@@ -351,21 +361,21 @@ class MergeReport:
     solver: SolverReport
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the report as plain values, as they are stored and written to ``metrics.json``."""
+        """Return the report as plain JSON values, the form that is stored and written to ``metrics.json``."""
         return dict(_to_plain(self))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> MergeReport:
-        """Return the report from plain values.
+        """Return the report from plain JSON values.
 
-        Missing values become empty or NaN, and unknown keys are dropped. So results of other versions can be
-        read.
+        Missing values become empty or NaN, and unknown keys are ignored. Therefore results of other versions
+        can be read.
         """
         return typing.cast(MergeReport, _from_plain(values, cls))
 
 
 def _to_plain(value: Any) -> Any:
-    """Return plain JSON values."""
+    """Convert a value of the report to plain JSON values."""
     if dataclasses.is_dataclass(value):
         out = {}
         for item in dataclasses.fields(value):
@@ -380,7 +390,7 @@ def _to_plain(value: Any) -> Any:
 
 
 def _from_plain(value: Any, hint: Any) -> Any:
-    """Return plain JSON values as a type; None as the empty value of that type."""
+    """Convert plain JSON values to the type `hint`. None becomes the empty value of the type."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         (inner,) = (argument for argument in arguments if argument is not type(None))

@@ -1,4 +1,7 @@
-"""Track points between two frames, with a check forwards and backwards. Pixels have COLMAP's origin."""
+"""Track points from one frame to another and check the result by tracking back.
+
+All pixel coordinates have COLMAP's origin, unless a text names OpenCV's pixels.
+"""
 
 from __future__ import annotations
 
@@ -15,62 +18,71 @@ GreyImage = npt.NDArray[np.uint8]
 Pixels = npt.NDArray[np.float32]
 
 REFERENCE_WIDTH_PX = 640.0
-"""Pixel thresholds are stated for images with this long side and scale with it."""
+"""Long side, pixels, of the images that the pixel thresholds refer to. For other images, the thresholds are
+scaled with the long side."""
 
 BLUR_SHARPNESS_RATIO = 0.6
-"""A frame is blurred if its sharpness is below this fraction of the sharpness of the frames around it.
-Evidence: none."""
+"""Minimum ratio of the sharpness of a frame to the sharpness of the frames around it. A frame with a smaller
+ratio is treated as blurred. Evidence: none."""
 
 _WINDOW_PX = 21
-"""Pixels: side of the compared square. Evidence: none."""
+"""Side, pixels, of the square around a point that is compared between two images. Evidence: none."""
 _LEVELS = 4
-"""Coarse pyramid levels without a guess."""
+"""Number of pyramid levels above the full image if no expected positions are given. Evidence: none."""
 _GUIDED_LEVELS = 2
-"""Coarse pyramid levels with a guess."""
+"""Number of pyramid levels above the full image if expected positions are given. Evidence: none."""
 _UNCHECKED_LEVELS = 0
-"""Coarse pyramid levels with a guess and without the check: they would only add cost and wrong matches."""
+"""Number of pyramid levels above the full image if expected positions are given and tracks are not checked.
+More levels would only increase the cost and the number of wrong matches."""
 _ITERATIONS = 20
-"""Most iterations of Lucas–Kanade on a level. Evidence: none."""
+"""Maximum number of Lucas–Kanade iterations on each pyramid level. Evidence: none."""
 _EPSILON_PX = 0.02
-"""Pixels: an iteration that moves a point by less is the last one. Evidence: none."""
+"""Minimum movement of a point, pixels, in an iteration. A smaller movement ends the iterations. Evidence:
+none."""
 _MAX_ROUND_TRIP_PX = 1.0
-"""Pixels: largest distance after tracking there and back. Evidence: none."""
+"""Maximum distance, pixels, between a point and its position after tracking forwards and back. Evidence:
+none."""
 _COARSE_WIDTH_PX = 320.0
-"""Pixels: long side of the reduced images for the motion of the whole image. Evidence: none."""
+"""Long side, pixels, of the reduced images in which the motion of the whole image is estimated. Evidence:
+none."""
 _COARSE_WINDOW_PX = 15
-"""Pixels of the reduced image: side of the compared square. Evidence: none."""
+"""Side, pixels of the reduced image, of the square around a point that is compared. Evidence: none."""
 _COARSE_LEVELS = 3
-"""Coarse pyramid levels of the reduced image."""
+"""Number of pyramid levels above the reduced image if no expected positions are given. Evidence: none."""
 _COARSE_POINTS = 48
-"""Most points that are followed for it. Evidence: none."""
+"""Maximum number of points that are tracked for the motion of the whole image. Evidence: none."""
 _MIN_COARSE_POINTS = 12
-"""Least points for a homography. Evidence: none."""
+"""Minimum number of points for the estimation of a homography. Evidence: none."""
 _COARSE_ERROR_PX = 2.5
-"""Pixels of the reduced image: inlier limit of the homography. Evidence: none."""
+"""Maximum error, pixels of the reduced image, of an inlier of the homography. Evidence: none."""
 _COARSE_MAX_TRIALS = 300
-"""RANSAC iterations. Evidence: none."""
+"""Maximum number of RANSAC iterations. Evidence: none."""
 _MIN_INLIERS = 7
-"""Least inliers of a homography. Origin: three more than the four points that determine it."""
+"""Minimum number of inliers of a homography. Origin: three more than the four points that determine a
+homography."""
 _RELIABLE_RATIO = 0.5
-"""Least ratio of inliers to points for a reliable motion. Origin: the majority."""
+"""Minimum fraction of the points that are inliers of a reliable motion. Origin: the majority."""
 _PIECE_SIDE_RATIO = 0.35
-"""Side of an image piece, as a fraction of the image's long side. Evidence: none."""
+"""Ratio of the side of an image piece to the long side of the image. Evidence: none."""
 _PIECE_ROWS, _PIECE_COLUMNS = 2, 3
-"""Rows and columns of image pieces. Evidence: none."""
+"""Numbers of rows and columns of image pieces. Evidence: none."""
 _MAX_PIECES = 2
-"""Best pieces whose shift is used as a guess. Evidence: none."""
+"""Maximum number of image pieces whose shifts are used as expected shifts of the points. The pieces with the
+best matches are used. Evidence: none."""
 _MIN_CONTRAST = 4.0
-"""Least standard deviation of the grey values of a piece. Evidence: none."""
+"""Minimum standard deviation, grey levels, of an image piece. A piece with less contrast is not searched.
+Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackedPoints:
-    """Tracked points.
+    """The result of tracking points from a first to a second image.
 
     Attributes:
-        px: (N,2) position in the second image, COLMAP origin.
+        px: (N,2) positions in the second image, with COLMAP's origin.
         ok: (N,) True if the point was found inside the image and passed the check.
-        round_trip_px: (N,) distance between a point and its image after tracking there and back.
+        round_trip_px: (N,) distance, pixels, in the first image between each point and its position after
+            tracking forwards and back; 0 without the check.
     """
 
     px: Pixels
@@ -79,7 +91,7 @@ class TrackedPoints:
 
 
 def pixel_scale(width_px: int, height_px: int) -> float:
-    """Return the factor on pixel thresholds for an image of this size."""
+    """Return the factor that scales pixel thresholds to an image of this size."""
     return max(width_px, height_px) / REFERENCE_WIDTH_PX
 
 
@@ -92,16 +104,17 @@ def track_points(
     with_check: bool = True,
     window_px: int = _WINDOW_PX,
 ) -> TrackedPoints:
-    """Track points from one image to the next by pyramidal Lucas–Kanade, with a check backwards.
+    """Track points from one image to another by pyramidal Lucas–Kanade.
 
     Args:
-        first: (H,W) uint8 image.
-        second: (H,W) uint8 image.
+        first: (H,W) uint8 image in which the points are given.
+        second: (H,W) uint8 image in which the points are searched.
         px: (N,2) float32 points in the first image.
-        guess_px: (N,2) expected positions in the second image.
-        with_check: Search far around the guess, track the points back too, and reject those that do not
-            return. Otherwise only the surroundings of the guess are searched, at a quarter of the cost.
-        window_px: Side of the compared square.
+        guess_px: (N,2) expected positions in the second image; None if they are unknown.
+        with_check: True to track the points back to the first image too, and to reject points that do not
+            return to their start. False to skip this check; if expected positions are given, only their
+            surroundings are then searched, at a quarter of the cost.
+        window_px: Side, pixels, of the square around a point that is compared.
 
     Source: Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000; the check is Kalal,
         Mikolajczyk, Matas, "Forward-backward error", ICPR 2010.
@@ -119,7 +132,8 @@ def track_points(
         return TrackedPoints(found_px, is_found, np.zeros(len(px), np.float32))
     returned_px = np.full_like(tracked, np.inf)
     if is_found.any():
-        # Tracking back starts with the opposite of the guess, so that it does not start at the answer.
+        # Tracking back starts at the found position minus the guessed shift. If it started at the original
+        # point, the check would always succeed.
         return_guess = None if guess is None else tracked[is_found] - (guess - start)[is_found]
         returned, refound = _lucas_kanade(second, first, tracked[is_found], return_guess, (window_px, levels))
         returned[~refound] = np.inf
@@ -132,17 +146,17 @@ def track_points(
 def _lucas_kanade(
     first: GreyImage, second: GreyImage, start: Pixels, guess: Pixels | None, size: tuple[int, int]
 ) -> tuple[Pixels, BoolArray]:
-    """Call OpenCV's tracker, in OpenCV's pixels.
+    """Call OpenCV's tracker. All positions are in OpenCV's pixels.
 
     Args:
-        first: (H,W) image.
-        second: (H,W) image.
+        first: (H,W) image in which the points are given.
+        second: (H,W) image in which the points are searched.
         start: (N,2) points in the first image.
-        guess: (N,2) expected positions in the second image, if there are any.
-        size: Side of the compared square, and the number of coarse levels.
+        guess: (N,2) expected positions in the second image; None if they are unknown.
+        size: Side, pixels, of the square that is compared, and number of pyramid levels above the full image.
 
     Returns:
-        Positions (N,2) in the second image, and which points (N,) were found.
+        Positions (N,2) in the second image, and a mask (N,) that is True for the points that were found.
     """
     import cv2
 
@@ -157,7 +171,7 @@ def _lucas_kanade(
 
 
 def make_coarse_image(grey: GreyImage) -> GreyImage:
-    """Reduce an image to the size that `estimate_coarse_motion` works at."""
+    """Reduce an image to the size that `estimate_coarse_motion` needs."""
     import cv2
 
     scale = min(1.0, _COARSE_WIDTH_PX / max(grey.shape))
@@ -166,11 +180,12 @@ def make_coarse_image(grey: GreyImage) -> GreyImage:
 
 @dataclass(frozen=True, slots=True)
 class ImageMotion:
-    """The motion of the whole image.
+    """The motion of the whole image from a first to a second image.
 
     Attributes:
-        homography: (3,3) second from first, in full-size pixels with COLMAP's origin.
-        is_reliable: True if most points agree with it.
+        homography: (3,3) homography from the first to the second image, in pixels of the full-size images
+            with COLMAP's origin.
+        is_reliable: True if at least half of the tracked points are inliers of the homography.
     """
 
     homography: FloatArray
@@ -184,20 +199,21 @@ class ImageMotion:
 def estimate_coarse_motion(
     first: GreyImage, second: GreyImage, px: Pixels, width_px: int
 ) -> ImageMotion | None:
-    """Estimate the homography from one image to the next, as a start for tracking.
+    """Estimate the homography from one image to another, as the initial motion for tracking.
 
-    Some points are followed from their own position. If few of them agree on a motion, they are followed
-    again from the shift of image pieces that are found in the second image. The camera on a hand rotates by
-    up to 35 degrees between two frames.
+    A subset of the points is tracked, starting at their positions in the first image. If too few points agree
+    on a motion, large pieces of the first image are searched in the second image. The points are then tracked
+    again from positions that are moved by the shifts of these pieces. This is necessary because a camera on a
+    hand can rotate by up to 35 degrees between two frames.
 
     Args:
         first: Reduced first image, from `make_coarse_image`.
-        second: Reduced second image.
-        px: (N,2) points of the first image at full size; some of them are followed.
-        width_px: Width of the full-size images.
+        second: Reduced second image, from `make_coarse_image`.
+        px: (N,2) points in the first image, in pixels of the full-size image.
+        width_px: Width of the full-size images, pixels.
 
     Returns:
-        The motion, or None if too few points agree.
+        The motion, or None if too few points agree on a motion.
     """
     scale = first.shape[1] / width_px
     chosen = px[np.linspace(0, len(px) - 1, min(len(px), _COARSE_POINTS)).astype(int)] if len(px) else px
@@ -210,7 +226,7 @@ def estimate_coarse_motion(
                 best, inliers = homography, count
     if best is None or inliers < _MIN_INLIERS:
         return None
-    # From OpenCV's pixels of the reduced images to COLMAP's pixels of the full-size images.
+    # This matrix converts OpenCV's pixels of the reduced images to COLMAP's pixels of the full-size images.
     full_from_coarse = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, scale]])
     return ImageMotion(
         np.asarray(full_from_coarse @ best @ np.linalg.inv(full_from_coarse)),
@@ -221,7 +237,17 @@ def estimate_coarse_motion(
 def _fit_homography(
     first: GreyImage, second: GreyImage, start: Pixels, guess: Pixels | None
 ) -> tuple[FloatArray | None, int]:
-    """Follow points and return the homography with the most inliers, and their number."""
+    """Track points and fit a homography to their motion by RANSAC.
+
+    Args:
+        first: Reduced first image.
+        second: Reduced second image.
+        start: (N,2) points in the first image, in OpenCV's pixels.
+        guess: (N,2) expected positions in the second image; None if they are unknown.
+
+    Returns:
+        The homography (3,3), or None if there is none, and its number of inliers.
+    """
     import cv2
 
     if len(start) < _MIN_COARSE_POINTS:
@@ -238,7 +264,10 @@ def _fit_homography(
 
 
 def _match_image_pieces(first: GreyImage, second: GreyImage) -> list[Pixels]:
-    """Find pieces of the first image in the second, and return the shifts (2,) of the best matches.
+    """Search pieces of the first image in the second image.
+
+    Returns:
+        The shifts (2,) from the first to the second image of the pieces with the best matches, in pixels.
 
     Source: Lewis, "Fast normalized cross-correlation", 1995.
     """
@@ -269,7 +298,16 @@ def apply_homography(px: Pixels, homography: FloatArray) -> Pixels:
 
 
 def detect_corners(grey: GreyImage, count: int, spacing_px: float, mask: BoolArray | None = None) -> Pixels:
-    """Detect corners (N,2), strongest first, at least `spacing_px` apart, where the mask is True.
+    """Detect corners in an image.
+
+    Args:
+        grey: (H,W) uint8 image.
+        count: Maximum number of corners.
+        spacing_px: Minimum distance between two corners, pixels.
+        mask: (H,W) True where corners are allowed; None if they are allowed everywhere.
+
+    Returns:
+        The corners (N,2), the strongest first, with COLMAP's origin.
 
     Source: Shi, Tomasi, "Good features to track", CVPR 1994.
     """
@@ -283,9 +321,9 @@ def detect_corners(grey: GreyImage, count: int, spacing_px: float, mask: BoolArr
 
 
 def sharpness(grey: GreyImage) -> float:
-    """Return the standard deviation of the image's second derivative.
+    """Return the sharpness of an image: the standard deviation of its second derivative.
 
-    It falls with blur and is comparable between neighbouring frames.
+    Blur decreases the sharpness. The values of neighbouring frames can be compared.
 
     Source: Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000.
     """
@@ -302,10 +340,18 @@ def unit_directions(rays: FloatArray) -> FloatArray:
 
 
 def fit_rotation(first: FloatArray, second: FloatArray, iterations: int = 4) -> FloatArray:
-    """Fit the rotation (3,3) from unit directions `first` (N,3) to `second` (N,3), robustly.
+    """Fit a rotation to corresponding unit directions, robustly.
 
-    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976, reweighted with
-        Cauchy weights at the median residual.
+    Args:
+        first: (N,3) unit directions before the rotation.
+        second: (N,3) unit directions after the rotation.
+        iterations: Number of iterations of reweighting.
+
+    Returns:
+        The rotation (3,3) from `first` to `second`.
+
+    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976; iteratively
+        reweighted with Cauchy weights, whose scale is the median residual.
     """
     weight = np.ones(len(first))
     rotation = np.eye(3)

@@ -1,4 +1,4 @@
-"""Estimate the relative pose of two cameras on one bone from all of their frames."""
+"""Estimate the relative pose of two cameras that are mounted on one bone, from all frames of both cameras."""
 
 from __future__ import annotations
 
@@ -19,23 +19,26 @@ from bodycap_batch.model.geometry import (
 from bodycap_batch.model.scene import Trajectory
 
 _MAX_ITERATIONS = 100
-"""Iterations of the rotation average."""
+"""Maximum number of iterations for the average of rotations."""
 _CONVERGED_RAD = 1e-9
-"""Radians: a smaller step ends the iterations, and no residual gets more weight than this one."""
+"""Minimum angle, radians, of a step of the average of rotations. A smaller step ends the iterations. Smaller
+residuals get the same weight as a residual of this angle."""
 MIN_INSTANTS = 30
-"""Least instants with a pose of both cameras: a second of frames. Fewer do not determine the relative
-pose."""
+"""Minimum number of instants with a pose of both cameras: the frames of one second. Fewer instants do not
+determine the relative pose."""
 _MAX_SPREAD_RATIO = 1.5
-"""Largest ratio of the scatter of the relative rotation to the scatter that the covariances of the poses
-explain. The covariances contain the error of the map, which both cameras share, so the ratio of a rig is
-below 1. Evidence: docs/decisions/registration.md."""
+"""Maximum ratio of the scatter of the relative rotation to the scatter that the covariances of the poses
+explain. In a rigid rig the ratio is below 1: the covariances also contain the error of the map, but this
+error is common to both cameras. Evidence: docs/decisions/registration.md."""
 _MEDIAN_NORM_3D = 1.538
-"""Median length of a vector of three standard normal variables."""
+"""Median length of a vector of three independent standard normal variables."""
 _SAME_INSTANT_RATIO = 0.25
-"""Largest time difference of one exposure in a synchronised rig, as a fraction of the frame interval. Time
-stamps are rounded, and no other exposure lies between."""
+"""Maximum time difference between two frames that were exposed at the same instant in a synchronised rig, as
+a fraction of the frame interval. Derivation: the timestamps are rounded, and the next exposure is a whole
+frame interval later."""
 _MAX_INTERPOLATION_FRAMES = 1.5
-"""Frame intervals between two poses that may be interpolated: they are neighbours."""
+"""Maximum time between two poses that are interpolated, in frame intervals. Only the poses of successive
+frames are this near."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,11 +47,14 @@ class RelativePose:
 
     Attributes:
         cameras: Names of the first and the second camera.
-        first_from_second: (4,4), translation in the unit of the gauge; NaN if no instant has both poses.
-        instants: Number of instants with both poses.
-        spread_rad: Median angle of single instants from the mean.
-        explained_rad: Median angle that the covariances of both trajectories explain.
-        spread: Median distance of single instants' centres from the mean, in the gauge's unit.
+        first_from_second: (4,4) pose of the second camera in the frame of the first camera, with the
+            translation in the unit of the gauge. NaN if there is no instant with a pose of both cameras.
+        instants: Number of instants with a pose of both cameras.
+        spread_rad: Median angle, radians, between the relative rotation at single instants and the mean
+            relative rotation.
+        explained_rad: Median angle, radians, that the covariances of both trajectories explain.
+        spread: Median distance between the relative translation at single instants and the mean relative
+            translation, in the unit of the gauge.
     """
 
     cameras: tuple[str, str]
@@ -63,26 +69,29 @@ class RelativePose:
 
     @property
     def is_rigid(self) -> bool:
-        """True if enough instants agree that the cameras are mounted rigidly and exposed synchronously."""
+        """True if enough instants show that the cameras are mounted rigidly and exposed at the same time."""
         return self.instants >= MIN_INSTANTS and self.spread_rad < _MAX_SPREAD_RATIO * self.explained_rad
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigPoses:
-    """The relative poses of the other cameras of a rig."""
+    """The poses of the cameras of a rig relative to another camera of the rig."""
 
     relative: tuple[RelativePose, ...]
 
 
 def estimate_relative_pose(first: Trajectory, second: Trajectory, offset_ns: int) -> RelativePose:
-    """Average the second camera's pose relative to the first robustly, over all frames with both poses.
+    """Estimate the mean pose of a second camera relative to a first camera, robustly.
 
-    The second trajectory is interpolated at the times of the first.
+    The mean is taken over all instants with a pose of both cameras. The second trajectory is interpolated at
+    the times of the first trajectory.
 
     Args:
-        first: Trajectory of one camera.
-        second: Trajectory of the other, in the same gauge; otherwise no instant has both poses.
-        offset_ns: Nanoseconds to add to the second camera's times to have them on the first camera's clock.
+        first: Trajectory of the first camera.
+        second: Trajectory of the second camera. If the two trajectories have different gauges, there is no
+            instant with a pose of both cameras.
+        offset_ns: Nanoseconds to add to the times of the second camera to convert them to the clock of the
+            first camera.
 
     Source: rotations by Hartley, Aftab, Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR
         2011; translations by their median along each axis.
@@ -120,15 +129,15 @@ def estimate_relative_pose(first: Trajectory, second: Trajectory, offset_ns: int
 
 
 def _rotation_variance(path: Trajectory) -> float:
-    """Return the median variance of a pose's rotation about one axis, rad²."""
+    """Return the median over all poses of the variance of the rotation about one axis, rad²."""
     covariance = path.covariance[path.localised][:, :3, :3]
     return float(np.median(np.trace(covariance, axis1=1, axis2=2))) / 3.0
 
 
 def mean_rotation(rotations: FloatArray) -> FloatArray:
-    """Return the rotation (3,3) with the least sum of angles to rotations (N,3,3).
+    """Return the rotation (3,3) with the smallest sum of angles to the given rotations (N,3,3).
 
-    Nearly half of the rotations may be wrong.
+    This mean is robust: nearly half of the given rotations may be wrong.
     """
     mean = nearest_rotation(np.median(rotations, axis=0))
     for _ in range(_MAX_ITERATIONS):
@@ -142,14 +151,14 @@ def mean_rotation(rotations: FloatArray) -> FloatArray:
 
 
 def match_instants(first_ns: IntArray, second_ns: IntArray) -> IntArray:
-    """Find for each frame of the second camera (N,) the first camera's frame at the same instant.
+    """Find for each frame of a second camera the frame of a first camera at the same instant.
 
     Args:
-        first_ns: (F,) increasing common times.
-        second_ns: (N,) increasing common times.
+        first_ns: (F,) common times of the first camera's frames, nanoseconds, increasing.
+        second_ns: (N,) common times of the second camera's frames, nanoseconds, increasing.
 
     Returns:
-        (N,) frame of the first camera; -1 if there is none.
+        (N,) index of the first camera's frame for each frame of the second camera; -1 if there is none.
     """
     if len(first_ns) < 2:
         return np.full(len(second_ns), -1, dtype=np.int64)
@@ -166,7 +175,7 @@ def _frame_interval_ns(times_ns: IntArray) -> float:
 
 
 def not_rigid_note(relative: RelativePose) -> str:
-    """Explain to the user why two cameras of a stated rig are not treated as one."""
+    """Return a note for the user: why two cameras are not treated as a rig, although the job says so."""
     pair = " and ".join(relative.cameras)
     if relative.instants < MIN_INSTANTS:
         return (

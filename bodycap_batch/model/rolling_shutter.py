@@ -1,7 +1,8 @@
-"""Correct the rolling shutter: move observations to the instant of the middle row.
+"""Correct the rolling shutter: move observations to the instant at which the middle row is exposed.
 
-Image row r of h is exposed at the frame's time + (r/h − ½) · readout_s. If a quarter turn lets the sensor's
-rows run along the image columns (`Camera.sideways`), column c of w is exposed at (c/w − ½) · readout_s.
+In an image of height h, row r is exposed at the time of the frame plus (r/h − ½) · readout_s. If the image is
+rotated by 90°, the rows of the sensor are the columns of the image (`Camera.sideways`). Then, in an image of
+width w, column c is exposed at the time of the frame plus (c/w − ½) · readout_s.
 """
 
 from __future__ import annotations
@@ -17,41 +18,45 @@ from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.scene import Map, Registration
 
 _MAX_GAP_FRAMES = 3.0
-"""Largest distance to a neighbouring frame that gives a velocity, in frame intervals. Beyond it only the
-other neighbour is used, because the velocity over a hole in the video is wrong. Evidence:
-docs/decisions/registration.md."""
+"""Maximum time, in frame intervals, between a frame and a neighbouring frame that is used for its image
+velocity. After a longer time without frames, the velocity would be wrong; only the other neighbour is then
+used. Evidence: docs/decisions/registration.md."""
 _MIN_POINTS = 30
-"""Least observations of a frame. Origin: the camera motion takes six unknowns. Evidence: none."""
+"""Minimum number of observations of a frame that is used. Origin: a camera motion has six unknowns, and
+the observations must determine them well. Evidence: none."""
 _MAX_RESIDUAL_PX = 4.0
-"""Pixels at 640 px image width: larger residuals are ignored. Evidence: none."""
+"""Maximum residual, pixels in an image of width 640, of an observation that is used. Evidence: none."""
 _LOSS_PX = 0.5
-"""Pixels: scale of the Cauchy loss. Evidence: none."""
+"""Scale of the Cauchy loss, pixels. Evidence: none."""
 _BATCH_ROWS = 1 << 14
-"""Observations projected at a time, each with a pose of its own. It bounds the memory."""
+"""Number of observations that are projected at a time. Each observation needs a separate pose, so the limit
+bounds the memory."""
 _SCREENED_OBSERVATIONS = 100_000
-"""About the number of observations used, from frames spread over the video. They are enough for a
-decision."""
+"""Approximate number of observations that are used, from frames spread over the video. This number is enough
+for a decision."""
 _MIN_APPARENT_S = 0.0005
-"""Seconds: least readout time in the residuals that shows a rolling shutter. Origin: a global shutter shows
-less than 0.0003 s."""
+"""Minimum readout time, seconds, estimated from the residuals of a camera with a rolling shutter. Origin:
+with a global shutter, the estimate is less than 0.0003 s."""
 _MIN_SIGMAS = 8.0
-"""Least significance of it, in standard deviations. Evidence: none."""
+"""Minimum ratio of the estimated readout time to its standard deviation for a rolling shutter. Evidence:
+none."""
 
 
 def image_velocity(
     camera: Camera, map_from_cam: FloatArray, times_ns: IntArray, frame: IntArray, points: FloatArray
 ) -> FloatArray:
-    """Return the velocity (M,2) in px/s of map points in the image, from the poses of neighbouring frames.
+    """Compute the image velocities of map points from the poses of the previous and the next frame.
 
     Args:
         camera: The camera model.
-        map_from_cam: (N,4,4) poses of all frames, NaN if there is none.
-        times_ns: (N,) frame times.
-        frame: (M,) frame of each observation.
-        points: (M,3) the observed point.
+        map_from_cam: (N,4,4) poses of all frames; NaN for a frame without a pose.
+        times_ns: (N,) frame times, nanoseconds.
+        frame: (M,) frame index of each observation.
+        points: (M,3) observed map point of each observation, in the map frame.
 
     Returns:
-        Zero if neither neighbour has a pose and is near in time, or if the point is behind it.
+        The velocities (M,2), px/s. A velocity is zero if no neighbouring frame is usable, because it has no
+        pose or is far in time, and if the point is behind the camera.
     """
     has_pose: BoolArray = np.asarray(np.isfinite(map_from_cam).all(axis=(1, 2)))
     cam_from_map = np.full_like(map_from_cam, np.nan)
@@ -71,7 +76,11 @@ def image_velocity(
 
 
 def _usable_neighbours(has_pose: BoolArray, times_ns: IntArray) -> tuple[BoolArray, BoolArray]:
-    """Return which frames (N,) have a previous, and which a next, frame with a pose near in time."""
+    """Find the frames whose neighbouring frames have a pose and are near in time.
+
+    Returns:
+        Two masks (N,): True if the previous frame is usable, and True if the next frame is usable.
+    """
     interval_ns = np.diff(times_ns)
     is_near = interval_ns <= _MAX_GAP_FRAMES * np.median(interval_ns) if len(interval_ns) else interval_ns > 0
     missing = np.zeros(1, dtype=bool)
@@ -83,7 +92,17 @@ def _usable_neighbours(has_pose: BoolArray, times_ns: IntArray) -> tuple[BoolArr
 def _project_in_frames(
     camera: Camera, cam_from_map: FloatArray, frame: IntArray, points: FloatArray
 ) -> FloatArray:
-    """Project points (M,3), each into a frame of its own, to pixels (M,2), in batches."""
+    """Project map points into frames, in batches.
+
+    Args:
+        camera: The camera model.
+        cam_from_map: (N,4,4) inverse poses of all frames; NaN for a frame without a pose.
+        frame: (M,) index of the frame that each point is projected into.
+        points: (M,3) points in the map frame.
+
+    Returns:
+        The pixels (M,2).
+    """
     out = np.empty((len(frame), 2))
     for start in range(0, len(frame), _BATCH_ROWS):
         batch = slice(start, start + _BATCH_ROWS)
@@ -94,22 +113,26 @@ def _project_in_frames(
 
 
 def row_delay(camera: Camera, px: FloatArray) -> FloatArray:
-    """Return the exposure time (M,) of pixels (M,2) relative to the frame's time, over the readout time."""
+    """Return the exposure time (M,) of pixels (M,2) relative to the frame time, in readout times.
+
+    The values are between −½ and ½.
+    """
     position = px[:, 0] / camera.width_px if camera.sideways else px[:, 1] / camera.height_px
     return np.asarray(position - 0.5, dtype=np.float64)
 
 
 def mean_row_fraction(registration: Registration, camera: Camera) -> FloatArray:
-    """Return the mean image row of the observations behind each pose, over the image height.
+    """Return the mean image row of the observations behind each pose, as a fraction of the image height.
 
-    If the sensor's rows run along the image columns, it is the mean column over the width.
+    If the rows of the sensor are the columns of the image, the mean column is returned, as a fraction of the
+    image width.
 
     Args:
         registration: The poses and observations of one camera.
-        camera: Its camera model.
+        camera: The camera model of this camera.
 
     Returns:
-        (N,) one value for each frame: 0.5 for a pose without observations, NaN for a frame without a pose.
+        (N,) fraction for each frame: 0.5 for a pose without observations, NaN for a frame without a pose.
     """
     frame_count = len(registration.trajectory.status)
     observed = np.bincount(registration.obs_frame, minlength=frame_count)
@@ -121,21 +144,33 @@ def mean_row_fraction(registration: Registration, camera: Camera) -> FloatArray:
 
 
 def px_at_mid_row(camera: Camera, px: FloatArray, velocity_px_s: FloatArray, readout_s: float) -> FloatArray:
-    """Return the pixels (M,2) at the instant of the middle row, given their velocities (M,2) in px/s."""
+    """Move observed pixels to where they would be at the exposure of the middle row.
+
+    Args:
+        camera: The camera model.
+        px: (M,2) observed pixels.
+        velocity_px_s: (M,2) image velocities, px/s.
+        readout_s: Readout time, seconds.
+
+    Returns:
+        The moved pixels (M,2).
+    """
     return np.asarray(px - velocity_px_s * (row_delay(camera, px) * readout_s)[:, None])
 
 
 def has_visible_rolling_shutter(
     registration: Registration, maps: Sequence[Map], *, allow_sideways: bool = False
 ) -> bool:
-    """Return True if a rolling shutter shows in the residuals of a camera's tracks.
+    """Return True if the residuals of a camera's tracks show that the camera has a rolling shutter.
 
-    A global shutter shows less than 0.3 ms; a readout time of 24 ms shows 3 ms.
+    The readout time estimated from the residuals is below 0.3 ms for a global shutter. It is about 3 ms for a
+    rolling shutter with a true readout time of 24 ms.
 
     Args:
         registration: The poses and tracks of the camera.
-        maps: The maps they belong to.
-        allow_sideways: Test both directions: the sensor's rows may run along the image columns.
+        maps: The maps, including the map that the poses refer to.
+        allow_sideways: True to test both directions, because the rows of the sensor may be the columns of
+            the image.
     """
     path = registration.trajectory
     scene_map = next((item for item in maps if item.gauge == path.gauge), None)
@@ -165,22 +200,24 @@ def has_visible_rolling_shutter(
 def estimate_residual_readout(
     camera: Camera, frame: IntArray, px: FloatArray, residual_px: FloatArray, velocity_px_s: FloatArray
 ) -> tuple[float, float]:
-    """Estimate the part of the readout time that poses and points have not absorbed.
+    """Estimate the part of the readout time that is still visible in the residuals.
 
-    With a rolling shutter the residuals (observed minus projected) grow with row times velocity. The part
-    that a similarity and a tilt of the image explain is removed from both, frame by frame, because the pose
-    has absorbed it. The map absorbs more. The value is therefore a lower bound, which suits a test and not a
-    correction.
+    With a rolling shutter, the residuals (observed minus projected) are proportional to the image row,
+    counted from the middle, times the image velocity. A part of this effect looks like a small camera motion,
+    and the pose has absorbed this part. Therefore the image motion of a small camera motion is fitted to the
+    effect and to the residuals of each frame, and subtracted from both. The map absorbs another part of the
+    effect. The estimate is therefore a lower bound of the readout time. It is good enough for a test, but not
+    for a correction.
 
     Args:
         camera: The camera model.
-        frame: (M,) frame of each observation, sorted.
-        px: (M,2) observed pixel.
-        residual_px: (M,2) residual.
-        velocity_px_s: (M,2) from `image_velocity`.
+        frame: (M,) frame index of each observation, sorted.
+        px: (M,2) observed pixels.
+        residual_px: (M,2) residuals, pixels.
+        velocity_px_s: (M,2) image velocities, px/s, from `image_velocity`.
 
     Returns:
-        Seconds and their standard deviation; (0, inf) if there are too few observations.
+        The readout time and its standard deviation, seconds; (0, inf) if there are too few observations.
     """
     keep = np.linalg.norm(residual_px, axis=1) < _MAX_RESIDUAL_PX * camera.width_px / 640.0
     frame, px, residual_px, velocity_px_s = frame[keep], px[keep], residual_px[keep], velocity_px_s[keep]
@@ -205,7 +242,10 @@ def estimate_residual_readout(
 
 
 def _camera_motion_basis(x: FloatArray) -> FloatArray:
-    """Return the image motions (2N,6) of a small camera motion: shift, scale, roll, and the two tilts."""
+    """Return the image motions (2N,6) that a small camera motion causes at N pixels.
+
+    The columns are the two shifts, scale, roll and the two tilts. Each pixel has two rows.
+    """
     out = np.zeros((2 * len(x), 6))
     out[0::2, 0] = out[1::2, 1] = 1.0
     out[0::2, 2], out[1::2, 2] = x[:, 0], x[:, 1]

@@ -1,7 +1,7 @@
 """The results of keyframe selection, mapping and registration: maps, trajectories and their observations.
 
-A map has its own gauge: a frame of reference with arbitrary origin, axes and scale. Each `Map` and
-`Trajectory` names its gauge. Poses of different gauges must not be mixed.
+Every map has a separate gauge: a frame of reference with arbitrary origin, axes and scale. Each `Map` and
+each `Trajectory` names its gauge. Poses in different gauges must not be combined.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 
 _FEATURE_STRIDE = 1 << 24
-"""Number of feature indices per frame in a combined (frame, feature) key. Derivation: above any SIFT count,
-and 2^39 frames still fit into 64 bits."""
+"""Number of feature indices reserved for each frame in a key that combines frame and feature. Derivation: the
+number is larger than the number of SIFT features of any image, and 2^39 frames still fit into 64 bits."""
 
 
 class FrameStatus(StrEnum):
-    """Whether a frame was localised, and if not, why.
+    """The status of a frame: localised, or lost for a given reason.
 
     KEYFRAME: The frame is a keyframe of the map.
     REGISTERED: The pose was estimated from the frame's own observations.
-    RIG: The pose follows from other cameras of a hardware-synchronised rig, because the frame itself has too
-        few observations.
-    BLUR: Lost; too few tracks reach the frame, and its image is blurred.
-    FEW_TRACKS: Lost; too few tracks reach the frame, although its image is sharp.
+    RIG: The pose was computed from other cameras of a hardware-synchronised rig, because the frame itself has
+        too few observations.
+    BLUR: Lost; too few tracks reach the frame, and the image is blurred.
+    FEW_TRACKS: Lost; too few tracks reach the frame, although the image is sharp.
     FEW_INLIERS: Lost; too few observations agree with any pose.
     UNCONSTRAINED: Lost; the observations do not determine the pose well enough.
     POSE_JUMP: Lost; the estimated pose was rejected as an outlier of the trajectory.
@@ -52,7 +52,7 @@ class FrameStatus(StrEnum):
 
     @property
     def localised(self) -> bool:
-        """Whether the frame has a measured pose."""
+        """True if the frame has a measured pose."""
         return self in (FrameStatus.KEYFRAME, FrameStatus.REGISTERED, FrameStatus.RIG)
 
 
@@ -64,8 +64,8 @@ class KeyframeSelection:
         camera: Camera name.
         frames: (K,) frame indices of the keyframes, increasing.
         frame_count: Number N of frames of the video.
-        sharpness: (N,) sharpness of each frame in an arbitrary unit; larger is sharper.
-        noise_px: Standard deviation of the tracked positions, measured by tracking forwards and backwards.
+        sharpness: (N,) sharpness of each frame in an arbitrary unit; a larger value means a sharper frame.
+        noise_px: Standard deviation of the tracked positions, pixels, measured by tracking forwards and back.
     """
 
     camera: str
@@ -87,24 +87,26 @@ class KeyframeSelection:
 class Map:
     """A sparse reconstruction: keyframe poses, points and observations in one gauge.
 
-    K keyframes, P points, M observations. The frame of reference is called ``map``.
+    The map has K keyframes, P points and M observations. Its frame of reference is called ``map``. The work
+    size is the image size that all stages work at.
 
     Attributes:
         gauge: Identifier of the gauge. Each adjustment of the map creates a new gauge.
-        cameras: Intrinsics after mapping, by camera name.
+        cameras: By camera name, the intrinsics after mapping, at the work size.
         keyframe_camera: (K,) camera name of each keyframe.
         keyframe_frame: (K,) frame index of each keyframe in the video of its camera.
-        map_from_cam: (K,4,4) keyframe poses. With a rolling shutter: the poses at the exposure of the middle
-            row.
+        map_from_cam: (K,4,4) poses of the keyframes. For a camera with a rolling shutter, the poses hold at
+            the exposure of the middle row.
         points: (P,3) points in the map frame, in the unit of the gauge.
         colors: (P,3) colours of the points, uint8 RGB.
         point_error_px: (P,) mean reprojection error of each point.
         obs_keyframe: (M,) keyframe index of each observation.
         obs_point: (M,) point index of each observation.
         obs_feature: (M,) index of the observed feature in its keyframe.
-        obs_px: (M,2) observed pixels at the work size, COLMAP's origin, not corrected for a rolling shutter.
-        readout_s: Readout time that the map was adjusted with, by camera name. A camera without an entry was
-            adjusted as if it had a global shutter.
+        obs_px: (M,2) observed pixels at the work size, with COLMAP's origin. They are not corrected for a
+            rolling shutter.
+        readout_s: By camera name, the readout time, seconds, that the adjustment of the map used. A camera
+            without an entry was treated as a camera with a global shutter.
     """
 
     gauge: str
@@ -134,21 +136,21 @@ class Map:
         set_array(self, "obs_px", (observations, 2))
 
     def keyframes_of(self, camera: str) -> IntArray:
-        """Return the indices of one camera's keyframes in this map, ordered by frame."""
+        """Return the indices of the keyframes of one camera in this map, ordered by frame index."""
         keyframes = np.flatnonzero(np.array([name == camera for name in self.keyframe_camera], dtype=bool))
         order = np.argsort(self.keyframe_frame[keyframes], kind="stable")
         return np.asarray(keyframes[order], dtype=np.int64)
 
     def points_of(self, camera: str, frame: IntArray, feature: IntArray) -> IntArray:
-        """Return the index of the map point behind each feature of a camera's keyframes.
+        """Find the map points that features of a camera's keyframes observe.
 
         Args:
             camera: Camera name.
-            frame: (N,) frame index of the keyframe of each feature.
-            feature: (N,) feature index in that keyframe.
+            frame: (N,) frame index of the keyframe that contains each feature.
+            feature: (N,) index of each feature in its keyframe.
 
         Returns:
-            (N,) point indices, −1 if the map has no such observation.
+            (N,) index of the map point of each feature; −1 if the feature is not an observation of the map.
         """
         observed = np.isin(self.obs_keyframe, self.keyframes_of(camera))
         keys = self.keyframe_frame[self.obs_keyframe[observed]] * _FEATURE_STRIDE + self.obs_feature[observed]
@@ -160,26 +162,30 @@ class Map:
         return np.asarray(np.where(keys[found] == queries, self.obs_point[observed][found], -1))
 
     def mean_error_px(self) -> float:
-        """Return the mean over all observations of their point's reprojection error; NaN without any."""
+        """Return the mean reprojection error, pixels; NaN if the map has no observations.
+
+        Each observation contributes the mean error of its point.
+        """
         return float(self.point_error_px[self.obs_point].mean()) if len(self.obs_point) else float("nan")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trajectory:
-    """The pose and status of each of the N frames of one camera.
+    """The poses and the status of the N frames of one camera.
 
     Attributes:
         camera: Camera name.
-        gauge: Identifier of the gauge of the map that the poses refer to, or "world" after merging (metres,
-            Z up).
+        gauge: Identifier of the gauge of the map that the poses refer to. After merging, it is "world"
+            (metres, Z up).
         frame_numbers: (N,) number of each frame in the video, counted from 0.
-        times_ns: (N,) the camera's own timestamps.
-        gauge_from_cam: (N,4,4) poses; NaN for lost frames.
-        covariance: (N,6,6) covariance of each pose in the camera's axes: rotation (rad) first, then
-            translation (unit of the gauge), as a right perturbation like GTSAM's Pose3. NaN for lost frames.
+        times_ns: (N,) timestamp of each frame on the clock of the camera, nanoseconds.
+        gauge_from_cam: (N,4,4) camera poses in the gauge; NaN for lost frames.
+        covariance: (N,6,6) covariance of each pose in the axes of the camera: rotation (rad) first, then
+            translation (unit of the gauge). It is the covariance of a right perturbation, as in
+            GTSAM's Pose3. NaN for lost frames.
         status: (N,) status of each frame.
-        inliers: (N,) number of PnP inliers.
-        error_px: (N,) mean reprojection error of the inliers; NaN for a frame without inliers.
+        inliers: (N,) number of PnP inliers of each frame.
+        error_px: (N,) mean reprojection error of the inliers, pixels; NaN for a frame without inliers.
     """
 
     camera: str
@@ -207,7 +213,7 @@ class Trajectory:
 
     @property
     def localised(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """(N,) True for the frames that have a measured pose."""
+        """Mask (N,) that is True for the frames with a measured pose."""
         return np.array([status.localised for status in self.status], dtype=bool)
 
 
@@ -216,10 +222,10 @@ class MapResult:
     """The result of mapping.
 
     Attributes:
-        maps: The maps, largest first, each in its own gauge.
-        workspace: Folder with ``database.db`` and ``sparse/<n>``, which an extension of the map needs.
-        log: Diagnostics as plain JSON values: the initial pairs tried, the models, the pairs matched, the
-            keyframes without a pose.
+        maps: The maps, the largest map first. Each map has a separate gauge.
+        workspace: Folder with ``database.db`` and ``sparse/<n>``. An extension of the map needs both.
+        log: Diagnostics as plain JSON values: the initial pairs that were tried, the models, the image pairs
+            that were matched, and the keyframes without a pose.
     """
 
     maps: tuple[Map, ...]
@@ -228,24 +234,26 @@ class MapResult:
 
     @property
     def diagnostics(self) -> MapDiagnostics:
-        """The typed content of the log."""
+        """The content of the log as typed fields."""
         return MapDiagnostics.from_log(self.log)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Registration:
-    """One camera's trajectory against the map, with the observations behind each pose.
+    """The result of registration for one camera: its trajectory in a map, and the tracked observations.
 
     Attributes:
         trajectory: Pose and status of each frame.
-        obs_frame: (M,) frame index of each tracked observation.
-        obs_keyframe: (M,) frame index of the keyframe in which the track starts.
-        obs_feature: (M,) feature index of the track in that keyframe. Frame and feature identify the track
-            even after the map has changed.
-        obs_px: (M,2) tracked pixels, float32, COLMAP's origin.
-        wanted_keyframes: (W,) frame indices that the map should add as keyframes: frames where tracking
-            failed, and misregistered keyframes whose pose should be estimated again.
-        tried_keyframes: (V,) frame indices of this camera that mapping has tried as keyframes so far.
+        obs_frame: (M,) index of the frame that contains each tracked observation.
+        obs_keyframe: (M,) frame index of the keyframe in which the track of each observation starts.
+        obs_feature: (M,) index of the feature in this keyframe at which the track of each observation starts.
+            Keyframe and feature identify the track even after the map has changed.
+        obs_px: (M,2) tracked pixels, float32, with COLMAP's origin.
+        wanted_keyframes: (W,) indices of the frames that mapping should add to the map as keyframes. These
+            are frames where tracking failed, and misregistered keyframes whose pose should be estimated
+            again.
+        tried_keyframes: (V,) indices of the frames of this camera that mapping has already tried as
+            keyframes.
     """
 
     trajectory: Trajectory

@@ -1,7 +1,7 @@
 """The body: skeleton, camera mounts, motion and forward kinematics.
 
-All coordinates are in metres and in the axes of the world: Z is up, the body faces −Y, its left is +X. In the
-zero pose, in which all joint rotations are the identity, the axes of every joint are those of the world.
+All coordinates are in metres and in world axes: Z is up, the body faces −Y, and the left side of the body is
+on +X. In the zero pose, all joint rotations are the identity, so the axes of every joint are the world axes.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ class SkeletonModel:
 
     Attributes:
         name: Name of the preset or the file.
-        joints: (J,) joint names, the root first and every parent before its children.
-        parents: (J,) index of each parent, −1 for the root.
-        offsets_m: (J,3) joint centre in the frame of the parent; for the root, its position in the world when
-            the body stands.
-        end_offsets_m: (J,3) far end of the bone in the frame of its joint; NaN for joints with children.
-        roles: (J,) anatomical (HumanIK) name of each joint, "" for joints without one.
-        bvh_channels: (J,) channel names from a BVH file, or () for the default order.
+        joints: (J,) joint names. The root comes first, and every parent comes before its children.
+        parents: (J,) index of the parent of each joint; −1 for the root.
+        offsets_m: (J,3) joint centres in the frames of the parents, metres. For the root, it is the position
+            in the world of the standing body.
+        end_offsets_m: (J,3) far ends of the bones in the frames of their joints, metres. NaN for joints with
+            children.
+        roles: (J,) anatomical (HumanIK) name of each joint; "" for a joint without a role.
+        bvh_channels: (J,) channel names of each joint from a BVH file; () for the default order.
         tpose_rotation: (J,3,3) parent_from_joint rotations of the T-pose; None if the T-pose is the zero
             pose.
-        file_rotation: (J,3,3) world_from_joint rotations of the T-pose in the original file, if this skeleton
-            was made by `with_tpose_as_zero_pose`; else None.
+        file_rotation: (J,3,3) world_from_joint rotations of the T-pose in the original file. None if this
+            skeleton was not made by `with_tpose_as_zero_pose`.
     """
 
     name: str
@@ -59,7 +60,7 @@ class SkeletonModel:
             raise ValueError("one root, and every joint name once")
 
     def index_of_role(self, role: str) -> int | None:
-        """Return the index of the joint with an anatomical role, or None if no joint has it."""
+        """Return the index of the joint with this anatomical role; None if no joint has this role."""
         return self.roles.index(role) if role in self.roles else None
 
 
@@ -70,10 +71,11 @@ class Mount:
     Attributes:
         camera: Camera name.
         role: Anatomical name of the joint at which the bone starts (``Spine1``, ``LeftHand`` …).
-        joint_from_cam: (4,4) nominal or estimated pose of the camera in the frame of that joint.
-        sigma_rad: Standard deviation of the rotation, per axis.
-        sigma_m: Standard deviation of the position, per axis.
-        by_name: Whether the rotation and its standard deviation are assumed from the camera's name alone.
+        joint_from_cam: (4,4) nominal or estimated pose of the camera in the frame of this joint, metres.
+        sigma_rad: Standard deviation of the rotation, radians per axis.
+        sigma_m: Standard deviation of the position, metres per axis.
+        by_name: True if only the name of the camera was used to choose the rotation and its standard
+            deviation.
     """
 
     camera: str
@@ -89,18 +91,20 @@ class Mount:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """The pose of a skeleton in the world at T ticks of constant rate.
+    """The poses of a skeleton in the world at T ticks with a constant rate.
 
     Attributes:
         skeleton: The skeleton, with J joints.
         fps: Ticks per second.
-        start_ns: Common time of tick 0.
-        root_in_world_m: (T,3) root position.
-        local_rotation: (T,J,3,3) parent_from_joint rotations; for the root, world_from_root. The zero pose
-            has identities.
-        observed: (T,J) True if cameras measured the joint; False if its pose follows from priors only.
-        hips_in_root_m: (T,3) position of the root's first child in the frame of the root, for a root on the
-            floor from which the hips move freely. None if every bone has a constant length.
+        start_ns: Common time of tick 0, nanoseconds.
+        root_in_world_m: (T,3) positions of the root in the world, metres.
+        local_rotation: (T,J,3,3) parent_from_joint rotations; for the root, world_from_root. In the zero
+            pose, all rotations are the identity.
+        observed: (T,J) True if cameras measured the joint at the tick; False if only priors determine its
+            pose.
+        hips_in_root_m: (T,3) positions of the root's first child in the frame of the root, metres. This is
+            used for a root on the floor and hips that move freely relative to the root. None if every bone
+            has a constant length.
     """
 
     skeleton: SkeletonModel
@@ -122,7 +126,10 @@ class Motion:
                 raise ValueError("hips_in_root_m: the root has no child")
 
     def local_position_m(self) -> FloatArray:
-        """Return the joint centres (T,J,3) in the frames of their parents; the root's in the world."""
+        """Return the joint centres (T,J,3) in the frames of the parents, metres.
+
+        The centre of the root is given in the world.
+        """
         out = np.tile(self.skeleton.offsets_m, (len(self.root_in_world_m), 1, 1))
         out[:, 0] = self.root_in_world_m
         if self.hips_in_root_m is not None:
@@ -130,12 +137,12 @@ class Motion:
         return out
 
     def times_ns(self) -> IntArray:
-        """Return the common time (T,) of each tick."""
+        """Return the common time (T,) of each tick, nanoseconds."""
         ticks = np.arange(len(self.root_in_world_m))
         return np.asarray(self.start_ns + np.round(ticks * (1e9 / self.fps)), dtype=np.int64)
 
     def world_from_joint(self) -> FloatArray:
-        """Return the joint poses (T,J,4,4) in the world."""
+        """Return the joint poses (T,J,4,4) in the world, metres."""
         local = make_transform(self.local_rotation, self.local_position_m())
         return _chain_poses(self.skeleton, local)
 
@@ -147,7 +154,7 @@ def forward_kinematics(
 
     Args:
         skeleton: The skeleton, with J joints.
-        root_in_world_m: (T,3) root positions.
+        root_in_world_m: (T,3) positions of the root in the world, metres.
         local_rotation: (T,J,3,3) parent_from_joint rotations; for the root, world_from_root.
     """
     local = make_transform(local_rotation, skeleton.offsets_m)
@@ -156,10 +163,10 @@ def forward_kinematics(
 
 
 def rest_pose(skeleton: SkeletonModel) -> FloatArray:
-    """Return the joint poses (J,4,4) of the skeleton that stands at the origin in its T-pose.
+    """Return the joint poses (J,4,4) in the world of the skeleton standing at the origin in its T-pose.
 
-    A skeleton without a separate T-pose stands in its zero pose. The height of the root is taken from its
-    offset. If that is not positive, the root is raised until the lowest point of the body touches the floor.
+    A skeleton without a separate T-pose stands in its zero pose. The height of the root is the height of its
+    offset. If this height is not positive, the body is raised until its lowest point touches the floor.
     """
     count = len(skeleton.joints)
     local = skeleton.tpose_rotation
@@ -176,9 +183,9 @@ def rest_pose(skeleton: SkeletonModel) -> FloatArray:
 
 
 def with_tpose_as_zero_pose(skeleton: SkeletonModel) -> SkeletonModel:
-    """Return the same body with its T-pose as zero pose.
+    """Return a skeleton of the same body whose zero pose is the T-pose.
 
-    `with_file_zero_pose` converts a motion of this skeleton back to the zero pose of the file.
+    `with_file_zero_pose` converts a motion of the returned skeleton back to the zero pose of the file.
     """
     if skeleton.tpose_rotation is None:
         return skeleton
@@ -194,9 +201,10 @@ def with_tpose_as_zero_pose(skeleton: SkeletonModel) -> SkeletonModel:
 
 
 def with_file_zero_pose(motion: Motion) -> Motion:
-    """Return the same motion of the skeleton with the zero pose of its file.
+    """Convert a motion to the skeleton with the zero pose of the original file.
 
-    This is the inverse of `with_tpose_as_zero_pose`. A motion of any other skeleton is returned unchanged.
+    This function reverses `with_tpose_as_zero_pose`. If the skeleton of the motion was not made by that
+    function, the motion is returned unchanged.
     """
     skeleton = motion.skeleton
     world = skeleton.file_rotation
@@ -215,7 +223,7 @@ def with_file_zero_pose(motion: Motion) -> Motion:
 
 
 def _chain_poses(skeleton: SkeletonModel, parent_from_joint: FloatArray) -> FloatArray:
-    """Return the joint poses (T,J,4,4) in the world from parent_from_joint (T,J,4,4)."""
+    """Multiply the poses parent_from_joint (T,J,4,4) along the tree to joint poses (T,J,4,4) in the world."""
     out: FloatArray = parent_from_joint.copy()
     for joint in range(1, len(skeleton.joints)):
         out[:, joint] = out[:, skeleton.parents[joint]] @ parent_from_joint[:, joint]

@@ -1,4 +1,4 @@
-"""The skeleton of a person by stature, the anatomical axes of its segments, and the nominal camera mounts."""
+"""Preset skeletons scaled to a stature, the anatomical axes of segments, and the nominal camera mounts."""
 
 from __future__ import annotations
 
@@ -18,35 +18,38 @@ from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.skeleton import Mount, SkeletonModel, rest_pose
 
 PRESETS = ("upper_body", "full_body")
-"""Both names give the whole skeleton. The cameras, not the preset, determine which joints are estimated."""
+"""Names of the presets. Both names give the whole skeleton, because the cameras determine which joints are
+estimated."""
 
 MEAN_HEIGHT_M = 1.70
-"""Metres. The stature if none is given: between the means of adult women and men in Europe, 1.64 m and 1.78
-m. Source: NCD Risk Factor Collaboration, "A century of trends in adult human height", eLife 2016."""
+"""Stature, metres, that is used if no stature is given. It lies between the means of adult women and men in
+Europe, 1.64 m and 1.78 m. Source: NCD Risk Factor Collaboration, "A century of trends in adult human height",
+eLife 2016."""
 
 _STATURE_RANGE_M = (0.5, 2.8)
-"""Metres. Statures outside are refused. Derivation: small children to the tallest people, with a margin; a
-value in centimetres or feet lies outside."""
+"""Minimum and maximum stature, metres. Derivation: the range from small children to the tallest people, with
+a margin. A stature in centimetres or feet is outside this range and is therefore refused."""
 
 NOMINAL_SIGMA_RAD = float(np.radians(15.0))
-"""Radians per axis. Weight of the rotation of a mount that is known by its name only. It is larger than the
-expected error `NOMINAL_ERROR_RAD`, so that postures count more. Evidence: docs/decisions/export.md."""
+"""Sigma, radians per axis, that weights the nominal rotation of a mount that only the camera's name
+determines. It is larger than the expected error `NOMINAL_ERROR_RAD`, so that the posture of the body has more
+influence on the rotation. Evidence: docs/decisions/export.md."""
 
 NOMINAL_SIGMA_M = 0.029
-"""Metres per axis, for the position of a mount that is known by its name only. Derivation: 5 cm in all three
-axes together, because straps move and bodies differ."""
+"""Sigma, metres per axis, of the nominal position of a mount that only the camera's name determines.
+Derivation: 5 cm for the three axes together, because straps move and bodies differ."""
 
 NOMINAL_ERROR_RAD = float(np.radians(15.0 / np.sqrt(3.0)))
-"""Radians per axis. Expected rotation error of a mount that is known by its name only. Derivation: 15° in all
-three axes together."""
+"""Expected error, radians per axis, of the nominal rotation of a mount that only the camera's name
+determines. Derivation: 15° for the three axes together."""
 
 STATED_SIGMA_RAD = float(np.radians(5.0))
-"""Radians per axis, for a mount whose pose the job states without an accuracy. Derivation: 15° are three
-sigmas."""
+"""Sigma, radians per axis, of a mount rotation that is given in the job without an accuracy. Derivation: 15°
+are three sigmas."""
 
 STATED_SIGMA_M = 0.015
-"""Metres per axis, for a mount whose pose the job states without an accuracy. Derivation: 4.5 cm are three
-sigmas."""
+"""Sigma, metres per axis, of a mount position that is given in the job without an accuracy. Derivation:
+4.5 cm are three sigmas."""
 
 _UP, _FORWARD, _LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 """Unit vectors of a standing body in the axes of the skeleton: z up, −y forward."""
@@ -57,10 +60,12 @@ _NEXT_ROLE = {
     "UpLeg": "Leg",
     "Leg": "Foot",
 }
-"""The part of a limb at the far end of each bone. Hands and feet point to the end of their own bone."""
+"""For each part of a limb, the part whose joint is at the far end of the bone. Hands and feet have no entry;
+their bones end at the farthest point of the hand or foot."""
 
 _MIN_BONE_M = 1e-6
-"""Metres. A shorter bone has no direction. Derivation: far below any real bone, above rounding errors."""
+"""Minimum length, metres, of a bone that has a direction. Derivation: the limit is far below the length of
+any real bone and above rounding errors."""
 
 
 @cache
@@ -74,8 +79,8 @@ def load_skeleton(preset: str, height_m: float | None = None) -> SkeletonModel:
     """Return the skeleton of a person of the given stature.
 
     Args:
-        preset: One of `PRESETS`.
-        height_m: Stature; None stands for `MEAN_HEIGHT_M`.
+        preset: Name of the preset, one of `PRESETS`.
+        height_m: Stature, metres; None for `MEAN_HEIGHT_M`.
 
     Raises:
         JobError: The preset does not exist, or no person has this stature.
@@ -114,7 +119,7 @@ def load_skeleton(preset: str, height_m: float | None = None) -> SkeletonModel:
 
 
 def split_side(role: str) -> tuple[str, str]:
-    """Split a role such as ``LeftForeArm`` into side and part; the side of trunk and head is ""."""
+    """Split a role such as ``LeftForeArm`` into side and part. For trunk and head, the side is ""."""
     for side in ("Left", "Right"):
         if role.startswith(side):
             return side, role.removeprefix(side)
@@ -122,7 +127,7 @@ def split_side(role: str) -> tuple[str, str]:
 
 
 def rest_positions(skeleton: SkeletonModel) -> FloatArray:
-    """Return the joint centres (J,3) in the zero pose."""
+    """Return the joint centres (J,3) in the world in the zero pose, metres."""
     out = np.array(skeleton.offsets_m)
     for joint in range(1, len(out)):
         out[joint] += out[skeleton.parents[joint]]
@@ -130,13 +135,13 @@ def rest_positions(skeleton: SkeletonModel) -> FloatArray:
 
 
 def bone_vector(skeleton: SkeletonModel, role: str) -> FloatArray | None:
-    """Return the vector (3,) from the joint of a role to the far end of its bone in the zero pose.
+    """Return the vector of a bone in the zero pose.
 
-    The far end is the next joint of the limb. A bone without a next joint, such as the hand, ends at the
-    farthest point of its descendants.
+    The bone starts at the joint with the given role and ends at the next joint of the limb. A bone without a
+    next joint, such as the hand, ends at the point of its descendants that is farthest from the joint.
 
     Returns:
-        The vector in metres, or None if no joint has the role or the bone has no length.
+        The vector (3,) in world axes, metres. None if no joint has the role, or if the bone has no length.
     """
     side, part = split_side(role)
     joint = skeleton.index_of_role(role)
@@ -154,7 +159,7 @@ def bone_vector(skeleton: SkeletonModel, role: str) -> FloatArray | None:
 
 
 def _is_descendant(skeleton: SkeletonModel, joint: int, ancestor: int) -> bool:
-    """Return whether a joint is `ancestor` itself or below it."""
+    """Return True if `joint` is `ancestor` or one of the descendants of `ancestor`."""
     while joint > ancestor:
         joint = int(skeleton.parents[joint])
     return joint == ancestor
@@ -165,12 +170,14 @@ def segment_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
 
     The columns are:
 
-    1. along: to the far end of the bone; up for trunk and head, down for the feet;
-    2. forward: where the standing body faces; the side to which the elbow bends; the thumb's side of the
-    hand; 3. outward: away from the body for a hanging limb; left for trunk and head; the back of the hand.
+    - along: the direction to the far end of the bone; for trunk and head the direction up, for the feet down;
+    - forward: the direction that the standing body faces; for the forearm the direction in which the elbow
+      bends, for the hand the direction of the thumb;
+    - outward: the direction away from the body for a hanging limb; for trunk and head the direction to the
+      left, for the hand the direction of the back of the hand.
 
-    The axes are taken from the T-pose, so they do not depend on how the arms are held in the zero pose. The
-    axes of left limbs are left-handed, so mirrored segments have mirrored axes.
+    The axes are computed in the T-pose, so they do not depend on how the arms are held in the zero pose. The
+    axes of left limbs are left-handed, so the axes of left and right segments are mirrored.
     """
     side, part = split_side(role)
     joint = skeleton.index_of_role(role)
@@ -181,7 +188,7 @@ def segment_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
     if vector is None and part == "Hand":
         vector = bone_vector(skeleton, side + "ForeArm")
     along = -_UP if vector is None else turn @ vector / np.linalg.norm(vector)
-    # For a limb that points forward, the forward axis is undefined; up takes its place.
+    # For a limb that points forward, the forward axis is undefined. The direction up replaces it.
     reference = _FORWARD if abs(along @ _FORWARD) < 0.9 else _UP
     forward = reference - (reference @ along) * along
     forward /= np.linalg.norm(forward)
@@ -190,12 +197,13 @@ def segment_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
 
 
 def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
-    """Return the nominal mount of a camera on the bone of an anatomical role.
+    """Return the nominal mount of a camera on the bone with an anatomical role.
 
-    A camera on trunk or head is mounted on the back if its name contains the word "back" (``torso_back``).
+    A camera on trunk or head is mounted on the back if the camera's name contains the word "back", as in
+    ``torso_back``.
 
     Raises:
-        JobError: The skeleton has no joint with that role.
+        JobError: The skeleton has no joint with this role.
     """
     if skeleton.index_of_role(role) is None:
         raise JobError(
@@ -224,37 +232,41 @@ def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
 
 
 def _faces_back(camera: str, role: str) -> bool:
-    """Return whether a camera on trunk or head is mounted on the back, according to its name."""
+    """Return True if a camera on trunk or head is mounted on the back, according to the camera's name."""
     return not split_side(role)[0] and "back" in re.split(r"[_\-. ]", camera.lower())
 
 
 _ARTICULATED = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase", "Neck", "Head")
-"""Parts of the body that move against their parent. The spine is treated as rigid."""
+"""Parts of the body that move relative to their parent. The spine is treated as rigid."""
 
 _REACH_MARGIN_RATIO = 0.15
-"""Ratio. Widens the reach on both sides, because bodies differ from the skeleton. Evidence: none."""
+"""Margin of the reach, as a fraction of the smallest and the largest distance. It decreases the smallest
+distance and increases the largest distance, because bodies differ from the skeleton. Evidence: none."""
 
 _REACH_MARGIN_M = 0.05
-"""Metres. Widens the reach on both sides, because straps slip. Evidence: none."""
+"""Margin of the reach, metres. It decreases the smallest distance and increases the largest distance, because
+straps slip. Evidence: none."""
 
 _MIN_DISTANCE_M = 0.08
-"""Metres. Smallest distance of two cameras on different bones. Derivation: each camera stands off its own
-bone by 4 to 5 cm (mounts.yaml)."""
+"""Minimum distance, metres, between two cameras on different bones. Derivation: the distance of each camera
+from its bone is 4 to 5 cm (mounts.yaml)."""
 
 
 def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple[str, str, float, float]]:
-    """Return the reach of each pair of cameras: the smallest and largest distance that any pose permits.
+    """Return the reach of each pair of cameras: the range of distances that are possible in any posture.
 
     Args:
         skeleton: The skeleton.
         mounts: The mount of each camera.
 
     Returns:
-        Rows (first camera, second camera, smallest, largest distance) in metres, rounded to centimetres. The
-        margins `_REACH_MARGIN_RATIO` and `_REACH_MARGIN_M` are included.
+        For each pair of cameras, a row (name of the first camera, name of the second camera, smallest
+        distance, largest distance). The distances are in metres, rounded to centimetres. They include the
+        margins `_REACH_MARGIN_RATIO` and `_REACH_MARGIN_M`.
 
-    Source: extremes of a chain of ball joints. The largest distance has all links in one line, the smallest
-        has the longest link against all others.
+    Source: the extreme lengths of a chain of ball joints. The largest distance is reached if all links form
+        one straight line. The smallest distance is reached if the longest link points in one direction and
+        all other links point in the opposite direction.
     """
     rest = rest_positions(skeleton)
     rows = []
@@ -284,7 +296,7 @@ def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple
 
 
 def _joints_to_root(skeleton: SkeletonModel, mount: Mount) -> list[int]:
-    """Return the joint of a mount and all its ancestors up to the root."""
+    """Return the index of the joint that a camera is mounted on, followed by its ancestors up to the root."""
     joint = skeleton.index_of_role(mount.role)
     if joint is None:
         raise JobError(f"no joint has the role {mount.role}", field="capture.cameras")
@@ -295,5 +307,5 @@ def _joints_to_root(skeleton: SkeletonModel, mount: Mount) -> list[int]:
 
 
 def _is_articulated(skeleton: SkeletonModel, joint: int) -> bool:
-    """Return whether a joint moves against its parent; the spine is treated as rigid."""
+    """Return True if a joint moves relative to its parent. The spine is treated as rigid."""
     return split_side(skeleton.roles[joint])[1] in _ARTICULATED

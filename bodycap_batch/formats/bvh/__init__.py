@@ -1,4 +1,7 @@
-"""BVH files: Y up, centimetres, and Euler angles in degrees. Only this package converts these conventions."""
+"""BVH files, with Y up, lengths in centimetres or metres, and Euler angles in degrees.
+
+Only this package converts between these conventions and the world.
+"""
 
 from bodycap_batch.formats.bvh.reader import read_bvh
 from bodycap_batch.formats.bvh.roles import ROLES, assign_roles

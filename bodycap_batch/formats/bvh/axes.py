@@ -1,4 +1,7 @@
-"""Convert between the axes and units of the world and of a BVH file: BVH = (x, z, −y) · units per metre."""
+"""Convert between world axes, metres, and the axes and units of a BVH file.
+
+A point (x, y, z) in the world is (x, z, −y) · units per metre in the file.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from bodycap_batch.core.arrays import FloatArray, frozen_array
 Units = Literal["cm", "m"]
 
 UNITS_PER_METRE: dict[str, float] = {"cm": 100.0, "m": 1.0}
-"""File units per metre, by the name of the unit."""
+"""By name of the unit, the number of file units per metre."""
 
 WORLD_FROM_FILE: FloatArray = frozen_array(
     [[1, 0, 0], [0, 0, -1], [0, 1, 0]], name="world_from_file", shape=(3, 3)

@@ -1,4 +1,4 @@
-"""Intrinsic Euler angles in any order of the axes, continuous over time."""
+"""Convert between rotations and intrinsic Euler angles in any order of the axes, continuous over time."""
 
 from __future__ import annotations
 
@@ -7,22 +7,23 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 
 _GIMBAL_LOCK_COSINE = 1e-7
-"""Cosine of the second angle below which the rotation counts as gimbal lock. Derivation: the first and third
-angle have errors of 1e-16 divided by this cosine; at 1e-7 that is 1e-9 rad."""
+"""Minimum cosine of the second angle. With a smaller cosine, the rotation is treated as gimbal lock.
+Derivation: the errors of the first and the third angle are 1e-16 divided by the cosine. At this minimum, they
+are 1e-9 rad."""
 
 _FULL_TURN_RAD = 2.0 * np.pi
-"""Radians. One full turn."""
+"""Angle of a full turn, radians."""
 
 
 def rotation_from_angles(axes: str, angles_rad: FloatArray) -> FloatArray:
-    """Multiply elementary rotations in the given order, the first axis leftmost.
+    """Multiply rotations about the axes in the given order. The rotation about the first axis is leftmost.
 
     Args:
-        axes: K letters of X, Y, Z, which may repeat.
-        angles_rad: (T,K) angle about each axis.
+        axes: K letters X, Y or Z. A letter may occur more than once.
+        angles_rad: (T,K) angles about the axes, radians.
 
     Returns:
-        (T,3,3) rotations; the identity for K = 0.
+        The rotations (T,3,3). They are the identity for K = 0.
     """
     out = np.broadcast_to(np.eye(3), (len(angles_rad), 3, 3)).copy()
     for column, axis in enumerate(axes):
@@ -31,7 +32,7 @@ def rotation_from_angles(axes: str, angles_rad: FloatArray) -> FloatArray:
 
 
 def _elementary_rotation(axis: int, angle_rad: FloatArray) -> FloatArray:
-    """Return the rotations (T,3,3) about one axis (0 = X) by angles (T,)."""
+    """Return the rotations (T,3,3) about one axis (0 is X, 1 is Y, 2 is Z) by angles (T,), radians."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     first, second = (axis + 1) % 3, (axis + 2) % 3
     out = np.zeros((len(angle_rad), 3, 3))
@@ -45,16 +46,18 @@ def _elementary_rotation(axis: int, angle_rad: FloatArray) -> FloatArray:
 def continuous_angles(orders: tuple[str, ...], rotation: FloatArray) -> FloatArray:
     """Convert rotations to the Euler angles that change as little as possible from tick to tick.
 
-    Every rotation has two triples of angles, (a, b, c) and (a + π, π − b, c + π), to which full turns may be
-    added. The triple nearest to that of the previous tick is returned. In gimbal lock only a ± c is
-    determined; of all solutions, the nearest to the previous tick is returned.
+    Two triples of angles describe the same rotation: (a, b, c) and (a + π, π − b, c + π). In addition, a full
+    turn may be added to any angle. At each tick, the triple nearest to the triple of the previous tick is
+    returned. In gimbal lock, the rotation determines only b and a ± c. Then infinitely many triples describe
+    the rotation, and the triple nearest to the triple of the previous tick is returned.
 
     Args:
-        orders: (J,) order of three different axes for each joint, the first axis leftmost ("ZXY").
+        orders: (J,) order of three different axes for each joint, for example "ZXY". The rotation about the
+            first axis is leftmost.
         rotation: (T,J,3,3) rotations.
 
     Returns:
-        (T,J,3) angles in radians, in the order of the axes.
+        The angles (T,J,3), radians, in the order of the axes.
     """
     axes = np.array([["XYZ".index(letter) for letter in order] for order in orders], dtype=np.int64)
     parity = np.where((axes[:, 1] - axes[:, 0]) % 3 == 1, 1.0, -1.0)
@@ -70,14 +73,15 @@ def continuous_angles(orders: tuple[str, ...], rotation: FloatArray) -> FloatArr
 
 
 def _principal_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the angles (a, b, c) of rotations R = Rx(a) Ry(b) Rz(c), and which rotations are in gimbal lock.
+    """Return the angles (a, b, c) of rotations R = Rx(a) Ry(b) Rz(c), with b between −π/2 and π/2.
 
     Args:
         rotation: (...,3,3) rotations.
 
     Returns:
-        (...,3) angles in radians; in gimbal lock, the first is c + sign(b) · a and the third is 0. And the
-        lock (...): sign(b) in gimbal lock, else 0.
+        The angles (...,3), radians, and the gimbal lock (...). The gimbal lock is sign(b) for a rotation in
+        gimbal lock, and 0 for any other rotation. In gimbal lock, the first number is not a but the sum
+        c + sign(b) · a, and the third number is 0.
     """
     cos_b = np.hypot(rotation[..., 0, 0], rotation[..., 0, 1])
     b = np.arctan2(rotation[..., 0, 2], cos_b)
@@ -90,7 +94,16 @@ def _principal_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _nearest_equivalent(principal: FloatArray, locked: FloatArray, previous: FloatArray) -> FloatArray:
-    """Return the equivalent angles (J,3) that are nearest to those of the previous tick (J,3)."""
+    """Return the equivalent angles that are nearest to the angles of the previous tick.
+
+    Args:
+        principal: (J,3) angles from `_principal_angles`, radians.
+        locked: (J,) gimbal lock from `_principal_angles`.
+        previous: (J,3) angles of the previous tick, radians.
+
+    Returns:
+        The angles (J,3), radians.
+    """
     direct = _add_full_turns(principal, previous)
     other = _add_full_turns(principal * [1, -1, 1] + np.pi, previous)
     if locked.any():
@@ -102,15 +115,24 @@ def _nearest_equivalent(principal: FloatArray, locked: FloatArray, previous: Flo
 
 
 def _add_full_turns(angles: FloatArray, previous: FloatArray) -> FloatArray:
-    """Add full turns such that each angle is within half a turn of the previous one."""
+    """Add full turns to the angles, so that each angle differs by at most half a turn from `previous`."""
     return np.asarray(angles + _FULL_TURN_RAD * np.round((previous - angles) / _FULL_TURN_RAD))
 
 
 def _split_locked_sum(angles: FloatArray, locked: FloatArray, previous: FloatArray) -> FloatArray:
-    """Return the angles (J,3) in gimbal lock for which a and c change by the same, smallest amount.
+    """Return the angles in gimbal lock that are nearest to the angles of the previous tick.
 
-    In gimbal lock only the sum c + sign · a is determined. `angles` may be either of the two equivalent
-    triples: adding π to a and c changes the sum by full turns only.
+    In gimbal lock, the rotation determines only the sum c + sign(b) · a. The change of this sum since the
+    previous tick is divided equally between a and c. `angles` may be either of the two equivalent triples,
+    because adding π to a and c changes the sum only by full turns.
+
+    Args:
+        angles: (J,3) triples of this tick, radians, from `_principal_angles` or equivalent.
+        locked: (J,) gimbal lock from `_principal_angles`.
+        previous: (J,3) angles of the previous tick, radians.
+
+    Returns:
+        The angles (J,3), radians. They are correct only for joints in gimbal lock.
     """
     total = angles[:, 0] + locked * angles[:, 2]
     before = previous[:, 2] + locked * previous[:, 0]

@@ -1,4 +1,4 @@
-"""Parse the text of a BVH file. Errors name the line."""
+"""Parse the text of a BVH file. Error messages name the line."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
 
 _CHANNELS = {name.lower(): name for axis in "XYZ" for name in (f"{axis}position", f"{axis}rotation")}
-"""Channel names as written in the specification, by their lower-case spelling."""
+"""By the name of a channel in lower case, the spelling in the BVH specification."""
 
 _MAX_JOINTS = 10_000
-"""Largest number of joints. Derivation: a production skeleton with face and fingers has a few hundred, so a
-file with more than this is no skeleton."""
+"""Maximum number of joints. Derivation: a production skeleton with face and fingers has a few hundred joints,
+so a file with more joints than this maximum is not a skeleton."""
 
 
 @dataclass(slots=True)
@@ -26,11 +26,11 @@ class FileJoint:
 
     Attributes:
         name: Name of the joint, unique in the file.
-        parent: Index of the parent, −1 for the root.
-        line: Line of the block, counted from 1.
-        offset: (3,) the OFFSET.
-        end: (3,) the OFFSET of the End Site, if there is one.
-        channels: Channel names.
+        parent: Index of the parent; −1 for the root.
+        line: Number of the line at which the block starts, counted from 1.
+        offset: (3,) OFFSET of the joint; None before it is read.
+        end: (3,) OFFSET of the End Site; None if the joint has no End Site.
+        channels: Names of the channels, in the order of the file.
         children: Number of child joints.
     """
 
@@ -48,9 +48,9 @@ class BvhFile:
     """The content of a BVH file.
 
     Attributes:
-        joints: The joints in the order of the file, every parent before its children.
-        values: (T, channels) values of the MOTION block, or None without frames.
-        frame_time: Text of the Frame Time, "" without frames.
+        joints: The joints in the order of the file. Every parent comes before its children.
+        values: (T, channels) values of the MOTION block; None if the file has no frames.
+        frame_time: Value of the Frame Time as text; "" if the file has no frames.
     """
 
     joints: list[FileJoint]
@@ -77,7 +77,7 @@ def parse_bvh(path: Path) -> BvhFile:
 
 @dataclass
 class _LineReader:
-    """Reader of the statements of a file, which knows the number of the current line."""
+    """Reader of the statements of a file. It stores the number of the current line."""
 
     path: Path
     source: Iterator[bytes]
@@ -85,7 +85,7 @@ class _LineReader:
     pending: list[str] = field(default_factory=list)
 
     def next(self) -> str | None:
-        """Return the next statement, or None at the end of the file. Each brace is a separate statement."""
+        """Return the next statement; None at the end of the file. Each brace is a separate statement."""
         while not self.pending:
             raw = next(self.source, None)
             if raw is None:
@@ -96,7 +96,7 @@ class _LineReader:
         return self.pending.pop(0)
 
     def error(self, message: str, *, line: int | None = None, hint: str | None = None) -> JobError:
-        """Return a `JobError` for the current line, or for another one."""
+        """Return a `JobError` that names the given line, or the current line if none is given."""
         return JobError(
             message,
             path=self.path,
@@ -106,7 +106,7 @@ class _LineReader:
 
 
 def _decode(raw: bytes) -> str:
-    """Decode a line as UTF-8, else as Latin-1."""
+    """Decode a line as UTF-8. If this fails, decode the line as Latin-1."""
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -117,13 +117,13 @@ def _read_hierarchy(lines: _LineReader) -> tuple[list[FileJoint], bool]:
     """Parse the HIERARCHY block.
 
     Returns:
-        The joints, and whether the block ends with MOTION (True) or with the end of the file (False).
+        The joints, and a flag: True if MOTION follows the block, False if the file ends after the block.
     """
     if (lines.next() or "").upper() != "HIERARCHY":
         raise lines.error("a BVH file begins with HIERARCHY", line=max(lines.number, 1))
     joints: list[FileJoint] = []
-    stack: list[int | None] = []  # open blocks: the index of the joint, or None for an End Site
-    opening: list[int | None] = []  # the block whose opening brace must come next
+    stack: list[int | None] = []  # for each open block, the index of the joint; None for an End Site
+    opening: list[int | None] = []  # the block whose opening brace must follow
     at_motion = False
     while (text := lines.next()) is not None:
         keyword = text.split(" ", 1)[0].upper()
@@ -151,7 +151,15 @@ def _read_hierarchy(lines: _LineReader) -> tuple[list[FileJoint], bool]:
 def _read_statement(
     lines: _LineReader, text: str, joints: list[FileJoint], stack: list[int | None], opening: list[int | None]
 ) -> None:
-    """Parse one ROOT, JOINT, End Site, OFFSET or CHANNELS line."""
+    """Parse a ROOT, JOINT, End Site, OFFSET or CHANNELS line.
+
+    Args:
+        lines: The reader of the file.
+        text: The line.
+        joints: All joints so far. A new joint is appended.
+        stack: For each open block, the index of the joint; None for an End Site.
+        opening: The block whose opening brace must follow. A new block is appended.
+    """
     keyword, _, rest = text.partition(" ")
     keyword = keyword.upper()
     if keyword in ("ROOT", "JOINT"):
@@ -212,7 +220,7 @@ def _read_channels(lines: _LineReader, rest: str) -> tuple[str, ...]:
 
 
 def _unique_name(name: str, joints: list[FileJoint]) -> str:
-    """Return the name, with a number added if an earlier joint has the same name."""
+    """Return a unique name: a number is appended to `name` if an earlier joint has the same name."""
     taken = {joint.name for joint in joints}
     free, number = name, 2
     while free in taken:
@@ -221,7 +229,7 @@ def _unique_name(name: str, joints: list[FileJoint]) -> str:
 
 
 def _check_joints(lines: _LineReader, joints: list[FileJoint]) -> None:
-    """Check that there is a root and that every joint has an OFFSET."""
+    """Raise `JobError` if there is no root, or if a joint has no OFFSET."""
     if not joints:
         raise lines.error("no ROOT in the hierarchy")
     for joint in joints:
@@ -230,7 +238,7 @@ def _check_joints(lines: _LineReader, joints: list[FileJoint]) -> None:
 
 
 def _parse_number(lines: _LineReader, token: str) -> float:
-    """Parse a finite number, which may have a decimal comma."""
+    """Parse a finite number. A comma is accepted as decimal point."""
     try:
         value = float(token.replace(",", "."))
     except ValueError:
@@ -246,7 +254,7 @@ def _read_motion(
     """Parse the MOTION block.
 
     Returns:
-        The values (T, channels), None without frames, and the text of the Frame Time.
+        The values (T, channels), and the Frame Time as text. If the file has no frames, None and "".
     """
     frames = _read_header(lines, "FRAMES")
     if frames is None:
@@ -263,7 +271,7 @@ def _read_motion(
         raise lines.error(f"Frame Time {frame_time} is not a positive duration")
     width = sum(len(joint.channels) for joint in joints)
     total = int(count) * width
-    if 2 * total > size_bytes + 1:  # every value takes a digit and a separator
+    if 2 * total > size_bytes + 1:  # every value needs at least a digit and a separator
         raise lines.error(
             f"{int(count)} frames of {width} channels do not fit into {size_bytes} bytes",
             hint="the file is truncated, or Frames is wrong",
@@ -283,7 +291,7 @@ def _read_motion(
 
 
 def _read_header(lines: _LineReader, label: str) -> str | None:
-    """Parse a line ``label: value`` and return the value; None at the end of the file."""
+    """Parse a line ``label: value`` and return the value. Return None at the end of the file."""
     text = lines.next()
     if text is None:
         return None

@@ -1,4 +1,8 @@
-"""Read BVH files of any skeleton and channel order, with tabs, CRLF line ends and irregular spaces."""
+"""Read BVH files.
+
+The skeleton and the order of the channels are arbitrary. Tabs, CRLF line ends and irregular spaces are
+accepted.
+"""
 
 from __future__ import annotations
 
@@ -17,32 +21,35 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel
 logger = logging.getLogger(__name__)
 
 _MAX_METRE_EXTENT = 10.0
-"""File units. If the zero pose spans less than this, the file is in metres. Derivation: a body spans 1 to 2
-m, which is 100 to 200 cm."""
+"""Maximum extent, file units, of the zero pose of a file in metres. A file with a larger extent is in
+centimetres. Derivation: the extent of a body is 1 to 2 m, which is 100 to 200 cm."""
 
 _MOTION_THRESHOLD = 1e-3
-"""File units. A joint whose position changes by less than this is taken as constant. Derivation: 10 µm in
-centimetres, above the rounding of the usual six decimals."""
+"""Minimum change, file units, of the position of a joint that moves relative to its parent. A position with a
+smaller change is treated as constant. Derivation: 10 µm for a file in centimetres. This is larger than the
+rounding error with the usual six decimals."""
 
 _WARNING_THRESHOLD = 1.0
-"""File units. A larger change of a bone's offset is reported. Derivation: 1 cm in centimetres, which is
-visible."""
+"""Minimum change, file units, of the position of a joint relative to its parent for a warning. Derivation: 1
+cm for a file in centimetres, which is visible."""
 
 
 def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, Motion | None]:
     """Read a BVH file and convert it to world axes and metres.
 
-    Position channels replace the OFFSET, as in Blender and MotionBuilder. They give the motion of the root,
-    and of hips that are the first child of the root. For other joints, constant position channels give the
-    bone; if they change, the OFFSET is used.
+    Position channels replace the OFFSET, as in Blender and MotionBuilder. The position channels of the root
+    give the motion of the root. If the first child of the root is the hips, its position channels give the
+    motion of the hips relative to the root. For any other joint, constant position channels give the offset
+    of the joint. If they change, the OFFSET is used.
 
     Args:
-        path: The file.
-        units: "cm", "m", or "auto": metres if the zero pose spans less than 10 units, else centimetres.
+        path: Path of the file.
+        units: Unit of length of the file: "cm", "m", or "auto". With "auto", the unit is the metre if the
+            extent of the zero pose is smaller than 10 units. Otherwise it is the centimetre.
 
     Returns:
-        The skeleton, and its motion or None if the file has no frames. `Motion.start_ns` is 0 and every joint
-        counts as observed.
+        The skeleton, and its motion. The motion is None if the file has no frames. `Motion.start_ns` is 0,
+        and every joint is marked as observed.
 
     Raises:
         JobError: The file is missing or malformed. The error names the line.
@@ -74,10 +81,13 @@ def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, M
 
 
 def rate_from_frame_time(frame_time: str) -> float:
-    """Return the frames per second of a Frame Time.
+    """Return the frame rate, frames per second, for a Frame Time.
 
-    A rounded Frame Time gives its nominal rate: 0.0333333 means 30 Hz, not 30.00003 Hz. The difference would
-    be 0.1 s per hour.
+    A rounded Frame Time gives the nominal frame rate. For example, 0.033333 means 30 Hz and not 30.0003 Hz.
+    Without this correction, the error of the time would be 0.04 s per hour.
+
+    Args:
+        frame_time: Value of the Frame Time as text, seconds.
     """
     seconds = float(frame_time.replace(",", "."))
     if seconds == 0:
@@ -94,13 +104,13 @@ def rate_from_frame_time(frame_time: str) -> float:
 
 
 def _channel_slices(joints: list[FileJoint]) -> list[slice]:
-    """Return the columns of each joint's channels in a frame."""
+    """Return for each joint the columns of its channels in the values of a frame."""
     ends = np.cumsum([len(joint.channels) for joint in joints]).tolist()
     return [slice(end - len(joint.channels), end) for end, joint in zip(ends, joints, strict=True)]
 
 
 def _have_hips_own_translation(joints: list[FileJoint], values: FloatArray) -> bool:
-    """Return whether the first child of the root is the hips and has a position that changes."""
+    """Return True if the first child of the root is the hips, and its position changes."""
     parents = [joint.parent for joint in joints]
     if len(joints) < 2 or assign_roles([joint.name for joint in joints], parents)[:2] != ("", "Hips"):
         return False
@@ -113,13 +123,16 @@ def _have_hips_own_translation(joints: list[FileJoint], values: FloatArray) -> b
 def _offsets_from_channels(
     path: Path, joints: list[FileJoint], offsets: FloatArray, values: FloatArray
 ) -> FloatArray:
-    """Return the offsets (J,3), with those of joints with constant, non-zero position channels replaced.
+    """Replace the offsets of joints whose position channels are constant and not zero.
 
     Args:
-        path: The file, for warnings.
+        path: Path of the file, for warnings.
         joints: The joints of the file.
-        offsets: (J,3) OFFSET of each joint, file axes and units.
+        offsets: (J,3) OFFSET of each joint, in file axes and units.
         values: (T, channels) values of all frames.
+
+    Returns:
+        The offsets (J,3), in file axes and units.
     """
     out = offsets.copy()
     for index, (joint, columns) in enumerate(zip(joints, _channel_slices(joints), strict=True)):
@@ -146,7 +159,10 @@ def _offsets_from_channels(
 
 
 def _positions(joint: FileJoint, values: FloatArray, offset: FloatArray) -> FloatArray:
-    """Return the positions (T,3) of a joint in file axes and units: its channels, else the OFFSET."""
+    """Return the positions (T,3) of a joint relative to its parent, in file axes and units.
+
+    A coordinate without a position channel is taken from the OFFSET.
+    """
     out = np.tile(offset, (len(values), 1))
     for column, name in enumerate(joint.channels):
         if name.endswith("position"):
@@ -165,7 +181,7 @@ def _rotations(joints: list[FileJoint], values: FloatArray) -> FloatArray:
 
 
 def _detect_units(joints: list[FileJoint], offsets: FloatArray) -> str:
-    """Return "m" or "cm", by the extent of the zero pose with offsets (J,3)."""
+    """Return the unit of length, "m" or "cm", that fits the extent of the zero pose with offsets (J,3)."""
     centres = np.zeros_like(offsets)
     for index, joint in enumerate(joints[1:], start=1):
         centres[index] = centres[joint.parent] + offsets[index]
@@ -174,7 +190,7 @@ def _detect_units(joints: list[FileJoint], offsets: FloatArray) -> str:
 
 
 def _skeleton(name: str, joints: list[FileJoint], offsets: FloatArray, units: str) -> SkeletonModel:
-    """Return the skeleton of joints with offsets (J,3) in file axes and units."""
+    """Return the skeleton with these joints and offsets (J,3), which are in file axes and units."""
     ends = np.full((len(joints), 3), np.nan)
     for index, joint in enumerate(joints):
         if joint.children == 0:

@@ -1,8 +1,10 @@
-"""Assign anatomical roles to the joints of a skeleton from their names and the tree.
+"""Assign anatomical roles to the joints of a skeleton from the joint names and the tree.
 
-Skeletons use names differently: "LeftShoulder" is the collar bone in HumanIK and Mixamo, but the upper arm in
-skeletons with a LeftCollar or a LeftElbow. Therefore a word only gives candidate roles, and the order of the
-joints along the limb decides.
+Names have different meanings in different skeletons. For example, "LeftShoulder" is the collar bone in
+HumanIK and Mixamo, but the upper arm in skeletons with a LeftCollar or a LeftElbow. Therefore a word in a
+name gives only candidates for the role. The order of the joints along the limb determines the role.
+
+The parts of a limb are numbered. These numbers are called slots: indices of `_ARM` or `_LEG`.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ ROLES = (
     *("Hips", "Spine", "Spine1", "Neck", "Head"),
     *(side + part for side in ("Left", "Right") for part in (*_ARM, *_LEG)),
 )
-"""All roles, with the names of HumanIK."""
+"""Names of all roles, as in HumanIK."""
 
 _ARM_WORDS = {
     (0,): "clavicle collar collarbone clav",
@@ -30,8 +32,8 @@ _ARM_WORDS = {
     (2,): "forearm lowerarm lowarm loarm elbow radius",
     (3,): "hand wrist palm",
 }
-"""Words of joint names by the arm's slots (indices of `_ARM`) they may stand for, the most likely slot
-first."""
+"""Words in the names of arm joints. The key is the slots (indices of `_ARM`) that a word may mean, the most
+likely slot first. The value is the words, separated by spaces."""
 
 _LEG_WORDS = {
     (0,): "upleg upperleg thigh femur hip",
@@ -41,7 +43,8 @@ _LEG_WORDS = {
     (2, 3): "foot",
     (3,): "toe toes toebase ball",
 }
-"""The same for the slots of the leg (`_LEG`)."""
+"""Words in the names of leg joints. The key is the slots (indices of `_LEG`) that a word may mean, the most
+likely slot first. The value is the words, separated by spaces."""
 
 _HIPS_WORDS = {"hips", "hip", "pelvis", "waist", "root"}
 _SPINE_WORDS = {
@@ -59,24 +62,28 @@ _NECK_WORDS = {"neck", "lowerneck", "upperneck"}
 _HEAD_WORDS = {"head", "skull"}
 
 _ARM_SCORES = (9.0, 10.0, 10.0, 10.0)
-"""Score of each slot of the arm that is found. The collar bone counts less because a skeleton may lack it.
-Evidence: none; only the order of the scores matters."""
+"""Score of each slot of the arm for which a joint is found. The score of the collar bone is lower, because
+some skeletons have no collar bone. Evidence: none; only the order of the scores is important."""
 
 _LEG_SCORES = (10.0, 10.0, 10.0, 9.0)
-"""Score of each slot of the leg that is found. The toes count less because a skeleton may lack them."""
+"""Score of each slot of the leg for which a joint is found. The score of the toes is lower, because some
+skeletons have no toes. Evidence: none; only the order of the scores is important."""
 
 _SECOND_CHOICE_COST = 0.1
-"""Score that is subtracted for each less likely meaning of a word. Derivation: less than the difference
-between two slot scores, so it only decides between equal scores."""
+"""Score that is subtracted if a word is used with its second meaning. For the third meaning, it is subtracted
+twice. Derivation: it is smaller than the difference between two slot scores, so it affects only the choice
+between otherwise equal scores."""
 
 _MIN_OFFSET_M = 1e-9
-"""Metres. A joint with a shorter offset is a helper joint without a bone. Derivation: zero up to rounding."""
+"""Minimum length, metres, of the offset of a joint with a bone. A joint with a shorter offset is a helper
+joint.
+Derivation: zero, except for rounding errors."""
 
 _WORD_PATTERN = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 
 
 def _slots_by_word(words: dict[tuple[int, ...], str]) -> dict[str, tuple[int, ...]]:
-    """Return the candidate slots of each word."""
+    """Return the candidate slots by word."""
     return {word: slots for slots, text in words.items() for word in text.split()}
 
 
@@ -90,14 +97,14 @@ def assign_roles(
 
     Args:
         joints: (J,) joint names of the skeleton.
-        parents: (J,) index of each parent, −1 for the root; parents come before their children.
-        offsets_m: (J,3) joint centres in the frames of their parents. With them, joints with a bone are
-            preferred to helper joints of zero length.
+        parents: (J,) index of the parent of each joint; −1 for the root. Parents come before their children.
+        offsets_m: (J,3) joint centres in the frames of the parents, metres. If they are given, joints with a
+            bone are preferred to helper joints of zero length.
 
     Returns:
-        (J,) roles with the names of HumanIK: Hips, Spine, Spine1 (the joint from which the arms branch),
-        Neck, Head, LeftShoulder (the collar bone), LeftArm and so on; "" for a joint without a role. Each
-        role occurs at most once.
+        (J,) role of each joint, with the names of HumanIK: Hips, Spine, Spine1 (the joint at which the arms
+        branch off), Neck, Head, LeftShoulder (the collar bone), LeftArm and so on. It is "" for a joint
+        without a role. Each role occurs at most once.
     """
     names = [_split_name(name) for name in _strip_common_prefix(joints)]
     ancestors = [_ancestors(joint, parents) for joint in range(len(joints))]
@@ -117,7 +124,7 @@ def assign_roles(
 
 
 def _strip_common_prefix(joints: Sequence[str]) -> list[str]:
-    """Remove a namespace ("mixamorig:") and a common prefix ("Bip01 ", "Character1_") from all names."""
+    """Remove the namespace ("mixamorig:") and the common prefix ("Bip01 ", "Character1_") from all names."""
     names = [name.rsplit(":", 1)[-1].rsplit("|", 1)[-1] for name in joints]
     if len(names) < 3:
         return names
@@ -130,7 +137,10 @@ def _strip_common_prefix(joints: Sequence[str]) -> list[str]:
 
 
 def _split_name(name: str) -> tuple[str, str]:
-    """Split a joint name into its side ("l", "r" or "") and the rest, in lower case without final digits."""
+    """Split a joint name into the side ("l", "r" or "") and the rest.
+
+    The rest is in lower case and without final digits.
+    """
     tokens = [token.lower() for token in _WORD_PATTERN.findall(name)]
     while tokens and tokens[-1].isdigit():
         tokens.pop()
@@ -162,17 +172,18 @@ def _ancestors(joint: int, parents: Sequence[int]) -> list[int]:
 def _best_chain(
     candidates: Sequence[tuple[int, ...]], ancestors: Sequence[list[int]], scores: tuple[float, ...]
 ) -> dict[int, int]:
-    """Select the joints along one path of the tree with the largest sum of scores.
+    """Select joints along one path of the tree for the slots of a limb, with the largest sum of scores.
 
-    The slots must increase along the path. Of equal sums, the joint nearest to the trunk is selected.
+    The slots must increase along the path. If several selections have the same sum, the joints nearest to the
+    trunk are selected.
 
     Args:
-        candidates: (J,) slots that each joint may have, the most likely first.
+        candidates: (J,) slots that each joint may have, the most likely slot first.
         ancestors: (J,) ancestors of each joint, from its parent to the root.
         scores: Score of each slot.
 
     Returns:
-        Joint index by slot.
+        By slot, the index of the selected joint.
     """
     best: dict[tuple[int, int], tuple[float, dict[int, int]]] = {}
     top: tuple[float, dict[int, int]] = (0.0, {})
@@ -195,8 +206,8 @@ def _assign_trunk(
     """Add Hips, Spine, Spine1, Neck and Head to the roles of the limbs.
 
     Args:
-        found: Joint index by role; it is extended.
-        bases: (J,) name of each joint in lower case, "" for joints with a side.
+        found: By role, the index of the joint. The new roles are added to this mapping.
+        bases: (J,) name of each joint in lower case; "" for joints with a side.
         ancestors: (J,) ancestors of each joint, from its parent to the root.
         has_bone: (J,) False for helper joints of zero length.
     """
@@ -235,7 +246,10 @@ def _assign_trunk(
 
 
 def _lowest_common_ancestor(joints: Sequence[int | None], ancestors: Sequence[list[int]]) -> int | None:
-    """Return the lowest joint that is an ancestor of all given joints; None if one of them is None."""
+    """Return the joint farthest from the root that is an ancestor of all given joints.
+
+    It is None if one of the given joints is None, or if there is no such ancestor.
+    """
     present = [joint for joint in joints if joint is not None]
     if len(present) < len(joints):
         return None
@@ -244,7 +258,11 @@ def _lowest_common_ancestor(joints: Sequence[int | None], ancestors: Sequence[li
 
 
 def _joints_between(upper: int | None, lower: int | None, ancestors: Sequence[list[int]]) -> list[int]:
-    """Return the joints strictly between two joints of one path, from the upper to the lower one."""
+    """Return the joints between two joints of one path, from the upper joint to the lower joint.
+
+    The two joints are not included. The list is empty if the upper joint is not an ancestor of the lower
+    joint.
+    """
     if upper is None or lower is None or upper not in ancestors[lower]:
         return []
     path = ancestors[lower]
@@ -254,7 +272,14 @@ def _joints_between(upper: int | None, lower: int | None, ancestors: Sequence[li
 def _choose_joint(
     word: str, among: Sequence[int], bases: Sequence[str], has_bone: Sequence[bool]
 ) -> int | None:
-    """Return the joint with this name and a bone, else the first with a bone, else the first, else None."""
+    """Choose one of the joints in `among`.
+
+    The order of preference is: a joint with the name `word` and a bone, the first joint with a bone, the
+    first joint.
+
+    Returns:
+        The index of the joint; None if `among` is empty.
+    """
     order = sorted(
         among, key=lambda joint: (not (bases[joint] == word and has_bone[joint]), not has_bone[joint])
     )

@@ -1,4 +1,4 @@
-"""Describe a user's skeleton in words: the role of each joint, the direction of its bone, missing joints."""
+"""Describe a user's skeleton in words: roles of the joints, directions of the bones, missing joints."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ _DIRECTIONS = {
     "left": (1, 0, 0), "right": (-1, 0, 0), "up": (0, 0, 1), "down": (0, 0, -1), "forward": (0, -1, 0),
     "back": (0, 1, 0),
 }  # fmt: skip
-"""Unit vectors of the body's directions in world axes."""
+"""By name, the unit vectors of the six directions of the body, in world axes."""
 
 _MAX_NAMED_DIRECTION_DEG = 10.0
-"""Degrees. Up to this angle a bone counts as parallel to one of the six directions. Evidence: none."""
+"""Maximum angle, degrees, between a bone and one of the six directions for the bone to be described as
+parallel to this direction. Evidence: none."""
 
 _MIN_HEIGHT_DIFFERENCE_M = 0.2
-"""Metres. In a standing pose the head is higher and the feet are lower than the hips by at least this.
-Derivation: less than either distance for a child of 1 m."""
+"""Minimum height difference, metres, between head and hips, and between hips and feet, in a standing pose.
+Derivation: both differences are larger for a child with a stature of 1 m."""
 
 _MIN_BONE_M = 1e-6
-"""Metres. A shorter bone has no direction. Derivation: below the six decimals of a BVH file in
-centimetres."""
+"""Minimum length, metres, of a bone that has a direction. Derivation: the rounding error of six decimals is
+smaller in a BVH file in centimetres."""
 
 _NEXT_PART = {
     "Shoulder": "Arm",
@@ -36,25 +37,25 @@ _NEXT_PART = {
     "Leg": "Foot",
     "Foot": "ToeBase",
 }
-"""The part of a limb at the far end of each bone."""
+"""For each part of a limb, the part whose joint is at the far end of the bone."""
 
 _OPTIONAL_PARTS = ("Shoulder", "ToeBase")
-"""Parts whose absence is no reason for a warning."""
+"""Parts that a skeleton may lack without a warning."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JointDescription:
-    """How one joint of a skeleton was understood.
+    """A description of one joint of a skeleton, as the program interprets the joint.
 
     Attributes:
         name: Name of the joint in the file.
-        role: Anatomical name, "" without one.
-        parent: Name of the parent, "" for the root.
-        bone_m: Length of the bone: to the next joint of the limb, else to the only child or the end of the
-            bone.
+        role: Anatomical name of the joint; "" if the joint has no role.
+        parent: Name of the parent; "" for the root.
+        bone_m: Length of the bone, metres. The bone ends at the next joint of the limb. If there is no next
+            joint, it ends at the only child, or at the End Site.
         points: Direction of the bone in the T-pose: ``left``, ``down, 20° left`` …; "" for a bone without
             length.
-        note: Remark about the joint, "" without one.
+        note: Note about the joint; "" if there is no note.
     """
 
     name: str
@@ -92,11 +93,13 @@ def describe_joints(skeleton: SkeletonModel) -> tuple[JointDescription, ...]:
 
 
 def _bone_vector(skeleton: SkeletonModel, rest: FloatArray, joint: int) -> FloatArray:
-    """Return the vector (3,) of the bone that starts at a joint, in the world; zero at a branch.
+    """Return the vector (3,) of the bone that starts at a joint, in the world, metres.
+
+    It is zero for a joint with several children, if none of them is the next joint of a limb.
 
     Args:
         skeleton: The skeleton.
-        rest: (J,4,4) joint poses in the T-pose.
+        rest: (J,4,4) joint poses in the T-pose, in the world.
         joint: Index of the joint.
     """
     side = next((word for word in ("Left", "Right") if skeleton.roles[joint].startswith(word)), "")
@@ -111,9 +114,13 @@ def _bone_vector(skeleton: SkeletonModel, rest: FloatArray, joint: int) -> Float
 
 
 def describe_direction(vector: FloatArray) -> str:
-    """Describe a direction by the nearest of six directions, and the angle towards the second nearest.
+    """Describe a direction in words, for example ``left`` or ``down, 20° left``.
 
-    Examples are ``left`` and ``down, 20° left``.
+    The first word is the nearest of six directions. The angle is the angle from this direction. The last word
+    is the second nearest direction.
+
+    Args:
+        vector: (3,) direction in world axes, of any length except zero.
     """
     unit = vector / np.linalg.norm(vector)
     ranked = sorted(_DIRECTIONS, key=lambda word: -float(unit @ np.array(_DIRECTIONS[word])))
@@ -125,7 +132,7 @@ def describe_direction(vector: FloatArray) -> str:
 
 
 def describe_arm_pose(skeleton: SkeletonModel) -> str:
-    """Describe how the arms are held in the T-pose, which the axes of the limbs are taken from."""
+    """Describe how the arms are held in the T-pose. The axes of the limbs are computed in this pose."""
     rest, arms = rest_pose(skeleton), []
     for side in ("Left", "Right"):
         joint = skeleton.index_of_role(f"{side}Arm")
@@ -141,17 +148,17 @@ def describe_arm_pose(skeleton: SkeletonModel) -> str:
 
 
 def _describe_direction_or_empty(vector: FloatArray) -> str:
-    """Describe the direction of a vector, "" for a vector without length."""
+    """Describe the direction of a vector in words; return "" for a vector without length."""
     return describe_direction(vector) if np.linalg.norm(vector) > _MIN_BONE_M else ""
 
 
 def missing_roles(skeleton: SkeletonModel) -> tuple[str, ...]:
-    """Return the roles that no joint has."""
+    """Return the roles that no joint of the skeleton has."""
     return tuple(role for role in ROLES if role not in skeleton.roles)
 
 
 def skeleton_warnings(skeleton: SkeletonModel) -> Iterator[str]:
-    """Yield a warning for missing joints and for a T-pose that is not the pose of a standing body."""
+    """Yield warnings: for missing joints, and for a T-pose that is not the pose of a standing body."""
     missing = [role for role in missing_roles(skeleton) if not role.endswith(_OPTIONAL_PARTS)]
     if missing:
         yield (

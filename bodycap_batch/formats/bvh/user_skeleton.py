@@ -1,4 +1,7 @@
-"""Read a user's own skeleton, with roles that the user sets and a T-pose from one of its frames."""
+"""Read the skeleton of a user from a BVH file.
+
+The user can give roles of joints, and a frame of the file that contains the T-pose.
+"""
 
 from __future__ import annotations
 
@@ -17,21 +20,22 @@ from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
 NO_ROLE = "none"
-"""The role that a user writes for a joint without a role."""
+"""The word that a user writes in place of a role for a joint without a role."""
 
 _MIN_WIDTH_M = 0.02
-"""Metres. Horizontal distance of the left and the right joint from which the facing direction can be
-computed. Derivation: far above rounding, far below the width of shoulders or hips."""
+"""Minimum horizontal distance, metres, between a left and a right joint for computing the facing direction.
+Derivation: the limit is far above rounding errors and far below the width of shoulders or hips."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigOptions:
-    """What the user states about a skeleton.
+    """The information about a skeleton that the user gives in the job.
 
     Attributes:
-        roles: Role by joint name, ``none`` for a joint without a role. These take precedence over the roles
-            that follow from the names.
-        tpose_frame: Number of the frame, counted from 0, that has the T-pose; None if it is the zero pose.
+        roles: By joint name, the role of the joint, or ``none`` for a joint without a role. These roles have
+            priority over the roles that are derived from the joint names.
+        tpose_frame: Number of the frame that contains the T-pose, counted from 0. None if the zero pose is
+            the T-pose.
     """
 
     roles: Mapping[str, str] = field(default_factory=dict)
@@ -41,14 +45,14 @@ class RigOptions:
 def read_rig(path: Path | str, options: RigOptions | None = None) -> tuple[SkeletonModel, Motion | None]:
     """Read a BVH file as the skeleton of a job.
 
-    Hierarchy, OFFSETs, channel order and zero pose stay as in the file.
+    The hierarchy, the OFFSETs, the channel order and the zero pose of the file are kept.
 
     Args:
-        path: The file.
-        options: What the user states about it.
+        path: Path of the file.
+        options: The information that the user gives about the skeleton; None if there is none.
 
     Returns:
-        The skeleton, and the motion of the file or None without frames.
+        The skeleton, and the motion in the file. The motion is None if the file has no frames.
 
     Raises:
         JobError: The file cannot be read, or a joint, a role or the frame does not exist.
@@ -65,9 +69,9 @@ def read_rig(path: Path | str, options: RigOptions | None = None) -> tuple[Skele
 
 
 def _override_roles(path: Path, skeleton: SkeletonModel, user_roles: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the roles with those of the user in place.
+    """Return the roles of all joints, with the roles given by the user.
 
-    If the user gives a role to a joint, another joint that had this role loses it.
+    If the user gives a role to a joint, any other joint that had this role has no role any more.
     """
     roles = list(skeleton.roles)
     for name, role in user_roles.items():
@@ -91,13 +95,13 @@ def _override_roles(path: Path, skeleton: SkeletonModel, user_roles: Mapping[str
 
 
 def _suggest_name(word: str, names: tuple[str, ...]) -> str:
-    """Return a hint with the most similar name, or with the first names if none is similar."""
+    """Return a hint with the most similar name. If no name is similar, the hint lists the first names."""
     similar = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
     return f"did you mean {similar[0]!r}?" if similar else f"one of {', '.join(names[:40])}"
 
 
 def _tpose_rotations(path: Path, skeleton: SkeletonModel, motion: Motion | None, frame: int) -> FloatArray:
-    """Return the local rotations (J,3,3) of a frame, with the body rotated to face −Y."""
+    """Return the local rotations (J,3,3) of a frame, after rotating the whole body to face −Y."""
     count = 0 if motion is None else len(motion.root_in_world_m)
     if motion is None or not 0 <= frame < count:
         hint = f"frames count from 0; the file has {count}"

@@ -1,4 +1,4 @@
-"""Write BVH files that Blender, MotionBuilder and retargeting tools read."""
+"""Write BVH files. Blender, MotionBuilder and retargeting tools can read these files."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _POSITION_CHANNELS = ("Xposition", "Yposition", "Zposition")
 def write_bvh(path: Path | str, motion: Motion, *, units: str = "cm", euler_order: str = "ZXY") -> None:
     """Write a motion as a BVH file.
 
-    A skeleton from a file keeps the hierarchy, the OFFSETs and the channel order of that file. If the
-    channels of a joint do not allow every rotation, the missing ones are appended. The root always has
-    position channels.
+    A skeleton that was read from a BVH file keeps the hierarchy, the OFFSETs and the channel order of that
+    file. If the channels of a joint do not permit every rotation, the missing rotation channels are appended.
+    The root always has position channels.
 
     Args:
-        path: The file; it is replaced atomically.
+        path: Path of the file, which is replaced atomically.
         motion: The motion, in world axes and metres.
-        units: Length unit of the file, "cm" or "m".
-        euler_order: Order of the rotation channels of joints without channels of their own.
+        units: Unit of length of the file, "cm" or "m".
+        euler_order: Order of the rotation channels for joints whose channels are not given by the skeleton.
 
     Raises:
         StoreError: The file cannot be written.
@@ -47,7 +47,7 @@ def write_bvh(path: Path | str, motion: Motion, *, units: str = "cm", euler_orde
 
 
 def _depth_first_order(skeleton: SkeletonModel) -> list[int]:
-    """Return the joints in the order of the file: each joint is followed by all its descendants."""
+    """Return the joint indices in the order of the file: all descendants of a joint follow the joint."""
     children: list[list[int]] = [[] for _ in skeleton.joints]
     for joint, parent in enumerate(skeleton.parents.tolist()[1:], start=1):
         children[parent].append(joint)
@@ -59,7 +59,7 @@ def _depth_first_order(skeleton: SkeletonModel) -> list[int]:
 
 
 def _joint_channels(skeleton: SkeletonModel, euler_order: str, position_count: int) -> list[tuple[str, ...]]:
-    """Return the channel names of each joint; the first `position_count` joints have position channels."""
+    """Return the channel names of each joint. The first `position_count` joints get position channels."""
     out = []
     for index, channels in enumerate(skeleton.bvh_channels):
         names = channels or tuple(f"{axis}rotation" for axis in euler_order)
@@ -78,7 +78,14 @@ def _joint_channels(skeleton: SkeletonModel, euler_order: str, position_count: i
 def _frame_values(
     motion: Motion, channels: list[tuple[str, ...]], order: list[int], units: str
 ) -> FloatArray:
-    """Return the values (T, channels) of all frames in file axes and units; angles are in degrees."""
+    """Return the values (T, channels) of all frames, in file axes and units. Angles are in degrees.
+
+    Args:
+        motion: The motion.
+        channels: (J,) channel names of each joint.
+        order: (J,) joint indices in the order of the file.
+        units: Unit of length of the file.
+    """
     orders = tuple("".join(name[0] for name in names if name.endswith("rotation")) for names in channels)
     angles = np.rad2deg(continuous_angles(orders, file_from_world_rotations(motion.local_rotation)))
     position = file_from_world_points(motion.local_position_m(), units)
@@ -101,7 +108,7 @@ def _hierarchy_lines(
     ends = file_from_world_points(np.nan_to_num(skeleton.end_offsets_m), units)
     if not any(skeleton.bvh_channels):
         offsets[0] = (
-            0.0  # some readers add the root's position to its OFFSET, others replace the OFFSET by it
+            0.0  # some readers add the root's position to the OFFSET, other readers ignore the OFFSET
         )
     if motion.hips_in_root_m is not None:
         offsets[1] = 0.0
@@ -131,12 +138,12 @@ def _hierarchy_lines(
 
 
 def _format_vector(vector: FloatArray) -> str:
-    """Return three lengths as text, with six to twelve decimals and no negative zero."""
+    """Return three lengths as text, each with six to twelve decimals. Zero has no minus sign."""
     return " ".join(_format_length(float(value)) for value in vector)
 
 
 def _format_length(value: float) -> str:
-    """Return a length with six to twelve decimals."""
+    """Return a length as text with six to twelve decimals."""
     text = f"{round(value, 12) + 0.0:.12f}".rstrip("0")
     whole, _, decimals = text.partition(".")
     return f"{whole}.{decimals:0<6}"

@@ -1,4 +1,4 @@
-"""Find Blender and run a script in it."""
+"""Find Blender and run a script in Blender."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pathlib import Path
 from bodycap_batch.core.errors import JobError
 
 BLENDER_VARIABLE = "BODYCAP_BLENDER"
-"""Environment variable with the path of Blender, or of a Python that has its module."""
+"""Name of the environment variable with the path of Blender, or of a Python that has the module ``bpy``."""
 
 _HINT = (
     f"`make blender` installs it as a Python module (Python 3.11); or set {BLENDER_VARIABLE} to a Python "
     "that has bpy, or to a blender executable"
 )
 _TIMEOUT_S = 3600.0
-"""Seconds. Longest run of Blender. Evidence: none; it only ends a process that hangs."""
+"""Maximum duration of a run of Blender, seconds. Evidence: none; it only ends a process that hangs."""
 
 _START_TEST = "import bpy"
 """Python statement that fails if Blender does not start."""
@@ -28,11 +28,11 @@ _START_TEST = "import bpy"
 def find_blender() -> Path:
     """Return the path of a Python that has the module ``bpy``, or of a Blender executable.
 
-    The search order is: ``BODYCAP_BLENDER``, the running Python, and ``.venv-blender`` in the working folder
-    and in the folder that contains this package.
+    The search order is: ``BODYCAP_BLENDER``, the running Python, ``.venv-blender`` in the working folder, and
+    ``.venv-blender`` in the folder that contains this package.
 
     Raises:
-        JobError: Nothing was found, or ``BODYCAP_BLENDER`` names no program.
+        JobError: Blender was not found, or the value of ``BODYCAP_BLENDER`` is not a program.
     """
     named = os.environ.get(BLENDER_VARIABLE)
     if named:
@@ -64,7 +64,17 @@ def require_blender() -> None:
 
 
 def run_script(script: Path, arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Run a Python file in Blender. The hash seed is constant, so that every run writes the same bytes."""
+    """Run a Python file in Blender.
+
+    Python's hash seed is constant, so that every run writes the same bytes.
+
+    Args:
+        script: Path of the Python file.
+        arguments: Command-line arguments of the Python file.
+
+    Returns:
+        The finished process, with its output.
+    """
     blender = find_blender()
     if is_blender_executable(blender):
         return _run([str(blender), *_flags(blender), "--python", str(script), "--", *arguments])
@@ -72,19 +82,22 @@ def run_script(script: Path, arguments: Sequence[str]) -> subprocess.CompletedPr
 
 
 def is_blender_executable(blender: Path) -> bool:
-    """Return whether a program is Blender itself, and not a Python with its module."""
+    """Return True if a program is Blender, and False if it is a Python with the module ``bpy``."""
     return blender.name.lower().startswith("blender")
 
 
 def _flags(blender: Path) -> list[str]:
-    """Return the command-line options that start Blender without window and user settings."""
+    """Return the command-line options that start Blender without a window and without user settings."""
     if is_blender_executable(blender):
         return ["--background", "--factory-startup", "--python-exit-code", "1"]
     return ["-P"]
 
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Run a command without the PYTHON… variables of this process, which could break Blender's Python."""
+    """Run a command without the environment variables whose names start with ``PYTHON``.
+
+    These variables of the running process could break Blender's Python.
+    """
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     environment = {**kept, "PYTHONHASHSEED": "0"}
     return subprocess.run(

@@ -2,8 +2,8 @@
 
     python blender_script.py in.glb out.fbx report.json fps frames
 
-The unit of the Blender scene is the centimetre. Blender's glTF importer converts metres to it, so the FBX
-needs no scale.
+The unit of length of the Blender scene is the centimetre. Blender's glTF importer converts metres to
+centimetres, so the FBX file needs no scale.
 """
 
 from __future__ import annotations
@@ -17,11 +17,19 @@ from pathlib import Path
 from typing import Any
 
 _COMPARED_FRAMES = 20
-"""Number of frames whose joints are reported. Evidence: none; enough to find a wrong frame rate or axis."""
+"""Number of frames whose joints are reported. Evidence: none; the number is enough to find a wrong frame rate
+or a wrong axis."""
 
 
 def convert(source: str, target: str, fps: float, frames: int) -> None:
-    """Import the GLB file and export the FBX file without leaf bones and with a key at every frame."""
+    """Import the GLB file and export the FBX file, without leaf bones and with a key at every frame.
+
+    Args:
+        source: Path of the GLB file.
+        target: Path of the FBX file.
+        fps: Frames per second.
+        frames: Number of frames.
+    """
     import bpy
 
     export_fbx_bin: Any = importlib.import_module("io_scene_fbx.export_fbx_bin")
@@ -33,7 +41,8 @@ def convert(source: str, target: str, fps: float, frames: int) -> None:
     bpy.ops.import_scene.gltf(filepath=source, disable_bone_shape=True)
     scene.frame_start, scene.frame_end = 0, frames - 1
     header = export_fbx_bin.fbx_header_elements
-    # The header would contain the current time, so equal motions would give different bytes.
+    # The header would contain the current time, and equal motions would give different bytes. Therefore the
+    # time is replaced by a constant.
     export_fbx_bin.fbx_header_elements = functools.partial(header, time=dt.datetime(1970, 1, 1))
     bpy.ops.export_scene.fbx(
         filepath=target,
@@ -57,8 +66,9 @@ def read_back(target: str, fps: float) -> dict[str, Any]:
     """Import the FBX file into an empty scene and return its joint centres.
 
     Returns:
-        ``first`` and ``last``: the frame range; ``frames``: the compared frames, counted from the first;
-        ``joints``: by name, the centres at these frames in metres, Z up.
+        A mapping with these keys. ``first`` and ``last``: first and last frame of the motion. ``frames``:
+        numbers of the reported frames, counted from the first frame. ``joints``: by joint name, the joint
+        centres at the reported frames, metres, Z up.
     """
     import bpy
 
@@ -80,7 +90,7 @@ def read_back(target: str, fps: float) -> dict[str, Any]:
 
 
 def _set_rate(scene: Any, fps: float) -> None:
-    """Set the frame rate of a scene; Blender stores it as an integer and a divisor."""
+    """Set the frame rate of a scene. Blender stores the frame rate as an integer and a divisor."""
     scene.render.fps = max(1, round(fps))
     scene.render.fps_base = scene.render.fps / fps
 

@@ -1,4 +1,4 @@
-"""Write FBX files, for Maya, Unreal and Unity, which do not read BVH."""
+"""Write FBX files for Maya, Unreal and Unity. These programs do not read BVH files."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion
 
 POSITION_TOLERANCE_M = 1e-4
-"""Metres. Largest accepted distance of a joint when the file is read back. Derivation: FBX and GLB have
-single precision, and this is below what an animator sees."""
+"""Maximum distance, metres, between a joint that is read back from the file and the joint of the motion.
+Derivation: FBX and GLB have single precision, and an animator cannot see such a distance."""
 
 _CONVERT_SCRIPT = Path(__file__).with_name("blender_script.py")
 
 _BEFORE_BLENDER_IMPORT = so3_exp([-np.pi / 2, 0.0, 0.0])
-"""Rotation of the scene in the GLB. It cancels the quarter turn about X of Blender's glTF importer, so that
-the axes of the joints stay as they are."""
+"""Rotation of the whole scene in the GLB file. It cancels the rotation by 90° about X of Blender's glTF
+importer, so that the axes of the joints are unchanged."""
 
 
 def write_fbx(path: Path, motion: Motion) -> Path:
-    """Write a motion as FBX.
+    """Write a motion as an FBX file.
 
-    Blender converts a GLB file to FBX and reads it back; the joint centres are compared with the motion. The
-    file is in centimetres, Y up, facing +Z. The armature has no scale and no rotation, and all joints have
-    identity rotations in the T-pose.
+    Blender converts a GLB file to FBX and reads the FBX file back. Then the joint centres are compared with
+    the motion. The file is in centimetres, Y up, facing +Z. The armature has neither scale nor rotation. In
+    the T-pose, all joints have identity rotations.
 
     Args:
-        path: The file; it is replaced atomically.
+        path: Path of the file, which is replaced atomically.
         motion: The motion, in world axes and metres.
 
     Returns:
-        The path.
+        The path of the file.
 
     Raises:
         JobError: Blender was not found.
@@ -63,9 +63,9 @@ def write_fbx(path: Path, motion: Motion) -> Path:
 
 
 def _max_joint_difference_m(report: dict[str, Any], motion: Motion) -> float:
-    """Return the largest distance between the joints in Blender's report and those of the motion.
+    """Return the largest distance, metres, between joints in Blender's report and joints of the motion.
 
-    It is infinite if the joints or the frame range differ.
+    The distance is infinite if the joint names or the frame ranges differ.
     """
     joints, frames = report["joints"], report["frames"]
     count = len(motion.root_in_world_m)

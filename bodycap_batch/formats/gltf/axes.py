@@ -1,4 +1,4 @@
-"""Conversion between world axes and file axes, and the numbers that the format defines."""
+"""Convert between world axes and file axes, and define the constants of the glTF format."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FILE_FROM_WORLD: FloatArray = frozen_array(
 """Rotation from world axes (Z up, facing −Y) to file axes (Y up, facing +Z)."""
 
 FLOAT, UINT16, UINT32 = 5126, 5123, 5125
-"""Component types of an accessor. Source: glTF 2.0 specification, 3.6.2."""
+"""Numbers of the component types of an accessor. Source: glTF 2.0 specification, 3.6.2."""
 
 COMPONENT_DTYPES: dict[int, np.dtype[Any]] = {
     FLOAT: np.dtype("<f4"),
@@ -26,11 +26,12 @@ ELEMENT_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 """Number of components of each accessor type. Source: glTF 2.0 specification, 3.6.2."""
 
 ELEMENT_ARRAY_BUFFER, ARRAY_BUFFER = 34963, 34962
-"""Targets of a buffer view: vertex indices, vertex attributes. Source: glTF 2.0 specification, 5.11."""
+"""Numbers of the targets of a buffer view: vertex indices, and vertex attributes. Source: glTF 2.0
+specification, 5.11."""
 
 
 def poses_in_file_axes(world_from_joint: FloatArray) -> FloatArray:
-    """Convert poses (...,4,4) from world axes to file axes, for the joint and its parent alike."""
+    """Convert poses (...,4,4) from world axes to file axes, both for the joint and for its parent."""
     rotation = FILE_FROM_WORLD @ world_from_joint[..., :3, :3] @ FILE_FROM_WORLD.T
     return make_transform(rotation, world_from_joint[..., :3, 3] @ FILE_FROM_WORLD.T)
 

@@ -1,4 +1,4 @@
-"""Read GLB files that `write_glb` has written, or that have the same form."""
+"""Read GLB files that `write_glb` has written, or files with the same structure."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel
 def read_glb(path: Path | str) -> Motion:
     """Read the animated skeleton of a file that `write_glb` has written.
 
-    The rest pose of the nodes becomes the T-pose; in the zero pose all rotations are the identity. The file
-    does not contain the far ends of bones and the BVH channels.
+    The rest pose of the nodes becomes the T-pose of the skeleton. In the zero pose, all rotations are the
+    identity. The far ends of bones and the BVH channels are missing, because the file does not contain them.
 
     Raises:
-        JobError: The file is no GLB file with one skin and one animation.
+        JobError: The file is not a GLB file with exactly one skin and one animation.
     """
     import pygltflib as gl
 
@@ -74,7 +74,13 @@ def _read_motion(document: Any, name: str) -> Motion:
 
 
 def _read_skeleton(document: Any, name: str, joint_of_node: dict[int, int]) -> SkeletonModel:
-    """Return the skeleton of a parsed file; `joint_of_node` gives the joint index of each node."""
+    """Return the skeleton of a parsed file.
+
+    Args:
+        document: The parsed file.
+        name: Name of the skeleton.
+        joint_of_node: By index of a node, the index of the joint.
+    """
     nodes = [document.nodes[node] for node in joint_of_node]
     parents = np.full(len(nodes), -1)
     for joint, node in enumerate(nodes):
@@ -95,7 +101,7 @@ def _read_skeleton(document: Any, name: str, joint_of_node: dict[int, int]) -> S
 
 
 def _read_accessor(document: Any, accessor: int) -> FloatArray:
-    """Return the values (N, width) of the accessor with this index."""
+    """Return the values (N, number of components) of the accessor with this index."""
     entry = document.accessors[accessor]
     view = document.bufferViews[entry.bufferView]
     values = np.frombuffer(

@@ -1,4 +1,4 @@
-"""Write GLB files that Blender, game engines and web viewers read."""
+"""Write GLB files. Blender, game engines and web viewers can read these files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, make_tran
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
 _FIGURE_COLOR_RGBA = (0.86, 0.39, 0.10, 1.0)
-"""Colour of the stick figure, 0 to 1."""
+"""Colour of the stick figure, RGBA, 0 to 1."""
 
 
 def write_glb(
@@ -36,14 +36,15 @@ def write_glb(
 ) -> None:
     """Write a motion as a skinned, animated stick figure.
 
-    The joints are nodes below one node ``Armature``. The mesh is bound to them in the T-pose. Every joint has
-    a LINEAR rotation channel; the root, and hips that move freely below it, also have a translation channel.
-    Frame k is at k / fps seconds.
+    The joints are nodes below a node ``Armature``. The mesh is bound to the joints in the T-pose. Every joint
+    has a LINEAR rotation channel. The root also has a translation channel, and so have hips that move freely
+    relative to the root. The time of frame k is k / fps seconds.
 
     Args:
-        path: The file; it is replaced atomically.
+        path: Path of the file, which is replaced atomically.
         motion: The motion, in world axes and metres.
-        file_from_up: (3,3) rotation of the whole scene, for a converter that rotates it back; None for none.
+        file_from_up: (3,3) rotation of the whole scene, for a converter that reverses this rotation. None for
+            no rotation.
 
     Raises:
         StoreError: The file cannot be written.
@@ -95,7 +96,7 @@ def write_glb(
 
 
 class _BinaryBuffer:
-    """The binary part of the file: arrays in a row, each with a buffer view and an accessor."""
+    """The binary part of the file: successive arrays, each with a separate buffer view and accessor."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -105,7 +106,17 @@ class _BinaryBuffer:
     def add(
         self, array: npt.NDArray[Any], kind: str, *, target: int | None = None, component: int = FLOAT
     ) -> int:
-        """Append an array (N, …) and return the index of its accessor."""
+        """Append an array to the buffer.
+
+        Args:
+            array: (N, …) array.
+            kind: Accessor type, a key of `ELEMENT_WIDTHS`.
+            target: Target of the buffer view; None for no target.
+            component: Number of the component type.
+
+        Returns:
+            The index of the accessor of the array.
+        """
         import pygltflib as gl
 
         values = np.ascontiguousarray(array, dtype=COMPONENT_DTYPES[component])
@@ -129,7 +140,12 @@ class _BinaryBuffer:
 
 
 def _joint_nodes(skeleton: SkeletonModel, rest: FloatArray) -> list[Any]:
-    """Return one node per joint, in the T-pose; `rest` has its joint poses (J,4,4) in file axes."""
+    """Return one node per joint, in the T-pose.
+
+    Args:
+        skeleton: The skeleton, with J joints.
+        rest: (J,4,4) joint poses in the T-pose, in file axes.
+    """
     import pygltflib as gl
 
     parents = skeleton.parents.tolist()
@@ -148,7 +164,13 @@ def _joint_nodes(skeleton: SkeletonModel, rest: FloatArray) -> list[Any]:
 
 
 def _figure_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
-    """Return the stick figure as a primitive. Every vertex is bound to one joint with weight 1."""
+    """Return the stick figure as a primitive. Each vertex is bound to one joint with weight 1.
+
+    Args:
+        skeleton: The skeleton.
+        turn: (4,4) rotation of the whole scene.
+        buffer: The buffer to which the arrays are appended.
+    """
     import pygltflib as gl
 
     figure = make_stick_figure(skeleton)
@@ -169,7 +191,13 @@ def _figure_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _Binary
 
 
 def _motion_animation(motion: Motion, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
-    """Return the animation: rotations of all joints, translations of the root and of freely moving hips."""
+    """Return the animation: rotations of all joints, translations of the root and of freely moving hips.
+
+    Args:
+        motion: The motion.
+        turn: (4,4) rotation of the whole scene.
+        buffer: The buffer to which the arrays are appended.
+    """
     import pygltflib as gl
 
     times = buffer.add(np.arange(len(motion.root_in_world_m)) / motion.fps, "SCALAR")
