@@ -159,8 +159,8 @@ def _camera_block(folder: Path, name: str, path: Path) -> dict[str, object]:
 def _refuse_missing_videos(folder: Path) -> None:
     """Refuse a folder in which the videos of a camera are missing.
 
-    Otherwise the body would be solved without this camera. Missing videos are broken links, and empty folders
-    with the name of a place on the body.
+    Otherwise the body would be solved without this camera. A video is missing if its link is broken. The
+    videos of a camera are missing if a folder with the name of a mount is empty.
     """
     for path in sorted(folder.iterdir()):
         if path.is_symlink() and not path.exists() and path.suffix.lower() in VIDEO_SUFFIXES:

@@ -16,7 +16,7 @@ _POLL_S = 0.1
 
 
 class Turns:
-    """The artefacts that are being computed at the moment for the jobs of this process."""
+    """Lets only one job of this process compute an artefact at a time; other jobs that need it wait."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()

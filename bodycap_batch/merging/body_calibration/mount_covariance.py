@@ -37,7 +37,8 @@ from bodycap_batch.merging.graph.factors import bone_key, mount_keys
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph
 
 _PRIOR_REDUNDANCY = 30.0
-"""Weight of the expected variance factor of a row type, as a number of redundant rows. Evidence: none."""
+"""Weight of the prior in the estimate of a row type's variance factor: the prior counts as much as this number
+of redundant rows. Evidence: none."""
 
 
 class RowType(IntEnum):
@@ -135,8 +136,8 @@ class LinearisedCalibration:
             The variance factor of the rows.
         """
         rows = self.row_types == row_type
-        # A camera pose has six degrees of freedom, but its four points have twelve rows. The other six
-        # degrees of freedom contain no information, and their residuals are zero.
+        # A camera pose has six degrees of freedom, but it is measured as four points, which have twelve rows.
+        # So half of the rows contain no information, and their residuals are zero.
         idle = 0.5 * rows.sum() if row_type == RowType.MEASUREMENT else 0.0
         redundancy = max(float(reduced.redundancy[rows].sum()) - idle, 0.0)
         squares = float((self.linear.rhs[rows] ** 2).sum())

@@ -39,7 +39,7 @@ class FootContact:
     Attributes:
         name: Name of the foot in the report.
         joint: Index of the ankle in the skeleton.
-        bone: Index of the bone with the camera, which holds the ankle.
+        bone: Index of the bone that contains the ankle; a camera is mounted on this bone.
         ankle_m: (3,) position of the ankle in the bone's frame.
         standing: (T,) whether the foot stands at each tick.
         sigma_m: Sigma per axis of the ankle's movement from one standing tick to the next, metres.

@@ -119,9 +119,10 @@ class _ScaleInformation:
     """Information about the scale from the distances between cameras.
 
     Attributes:
-        uninformative: Names of cameras with a kinematic neighbour in another map, if the distance between
-            both cameras carries no information.
-        sigma_log: Sigma of the scale's logarithm from all other distances; infinite without such distances.
+        uninformative: Names of cameras whose distance from a kinematic neighbour in another map contains no
+            information about the scale.
+        sigma_log: Sigma of the scale's logarithm from the distances of the other cameras; infinite if there
+            are none.
     """
 
     uninformative: set[str]

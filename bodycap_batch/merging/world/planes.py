@@ -32,8 +32,8 @@ often lie on the same plane."""
 _MAX_POINTS = 20_000
 """Maximum number of points that are used. The map of a long capture has hundreds of thousands of points."""
 TILT_LIMIT_DEG = 20.0
-"""Maximum angle (degrees) between the vertical and the body's up direction. It is three sigmas of the tilt of
-a chest and of the error of its camera's mount."""
+"""Maximum angle (degrees) between the vertical and the body's up direction. It is three times the
+combined sigma of two angles: the tilt of a chest, and the error of its camera's mount."""
 BENT_TILT_LIMIT_DEG = 35.0
 """Maximum angle (degrees) between the vertical and the up direction of a person who bends most of the time.
 At 45 degrees, a wall could be mistaken for the floor."""

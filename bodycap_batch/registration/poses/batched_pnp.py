@@ -13,8 +13,8 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp, transform_points
 
 _RAY_STEP = 1e-4
-"""Step of the central differences, in units of the ray (x/z, y/z). Origin: about the cube root of the float64
-precision, rounded up. Evidence: none."""
+"""Step of the central differences, in units of the ray (x/z, y/z). It is about 16 times the cube root of the
+float64 precision, the step with the smallest error for a function of unit scale. Evidence: none."""
 _CHUNK_FRAMES = 48
 """Number of frames solved together. More frames hide numpy's overhead; fewer frames stay in the processor's
 cache."""
