@@ -21,8 +21,8 @@ from bodycap_batch.model.scene import Trajectory
 _MAX_ITERATIONS = 100
 """Maximum number of iterations for the average of rotations."""
 _CONVERGED_RAD = 1e-9
-"""Angle, radians, in the iterative average of rotations. The iterations end when a step is smaller. It is also
-the lower limit of a residual in the weight 1/residual, so that the weight stays finite."""
+"""Angle, radians, in the iterative average of rotations. The iterations end when a step is smaller. It is
+also the lower limit of a residual in the weight 1/residual, so that the weight stays finite."""
 MIN_INSTANTS = 30
 """Minimum number of instants with a pose of both cameras: the frames of one second. Fewer instants do not
 determine the relative pose."""

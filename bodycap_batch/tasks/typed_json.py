@@ -69,7 +69,7 @@ def key_inputs(task: Any) -> dict[str, Any]:
 
 
 def key_options(task: Any) -> dict[str, Any]:
-    """Return the options of a task as JSON values of the artefact's key; empty for a stage without options."""
+    """Return the options of a task as JSON values of the artefact's key; empty if there are none."""
     for field in dataclasses.fields(task):
         if field.name == _OPTIONS:
             return dict(_without(to_json(task.options), field))

@@ -68,8 +68,8 @@ def repair_model(
             break
         untried = _untried_pairs(ids, wrong | missing, tried)
         if len(untried) > max(_MIN_PAIR_BUDGET, len(tried)):
-            # If many keyframes are missing, most of them show too little of the room to be registered. Matching
-            # them with all others would take most of the time, so only misregistered keyframes are matched.
+            # If many keyframes are missing, most of them show too little of the room to be registered.
+            # To match them would take most of the time, so only misregistered keyframes are matched.
             untried = _untried_pairs(ids, wrong, tried)
         tried |= set(untried)
         verified = match_pairs(context.workspace, untried, context.intrinsics, context.stage)

@@ -37,8 +37,8 @@ from bodycap_batch.merging.graph.factors import bone_key, mount_keys
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph
 
 _PRIOR_REDUNDANCY = 30.0
-"""Weight of the prior in the estimate of a row type's variance factor: the prior counts as much as this number
-of redundant rows. Evidence: none."""
+"""Weight of the prior in the estimate of a row type's variance factor: the prior counts as much as this
+number of redundant rows. Evidence: none."""
 
 
 class RowType(IntEnum):

@@ -43,9 +43,9 @@ heights of the floor. Evidence: none."""
 _LEGLESS_HIP_M = 0.9
 """Height (metres) of the hips of a skeleton without legs, if its zero pose does not give this height."""
 _ANKLE_OVER_LEG = 0.039 / 0.491
-"""Ratio of the ankle's height above the sole to the length of the leg. The height of the ankle is at least this
-ratio times the leg length. In a skeleton whose feet end at the ankle, it is exactly this height. Source: R. Drillis, R. Contini, "Body segment parameters",
-1966."""
+"""Ratio of the ankle's height above the sole to the length of the leg. The height of the ankle is at least
+this ratio times the leg length. In a skeleton whose feet end at the ankle, it is exactly this height.
+Source: R. Drillis, R. Contini, "Body segment parameters", 1966."""
 
 
 @dataclass(frozen=True, slots=True)
