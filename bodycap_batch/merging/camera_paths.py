@@ -43,14 +43,15 @@ def with_solved_centres(
 ) -> Trajectory:
     """Return the trajectory with the camera centres of the solved motion.
 
-    The motion graph combines the measured poses of all cameras with the skeleton. Joints between the bones of
-    two cameras reduce the local errors of the map, and the motion prior reduces noise. Evidence:
+    The motion graph combines the measured poses of all cameras with the skeleton. The joints of the skeleton
+    connect the cameras, which reduces local errors of the map. The motion prior reduces noise. Evidence:
     docs/decisions/body_calibration.md.
 
-    Each centre moves towards the solved centre by a fraction: the robust weight of its measurement in the
-    solution. If measurement and solution differ by centimetres, this weight is small, because either of them
-    may be wrong. The measured orientations remain unchanged, because joints do not determine orientations to
-    a tenth of a degree. A camera with an uncalibrated mount keeps its measured path.
+    Each centre moves a fraction of the way to the solved centre. This fraction is the robust weight of the
+    measured pose in the solution. The weight is small if the measured and the solved centre differ by
+    centimetres, because either of the two may be wrong. The measured orientations remain unchanged, because
+    joints do not determine orientations to a tenth of a degree. A camera with an uncalibrated mount keeps its
+    measured path.
 
     Args:
         trajectory: The measured trajectory of the camera in the world.

@@ -28,9 +28,10 @@ REFERENCE_ROLES = ("Spine1", "Spine", "Hips", "Neck", "Head")
 Cameras on limbs are considered after the cameras on these bones, because limbs move relative to the trunk.
 """
 _MIN_TIME_RATIO = 0.25
-"""Minimum ratio of the reference camera's localised time to the longest localised time of all cameras.
+"""Minimum localised time of a good reference camera, as a fraction of the longest localised time of a camera.
 
-A camera below this ratio is considered as the reference camera only after all other cameras. Evidence: none.
+A camera with a smaller fraction becomes the reference camera only if no other camera is suitable. Evidence:
+none.
 """
 
 
@@ -38,7 +39,7 @@ class SelectedCameras(NamedTuple):
     """The cameras that are used to solve the motion of the body.
 
     Attributes:
-        inputs: The inputs, with correlated mount priors (see `correlate_mount_priors`).
+        inputs: The inputs, with wider mount priors for cameras of one rig (see `correlate_mount_priors`).
         aligned: The usable cameras, with trajectories in the gauge of the main map.
     """
 
@@ -51,7 +52,7 @@ class MainMapCandidate(NamedTuple):
 
     Attributes:
         cameras: Trajectories in this map. The trajectory of the reference camera is the first.
-        further: Trajectories in all other maps.
+        further: Trajectories in all other maps. These maps may be aligned to this map.
     """
 
     cameras: list[Trajectory]
@@ -59,7 +60,9 @@ class MainMapCandidate(NamedTuple):
 
 
 def select_cameras(inputs: MergeInputs, step: Callable[[], None], options: MergeOptions) -> SelectedCameras:
-    """Select the cameras that are used to solve the body, and correlate mount priors at equal positions.
+    """Select the cameras that are used to solve the body.
+
+    This function also widens the mount priors of cameras that share one nominal position.
 
     Args:
         inputs: Trajectories, skeleton, mounts and clocks.
@@ -83,7 +86,9 @@ def align_usable_cameras(
     options: MergeOptions | None = None,
     excluded: Mapping[str, str] | None = None,
 ) -> UsableCameras:
-    """Align the usable cameras to the best main map with which the cameras determine the scale.
+    """Select the main map, and align the maps of all usable cameras to the main map.
+
+    The main map is the best candidate for which the cameras determine the scale.
 
     Args:
         inputs: Trajectories, skeleton, mounts and clocks.
@@ -159,7 +164,7 @@ def excluded_cameras(inputs: MergeInputs) -> dict[str, str]:
         inputs: Trajectories, mounts and clocks.
 
     Returns:
-        By name of an excluded camera, the reason.
+        By name of an excluded camera, the reason why the camera is excluded.
     """
     rare = rarely_localised(inputs.trajectories)
     still = stationary_cameras(inputs, [each for each in inputs.trajectories if each.camera not in rare])
@@ -174,7 +179,7 @@ def rarely_localised(trajectories: Sequence[Trajectory]) -> dict[str, str]:
         trajectories: The trajectories of all cameras.
 
     Returns:
-        By name of such a camera, the reason why it is excluded.
+        By name of an excluded camera, the reason why the camera is excluded.
     """
     counts = {each.camera: int(each.localised.sum()) for each in trajectories}
     needed = f"{MIN_LOCALISED_FRAMES} needed"
@@ -221,7 +226,7 @@ def candidate_main_maps(
 
 
 def _can_determine_scale(skeleton: SkeletonModel, roles: Sequence[str]) -> bool:
-    """Return True if the body bounds the distance between at least two cameras on these bones."""
+    """Return True if the skeleton limits the distance between at least two cameras on these bones."""
     if len(roles) < 2:
         return False
     bones = kinematic_chain(skeleton, set(roles))

@@ -52,9 +52,9 @@ from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import SkeletonModel
 
 _EXPECTED_ITERATIONS = 80
-"""Expected number of optimiser iterations in the whole stage, as the initial total of the progress.
+"""Expected number of optimiser iterations in the whole stage. Evidence: none.
 
-The total grows if more iterations are needed. Evidence: none.
+The progress display starts with this total. The total grows if more iterations are needed.
 """
 
 
@@ -131,8 +131,8 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         window_ticks=max_window_ticks(len(bones), tracks, tick_times),
         error_modes=calibration.error_modes,
     )
-    # The first mount belongs to the reference camera. The solution does not identify the reference camera,
-    # because the first window of a long capture may not contain this camera.
+    # The first mount of the calibration always belongs to the reference camera. The solution of a long
+    # capture may begin with a window that does not contain the reference camera.
     points = map_points_of(inputs, calibration.mounts[0].camera)
     placed = _place_in_world(inputs.skeleton, bones, solution, calibration, scale * points, fps)
     to_world = placed.world_from_solved
@@ -217,7 +217,7 @@ def timeline(clocks: Mapping[str, CameraClock], used: Sequence[Trajectory], fps:
 
 @dataclass(frozen=True, slots=True)
 class _PreparedTracks:
-    """Tracks without gross errors.
+    """Tracks without gross errors, ready for the calibration of the body.
 
     Attributes:
         tracks: The cleaned tracks, one per camera. The track of the reference camera is the first.

@@ -1,7 +1,7 @@
 """Error modes of a skeleton whose bone lengths were not measured but scaled from the stature.
 
-People of one stature differ in bone lengths. The skeletons of different motion capture systems differ in
-where they place the joints of one body.
+There are two kinds of error. People of equal stature have different bone lengths. Different motion capture
+systems place the joints at different points of the same body.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from bodycap_batch.merging.graph.error_modes import ErrorModes
 from bodycap_batch.model.skeleton_presets import split_side
 
 PROPORTION_SIGMA = 0.04
-"""Relative sigma of a bone's length at a given stature, and of a scale that is derived from bone lengths.
+"""Relative sigma of a bone length that was scaled from the stature.
+
+A scale that is derived from such bone lengths has the same relative sigma.
 
 Between people, the ratio of a segment's length to the stature has a standard deviation of 3 to 5 %.
 Winter's table gives only mean ratios. Source: C. C. Gordon et al., "2012 Anthropometric Survey of U.S. Army
@@ -30,9 +32,10 @@ _JOINT_PLACEMENT_SIGMA = {
     "ForeArm": (0.025, 0.0, 0.0),
     "Hand": (0.03, 0.0, 0.0),
 }
-"""By joint, sigma of its position between the skeletons of motion capture systems.
+"""By joint, sigma of the joint's position in the body, as fractions of the stature.
 
-The three values are fractions of the stature, for the directions [outwards, back, up] in a T-pose.
+Motion capture systems place a joint at different points of the body. The three sigmas are for the directions
+[outwards, back, up] in a T-pose.
 
 Derived from the skeletons of three makers, see docs/decisions/body_calibration.md.
 """
@@ -40,11 +43,11 @@ Derived from the skeletons of three makers, see docs/decisions/body_calibration.
 
 @dataclass(frozen=True, slots=True)
 class SkeletonErrorModes:
-    """Error modes of a skeleton whose bones were not measured.
+    """Error modes of a skeleton that was scaled from a stature. They increase the sigmas of the calibration.
 
     Attributes:
-        bone_lengths: Variation of bone lengths between people of one stature.
-        joint_placement: Variation of joint centres between the skeletons of motion capture systems.
+        bone_lengths: Error modes because people of equal stature have different bone lengths.
+        joint_placement: Error modes because motion capture systems place the joints differently.
     """
 
     bone_lengths: ErrorModes
@@ -70,10 +73,9 @@ def skeleton_error_modes(
 
 
 def bone_length_modes(bones: Sequence[Bone], cameras: Sequence[str]) -> ErrorModes:
-    """Return one error mode for each kind of bone, for example both forearms.
+    """Return one error mode for each kind of bone. For example, both forearms are one kind.
 
-    In such a mode, the bones of this kind are longer by the fraction `PROPORTION_SIGMA`, left and right
-    alike.
+    The mode makes all bones of this kind longer by the fraction `PROPORTION_SIGMA`, left and right alike.
 
     Args:
         bones: Bones of the graph.
@@ -94,10 +96,11 @@ def bone_length_modes(bones: Sequence[Bone], cameras: Sequence[str]) -> ErrorMod
 def joint_placement_modes(bones: Sequence[Bone], cameras: Sequence[str], stature_m: float) -> ErrorModes:
     """Return the error modes of joint placement.
 
-    In such a mode, another maker's skeleton places a joint elsewhere in the body, left and right alike.
+    Each mode moves one joint to another point of the body, because another motion capture system may define
+    the joint there. The left and the right joint move symmetrically.
 
-    If ``Spine1`` moves, its child joints keep their places. If a joint of an arm moves, its descendants move
-    with it, because the offset of each arm bone varies independently.
+    If ``Spine1`` moves, its child joints keep their places. If a joint of an arm moves, all joints further
+    along the arm move by the same amount.
 
     Args:
         bones: Bones of the graph.
@@ -127,7 +130,7 @@ def joint_placement_modes(bones: Sequence[Bone], cameras: Sequence[str], stature
 
 
 def _part_names(bones: Sequence[Bone]) -> list[str]:
-    """Return the role of each bone without its side: ``Arm`` for ``LeftArm``."""
+    """Return the role of each bone without the side, for example ``Arm`` for ``LeftArm``."""
     return [split_side(bone.role)[1] for bone in bones]
 
 

@@ -56,21 +56,23 @@ _SAMPLES = 80
 Times of a T-pose and times for rarely measured cameras are added to these.
 """
 MIN_WALKING_SAMPLES = 10
-"""Minimum number of walking samples for a height over the floor from walking samples only. Evidence: none.
+"""Minimum number of samples at which the person walks. Evidence: none.
 
-With fewer walking samples, the height comes from all samples.
+If there are enough such samples, only these samples determine the height over the floor. With fewer walking
+samples, all samples determine it.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationInput:
-    """Camera tracks that are ready for the calibration.
+    """The measured data of the calibration: cleaned camera tracks and facts about their maps.
 
     Attributes:
         tracks: Tracks without gross errors, in the gauge of the main map. The track of the reference camera
             is the first.
         provisional: Approximate scale, metres per map unit.
-        alignment: By camera whose map was aligned to the main map, uncertainty of the pose of this map.
+        alignment: By camera, uncertainty of the pose of this camera's map in the main map. It contains only
+            cameras whose map was aligned to the main map.
         main_from_gauge: By gauge of each used map, similarity from this map to the main map. None if all
             cameras are in one map.
     """
@@ -83,23 +85,25 @@ class CalibrationInput:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BodyCalibration:
-    """The quantities that are constant over a capture.
+    """The result of the body calibration: the quantities that are constant over a capture.
 
     Attributes:
         scale: The metric scale, combined from all of its sources.
-        bones_alone: The scale from the bones alone, at which the calibration graph has the lowest cost.
-        limbs: The scale that each limb gives alone; a diagnostic.
+        bones_alone: The scale from the bones without other sources. At this scale the calibration graph has
+            the lowest cost.
+        limbs: One scale per limb, estimated from the cameras of this limb. The scales are a diagnostic only.
         mounts: The solved mounts with their sigmas. The mount of the reference camera is the first.
         reference_prior: Mount prior of the reference camera, rotated by the roll that was found.
-        error_modes: Error modes of scale, mounts and body, both constant and transient modes.
+        error_modes: Error modes of scale, mounts and body. Some are constant over the capture, the others
+            are transient.
         vertical: The vertical in the gauge of the main map.
         height_over_floor_m: Height of the reference camera's joint over the floor, metres. None if no floor
             was found, or if the reference camera is on a limb.
         t_pose_ns: First and last common time of the T-pose; None if the capture has no T-pose.
         rolls: For each camera whose roll was searched, the costs of all rolls. The reference camera is not
             among these cameras.
-        off_hinge_m: By role of the bone below a violated hinge, sigma (metres) of the distance of the bone's
-            far end from the hinge's plane.
+        off_hinge_m: Size of each hinge violation. The key is the role of the bone below the hinge. The value
+            is the sigma of the distance between the bone's far end and the plane of the hinge, metres.
     """
 
     scale: MetricScale
@@ -120,8 +124,8 @@ class ReferenceCameraRoll(NamedTuple):
 
     Attributes:
         roll_deg: Roll about the optical axis, degrees.
-        vertical: The vertical in the gauge of the tracks' map. None if job, map and walk do not determine it,
-            or if the reference camera is on a limb.
+        vertical: The vertical in the gauge of the tracks' map. None if neither the job nor the map nor the
+            walk determines the vertical, or if the reference camera is on a limb.
     """
 
     roll_deg: float
@@ -216,7 +220,7 @@ def calibrate_body(
 
 
 class _ResolvedRolls(NamedTuple):
-    """The inputs with the rolls of all cameras applied, facts about the posture, and the roll searches."""
+    """The result of the roll searches: inputs with rotated mount priors, posture hints, and the searches."""
 
     inputs: MergeInputs
     hints: PostureHints
@@ -257,7 +261,7 @@ def reference_camera_roll(
         bones: Bones of the graph.
         tracks: Cleaned tracks in one map. The track of the reference camera is the first.
         provisional: Approximate scale, metres per map unit.
-        stated: Possible verticals from the marker board of the job.
+        stated: Possible verticals from the marker board that the job describes.
 
     Returns:
         The roll and the vertical.
@@ -301,11 +305,12 @@ def preliminary_vertical(
         reference: Track of the reference camera, metres.
         mount: Mount prior of the reference camera.
         points_m: (P,3) points of the reference camera's map, metres.
-        stated: Possible verticals from the marker board of the job.
+        stated: Possible verticals from the marker board that the job describes.
 
     Returns:
-        The vertical. None if the vertical is ambiguous or only the body gives it. None also if the reference
-        camera is on a limb: a swinging arm gives neither the vertical nor the direction that the body faces.
+        The vertical. None if the vertical is ambiguous, or if it could be estimated only from the posture of
+        the body. None also if the reference camera is on a limb, because a swinging arm shows neither the
+        vertical nor the facing direction of the body.
     """
     if split_side(bones[reference.bone].role)[0]:
         return None
@@ -338,7 +343,8 @@ def with_rolls(inputs: MergeInputs, rolls_deg: Mapping[str, float]) -> MergeInpu
 
     Args:
         inputs: The inputs of the stage.
-        rolls_deg: By camera, roll about the optical axis, degrees. Other mount priors remain unchanged.
+        rolls_deg: By camera, roll about the optical axis, degrees. The mount priors of all other cameras
+            remain unchanged.
 
     Returns:
         The inputs with the rotated mount priors.
@@ -366,10 +372,11 @@ def _t_pose_interval(
 ) -> tuple[int, int] | None:
     """Return the first and last common time of the T-pose.
 
-    The T-pose is the one that the job gives. If the job says nothing about a T-pose, it is detected.
+    If the job gives the time of a T-pose, this time is used. If the job says nothing about a T-pose, the
+    function tries to detect a T-pose in the motion.
 
     Returns:
-        The two times. None if the job excludes a T-pose or none is detected.
+        The two times. None if the job says that there is no T-pose, or if no T-pose is detected.
     """
     if stated_s is not None:
         start = min(int(track.times_ns[0]) for track in data.tracks)
@@ -378,7 +385,7 @@ def _t_pose_interval(
 
 
 def _height_over_floor(first: Bone, poses: FloatArray, up: Vertical, scene: SceneContext) -> float | None:
-    """Return the median height of the first bone's joint over the floor that the person walks on.
+    """Return the median height of the reference camera's joint over the floor that the person walks on.
 
     Args:
         first: The first bone, on which the reference camera is mounted.

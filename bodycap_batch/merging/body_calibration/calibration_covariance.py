@@ -1,4 +1,7 @@
-"""Estimate the uncertainty of a solved calibration graph, and how its residuals depend on camera poses."""
+"""Estimate the uncertainty of a solved calibration graph.
+
+Also compute the derivatives of the graph's residuals with respect to camera poses and scale.
+"""
 
 from __future__ import annotations
 
@@ -33,10 +36,11 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_RAD
 
 _TRANSIENT_SHARE = float(np.sqrt(1.0 - POSTURE_BIAS_SHARE**2))
-"""Fraction of a joint's everyday sigma that varies within a capture.
+"""Transient part of the sigma of a joint's rotation prior, as a fraction of this sigma.
 
-The everyday sigma is the sigma of the joint's rotation prior. The fraction `POSTURE_BIAS_SHARE` of this sigma
-is constant over a capture. The squares of the two fractions add up to 1.
+The rotation prior has a constant and a transient part. The constant part is one posture bias for the whole
+capture. It has the fraction `POSTURE_BIAS_SHARE` of the sigma. The transient part varies within the capture.
+The squares of the two fractions add up to 1.
 """
 
 
@@ -67,12 +71,12 @@ class ScaleUncertainty:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationErrorModes:
-    """The error modes of a calibration.
+    """The error modes of a calibration, from which the uncertainty of the solved motion follows.
 
     Attributes:
         constant: Modes that are constant over the capture: noise of the calibration, bias of the posture,
             scale, bone lengths.
-        transient: Modes that act only on single intervals of the motion: bends of the map, varying posture,
+        transient: Modes that each act on one interval of the motion only: bends of the map, varying posture,
             placement of the joints.
     """
 
@@ -95,7 +99,8 @@ def error_modes(
     Args:
         graph: The solved calibration graph.
         scale: Uncertainty of the scale.
-        alignment: By camera whose map was aligned through the body, uncertainty of the pose of this map.
+        alignment: By camera, uncertainty of the pose of this camera's map. It contains only cameras whose map
+            was aligned to the main map through the body.
         skeleton: Error modes of the bones; None if the bones were measured. The modes of joint placement are
             transient. They do not increase the uncertainty of the mounts, because the mounts refer to the
             same placement of the joints.
@@ -169,16 +174,18 @@ def variance_factors(
     """
     correlated = samples.correlated_samples
     map_error = _map_error_variance(samples, linearised, reduced)
-    # The gaps of joints at different samples may be correlated in the same way as the errors of the map.
+    # Errors of the map correlate the camera poses of successive samples. The joint gaps may be correlated in
+    # the same way.
     gap = correlated * linearised.variance_factor(reduced, RowType.JOINT_GAP, 1.0 / correlated)
     factors = {
         RowType.PRIOR: 1.0,
         RowType.MEASUREMENT: samples.white_noise_share + correlated * map_error,
         RowType.JOINT_GAP: gap,
-        # The graph weighs joint rotations with widened sigmas. Only the transient part of the rotations
-        # differs between samples.
+        # The graph uses joint rotation priors with widened sigmas. The factor restores the original sigmas,
+        # reduced to the transient part, because only this part differs between samples.
         RowType.JOINT_ROTATION: (_TRANSIENT_SHARE / JOINT_PRIOR_SCALE) ** 2,
-        # The graph weighs mounts that are known by name only with a larger sigma than their expected error.
+        # Some mount orientations are assumed from the camera's name only. The graph uses a larger sigma for
+        # these orientations than their expected error.
         RowType.NAMED_MOUNT: (NOMINAL_ERROR_RAD / NOMINAL_SIGMA_RAD) ** 2,
     }
     return np.array([factors[row_type] for row_type in RowType])
@@ -189,8 +196,8 @@ def rescale_sigmas(
 ) -> None:
     """Reduce the sigmas of camera poses and joint gaps to the sigmas estimated from the residuals.
 
-    If the residuals are below the usual error of a map, this map is better than usual. This function never
-    increases a sigma.
+    Small residuals show that the map has smaller errors than assumed. Large residuals do not change the
+    sigmas: this function never increases a sigma.
 
     Args:
         graph: The solved calibration graph. Its sigmas are changed.
@@ -238,11 +245,10 @@ def measurement_jacobian(
 
 
 def scale_jacobian(graph: CalibrationGraph, linearised: LinearisedCalibration) -> FloatArray:
-    """Return the derivative of the residuals with respect to log scale that is due to their sigmas.
+    """Return the derivative of the residuals with respect to log scale, as far as their sigmas cause it.
 
-    The sigmas of camera centres and joint gaps are constant in map units. In metres they grow with the scale,
-    so their whitened residuals shrink. Without this term the smallest scale would have the lowest cost.
-    Rotations do not depend on the scale.
+    The sigmas of camera centres and joint gaps are constant in map units. In metres these sigmas grow with
+    the scale, so the whitened residuals shrink. The sigmas of rotations do not depend on the scale.
 
     Args:
         graph: The solved calibration graph.
@@ -263,7 +269,7 @@ def scale_jacobian(graph: CalibrationGraph, linearised: LinearisedCalibration) -
 def _transient_shares(
     samples: CalibrationSamples, linearised: LinearisedCalibration, reduced: ReducedSystem
 ) -> FloatArray:
-    """Return the fraction (B,) of each joint's everyday sigma that varies within the capture."""
+    """Return the transient part of the sigma of each joint's rotation prior, as a fraction (B,)."""
     usual = np.flatnonzero(~samples.posture.t_pose)
     shares = transient_variance_shares(linearised, reduced, usual, samples.times_ns[usual], JOINT_PRIOR_SCALE)
     return np.sqrt(shares)
@@ -272,12 +278,12 @@ def _transient_shares(
 def _map_error_variance(
     samples: CalibrationSamples, linearised: LinearisedCalibration, reduced: ReducedSystem
 ) -> float:
-    """Return the variance of the camera poses that is error of the map, relative to their assumed variance.
+    """Return the variance of the map's error, as a fraction of the assumed variance of the camera poses.
 
-    It is the variance estimated from the residuals minus the variance of the independent noise.
+    The variance of the map's error is the variance of the residuals minus the variance of independent noise.
     """
     white, correlated = samples.white_noise_share, samples.correlated_samples
-    # In the assumed variance, the error of the map is multiplied by the number of samples that share this
-    # error. The residuals of single samples do not contain this factor.
+    # The assumed variance contains the variance of the map's error, multiplied by the number of samples that
+    # share one error. The residuals of single samples do not contain this factor.
     prior = white + (1.0 - white) / correlated
     return max(linearised.variance_factor(reduced, RowType.MEASUREMENT, prior) - white, 0.0)

@@ -25,23 +25,25 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
 
 ROLLS_DEG = (0.0, 90.0, 180.0, 270.0)
-"""The rolls that are tried, degrees: the four ways to strap a box-shaped camera on. The usual roll is 0."""
+"""The rolls that are tried, degrees: the four ways to strap a box-shaped camera on. The usual roll is 0°."""
 MIN_COST_DIFFERENCE = 8.0
-"""Minimum reduction of the cost for the selection of a roll other than the usual roll. Evidence: none.
+"""Minimum reduction of the cost to select a roll other than the usual roll. Evidence: none.
 
-The value is half the square of 4 sigma. It expresses how certain it is that people wear cameras the usual way
-up.
+The cost is half the sum of squared residuals, so a residual of 4 sigma has the cost 8. The threshold is high
+because most people wear their cameras with the usual roll.
 """
 _MIN_DOWN_COSINE = 0.3
-"""Minimum mean cosine between down and the direction to the limbs' cameras, to accept the usual roll.
+"""Threshold of the mean cosine between the downward direction and the directions to the limbs' cameras.
 
-Seen from a camera on the chest, hanging hands are 45° or more below the horizontal: a cosine of 0.7. If the
-roll is wrong by 90°, the hands seem to be beside the camera, and the mean cosine is 0.
+With at least this mean cosine, the usual roll is accepted. Seen from a camera on the chest, hanging hands are
+45° or more below the horizontal, which gives a cosine of 0.7. If the roll is wrong by 90°, the hands seem to
+be beside the camera, and the mean cosine is 0.
 """
 _MIN_COSINE_GAIN = 0.4
-"""Minimum increase of the mean cosine of `_MIN_DOWN_COSINE`, to select a roll other than the usual roll.
+"""Minimum increase of the mean cosine to select a roll other than the usual roll.
 
-The derivation is as for `_MIN_DOWN_COSINE`.
+The mean cosine is between the downward direction and the directions to the limbs' cameras. Derivation: see
+`_MIN_DOWN_COSINE`. The right roll has a mean cosine of about 0.7, a roll that is wrong by 90° has 0.
 """
 _LEGS = frozenset({"UpLeg", "Leg", "Foot", "ToeBase"})
 _PARTS_BELOW = {
@@ -51,7 +53,7 @@ _PARTS_BELOW = {
     "Neck": _LEGS | {"Arm", "ForeArm", "Hand"},
     "Head": _LEGS | {"Shoulder", "Arm", "ForeArm", "Hand"},
 }
-"""By bone of the reference camera, the bones that are below this camera even if the elbows are bent.
+"""Bones that are below the reference camera even if the elbows are bent, by the reference camera's bone.
 
 Working hands are above the belt, so a camera on the hips or the lower spine has only the legs below it.
 Shoulders are always above a camera on the chest.
@@ -80,8 +82,8 @@ class ReferenceRoll(NamedTuple):
 
     Attributes:
         roll_deg: Roll about the optical axis, degrees.
-        vertical: (3,) the vertical for this roll from the job, the map or the walk; None if none of these
-            gives a vertical.
+        vertical: (3,) the vertical that the job, the map or the walk gives for this roll. None if none of
+            these sources gives a vertical.
     """
 
     roll_deg: float
@@ -90,7 +92,9 @@ class ReferenceRoll(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RollSearch:
-    """How well each roll of a camera explains the camera's motion relative to the reference camera.
+    """The result of the roll search for one camera: the cost of each roll, and the selected roll.
+
+    A low cost means that the roll explains the camera's motion relative to the reference camera well.
 
     Attributes:
         camera: Camera name.
@@ -118,9 +122,10 @@ def with_roll(mount: Mount, degrees: float) -> Mount:
 
 
 def has_unknown_roll(mount: Mount) -> bool:
-    """Return True if the mount's orientation is assumed from the camera's name only.
+    """Return True if the job does not give the mount's orientation.
 
-    If the job gives a sigma for the mount, the job also gives the orientation.
+    The orientation is then assumed from the camera's name only. A sigma given in the job shows that the job
+    also gives the orientation.
     """
     return mount.by_name
 
@@ -193,11 +198,12 @@ def reference_roll(
     Args:
         mounts: By camera, its mount prior.
         tracks: Cleaned tracks. The track of the reference camera is the first.
-        vertical_of: Function from a roll in degrees to the vertical (3,), or to None. The vertical comes from
-            the job, the map or the walk. If several directions are possible, the up direction of the camera
-            with this roll decides between them.
-        trunk_up_of: Function from a roll in degrees to the up direction of the trunk (3,), or to None. It is
-            used only if `vertical_of` returns None for all rolls. It is never returned as the vertical.
+        vertical_of: Function that takes a roll in degrees and returns the vertical (3,) or None. The vertical
+            comes from the job, the map or the walk. If several directions are possible, the function selects
+            the direction that best fits the up direction of the camera with this roll.
+        trunk_up_of: Function that takes a roll in degrees and returns the up direction of the trunk (3,) or
+            None. This direction is used only if `vertical_of` returns None for all rolls. It is never
+            returned as the vertical.
 
     Returns:
         The roll and the vertical. The roll is 0 if the job gives the orientation of the reference camera, if
@@ -222,7 +228,9 @@ def reference_roll(
 
 
 def mean_down_cosine(reference: CameraTrack, limbs: Sequence[CameraTrack], vertical: FloatArray) -> float:
-    """Return the mean cosine between down and the direction from the reference camera to the limbs' cameras.
+    """Return the mean cosine between the downward direction and the directions to the limbs' cameras.
+
+    The directions start at the reference camera.
 
     Args:
         reference: Track of the reference camera.
@@ -245,8 +253,8 @@ def mean_down_cosine(reference: CameraTrack, limbs: Sequence[CameraTrack], verti
 def _hanging_tracks(mounts: Mapping[str, Mount], tracks: Sequence[CameraTrack]) -> list[CameraTrack]:
     """Return the tracks of the cameras on limbs that hang below the reference camera.
 
-    The list is empty if the left or the right side has no such camera: one hand alone is beside the chest
-    rather than below it.
+    The list is empty if only one side of the body has such cameras. Seen from the chest, the hand of one side
+    is to the left or right rather than below. Hands of both sides are below on average.
     """
     below = _PARTS_BELOW.get(mounts[tracks[0].camera].role, frozenset())
     sides = [split_side(mounts[track.camera].role) for track in tracks]
@@ -257,8 +265,9 @@ def _hanging_tracks(mounts: Mapping[str, Mount], tracks: Sequence[CameraTrack]) 
 def _roll_from_trunk(
     reference: CameraTrack, limbs: Sequence[CameraTrack], trunk_up_of: Callable[[float], FloatArray | None]
 ) -> float:
-    """Return the roll (degrees) with which the limbs hang opposite to the up direction of the trunk.
+    """Return the roll (degrees) for which the limbs' cameras are most clearly below the reference camera.
 
+    Down is the direction opposite to the up direction of the trunk.
     The roll is 0 if no other roll is clearly better.
     """
     cosines = {

@@ -1,12 +1,14 @@
 """Test whether the motion obeys the hinges of the skeleton, and loosen the violated hinges.
 
-A hinge can be violated for three reasons. No elbow is a perfect hinge. The joint may not be a hinge in the
-system that the skeleton comes from. A sliding strap looks like sideways bending. If the graph
-enforces a violated hinge to a centimetre, errors of mounts and scale absorb the violation and hide it. The
-violation can be measured only if the hinge is free.
+A hinge joint bends about one axis only. There are three reasons why the measured motion can violate a hinge.
+First, no elbow is a perfect hinge. Second, the motion capture system that made the skeleton may not treat
+this joint as a hinge. Third, a camera strap that slides on the limb looks like sideways bending.
+
+If the graph enforces a violated hinge tightly, mounts and scale become wrong, and the residuals do not show
+the violation. Therefore the test first frees the hinge.
 
 Source: estimation of variance components from redundancies, W. Foerstner, "Ein Verfahren zur Schaetzung von
-Varianz- und Kovarianzkomponenten", AVN 1979. Each hinge has one variance component.
+Varianz- und Kovarianzkomponenten", AVN 1979. One variance component is estimated for each hinge.
 """
 
 from __future__ import annotations
@@ -26,16 +28,16 @@ FREE_SIGMA_M = 0.1
 TIGHT_SIGMA_M = HINGE_SLACK_RATIO * JOINT_SLACK_M
 """Sigma of the distances of a hinge that the motion obeys, metres."""
 _MIN_VARIANCE_RATIO = 1.5
-"""Minimum ratio of the variance of a hinge's distances to ``TIGHT_SIGMA_M**2`` for a violated hinge.
+"""Threshold of the variance of a hinge's distances, relative to ``TIGHT_SIGMA_M**2``.
 
-Evidence: docs/decisions/body_calibration.md.
+A hinge with at least this ratio is violated. Evidence: docs/decisions/body_calibration.md.
 """
 
 
 def observable_hinges(hinges: Sequence[Hinge], measured: Collection[int]) -> list[Hinge]:
-    """Return the hinges with a camera on the bone above and on one of the two bones below.
+    """Return the hinges that the measured camera poses can contradict.
 
-    Only these hinges can be contradicted by measurements.
+    Such a hinge has a camera on the bone above it, and a camera on one of the two bones below it.
 
     Args:
         hinges: Hinges of the body.
@@ -52,13 +54,13 @@ def observable_hinges(hinges: Sequence[Hinge], measured: Collection[int]) -> lis
 
 
 def hinge_violation_sigma(linearised: LinearisedCalibration) -> dict[int, float]:
-    """Return how far the distances of each freed hinge vary beyond `TIGHT_SIGMA_M`.
+    """Return the size of each hinge violation: the sigma of its distances in excess of `TIGHT_SIGMA_M`.
 
     Args:
-        linearised: The calibration graph, linearised at its solution. Hinges that are not free are skipped.
+        linearised: The calibration graph, linearised at its solution. Only its freed hinges are examined.
 
     Returns:
-        By index of the bone below the hinge, sigma in metres; 0 if the motion obeys the hinge.
+        Sigma in metres by index of the bone below the hinge. The sigma is 0 if the motion obeys the hinge.
     """
     out, reduced = {}, linearised.reduced()
     for number, hinge in enumerate(linearised.body.hinges):
@@ -78,8 +80,8 @@ def with_hinge_slack(bones: Sequence[Bone], off_hinge_m: Mapping[int, float]) ->
 
     Args:
         bones: Bones of the graph.
-        off_hinge_m: By index of a bone, sigma (metres) of the distance of the bone's far end from the plane
-            of its hinge. All other bones remain unchanged.
+        off_hinge_m: By index of a bone, sigma of the distance between the bone's far end and the plane of
+            its hinge, metres. Bones without an entry remain unchanged.
 
     Returns:
         All bones, in the same order.

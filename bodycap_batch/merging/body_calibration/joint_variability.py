@@ -1,6 +1,6 @@
-"""Estimate the fraction of a joint's everyday variance that occurs within one capture.
+"""Estimate how much each joint rotation varies within one capture, as a fraction of the prior variance.
 
-The everyday variance is the variance of the joint's rotation prior.
+The prior variance is the variance of the joint's rotation prior. It describes everyday motion.
 
 Source: estimation of variance components from redundancies, W. Foerstner, "Ein Verfahren zur Schaetzung von
 Varianz- und Kovarianzkomponenten", AVN 1979. Each joint has one variance component for all of its axes.
@@ -16,9 +16,10 @@ from bodycap_batch.merging.graph.error_modes import POSTURE_BIAS_SHARE
 from bodycap_batch.merging.graph.joint_priors import samples_per_gesture
 
 _PRIOR_REDUNDANCY = 6.0
-"""Weight of the prior variance, as a number of redundant rotations of different gestures.
+"""Weight of the expected fraction against the fraction that is measured in the capture.
 
-It corresponds to two gestures about three axes. Evidence: docs/decisions/body_calibration.md.
+The expected fraction has the weight of this number of measured rotation angles from independent gestures: two
+gestures with three angles each. Evidence: docs/decisions/body_calibration.md.
 """
 
 
@@ -29,9 +30,9 @@ def transient_variance_shares(
     times_ns: IntArray,
     prior_scale: float,
 ) -> FloatArray:
-    """Return the fraction of each joint's everyday variance that varies within the capture.
+    """Return the variance of each joint's rotation within the capture, as a fraction of its prior variance.
 
-    The observable axes of a joint determine its variance. The unobservable axes get the same variance.
+    The fraction is estimated from the rotation axes that the cameras observe. It is used for all three axes.
 
     Args:
         linearised: The calibration graph, linearised at its solution.
@@ -41,7 +42,7 @@ def transient_variance_shares(
         prior_scale: Factor on the sigmas of the joint rotation priors in the calibration graph.
 
     Returns:
-        (B,) fraction for the joint of each bone.
+        (B,) the fraction for each bone's joint.
     """
     out = np.full(len(linearised.body.bones), 1.0 - POSTURE_BIAS_SHARE**2)
     if not len(ticks):

@@ -19,11 +19,14 @@ from bodycap_batch.model.scene import Trajectory
 
 _FIELD = "merge.known_distance"
 _MIN_SIGMA = 0.003
-"""Relative sigma of a measured distance between two lenses: a few millimetres per metre. Evidence: none."""
-_MIN_SIGNAL_TO_NOISE = 10.0
-"""Minimum ratio of the distance between the two camera centres to the sigma per axis of their difference.
+"""Relative sigma of the distance that the job gives. Evidence: none.
 
-Evidence: none.
+A person measures the distance between two lenses with an error of a few millimetres per metre.
+"""
+_MIN_SIGNAL_TO_NOISE = 10.0
+"""Minimum distance between the two camera centres in the map, in sigmas. Evidence: none.
+
+The sigma is the uncertainty of the difference of the two centres, per axis.
 """
 
 
@@ -46,8 +49,8 @@ def known_distance(
 
     Raises:
         JobError: A camera or a frame does not exist, or the two cameras are in different maps.
-        EstimationError: A frame was not localised, the two centres are too near to each other, or their map
-            was not aligned to the main map.
+        EstimationError: A frame was not localised, the two centres are too near to each other, or the map of
+            the two cameras was not aligned to the main map.
     """
     if stated is None:
         return None
@@ -79,7 +82,7 @@ def known_distance(
 
 
 class _End(NamedTuple):
-    """One end of the distance: gauge, camera centre (3,) in this gauge, and its variance per axis."""
+    """One end of the known distance: gauge, camera centre (3,) in this gauge, and its variance per axis."""
 
     gauge: str
     centre: FloatArray

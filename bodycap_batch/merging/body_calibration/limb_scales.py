@@ -22,7 +22,10 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
 
 _LOG_SCALE_STEP = 0.1
-"""Difference of log scale between the three scales at which a limb is calibrated. Evidence: none."""
+"""Step of log scale between the three trial scales. Evidence: none.
+
+Each limb is calibrated at three trial scales. A parabola through the three costs gives the scale of the limb.
+"""
 _SAMPLES = 40
 """Maximum number of sampled times in a limb's calibration: half of the number for the whole body.
 
@@ -57,8 +60,9 @@ def limb_scales(
         step: Function that is called after each iteration. It may raise an exception to stop the work.
 
     Returns:
-        One source per limb whose cost has a minimum. Cameras that share too few frames with the reference
-        camera are not used. Empty if fewer than two limbs have usable cameras.
+        One scale per limb. Limbs without a minimum of the cost are missing. Cameras that share too few frames
+        with the reference camera are not used. The result is empty if fewer than two limbs have usable
+        cameras.
     """
     limbs: dict[str, list[CameraTrack]] = {}
     for track in tracks[1:]:

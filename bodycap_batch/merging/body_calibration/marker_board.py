@@ -23,10 +23,13 @@ SOURCE_NAME = "marker board"
 _MIN_VIEWS = 3
 """Minimum number of views of the board.
 
-Two views always agree on the size of a board. A third view checks this size.
+Two views always agree on the size of the board, even if a view is wrong. A third view reveals such an error.
 """
 _MIN_SIGMA = 0.003
-"""Minimum sigma of the log of the scale. Printers and rulers have errors of a millimetre in 30 cm."""
+"""Minimum sigma of the log of the scale from a board.
+
+Derivation: the printed size of the board has an error of about a millimetre in 30 cm.
+"""
 _MAX_SIGMA = 0.05
 """Maximum sigma of the log of the scale for a usable board.
 
@@ -40,9 +43,10 @@ The third fit changes the result by less than a tenth of its sigma.
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 """Rotation by 180° about the normal of the board."""
 _PLACED_SIGMA_DEG = 1.5
-"""Sigma of the vertical from a board that was hung by eye, degrees.
+"""Sigma of the vertical from a board, degrees.
 
-It is used for lying boards as well, although floors and tables are more exact.
+The value is for a board that a person hung straight by eye. The same value is used for lying boards, although
+floors and tables are more exactly horizontal.
 """
 
 
@@ -52,8 +56,8 @@ class LocatedBoard:
 
     Attributes:
         scale: The scale of the main map from the board.
-        axes: (3,3) unit vectors along the two edges of the board, and the normal of the board towards the
-            cameras, as columns in the main map's gauge.
+        axes: (3,3) matrix with three unit vectors as columns, in the main map's gauge. The first two are
+            along the edges of the board. The third is the normal of the board towards the cameras.
     """
 
     scale: ScaleSource
@@ -109,9 +113,9 @@ def locate_board(
     of the board's corners in all keyframes. The keyframe poses are fixed.
 
     A jackknife over groups of views estimates the uncertainty of the size. A group holds the views of one
-    camera in one second, because the poses of these views share an error. With few groups, the jackknife
-    cannot measure this error. The usual bend of a map over the path of the views therefore gives a minimum of
-    the uncertainty.
+    camera in one second, because the poses of these views share one error of the map. With few groups, the
+    jackknife underestimates the uncertainty. Therefore the uncertainty has a lower limit: the error of the
+    size that the usual bend of a map causes.
 
     Args:
         trajectories: The trajectories of the keyframes.
@@ -162,7 +166,7 @@ def _select_observations(
 ) -> tuple[str, _BoardObservations]:
     """Select the views of the board in one map.
 
-    This is the main map if it has enough views, else the map with the most views.
+    The main map is selected if it has enough views, else the map with the most views.
 
     Returns:
         The gauge of the selected map, and the observations of the board in this map.
@@ -195,9 +199,10 @@ def _with_one_orientation(
 ) -> _BoardObservations:
     """Return the views with corners relative to the middle of the board, in one orientation of the board.
 
-    A rotation by 180° maps many chessboards onto themselves, so a detector may start at either end. With
-    `has_half_turns`, this function rotates such views into the orientation of the first view. A ChArUco board
-    has numbered markers. A view of a ChArUco board with a rotation of 180° is wrong and remains unchanged.
+    Many chessboards look the same after a rotation by 180°. A detector may then number the corners from
+    either end. If `has_half_turns` is True, this function rotates such views into the orientation of the
+    first view. For a ChArUco board it is False: the markers have numbers, so a view that is rotated by 180°
+    is an error and remains unchanged.
     """
     corners = np.concatenate([view.board_m for view in views])
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
@@ -227,8 +232,8 @@ def _with_one_orientation(
 def _initial_fit(seen: _BoardObservations) -> FloatArray:
     """Return an initial fit (7,): rotation vector, position and log of the size of the board in the map.
 
-    The size is in map units per metre. The board poses from the single views determine these values: each
-    view gives the middle of the board in metres.
+    The size is in map units per metre. The initial fit uses the pose of the board in each view, which was
+    estimated from this view alone.
     """
     rotation = seen.map_from_cam[:, :3, :3]
     turn = nearest_rotation((rotation @ seen.cam_from_board[:, :3, :3]).sum(axis=0))
@@ -256,8 +261,8 @@ def _residuals(seen: _BoardObservations, fit: FloatArray) -> FloatArray:
 def _fit(seen: _BoardObservations, start: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the fit (7,) with the Cauchy loss, and the robust weight of each residual (2N,).
 
-    The width of the loss is twice the standard deviation of the residuals. The median of the absolute
-    residuals gives this standard deviation.
+    The width of the loss is twice the standard deviation of the residuals. This standard deviation is
+    estimated from the median of the absolute residuals.
     """
     from scipy.optimize import least_squares
 
@@ -269,7 +274,10 @@ def _fit(seen: _BoardObservations, start: FloatArray) -> tuple[FloatArray, Float
 
 
 def _jackknife_sigma(seen: _BoardObservations, fit: FloatArray, weight: FloatArray) -> float:
-    """Return the jackknife sigma of the log of the size: its variation as single groups are excluded.
+    """Return the jackknife sigma of the log of the board's size.
+
+    The fit is repeated several times. Each time, one group of views is excluded. The variation of the results
+    gives the sigma.
 
     Args:
         seen: The observations of the board.
@@ -296,16 +304,17 @@ def _jackknife_sigma(seen: _BoardObservations, fit: FloatArray, weight: FloatArr
         rest = normal - weighted[rows].T @ jacobian[rows]
         changes.append(np.linalg.lstsq(rest, weighted[rows].T @ residual[rows], rcond=None)[0][6])
     count = len(changes)
-    # A jackknife over few groups underestimates the error. With four groups it would give 0.87 of the error
-    # without the factor (n + 1) / (n - 1) on the usual variance.
+    # A jackknife over few groups underestimates the error. With four groups, the usual jackknife gives only
+    # 0.87 of the error. The factor (n + 1) / (n - 1) on the usual variance compensates for this.
     variance = (count + 1) / count * np.sum((np.array(changes) - np.mean(changes)) ** 2)
     return float(np.sqrt(variance))
 
 
 def _map_bend_sigma(seen: _BoardObservations, fit: FloatArray) -> float:
-    """Return the sigma of the log of the size that the usual error of a map at both ends of the path causes.
+    """Return the sigma of the log of the board's size that the usual error of a map causes.
 
-    The path is the line along which the camera centres of the views are spread farthest.
+    The usual error is assumed at both ends of the path of the views. The path is the straight line along
+    which the camera centres of the views are spread farthest.
     """
     centre = seen.map_from_cam[:, :3, 3]
     along = np.linalg.svd(centre - centre.mean(axis=0), full_matrices=False)[2][0]

@@ -1,4 +1,4 @@
-"""The calibration graph: mounts and body poses at sampled ticks, solved for a given metric scale.
+"""The calibration graph: estimate mounts and body poses at sampled ticks, for a given metric scale.
 
 The module `calibration_covariance` estimates the uncertainty of a solution.
 """
@@ -52,12 +52,12 @@ the measurements. Evidence: none.
 POINTS_PER_MOUNT = 4
 """Number of points that represent a mount.
 
-It is also the number of factors that each measurement and each mount prior adds to the graph.
+Each measured camera pose and each mount prior adds one factor per point to the graph.
 """
 
 
 class CalibrationGraph:
-    """The calibration graph of some cameras. Each solution starts from the previous solution.
+    """The calibration graph of a set of cameras. Each solution starts from the previous solution.
 
     The sigmas of camera centres and joint gaps are constant in map units, because the errors of the map cause
     them. Sigmas fixed in metres would favour a small scale, because a small scale makes all residuals small.
@@ -71,8 +71,9 @@ class CalibrationGraph:
         bones: Bones of the graph.
         samples: Camera poses at the sampled ticks.
         priors: By camera, its mount prior.
-        provisional: Approximate scale, metres per map unit. At this scale, a joint gap has the sigma
-            `JOINT_SLACK_M`, times the root of the number of samples that share one error of the map.
+        provisional: Approximate scale, metres per map unit. The scale converts the sigma of a joint gap to
+            map units. In metres, this sigma is `JOINT_SLACK_M` times √n, where n samples share one error of
+            the map.
         step: Function that is called after each iteration. It may raise an exception to stop the work.
     """
 
@@ -102,7 +103,7 @@ class CalibrationGraph:
 
     @property
     def bones(self) -> tuple[Bone, ...]:
-        """Bones of the graph, without the changes by `widen_joint_priors` and `test_hinges`."""
+        """Original bones of the graph, before `widen_joint_priors` and `test_hinges` changed their priors."""
         return self._bones
 
     @property
@@ -163,7 +164,7 @@ class CalibrationGraph:
 
     def widen_joint_priors(self) -> None:
         """Widen the joint rotation priors that the last solution contradicts."""
-        # A T-pose has a separate prior and is no evidence for the posture at other ticks.
+        # The ticks of a T-pose have a separate prior. They are no evidence for the posture at other ticks.
         usual = ~self._samples.posture.t_pose
         if usual.any():
             poses, times_ns = self.poses()[usual], self._samples.times_ns[usual]
@@ -172,9 +173,9 @@ class CalibrationGraph:
     def test_hinges(self) -> bool:
         """Test the hinges that cameras can contradict, and loosen the violated hinges.
 
-        A joint that leaves its hinge does so for a whole gesture. All samples of one gesture together
-        therefore count as one sample. Otherwise the many samples of a violated hinge would distort the
-        mounts.
+        A joint that violates its hinge violates it during a whole gesture. The samples of one gesture are
+        therefore not independent, and together they have the weight of one sample. With full weights, a
+        violated hinge would distort the mounts.
 
         Returns:
             True if a hinge is violated. The graph then has loosened hinges and must be solved again.
@@ -194,10 +195,10 @@ class CalibrationGraph:
         return True
 
     def hinge_violation_m(self) -> dict[str, float]:
-        """Return the sigma of each violated hinge's distances, in addition to the slack of a hinge.
+        """Return the size of each hinge violation: the sigma of its distances in excess of a hinge's slack.
 
         Returns:
-            By role of the bone below the hinge, sigma in metres.
+            Sigma in metres by role of the bone below the hinge.
         """
         return {bone.role: bone.off_hinge_m for bone in self._rest_bones if bone.off_hinge_m > 0.0}
 
@@ -242,7 +243,7 @@ class CalibrationGraph:
         )
 
     def measurement_factors(self, camera: int) -> IntArray:
-        """Return the factor indices (N,4) of a camera's N measurements: one factor per point of the mount."""
+        """Return the factor indices (N,4) of a camera's N measured poses. Each pose has four factors."""
         first = 0
         for other in range(camera):
             first += POINTS_PER_MOUNT + POINTS_PER_MOUNT * int(self._samples.valid[other].sum())
@@ -258,7 +259,7 @@ class CalibrationGraph:
         out, first = [], 0
         for camera, name in enumerate(self._samples.cameras):
             if self._priors[name].by_name:
-                out += [first + 1, first + 2, first + 3]  # the first factor of a prior is that of the centre
+                out += [first + 1, first + 2, first + 3]  # the first factor of a prior is for the centre
             first += POINTS_PER_MOUNT + POINTS_PER_MOUNT * int(self._samples.valid[camera].sum())
         return np.array(out, dtype=np.int64)
 
@@ -312,7 +313,7 @@ class CalibrationGraph:
         return graph
 
     def _joint_factors(self, scale: float) -> tuple[JointFactors, JointFactors]:
-        """Return the joint factors of usual ticks, and the joint factors of ticks in a T-pose.
+        """Return the joint factors of ticks outside a T-pose, and the joint factors of ticks in a T-pose.
 
         The T-pose prior has the weight of a single tick, distributed over all ticks of the T-pose.
         """

@@ -1,12 +1,12 @@
 """Estimate the covariance of the calibrated mounts from the residuals of the calibration graph.
 
-The calibration weighs its residuals with pessimistic sigmas. The residuals at the solution are therefore used
-to estimate the actual uncertainty, in two steps:
+The calibration graph assumes sigmas that are larger than the actual errors. The actual uncertainty is
+therefore estimated from the residuals at the solution, in two steps:
 
-1. For each type of residual rows, the rows and their redundancies give the actual variance of the rows. The
-   redundancy of a row is its contribution to the degrees of freedom, 0 to 1.
-2. The solution is a linear function of the noise in the rows. Noise with these variances therefore gives the
-   covariance of the mounts. This covariance has the sandwich form.
+1. Estimate the actual variance of each type of residual rows from the residuals and redundancies of its rows.
+   The redundancy of a row is its contribution to the degrees of freedom, 0 to 1.
+2. Propagate these variances to the mounts. Near the solution, the mounts are a linear function of the noise
+   in the rows. The resulting covariance has the sandwich form.
 
 Source: estimation of variance components from redundancies, W. Foerstner, "Ein Verfahren zur Schaetzung von
 Varianz- und Kovarianzkomponenten", AVN 1979.
@@ -37,8 +37,10 @@ from bodycap_batch.merging.graph.factors import bone_key, mount_keys
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph
 
 _PRIOR_REDUNDANCY = 30.0
-"""Weight of the prior in the estimate of a row type's variance factor: the prior counts as much as this
-number of redundant rows. Evidence: none."""
+"""Weight of the expected variance factor against the residuals. Evidence: none.
+
+For each row type, the expected factor has the same weight as the residuals of 30 fully redundant rows.
+"""
 
 
 class RowType(IntEnum):
@@ -58,15 +60,17 @@ class RowType(IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinearisedCalibration:
-    """A calibration graph, linearised at its solution. Only the mounts connect its ticks.
+    """A calibration graph, linearised at its solution, to estimate the uncertainty of the mounts.
+
+    Different ticks share only the unknowns of the mounts.
 
     Attributes:
         linear: The whitened Jacobian, with R rows, and its right-hand side.
         body: Bones and hinges of the graph.
         world_from_bone: (K,B,4,4) solved bone poses at K ticks, metres.
-        mount_columns: By camera, (12,) columns of the unknowns that represent the camera's mount.
-        mount_jacobian: By camera, (6,12) derivative of the right perturbation of joint_from_cam (rotation
-            first) with respect to these unknowns.
+        mount_columns: By camera, indices (12,) of the columns that belong to the camera's mount.
+        mount_jacobian: By camera, (6,12) derivative of the right perturbation of joint_from_cam with respect
+            to the 12 unknowns of the mount. The perturbation is a rotation, then a translation.
         row_types: (R,) `RowType` of each row.
         first_joint_factor: Index of the first joint factor in the graph.
     """
@@ -124,27 +128,29 @@ class LinearisedCalibration:
         return ReducedSystem(jacobian=jacobian, covariance=covariance, redundancy=1.0 - leverage)
 
     def variance_factor(self, reduced: ReducedSystem, row_type: RowType, prior: float = 1.0) -> float:
-        """Return the ratio of the actual variance of the rows of one type to their assumed variance.
+        """Return the variance factor of one row type: the actual variance divided by the assumed variance.
 
         Args:
             reduced: The reduced system of this linearisation.
             row_type: Type of the rows.
-            prior: Expected ratio. It dominates the result if the redundancy of the rows is low. It is less
-                than 1 if the weight of the rows was reduced because several samples share one error.
+            prior: Expected variance factor. It dominates the result if the redundancy of the rows is low. A
+                value below 1 is needed for rows with enlarged sigmas. The graph enlarges sigmas if several
+                samples share one error.
 
         Returns:
             The variance factor of the rows.
         """
         rows = self.row_types == row_type
-        # A camera pose has six degrees of freedom, but it is measured as four points, which have twelve rows.
-        # So half of the rows contain no information, and their residuals are zero.
+        # A camera pose has six degrees of freedom. The graph represents it by four points with twelve rows.
+        # Six of the twelve rows are therefore superfluous. They add to the redundancy, but their residuals
+        # are zero.
         idle = 0.5 * rows.sum() if row_type == RowType.MEASUREMENT else 0.0
         redundancy = max(float(reduced.redundancy[rows].sum()) - idle, 0.0)
         squares = float((self.linear.rhs[rows] ** 2).sum())
         return (_PRIOR_REDUNDANCY * prior + squares) / (_PRIOR_REDUNDANCY + redundancy)
 
     def posture_bias_jacobian(self) -> Any:
-        """Return the change of the residuals along each one-sigma mode of the posture bias.
+        """Return the change of the residuals that each error mode of the posture bias causes at one sigma.
 
         Returns:
             (R,M) sparse matrix for M modes.
@@ -163,8 +169,8 @@ class LinearisedCalibration:
             body_modes: Error modes of the assumed body.
 
         Returns:
-            The error modes of the mounts that noise in the residual rows causes. After these modes,
-            `body_modes` with the changes of the mounts that they cause.
+            First, the error modes of the mounts due to noise in the residual rows. Second, the modes of
+            `body_modes`, extended by the mount changes that each of these modes causes.
         """
         gain = reduced.covariance @ reduced.jacobian.T
         change = block_diag(*self.mount_jacobian.values())
@@ -179,14 +185,14 @@ class LinearisedCalibration:
         return stack_modes([noise_modes, self.propagated(reduced, body_modes)])
 
     def propagated(self, reduced: ReducedSystem, body_modes: ErrorModes) -> ErrorModes:
-        """Return error modes of the body, extended by the changes of the mounts that they cause.
+        """Extend error modes of the body by the changes of the mounts that these modes cause.
 
         Args:
             reduced: The reduced system of this linearisation.
             body_modes: Error modes of the assumed body.
 
         Returns:
-            `body_modes` with their changes of the mounts.
+            The modes of `body_modes`, each with its changes of the mounts.
         """
         gain = reduced.covariance @ reduced.jacobian.T
         shifts = joint_residual_jacobian(

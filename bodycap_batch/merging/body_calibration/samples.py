@@ -18,9 +18,9 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 MAP_ERROR_M = 0.005
 """Sigma of the positional error of a map along a camera path, metres.
 
-A map bends, so all poses in a short interval of time have the same error. The graph reduces the weight of
-these correlated errors. Otherwise the mounts would absorb the bends of the map. Evidence:
-docs/decisions/body_calibration.md.
+A map is slightly bent, so all poses in a short interval of time have nearly the same error. The graph
+therefore reduces the weight of the poses. With full weights, the bends of the map would distort the mounts.
+Evidence: docs/decisions/body_calibration.md.
 """
 MAP_ERROR_RAD = float(np.radians(0.25))
 """Sigma of the rotational error of a map along a camera path, radians.
@@ -35,14 +35,16 @@ Evidence: docs/decisions/body_calibration.md.
 T_POSE_SAMPLES = 8
 """Maximum number of additional sampled times in a T-pose. Evidence: none."""
 MIN_SAMPLES = 10
-"""Minimum number of samples of each camera at which another camera was measured too. Evidence: none.
+"""Desired number of samples of each camera together with another camera. Evidence: none.
 
-A camera that was rarely measured together with another camera has fewer samples.
+At such a sample, this camera and at least one other camera were measured. If there are too few such frames,
+the camera gets fewer samples.
 """
 MIN_COMMON_FRAMES = 15
-"""Minimum number of frames common to a camera and the reference camera for a separate calibration of the two.
+"""Minimum number of common frames of a camera and the reference camera. Evidence: none.
 
-The value is half a second at 30 fps. Evidence: none.
+A camera with fewer common frames is not calibrated separately, neither for its roll nor for a limb's scale.
+The value is half a second at 30 fps.
 """
 
 
@@ -72,8 +74,8 @@ class CalibrationSamples:
         sigma_rad: (C,) rotation sigma of each camera's poses, radians per axis.
         sigma_map: (C,) centre sigma of each camera's poses, map units per axis.
         correlated_samples: Number of samples that share one error of the map, at least 1.
-        white_noise_share: Fraction of the variance of the camera centres that is independent noise, 0 to 1,
-            as a mean over the cameras. The rest of the variance is error of the map.
+        white_noise_share: Independent noise of the camera centres, as a fraction of their variance, 0 to 1.
+            It is the mean over the cameras. The rest of the variance is error of the map.
         posture: Facts about the posture at the ticks.
     """
 
@@ -105,8 +107,9 @@ def take_samples(
 ) -> CalibrationSamples:
     """Sample the camera poses at times at which many cameras were measured together.
 
-    The times are evenly spaced among the frames of the reference camera with the most measured cameras. If
-    these frames are too few, all frames with at least two measured cameras are used.
+    The times are frame times of the reference camera at which as many cameras as possible were measured. If
+    there are too few such frames, all frames with at least two measured cameras are used. The samples are
+    evenly spaced among these frames.
 
     Args:
         tracks: Cleaned tracks. The track of the reference camera is the first.
@@ -150,7 +153,7 @@ def take_samples(
 
 @dataclass(frozen=True, slots=True)
 class CameraSubset:
-    """Some of the cameras, sampled for a separate calibration.
+    """The data for a separate calibration of some of the cameras, for example of one limb.
 
     Attributes:
         bones: Bones of the kinematic chain between these cameras.
@@ -205,7 +208,8 @@ def count_common_frames(reference: CameraTrack, track: CameraTrack) -> int:
 def _sample_times(tracks: Sequence[CameraTrack], count: int, t_pose_ns: tuple[int, int] | None) -> IntArray:
     """Select frame times of the reference camera.
 
-    A camera that was rarely measured together with the reference camera adds some of its own frame times.
+    For a camera that was rarely measured together with the reference camera, some frame times of that camera
+    are added.
     """
     times_ns = tracks[0].times_ns
     measured = np.array([track.poses_at(times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1] for track in tracks])

@@ -36,7 +36,10 @@ from bodycap_batch.merging.body_calibration.mount_calibration_graph import Calib
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO
 
 MEAN_STATURE = "mean stature"
-"""Name of the scale from the bones if neither the skeleton nor the height of the subject is known."""
+"""Name, in the report, of the scale from bones of a person of mean stature.
+
+It is used if the job gives neither a skeleton nor the height of the subject.
+"""
 _COARSE_STEP = 0.16
 """Step of the log of the scale for the first parabola through the costs. Evidence: none."""
 _FINE_STEP = 0.05
@@ -46,24 +49,25 @@ The cost is not symmetric about its minimum, because an arm can bend but not str
 coarse step is therefore biased towards small scales. The fine step removes most of this bias.
 """
 _MAX_SOLVES = 14
-"""Number of solutions of the graph after which the search for the minimum stops. Evidence: none."""
+"""Maximum number of solutions of the graph in the search for the scale. Evidence: none."""
 _MIN_SIGMA = 0.01
 """Minimum sigma of the log of the scale from the bones. Evidence: none."""
 FLOOR_SIGMA = 0.06
-"""Sigma of the log of a joint's height over the floor.
+"""Sigma of the log of the scale from a joint's height over the floor.
 
 Bent knees lower the joint by 1 to 6 cm, shoes raise the joint by 1 to 3 cm. Evidence: none.
 """
 STATURE_SIGMA = 0.055
-"""Sigma of the log of adults' stature about the common mean of both sexes.
+"""Sigma of the log of an adult's stature if the sex is unknown.
 
-The stature has a sigma of 7 cm within each sex. The means of the sexes differ by 14 cm. Evidence: none.
+Within each sex, the stature has a sigma of 7 cm. The mean statures of the two sexes differ by 14 cm.
+Evidence: none.
 """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleEstimate:
-    """The scale at which the calibration graph has the lowest cost.
+    """The result of `estimate_scale`: the scale at which the calibration graph has the lowest cost.
 
     Attributes:
         scale: Metres per map unit.
@@ -80,7 +84,7 @@ class ScaleEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleSource:
-    """A source of the metric scale.
+    """A source of the metric scale, for example the bones or the floor, with the scale that it gives.
 
     Attributes:
         name: Name of the source in the report.
@@ -113,8 +117,8 @@ class MetricScale:
 def estimate_scale(graph: CalibrationGraph, provisional: float) -> ScaleEstimate:
     """Find the scale at which a calibration graph has the lowest cost.
 
-    Two parabolas through the costs at three values of log scale give the minimum. The first parabola has a
-    coarse step, the second parabola has a fine step.
+    The search fits a parabola to the costs at three values of log scale, and moves to the minimum of the
+    parabola. It does this twice: first with a coarse step between the three values, then with a fine step.
 
     Args:
         graph: The calibration graph. At the end, its last solution is at the returned scale.
@@ -144,13 +148,13 @@ def estimate_scale(graph: CalibrationGraph, provisional: float) -> ScaleEstimate
     cost(centre)
     for side in (-_FINE_STEP, _FINE_STEP):
         if not any((x - centre) * side > 0.0 for x in costs):
-            # The search ended at the smallest or largest solved scale. The slope of the mounts needs a
-            # solution on each side of the minimum.
+            # No solution exists yet on this side of the minimum. The slope of the mounts needs a solution on
+            # both sides.
             cost(centre + side)
     below, above = (_nearest_solution(mounts, centre, sign * _FINE_STEP) for sign in (-1.0, 1.0))
     width = above - below
     slope = {name: (mounts[above][name] - mounts[below][name]) / width for name in mounts[above]}
-    # Solve at the minimum once more: the caller uses the mounts of the graph's last solution.
+    # Solve at the minimum once more, because the caller uses the mounts of the graph's last solution.
     costs.pop(centre)
     cost(centre)
     return ScaleEstimate(
@@ -164,7 +168,10 @@ def estimate_scale(graph: CalibrationGraph, provisional: float) -> ScaleEstimate
 def _nearest_solution(
     mounts: Mapping[float, Mapping[str, FloatArray]], centre: float, offset: float
 ) -> float:
-    """Return the solved log scale nearest to ``centre + offset``, on the same side of the centre."""
+    """Return the solved log scale nearest to ``centre + offset``.
+
+    Only solutions on the side of the centre to which the offset points are considered.
+    """
     return min((x for x in mounts if (x - centre) * offset > 0.0), key=lambda x: abs(x - centre - offset))
 
 
@@ -213,8 +220,8 @@ def combine_sources(
     Args:
         bones: The scale from the bones.
         floor: The scale from the floor; None if no floor was found.
-        stated: Scales from a known distance or a marker board. With any of them, bones and floor are not
-            used.
+        stated: Scales from a known distance or a marker board. If there is at least one such scale, bones and
+            floor are not used.
 
     Returns:
         The combined scale.

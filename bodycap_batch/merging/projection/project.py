@@ -2,8 +2,8 @@
 
 In the motion graph the joints have some slack, so bones can shift by millimetres. In a rigid motion only the
 root shifts, and all other joints only rotate. This module estimates a rigid motion that is close to the
-camera poses and to the motion graph. The difference between rigid motion and motion graph changes slowly over
-time.
+camera poses and to the motion graph. It also requires that the difference between the rigid motion and the
+motion graph changes slowly over time.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ from bodycap_batch.model.merge_data import CameraClock, SolvedBody, standing_sig
 from bodycap_batch.model.skeleton import Motion, forward_kinematics
 
 _MAX_GAP_INTERVALS = 1.6
-"""Maximum time without poses over which camera poses are interpolated, as a number of frame intervals.
+"""Maximum time between two camera poses for interpolation between them, in frame intervals.
 
-Derivation: between one interval (neighbouring frames) and two intervals (one lost frame between them).
+Derivation: poses of neighbouring frames are one interval apart. If one frame between them is lost, they are
+two intervals apart. The threshold is between the two values.
 """
 
 _SNAP_NS = 1_000_000
-"""Maximum time between a camera pose and a tick for use of the pose without interpolation, nanoseconds.
+"""Maximum time between a camera pose and a tick, nanoseconds, to use the pose without interpolation.
 
 Evidence: none; the motion in 1 ms is below the noise.
 """
@@ -47,9 +48,9 @@ class Projection:
         motion: The rigid motion.
         gap: Differences between the rigid motion and the solution of the motion graph, as plain JSON values.
             ``joints``: difference between the poses of the solved joints. ``cameras``: by camera, difference
-            between the camera poses on the rigid skeleton and the camera path (see
-            `MergeOptions.camera_paths`). ``feet``: by joint, sliding speed of standing feet in the rigid
-            motion.
+            between the camera poses on the rigid skeleton and the poses of the camera's path (see
+            `MergeOptions.camera_paths`). ``feet``: by ankle joint, sliding speed in the rigid motion while
+            the foot stands.
     """
 
     motion: Motion
@@ -115,8 +116,8 @@ def projection_problem(
 def initial_motion(body: SolvedBody) -> RigidMotion:
     """Return the rigid motion that has the joint rotations of the motion graph.
 
-    At each tick, the position of the root minimises the squared distances between the centres of the solved
-    joints in the rigid motion and in the graph.
+    Each solved joint has one centre in the rigid motion and one centre in the motion graph. At each tick, the
+    position of the root minimises the sum of the squared distances between the two centres.
 
     Args:
         body: The solution of the motion graph.

@@ -1,7 +1,7 @@
 """The least-squares problem of the projection onto the rigid skeleton, and its solution.
 
-The unknowns of a tick are a shift of the root and one rotation for each solved joint. This rotation moves the
-joint and all its descendants about the joint's centre, in world axes.
+The unknowns of a tick are a shift of the root and one rotation for each solved joint. Each rotation is about
+the centre of its joint, in world axes. It rotates the joint and all descendants of the joint.
 
 Only neighbouring ticks are linked, so the normal equations are block-tridiagonal. The solution takes a time
 proportional to the number of ticks. Long motions are solved in overlapping windows, so that the required
@@ -23,31 +23,34 @@ from bodycap_batch.model.geometry import skew, so3_exp, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
 
 _CAMERA_SIGMA = np.repeat([np.deg2rad(0.5), 0.005], 3)
-"""Sigmas of a camera pose: three of the rotation (radians), then three of the centre (metres).
+"""Six sigmas of a camera pose: the rotation about three axes (radians), then the centre (metres).
 
 Evidence: docs/decisions/export.md.
 """
 
 _GRAPH_SIGMA = np.repeat([np.deg2rad(3.0), 0.01], 3)
-"""Sigmas of a joint's difference from the motion graph: three of the rotation (radians), then three of the
-centre (metres).
+"""Six sigmas of the difference of a joint's pose from the motion graph.
+
+The first three are for the rotation (radians), the last three for the joint's centre (metres).
 
 Derivation: the rotation sigma is smaller than the sigmas of the graph's rotation priors (20 to 45°). The
 sigma of the centre is larger than the slack of the graph's joints (5 mm).
 """
 
 _CHANGE_SIGMA = np.repeat([0.002, np.deg2rad(0.3)], 3)
-"""Sigmas of the change of the correction in 1/30 s: three of the root shift (metres), then three of a
-rotation (radians).
+"""Six sigmas of the change of the correction in 1/30 s.
+
+The first three are for the shift of the root (metres), the last three for the rotation of a joint (radians).
 
 Derivation: a viewer does not see changes of this size as jitter. The sigmas grow with the square root of the
 time, to 1.1 cm and 1.6° in a second.
 """
 
 _INDEPENDENT_HZ = 30.0
-"""Number of errors per second that are treated as independent, hertz.
+"""Assumed number of independent errors per second, hertz.
 
-The errors of successive ticks are correlated. The weight of a tick is therefore proportional to its duration.
+The errors of successive ticks are correlated. More ticks per second therefore do not add information, and the
+weight of a tick is proportional to its duration.
 Evidence: docs/decisions/export.md for the weight; none for the value.
 """
 
@@ -60,7 +63,8 @@ A larger movement is treated as slipping. The motion graph uses the same thresho
 _GEMAN_MCCLURE_SQUARED = 100.0
 """Parameter c² of the Geman-McClure loss for a camera pose, in squared sigmas.
 
-Derivation: an error of 4 sigmas in each of its six components has about the length c = 10.
+Derivation: if each of the six components of the error is 4 sigmas, the whole error has a length of about 10
+sigmas. This length is c.
 """
 
 _MAX_STEPS = 12
@@ -88,14 +92,14 @@ Derivation: with 15 joints and four blocks of 18 kB per tick, a window takes 180
 OVERLAP_S = 4.0
 """Duration of the overlap that extends a window on each side, seconds.
 
-Derivation: the correction has a sigma of 3°, and its change in 1/30 s has a sigma of 0.3°. The influence of
-a tick therefore falls by a tenth in 1/30 s, and to e^-12 over the overlap.
+Derivation: the correction has a sigma of 3°, and its change in 1/30 s has a sigma of 0.3°. A tick therefore
+influences other ticks by an amount that decreases by a tenth every 1/30 s. After 4 s the influence is e^-12.
 """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraTarget:
-    """The poses of a camera at T ticks, from the camera's path in the world.
+    """The poses that a camera should have at T ticks. They come from the camera's path in the world.
 
     Attributes:
         camera: Camera name.
@@ -148,9 +152,9 @@ class ProjectionProblem:
     standing: tuple[StandingJoint, ...] = ()
 
     def ancestor_matrix(self) -> FloatArray:
-        """Return the ancestor matrix (J,S).
+        """Return the ancestor matrix (J,S) with one row per joint and one column per solved joint.
 
-        An entry is 1 if the solved joint S is the joint J itself or an ancestor of J, else 0.
+        An entry is 1 if the column's joint is the row's joint or an ancestor of the row's joint, else 0.
         """
         out = np.zeros((len(self.skeleton.joints), len(self.solved)))
         for joint in range(len(out)):
@@ -183,7 +187,7 @@ class ProjectionProblem:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigidMotion:
-    """A motion of bones of constant length.
+    """A motion of the rigid skeleton, in which all bones have constant lengths.
 
     Attributes:
         root: (T,3) root position in the world, metres.
@@ -290,8 +294,9 @@ def _camera_error(target: CameraTarget, world: FloatArray, ticks: slice) -> tupl
         ticks: Indices of the T ticks among all ticks of `target`.
 
     Returns:
-        (T,6) errors of the camera poses in sigmas, rotation first. The error is zero at a tick without a
-        camera pose. Then (T,3) centres of the camera on the rigid skeleton, in the world.
+        Two arrays. The first array (T,6) contains the errors of the camera poses in sigmas, rotation first.
+        The error is zero at a tick without a camera pose. The second array (T,3) contains the camera centres
+        on the rigid skeleton, in the world.
     """
     rigid = world[:, target.joint] @ target.joint_from_cam
     measured = target.world_from_cam[ticks]
@@ -319,7 +324,7 @@ def _graph_error(problem: ProjectionProblem, world: FloatArray, ticks: slice) ->
 def _scaled_correction(
     problem: ProjectionProblem, motion: RigidMotion, graph_error: FloatArray
 ) -> FloatArray:
-    """Return the correction, divided by the sigmas of its change from tick to tick.
+    """Return the correction in units of the sigmas with which it may change from tick to tick.
 
     Args:
         problem: The problem, which contains the poses of the motion graph.
@@ -367,7 +372,7 @@ def cost(problem: ProjectionProblem, motion: RigidMotion) -> float:
 
 
 def _slip(standing: StandingJoint, world: FloatArray) -> FloatArray:
-    """Return the movement (T-1,3) of a joint between ticks in sigmas. It is zero where the joint may move."""
+    """Return the movement (T-1,3) of a joint between ticks in sigmas, or zero if the joint may move."""
     movement = np.diff(world[:, standing.joint, :3, 3], axis=0)
     return np.asarray(np.where(standing.held[:, None], movement / standing.sigma_m, 0.0))
 

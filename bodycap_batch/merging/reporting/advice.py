@@ -1,6 +1,6 @@
-"""Describe in a sentence how well each estimated quantity is known, with advice for a better capture.
+"""Write one sentence per estimated quantity: how well it is known, and advice for a better capture.
 
-The sentences are part of the stored results. The report page splits them at "; to know it better, ".
+The sentences are part of the stored results. The report page splits each sentence at "; to know it better, ".
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ def describe_clock(camera: str, shift_s: float, scatter_left: float, offset_s: f
     Args:
         camera: Camera name.
         shift_s: Time to add to the camera's timestamps, seconds.
-        scatter_left: Ratio of the scatter of the camera's positions with the shift to the scatter without the
-            shift, 0 to 1. The positions are relative to the trunk.
-        offset_s: Clock offset that includes the shift, seconds.
+        scatter_left: Scatter of the camera's positions relative to the trunk after the shift, divided by the
+            scatter before the shift, 0 to 1.
+        offset_s: Clock offset after the shift, seconds.
 
     Returns:
         A sentence for the report.
@@ -106,7 +106,7 @@ def describe_hinge(role: str, off_m: float) -> str:
 
     Args:
         role: Anatomical name of the bone below the hinge.
-        off_m: Sigma of the distance of the bone's far end from the plane of the hinge, metres.
+        off_m: Sigma of the distance between the bone's far end and the plane of the hinge, metres.
 
     Returns:
         A sentence for the report, with advice.

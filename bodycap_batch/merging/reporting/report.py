@@ -58,22 +58,22 @@ The report gives the number of down-weighted measurements.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionFacts:
-    """Further facts for the report that are not in the calibration or in the solution.
+    """Facts about the motion for the report that neither the calibration nor the solution contains.
 
     Attributes:
         start_ns: Common time of the first tick.
         end_ns: Common time of the last tick.
         dropped: By camera, (N,) numbers of the frames with gross errors.
         floor: The floor.
-        unused: By unused camera, the reason why it is not used.
-        aligned: By camera whose map was aligned to the main map, uncertainty of the pose of this map.
+        unused: By name of an unused camera, the reason why the camera is not used.
+        aligned: By camera, uncertainty of the pose of this camera's map in the main map. It contains only
+            cameras whose map was aligned to the main map.
         joint_sigma_m: By role of a joint, then by ``observed`` or ``filled`` ticks, percentiles of the sigma
             of the joint's centre, metres per axis.
         joint_gap_m: By role of a joint, (T,) distance of the joint from its place on the parent bone, metres.
         hinge_off_plane_m: By role of the joint at the far end of a hinged bone, (T,) distance of this joint
             from the plane of the hinge, metres.
-        contacts: By foot, statistics of its contacts: how often it stands, and how fast it slides while it
-            stands.
+        contacts: By foot, how often the foot stands, and how fast the foot slides while it stands.
         rule_violation_m: By name of a soft rule, (T,) amount by which the motion violates the rule, metres.
     """
 
@@ -161,7 +161,8 @@ def _clock_reports(
 ) -> dict[str, ClockReport]:
     """Report suspicious clocks of the cameras in the main map.
 
-    The caller passes no tracks of aligned maps, because the alignment of a map absorbs a wrong clock.
+    The tracks of aligned maps cannot be tested. If a camera in such a map has a wrong clock, the alignment
+    shifts the map and hides the error. The caller therefore passes only tracks of the main map.
     """
     out = {}
     for camera, doubt in suspicious_clocks(tracks).items():
@@ -178,7 +179,7 @@ def _clock_reports(
 def _sides_report(
     priors: Collection[Mount], calibration: BodyCalibration, tracks: Sequence[CameraTrack]
 ) -> SwappedSidesReport | None:
-    """Report swapped sides. Return None unless all cameras on limbs are on the wrong side of the body."""
+    """Report swapped sides if all cameras on limbs are on the wrong side of the body, else return None."""
     mounts = {mount.camera: mount for mount in (*priors, calibration.reference_prior)}
     wrong = swapped_sides(tracks, mounts, calibration.vertical.up)
     return SwappedSidesReport(cameras=wrong, says=describe_swapped_sides(wrong)) if wrong else None
