@@ -32,8 +32,8 @@ sigma."""
 
 
 MAX_SAMPLE_GAP_NS = 100_000_000
-"""Maximum time (nanoseconds) between two frames, for interpolation in the calibration and the checks. No pose
-is interpolated between frames that are further apart. The value is three frame intervals at 30 fps. Evidence:
+"""Maximum time (nanoseconds) between two frames, for interpolation in the calibration and the checks. Poses
+between frames that are further apart are not used. The value is three frame intervals at 30 fps. Evidence:
 none."""
 MAX_COARSE_GAP_NS = 200_000_000
 """Maximum time (nanoseconds) between two frames, for interpolation in the initial values and in the search

@@ -135,7 +135,7 @@ def _contact_ticks(centre: FloatArray, measured: BoolArray, height: FloatArray, 
     rest &= height < np.percentile(height[measured], 5.0) + _MAX_HEEL_RISE_M
     out = np.zeros_like(rest)
     for start, stop in runs(rest):
-        # At the first and the last tick of a contact, the foot comes down or lifts off.
+        # The first and the last tick are removed: the foot still comes down or already lifts off.
         if (stop - start) * tick_s >= _MIN_DURATION_S:
             out[start + 1 : stop - 1] = True
     return np.asarray(out, dtype=np.bool_)
