@@ -58,7 +58,7 @@ _PRIORS = {
 of the range of motion in D. A. Neumann, "Kinesiology of the Musculoskeletal System". Power spectral
 densities: measured on walking with reaching."""
 _BONE_AFTER_HINGE = {"ForeArm": "Hand", "Leg": "Foot"}
-"""By bone that starts at a hinge, the next bone of the limb."""
+"""Next bone of the limb, for each bone that starts at a hinge."""
 
 
 class LimbChain(NamedTuple):
@@ -86,7 +86,10 @@ _REST_ABDUCTION_DEG = {"Arm": 10.0, "UpLeg": 0.0}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hinge:
-    """A hinge joint. Equal distances from two points on its axis keep the following joint in its plane.
+    """A hinge joint, such as an elbow or a knee, at which a limb bends in one plane.
+
+    The joint at the far end of the lower bone stays in this plane, because its distances from two points on
+    the hinge's axis are equal.
 
     Attributes:
         upper: Index of the bone above the hinge.
@@ -137,7 +140,7 @@ def kinematic_chain(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tu
 
     Args:
         skeleton: The body.
-        mounted_roles: Roles of the bones with a camera. Each role is that of a joint of the skeleton.
+        mounted_roles: Roles of the bones with a camera. The skeleton has a joint for each role.
     """
     joints = [skeleton.roles.index(role) for role in set(mounted_roles)]
     chains = [joints_to_root(skeleton, joint) for joint in joints]

@@ -19,8 +19,8 @@ def complete_skeleton(
     """Return the poses of all joints.
 
     From the first solved bone towards the root, the trunk straightens joint by joint to an upright pelvis
-    with the heading of the first solved bone. Legs without cameras therefore stand. Below the solved bones,
-    joints keep their zero rotation.
+    with the heading of the first solved bone. Legs without cameras are therefore in a standing pose. Below
+    the solved bones, joints keep their zero rotation.
 
     Args:
         skeleton: The body.
@@ -64,7 +64,10 @@ def _straighten_trunk_above(skeleton: SkeletonModel, first: Bone, out: FloatArra
 
 
 def _yaw_only(rotation: FloatArray) -> FloatArray:
-    """Return the rotations (T,3,3) about z with the headings of given rotations; the zero pose faces −y."""
+    """Return the rotations (T,3,3) about z that have the headings of given rotations (T,3,3).
+
+    The identity has the heading −y.
+    """
     forward, left = -rotation[:, :, 1], rotation[:, :, 0]
     # If the body bends far forward, its forward axis points down. The left axis then gives the heading.
     level = forward + 0.0
@@ -116,7 +119,7 @@ def _measured_above(
     below: Mapping[int, BoolArray],
     never: BoolArray,
 ) -> dict[int, BoolArray]:
-    """Return by bone the ticks (T,) at which a bone that is not in the bone's own subtree is measured.
+    """Return, for each bone, the ticks (T,) at which at least one bone outside its subtree is measured.
 
     The subtree of a bone consists of the bone and all bones below it.
 

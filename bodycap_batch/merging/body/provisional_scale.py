@@ -40,11 +40,13 @@ class ReachConstraint:
 
 @dataclass(frozen=True, slots=True)
 class DistanceConstraint:
-    """Bound on the length of ``scale · camera_offsets + mount_offsets_m``, the vector between two points.
+    """Bound on the distance between two points of the body, each measured by a camera.
+
+    At a given scale, the vector between the points is ``scale · camera_offsets + mount_offsets_m``.
 
     Attributes:
         camera_offsets: (N,3) differences of the two cameras' centres, map units.
-        mount_offsets_m: (N,3) differences of the vectors from each camera to its point, according to the
+        mount_offsets_m: (N,3) difference between the two vectors from a camera to its point, according to the
             mounts.
         reach_m: Maximum length (metres) of the vector; 0 if both points are one point of the body.
     """

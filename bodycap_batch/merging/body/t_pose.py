@@ -29,8 +29,8 @@ none."""
 _SPEED_HALF_WINDOW_NS = 1.5e8
 """Half of the duration (nanoseconds) over which a speed is computed. Noise averages out over 0.3 s."""
 _SHOULDER_WIDTH_M = 0.2
-"""Distance (metres) between the shoulders, which is added to the lengths of the arms. It is smaller than the
-shoulder width of any adult."""
+"""Distance (metres) between the shoulders. The expected distance between the hands is this distance plus the
+lengths of the arms. The value is smaller than the shoulder width of any adult."""
 
 _SIGMA_DEG = {
     "Shoulder": (4.0, 4.0, 4.0), "Arm": (15.0, 6.0, 6.0), "ForeArm": (20.0, 6.0, 6.0),
@@ -41,7 +41,8 @@ _SIGMA_DEG = {
 flexion axes. The twist of the arms has the largest sigma, because palms may face down or forward. Evidence:
 none."""
 _TRUNK_SIGMA_DEG = (4.0, 4.0, 4.0)
-"""Sigmas (degrees) of all other joints in a T-pose, about the along, forward and flexion axes."""
+"""Sigmas (degrees) of the joints that `_SIGMA_DEG` does not contain, in a T-pose, about the along, forward
+and flexion axes."""
 
 
 def find_t_pose(
@@ -49,8 +50,8 @@ def find_t_pose(
 ) -> tuple[int, int] | None:
     """Find the longest T-pose of a capture.
 
-    In a T-pose, the hands lie on opposite sides of the trunk's camera. Their distance is about the largest
-    in the capture, and they hardly move.
+    In a T-pose, the hands lie on opposite sides of the trunk's camera. The distance between the hands is
+    nearly the largest in the capture, and the hands hardly move.
 
     Args:
         bones: The graph's bones.
@@ -94,14 +95,20 @@ def _speed(points: FloatArray, times_ns: IntArray) -> FloatArray:
 
 
 def _longest_run(mask: BoolArray, times_ns: IntArray) -> tuple[int, int] | None:
-    """Return the first and last time of the longest run of True in a mask (T,); None if it is too short."""
+    """Return the first and last time of the longest run of True in a mask (T,).
+
+    The result is None if this run is shorter than a T-pose.
+    """
     spans = [(int(times_ns[start]), int(times_ns[stop - 1])) for start, stop in runs(mask)]
     best = max(spans, key=lambda span: span[1] - span[0], default=(0, 0))
     return best if best[1] - best[0] >= _MIN_DURATION_S * 1e9 else None
 
 
 def arm_span(bones: Sequence[Bone], skeleton: SkeletonModel) -> float:
-    """Return the distance (metres) of the wrists in a T-pose, without bones that are not in the graph."""
+    """Return the distance (metres) between the wrists in a T-pose.
+
+    Arm bones that are not in the graph add no length.
+    """
     index = {bone.role: bone for bone in bones}
     total = 0.0
     for side in ("Left", "Right"):

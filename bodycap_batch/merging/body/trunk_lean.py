@@ -21,8 +21,8 @@ _MODE_RADIUS_RAD = float(np.radians(15.0))
 """Maximum angle (radians) between directions that belong to one mode. In walking and standing, the angle
 between a trunk and its usual direction is smaller. Evidence: none."""
 _MAX_SAMPLES, _SPHERE_DIRECTIONS = 300, 1000
-"""Maximum number of instants of a capture, and number of directions on the sphere, that are evaluated. They
-bound the computing time."""
+"""First: maximum number of instants of a capture that are evaluated. Second: number of directions on the
+sphere that are evaluated. Both numbers bound the computing time."""
 _UPRIGHT_SIGMA_DEG = 12.0
 """Sigma (degrees) of the forward tilt of the trunk of a person who stands or walks. It contains 5 degrees of
 systematic bias; the rest is the error of the camera's mount. Evidence: none."""
@@ -32,9 +32,10 @@ _UPRIGHT_SHARE, _FORWARD_SHARE, _BACKWARD_SHARE, _OUTLIER_SHARE = 0.57, 0.35, 0.
 """Assumed fractions of the time in which a trunk is upright, bends forward, reclines, or does anything else.
 Evidence: none."""
 _FORWARD_SCALE_DEG, _BACKWARD_SCALE_DEG, _OUTLIER_HALF_RANGE_DEG = 60.0, 15.0, 180.0
-"""Scales (degrees) of the exponential densities of the forward and the backward tilt, and half of the range
-(degrees) of the uniform density of outliers. When a person picks things up, the trunk bends by a right angle
-and more. In a chair, the trunk reclines by up to 30 degrees. Evidence: none."""
+"""Parameters (degrees) of the densities of the tilt. First and second: scales of the exponential densities of
+the forward tilt and the backward tilt. Third: half of the range of the uniform density of outliers. When a
+person picks things up, the trunk bends by a right angle and more. In a chair, the trunk reclines by up to 30
+degrees. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +81,7 @@ class TrunkOrientation:
         return self._mean_nll(ups, _OUTLIER_SHARE)
 
     def posterior_spread_deg(self, up: FloatArray) -> float:
-        """Return the RMS error (degrees) of the vertical `up` (3,), if it is based only on the trunk's tilt.
+        """Return the RMS error (degrees) of a vertical `up` (3,) that is based only on the trunk's tilt.
 
         A constant tilt of the trunk cannot be distinguished from an error of the vertical. All instants
         together therefore count as one observation. Outliers are ignored here, because they may be in any
@@ -103,7 +104,7 @@ class TrunkOrientation:
 
 
 def _pitch_nll(pitch_deg: FloatArray, outlier_share: float) -> FloatArray:
-    """Return the negative log-likelihood of tilts (forward positive) relative to that of no tilt."""
+    """Return the negative log-likelihood of tilts (forward positive), minus the value for no tilt."""
 
     def density(pitch: FloatArray) -> FloatArray:
         forward, backward = np.maximum(pitch, 0.0), np.maximum(-pitch, 0.0)
@@ -119,7 +120,7 @@ def _pitch_nll(pitch_deg: FloatArray, outlier_share: float) -> FloatArray:
 
 
 def _lateral_nll(side_deg: FloatArray, outlier_share: float) -> FloatArray:
-    """Return the negative log-likelihood of sideways tilts relative to that of no sideways tilt."""
+    """Return the negative log-likelihood of sideways tilts, minus the value for no sideways tilt."""
     density = (1.0 - outlier_share) * np.exp(-0.5 * (side_deg / _LATERAL_SIGMA_DEG) ** 2) + outlier_share
     return np.asarray(-np.log(density))
 
@@ -153,7 +154,7 @@ def trunk_orientation(
 
 
 def trunk_orientation_from_prior(bones: Sequence[Bone], trunk: CameraTrack, mount: Mount) -> TrunkOrientation:
-    """Return the trunk's orientation in the map from the path of its camera and the mount prior.
+    """Return the trunk's orientation in the map from the path and the mount prior of the trunk's camera.
 
     The joints between the camera's bone and the first bone are assumed to be in the rest pose.
     """

@@ -20,8 +20,8 @@ _MIN_OVERLAP_RATIO = 3.0
 _MAX_SAMPLES = 200
 """Maximum number of frames of the limb's camera that are compared. It bounds the time of the search."""
 _MIN_SAMPLES = 30
-"""Minimum number of frames for a scatter: one second at 30 fps. With fewer frames, the scatter is not
-reliable."""
+"""Minimum number of frames for a reliable scatter: one second at 30 fps. The scatter is the RMS distance of
+the limb's camera from its median position in the axes of the trunk's camera."""
 _MIN_SHIFT_S = 0.25
 """Minimum shift (seconds) of a suspicious clock. Even with a correct clock, the best shift may be almost this
 large. Evidence: docs/decisions/merging.md."""
@@ -50,17 +50,17 @@ def suspicious_clocks(tracks: Sequence[CameraTrack]) -> dict[str, dict[str, floa
     With a wrong clock, this position also varies with the movement of the whole body during the clock's
     error.
 
-    A straight walk does not reveal a wrong clock, because it moves the limb's camera by a constant. At a
-    wrong shift, a swinging arm may then accidentally follow the rotations of the trunk. A wrong shift
-    increases the distance between the cameras; the correct shift hardly does. A shift is therefore accepted
-    only if it also decreases this distance.
+    A straight walk does not reveal a wrong clock, because the clock's error then moves the limb's camera by a
+    constant vector. At a wrong shift, a swinging arm may then accidentally follow the rotations of the trunk.
+    A wrong shift increases the distance between the cameras; the correct shift hardly does. A shift is
+    therefore accepted only if it also decreases this distance.
 
     Args:
         tracks: Tracks in one map, the track of the trunk's camera first.
 
     Returns:
         By camera, ``shift_s`` to be added to its times (seconds), and ``scatter_left``, the ratio of the
-        scatters with and without the shift.
+        scatter with the shift to the scatter without the shift.
     """
     out = {}
     for limb in tracks[1:]:

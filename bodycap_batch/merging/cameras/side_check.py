@@ -19,16 +19,19 @@ _MAX_FORWARD_COSINE = 0.8
 """Maximum cosine of the angle between the trunk's forward axis and the vertical. With a larger cosine, the
 trunk does not show where the body faces. Evidence: none."""
 _MIN_UP_COSINE = 0.5
-"""Minimum median cosine of the angle between the vertical and the trunk's up axis. The mount prior implies
-this axis. With a smaller cosine, the prior is wrong or the person lies. Evidence: none."""
+"""Minimum median cosine of the angle between the vertical and the trunk's up axis. The up axis follows from
+the mount prior. With a smaller cosine, the prior is wrong or the person lies down. Evidence: none."""
 _MIN_WRONG_RATIO = 0.8
-"""Minimum fraction of frames on the wrong side for swapped sides. Evidence: docs/decisions/merging.md."""
+"""Minimum fraction of frames in which a camera must be on the wrong side, for its side to be treated as
+swapped. Evidence: docs/decisions/merging.md."""
 
 
 def swapped_sides(
     tracks: Sequence[CameraTrack], mounts: Mapping[str, Mount], up: FloatArray
 ) -> dict[str, float]:
-    """Find limb cameras that stay on the wrong side of the body, if all limb cameras do.
+    """Find limb cameras with swapped sides, such as a left camera on the right side of the body.
+
+    The sides are treated as swapped only if all limb cameras stay on the wrong side.
 
     Args:
         tracks: Tracks in one map, the track of the trunk's camera first.
@@ -38,8 +41,8 @@ def swapped_sides(
 
     Returns:
         By camera, the fraction of frames on the wrong side. The result is empty if a limb is on the correct
-        side, or if the first camera does not show where the body faces. This camera is then on a limb or
-        upside down, or the person lies.
+        side, or if the first camera does not show where the body faces. The latter happens if this camera is
+        on a limb or upside down, or if the person lies down.
     """
     trunk_mount = mounts[tracks[0].camera]
     joint = tracks[0].map_from_cam[:, :3, :3] @ trunk_mount.joint_from_cam[:3, :3].T

@@ -17,8 +17,8 @@ _MAX_DEVIATION_RATIO, _MAX_DEVIATION_RAD = 0.005, float(np.radians(0.3))
 the camera that moves most in the map. Second: maximum rotation (radians) of a stationary camera. Evidence:
 docs/decisions/merging.md."""
 _MAX_NOISE_FACTOR = 2.0
-"""Maximum factor by which noise widens both bounds. It keeps moving cameras with noisy poses from being
-excluded."""
+"""Maximum factor by which noise widens the maximum deviations of position and rotation. Without this maximum,
+moving cameras with noisy poses would be treated as stationary."""
 _WINDOW_FRAMES = 15
 """Number of localised frames that are averaged: half a second at 30 fps. Noise is independent between frames;
 a movement of the body is not."""
@@ -52,7 +52,7 @@ class _CameraPath:
     sigma_map: float
 
     def deviations_during(self, first_ns: int, last_ns: int) -> FloatArray:
-        """Return the distances (M,), map units, of the centres in a time span from their median."""
+        """Return the distances (M,), map units, from the median centre, for the centres in a time span."""
         inside = self.centres[(self.times_ns >= first_ns) & (self.times_ns <= last_ns)]
         return (
             np.asarray(np.linalg.norm(inside - np.median(inside, axis=0), axis=1)) if len(inside) else inside

@@ -14,8 +14,8 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_M
 
 OUTLIER_HALF_WINDOW = 6
-"""Number of frames on either side with which a frame is compared: 0.2 s at 30 fps. Over that time, a
-quadratic follows a swinging hand to a few centimetres. Evidence: none."""
+"""Number of frames before a frame, and also after it, that the frame is compared with: 0.2 s at 30 fps. Over
+this time, a quadratic follows a swinging hand to a few centimetres. Evidence: none."""
 OUTLIER_LIMIT_M = 0.12
 """Maximum distance (metres) of a pose from the quadratic. It is several times the deviation of a swinging
 hand from the quadratic; a pose at a larger distance is wrong. Evidence: none."""
@@ -25,17 +25,19 @@ MIN_SIGMA_M, MIN_SIGMA_RAD = 0.004, float(np.radians(0.4))
 noise, but neither the error of the map nor the movement of the strap. Evidence: none."""
 
 _UNCALIBRATED_SIGMA_RAD, _UNCALIBRATED_SIGMA_M = 0.98 * NOMINAL_ERROR_RAD, 0.98 * NOMINAL_SIGMA_M
-"""Minimum sigmas (radians, metres per axis) of a mount that counts as uncalibrated. The sigmas of its prior
-are hardly larger. A mount must reach both minimums: a calibrated palm may have such a rotation sigma, because
-of the posture's systematic bias alone."""
+"""Minimum sigmas (radians, metres per axis) of a mount that is treated as uncalibrated. They are slightly
+below the sigmas of the mount prior. Both sigmas of the mount must reach their minimum. The rotation sigma
+alone is not enough: even on a calibrated palm, the posture's systematic bias may cause such a rotation
+sigma."""
 
 
 MAX_SAMPLE_GAP_NS = 100_000_000
-"""Maximum time (nanoseconds) between two frames for a pose to be interpolated between them, for the
-calibration and the checks. It is three frame intervals at 30 fps. Evidence: none."""
+"""Maximum time (nanoseconds) between two frames, for interpolation in the calibration and the checks. Poses
+between frames that are further apart are not used. The value is three frame intervals at 30 fps. Evidence:
+none."""
 MAX_COARSE_GAP_NS = 200_000_000
-"""Maximum time (nanoseconds) between two frames for a pose to be interpolated between them, for initial
-values and for the search for a T-pose. These need less accuracy. Evidence: none."""
+"""Maximum time (nanoseconds) between two frames, for interpolation in the initial values and in the search
+for a T-pose. These two uses need less accuracy than the calibration. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

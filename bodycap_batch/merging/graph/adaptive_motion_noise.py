@@ -12,16 +12,18 @@ from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.model.geometry import so3_log
 
 _MAX_PSD_RATIO = 100.0
-"""Maximum factor on a power spectral density of `body.bones`. It stands for ten times the usual
-accelerations; poses with larger accelerations are wrong. Evidence: none."""
+"""Maximum factor on the power spectral density of a bone's acceleration. A factor of 100 stands for ten times
+the usual acceleration. Poses with a larger acceleration are wrong. Evidence: none."""
 
 
 def scale_motion_noise(bones: Sequence[Bone], tracks: Sequence[CameraTrack]) -> tuple[Bone, ...]:
     """Increase the noise of the motion prior for bones that accelerate more than usual.
 
-    For a power spectral density q of the acceleration and a frame interval h, the second difference of a path
-    has the variance 2/3 q h³. Independent noise of the poses with sigma σ adds 6 σ². A bone without a camera
-    takes the largest ratio of the bones below it, because a limb swings as a whole.
+    The function estimates the power spectral density q of the acceleration from the second differences of
+    each camera's path. With a frame interval h, a second difference has the variance 2/3 q h³. Independent
+    noise of the poses with sigma σ adds 6 σ². The estimate divided by the usual value gives a factor for the
+    bone. A bone without a camera gets the largest factor of the bones below it, because a limb swings as a
+    whole.
 
     Args:
         bones: The graph's bones.

@@ -18,9 +18,9 @@ from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.posture import Posture
 
 UPRIGHT_SIGMA_RAD, HEADING_SIGMA_RAD = float(np.radians(5.0)), float(np.radians(8.0))
-"""Sigmas (radians) of a walker's mean chest: tilt from the vertical, and angle to the direction of walking.
-They contain the person's systematic tilt of the trunk, and how the rig defines the axes of the chest.
-Evidence: none."""
+"""Sigmas (radians) of the mean orientation of a walker's chest. First: tilt from the vertical. Second: angle
+between the heading of the chest and the direction of walking. The sigmas contain the person's systematic tilt
+of the trunk, and the rig's definition of the axes of the chest. Evidence: none."""
 STANDING_SIGMA_RAD = float(np.radians(7.0))
 """Sigma (radians) of the tilt of a chest at its highest position, in a capture without walking. A person who
 bends and lifts things stands up in between. The sigma contains the 5 degrees of a walker, and about 5 degrees
@@ -32,7 +32,7 @@ _OWN_UP, _OWN_LEFT = gtsam.Unit3(np.array([0.0, 0.0, 1.0])), gtsam.Unit3(np.arra
 
 
 class AttitudeFactors:
-    """The attitude factors of the trunk.
+    """The factors that keep the trunk upright, and make it face the direction of walking.
 
     Args:
         bones: The graph's bones.
@@ -51,7 +51,8 @@ class AttitudeFactors:
     def add(self, graph: Any, tick: int) -> None:
         """Add the factors of one tick to a graph.
 
-        They align the trunk's up axis with the vertical, and its left axis across the direction of walking.
+        The factors align the trunk's up axis with the vertical. They align the trunk's left axis with the
+        horizontal direction to the left of the direction of walking.
         """
         posture = self._posture
         upright = posture.walking[tick] or posture.t_pose[tick]

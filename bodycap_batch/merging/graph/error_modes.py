@@ -1,4 +1,7 @@
-"""The uncertainty of the calibration as independent error modes: columns of its square-root covariance."""
+"""The uncertainty of the calibration as independent error modes.
+
+Each error mode is one column of a square root of the calibration's covariance.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from bodycap_batch.model.geometry import invert, make_transform, se3_adjoint
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BodyModel:
-    """The graph's bones and hinges."""
+    """The graph's bones and hinges. They determine the joint and hinge factors of each tick."""
 
     bones: Sequence[Bone]
     hinges: Sequence[Hinge]
@@ -72,7 +75,8 @@ def joint_residual_jacobian(
 ) -> Any:
     """Return the change (R,M), sparse, of the residuals of joints and hinges per error mode.
 
-    The change has the sign of the right-hand side. It is the movement that compensates the error mode.
+    The change has the sign of the right-hand side of the linearised graph. For this right-hand side, the
+    solution is the movement of the bones that compensates the error mode.
 
     Args:
         linear: Linearised graph at the solution.
@@ -112,15 +116,15 @@ def joint_residual_jacobian(
 
 
 POSTURE_BIAS_SHARE = 0.5
-"""Fraction of a joint's everyday range that is a systematic bias of the posture over the whole capture. The
-rest varies within seconds. At one tick, both parts contribute to the error; only the bias changes the mounts.
-Evidence: none."""
+"""Systematic bias of the posture over the whole capture, as a fraction of a joint's everyday range. The rest
+of the range is variation within seconds. At one tick, the bias and the variation both contribute to the
+error. Only the bias changes the mounts. Evidence: none."""
 
 
 def posture_bias_modes(
     bones: Sequence[Bone], cameras: Sequence[str], share: float | FloatArray
 ) -> ErrorModes:
-    """Return the error modes of joints that are held away from the rest pose.
+    """Return the error modes of a biased posture: joints that stay away from the rest pose.
 
     Args:
         bones: The graph's bones.
@@ -159,7 +163,7 @@ def map_error_modes(bones: Sequence[Bone], sigmas: Mapping[str, FloatArray]) -> 
 
 
 def mount_perturbation(joint_from_cam: FloatArray, change: FloatArray) -> FloatArray:
-    """Return an additive change (4,4) of a mount as a right perturbation (6,), rotation first."""
+    """Convert an additive change (4,4) of a mount to a right perturbation (6,), rotation first."""
     rotation = joint_from_cam[:3, :3].T @ change[:3, :3]
     rotation = 0.5 * (rotation - rotation.T)
     translation = joint_from_cam[:3, :3].T @ change[:3, 3]

@@ -18,13 +18,14 @@ from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, Hinge
 from bodycap_batch.model.geometry import nearest_rotation, skew
 
 MAX_BONES = 64
-"""Maximum number of bones of a graph. The keys of two successive ticks differ by this number."""
+"""Maximum number of bones of a graph. The keys of one bone at two successive ticks differ by this number."""
 GEMAN_MCCLURE_C = 6.0
 """Scale of the Geman-McClure loss, in sigmas of a six-dimensional residual. Such a residual typically has a
 length of 2.4 sigmas. Gross errors are removed before the graph is built. Evidence:
 docs/decisions/merging.md."""
 HINGE_SLACK_RATIO = 2.0
-"""Ratio of the sigma of a hinge's distances to the sigma of a joint's gap. Evidence: none."""
+"""Ratio of two sigmas: the sigma of the distances that define a hinge, and the sigma of the gap at a joint.
+Evidence: none."""
 _AXIS_WEIGHT = 0.1
 """Ratio of the information of a mount's axis point to the information of the mount's centre point. The ratio
 is small, so that the rotation of the mount hardly depends on its translation."""
@@ -69,8 +70,7 @@ class MountPoints:
     sigma_m: float
 
     AXIS_WHITENING_RATIO: ClassVar[float] = float(np.sqrt(_AXIS_WEIGHT))
-    """Ratio of an axis point's shift in sigmas to the centre point's shift in sigmas, for equal shifts in
-    metres."""
+    """Ratio of the centre point's sigma to an axis point's sigma. It is less than 1."""
 
     @property
     def axis_sigma_m(self) -> float:
@@ -151,7 +151,7 @@ def add_mount_measurements(
 
     Args:
         graph: Graph that receives the factors.
-        bones: N keys of the bone's poses.
+        bones: N keys of poses: the pose of the camera's bone at each measurement.
         camera: Index of the camera; it determines the keys of the mount.
         world_from_cam: (N,4,4) measured poses of the camera.
         points: Points of the mount.

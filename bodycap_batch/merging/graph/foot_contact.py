@@ -29,7 +29,8 @@ before the foot leaves the floor. Evidence: none."""
 _MIN_DURATION_S = 0.1
 """Minimum duration (seconds) of a contact. Evidence: none."""
 _FREE_ROTATION_SIGMA_RAD = 10.0
-"""Sigma (radians) of a foot's rotation about a standing ankle. It leaves the rotation unconstrained."""
+"""Sigma (radians) of a foot's rotation about a standing ankle. Because of this large value, the rotation is
+free."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +135,7 @@ def _contact_ticks(centre: FloatArray, measured: BoolArray, height: FloatArray, 
     rest &= height < np.percentile(height[measured], 5.0) + _MAX_HEEL_RISE_M
     out = np.zeros_like(rest)
     for start, stop in runs(rest):
-        # At the first and the last tick of a contact, the foot comes down or lifts off.
+        # The first and the last tick are removed: the foot still comes down or already lifts off.
         if (stop - start) * tick_s >= _MIN_DURATION_S:
             out[start + 1 : stop - 1] = True
     return np.asarray(out, dtype=np.bool_)
@@ -177,7 +178,7 @@ def contact_statistics(
 
 
 def standing_joints(contacts: Sequence[FootContact], ticks: int, joints: int) -> BoolArray | None:
-    """Return whether each joint is an ankle whose foot stands (T,J); None if `contacts` is empty.
+    """Return whether each joint is a standing ankle at each tick (T,J); None if `contacts` is empty.
 
     Args:
         contacts: Contacts of each foot on the whole timeline.

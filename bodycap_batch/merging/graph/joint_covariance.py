@@ -25,7 +25,7 @@ gigabytes."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolvedGraph:
-    """A motion graph at its solution.
+    """A motion graph at its solution. The covariance of the joints is computed from it.
 
     Attributes:
         graph: Factors of the graph. The measurements come first, track by track.
@@ -56,7 +56,7 @@ def joint_covariance(
     error_modes: ErrorModes,
     begin: Callable[[str], None] = lambda _: None,
 ) -> FloatArray:
-    """Return the covariance (T,B,3,3), m², of each bone's joint centre relative to the first bone's.
+    """Return the covariance (T,B,3,3), m², of each joint's centre relative to the first bone's joint centre.
 
     The covariance is the sum of two parts. The first part is the marginal covariance of the graph, which
     contains the noise of the measurements. The second part is J Σ Jᵀ, the effect of the calibration, which
@@ -148,7 +148,7 @@ def _columns_by_tick(solved: SolvedGraph, linear: LinearisedGraph) -> _TickColum
 def _measurement_residual_jacobian(
     solved: SolvedGraph, linear: LinearisedGraph, error_modes: ErrorModes
 ) -> Any:
-    """Return the change (R,M), sparse, of the measurements' residuals per mode of mounts and scale."""
+    """Return the sparse change (R,M) of the measurements' residuals for each of the M error modes."""
     out = sparse.csr_matrix((linear.matrix.shape[0], len(error_modes.log_scale)))
     middle = np.concatenate([track.map_from_cam[:, :3, 3] for track in solved.tracks]).mean(axis=0)
     first = 0

@@ -17,9 +17,10 @@ from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions, split_side
 
 _REACH_SIGMA_M = 0.05
-"""Sigma (metres) of a distance outside its bounds. Evidence: none."""
+"""Sigma (metres) of the violation of a limit on the reach or on the position of a palm. Evidence: none."""
 _HINGE_SIGMA_M = 0.02
-"""Sigma (metres) of a distance outside its bounds, for elbows and knees. Evidence: none."""
+"""Sigma (metres) of the violation of a limit that keeps an elbow or a knee from bending backward. Evidence:
+none."""
 _SHOULDER_MOTION_M = 0.05
 """Distance (metres) that the centre of a shoulder moves relative to the trunk when the clavicle rotates by 15
 to 20°."""

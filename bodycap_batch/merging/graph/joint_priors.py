@@ -27,9 +27,9 @@ def widen_joint_priors(
     It contributes the standard deviation of the rotations, divided by the square root of the number of
     gestures.
 
-    Sometimes the mean differs even more, although the prior attracts it. An example is a person who lifts the
-    arms all the time. The range is then widened until the bias equals this difference, because one draw of a
-    normal distribution is most likely if sigma equals the draw.
+    Sometimes the mean rotation differs from the rest pose by more than these two reasons explain. An example
+    is a person who lifts the arms all the time. The function then widens the everyday range until the sigma
+    of the bias equals the difference. With this sigma, the difference is most likely.
 
     Args:
         skeleton: The body.

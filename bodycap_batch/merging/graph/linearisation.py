@@ -47,7 +47,7 @@ class LinearisedGraph:
         return out
 
     def sparse_rows(self, factors: IntArray, values: FloatArray) -> Any:
-        """Return a sparse matrix (R,M) that has values in the rows of some factors and is zero elsewhere.
+        """Return a sparse matrix (R,M) with values in the rows of some factors, and zeros elsewhere.
 
         Args:
             factors: (N,) indices of the factors.

@@ -37,8 +37,8 @@ from bodycap_batch.model.geometry import interpolate_pose, invert, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel
 
 ON_TICK_TOLERANCE_NS = 1_000_000
-"""Maximum time (nanoseconds) between a measurement and a tick at which the measurement belongs to the tick's
-state. In a millisecond, a hand at 3 m/s moves 3 mm."""
+"""Maximum time (nanoseconds) between a measurement and a tick whose state the measurement uses. A measurement
+at a larger distance gets a separate state. In a millisecond, a hand at 3 m/s moves 3 mm."""
 
 _TOLERANCE = 1e-4
 """Minimum relative decrease of the error per step. The solver stops after a smaller decrease. Convergence is
@@ -72,8 +72,8 @@ class MotionSolution:
         world_from_cam: By camera, (N,4,4) solved pose at each measurement, from bone and mount.
         iterations: Number of iterations of the optimiser.
         errors: By kind of factor, half the sum of the squared residuals.
-        joint_covariance: (T,B,3,3) covariance, m², of each bone's joint centre relative to the first bone's;
-            None if it was not computed.
+        joint_covariance: (T,B,3,3) covariance, m², of each joint's centre relative to the first bone's joint
+            centre; None if it was not computed.
     """
 
     world_from_bone: FloatArray
@@ -90,7 +90,7 @@ class SolverProgress(Protocol):
     """Callback that reports the progress of the optimisation. It may raise to stop the optimisation."""
 
     def __call__(self, what: str = "", /) -> None:
-        """Report an iteration; with a name, report that the part of the computation with this name starts."""
+        """Report an iteration, or the start of the part of the computation that `what` names."""
 
 
 class MotionGraph:
@@ -383,9 +383,9 @@ def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, 
 def hinge_deviations(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray
 ) -> dict[str, FloatArray]:
-    """Return by role the distance (T,), metres, of the bone after each hinge from the hinge's plane.
+    """Return by role the distance (T,), metres, of the joint after each hinge from the hinge's plane.
 
-    That bone follows the lower bone of the hinge. The distance is measured from its joint to the plane.
+    The joint after a hinge is at the far end of the hinge's lower bone: for an elbow, it is the wrist.
     """
     out = {}
     for hinge in hinges(skeleton, tuple(bones)):

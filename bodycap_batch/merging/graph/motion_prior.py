@@ -13,8 +13,8 @@ from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.graph.factors import MotionState
 
 _VELOCITY_SIGMA = np.array([8.0, 8.0, 8.0, 3.0, 3.0, 3.0])
-"""Sigmas (rad/s, m/s) of a weak prior on a bone's first and last velocity. At these states, the motion prior
-has only one neighbour. Evidence: none."""
+"""Sigmas (rad/s, m/s) of a weak prior on a bone's first and last velocity. The motion prior links each of
+these two states to only one neighbour. Evidence: none."""
 _REST_VELOCITY_SIGMA = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
 """Sigmas (rad/s, m/s) of a prior on a bone's velocities before the first and after the last measurement of
 all cameras. The prior makes the body rest there. Without the prior, the body would keep its last velocity.
@@ -33,7 +33,7 @@ def add_motion_prior(
         graph: The gtsam graph that receives the factors.
         bone: The bone, with the power spectral density of its acceleration.
         chain: The states of the bone in order of time.
-        start_ns: Time from which gtsam's seconds are counted.
+        start_ns: Time (nanoseconds) of second 0 in gtsam.
         measured_ns: First and last time at which a camera measured.
 
     Source: T. D. Barfoot, C. H. Tong, S. Särkkä, "Batch continuous-time trajectory estimation as exactly

@@ -9,8 +9,8 @@ import gtsam
 
 _MIN_DAMPING = 1e-5
 """Minimum damping (lambda) of Levenberg-Marquardt. The optimiser increases the damping tenfold until the
-error falls, and each attempt needs a solve. Near the solution, no damping lowers the error. A smaller minimum
-would only add attempts."""
+error falls, and each attempt needs a solve. Near the solution, the error no longer falls, whatever the
+damping is. A smaller minimum of the damping would then only add failed attempts."""
 
 
 def levenberg_marquardt(

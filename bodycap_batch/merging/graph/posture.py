@@ -27,8 +27,8 @@ _BENT_DROP_M = 0.12
 """Maximum distance (metres) of an upright chest below its usual height in walking. In a lower position, the
 trunk or the knees are bent. In normal walking, the chest's height varies by 5 cm."""
 _MAX_HEADING_CHANGE_RAD = float(np.radians(35.0))
-"""Maximum deviation (radians) of the angle between heading and path from its usual value, for a person who
-walks forward. Evidence: none."""
+"""Maximum change (radians) of the angle between the camera's heading and the path. With a larger change from
+the usual angle, the person is not treated as walking forward. Evidence: none."""
 _BOUNCE_M = 0.03
 """Scale (metres) of the vertical deviations of a walking trunk from its mean height. Its height varies by 4
 to 5 cm from the lowest to the highest position."""
@@ -56,8 +56,8 @@ class Posture:
         walking: (K,) whether the person walks.
         walking_direction: (K,3) horizontal direction of walking; NaN where the person does not walk forward.
         t_pose: (K,) whether the person holds a T-pose.
-        standing: (K,) whether the trunk is as upright as ever in the capture. It is False for all ticks if
-            the person walks in the capture.
+        standing: (K,) whether the trunk is near its highest position in the capture. It is False for all
+            ticks if the person walks in the capture.
     """
 
     up: FloatArray | None

@@ -25,8 +25,8 @@ OVERLAP_S = 3.0
 solve the ticks of their overlap differently, because each of them lacks the measurements outside itself. The
 influence of these measurements ends after three seconds. Evidence: none."""
 _PREFERRED_OVERLAPS, _MIN_OVERLAPS = 4.0, 2.0
-"""Preferred and minimum length of a window at a high rate, as multiples of `OVERLAP_S`. With four overlaps,
-each tick is solved 1.5 times on average; with two, twice."""
+"""Preferred and minimum length of a window at a high rate, as multiples of `OVERLAP_S`. With a length of four
+overlaps, each tick is solved 1.5 times on average; with a length of two overlaps, twice."""
 _MAX_WINDOW_BYTES = 5e8
 """Maximum memory (bytes) of a window with its overlaps. A window of the minimum length may need more."""
 _STATE_BYTES = 25e3
@@ -50,8 +50,8 @@ class WindowSolution:
 
     Attributes:
         solution: Solution of the window with its overlaps.
-        first: Index of the window's first tick without its overlaps.
-        low: Index of the solution's first tick, with the overlaps.
+        first: Index, on the timeline, of the window's first tick without its overlaps.
+        low: Index, on the timeline, of the window's first tick with its overlaps. The solution starts there.
     """
 
     solution: MotionSolution
@@ -127,8 +127,8 @@ def split_timeline(
     """Split the ticks into windows of about equal length that each contain measurements.
 
     The boundaries lie where most cameras are localised. If a boundary were in a time without poses, neither
-    window would contain the poses at both ends of this time. A window therefore gets longer than
-    `window_ticks`, by at most a quarter.
+    window would contain the poses at both ends of this time. Boundaries therefore move, and a window may be
+    longer than `window_ticks` by up to a quarter.
 
     Args:
         tick_times_ns: (T,) times of the timeline's ticks.

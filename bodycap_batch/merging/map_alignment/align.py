@@ -48,21 +48,22 @@ from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 
 MAX_SIGMA_M = 0.06
-"""Maximum position sigma per axis (metres) of the cameras of a map that is used. Evidence: none."""
+"""Maximum sigma (metres per axis) of the positions of a further map's cameras. A map with a larger sigma is
+not used. Evidence: none."""
 _MAX_SAMPLES = 240
 """Maximum number of instants at which the cameras are sampled. It bounds the computing time. Evidence:
 none."""
 _REACH_SIGMA = 0.05
-"""Sigma of the scale's logarithm from the limbs' reach: walking elbows keep 15 to 30 degrees of flexion. This
-source of the scale is needed with separate maps, because errors of mounts and scale can then compensate each
-other."""
+"""Sigma of the logarithm of the scale that follows from the limbs' reach. The sigma allows for walking
+elbows, which keep 15 to 30 degrees of flexion. With separate maps, errors of mounts and errors of the scale
+can compensate each other. The limbs' reach is therefore used as a source of the scale."""
 _SEPARATE_MAPS_SIGMA = 0.15
-"""Sigma of the scale's logarithm from the limbs' reach, if no map contains cameras of both the trunk and the
-end of a limb. The error of a mount is then about a tenth of half an arm's length. Evidence:
-docs/decisions/merging.md."""
+"""Sigma of the logarithm of the scale that follows from the limbs' reach, if no map contains both a camera of
+the trunk and a camera at the end of a limb. The error of a mount is then about a tenth of the length that
+determines the scale, half of an arm. Evidence: docs/decisions/merging.md."""
 _UNOBSERVABLE_SIGMA = 0.4
-"""Sigma of the scale's logarithm from the limbs' reach, if the scale is based only on this reach or on two
-cameras near each other. Evidence: docs/decisions/merging.md."""
+"""Sigma of the logarithm of the scale that follows from the limbs' reach, if all knowledge about the scale
+comes from this reach or from two cameras near each other. Evidence: docs/decisions/merging.md."""
 _MAX_STRAIN = 2.0
 """Maximum difference, in sigmas, between the log scale from the limbs' reach and the solved log scale. With a
 larger difference, the body does not determine the maps. Evidence: none."""
@@ -231,10 +232,10 @@ def _exclusion_reason(gauge: str, trunk_camera: str, main_gauge: str, why: str) 
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """Knowledge before the alignment is refined.
+    """The initial values for the refinement of the alignment.
 
     Attributes:
-        inputs: Merge inputs, with the mount of the trunk's camera rolled to the camera's real roll.
+        inputs: Merge inputs. The mount of the trunk's camera has the estimated roll of this camera.
         alignment: Initial similarities and scale.
         up: The vertical in the main map; None if it is unknown.
     """

@@ -72,10 +72,10 @@ def align_maps_initially(
 ) -> InitialAlignment:
     """Estimate the similarities of further maps and the metric scale in turn.
 
-    Some distances between cameras in different maps carry no information about the scale. An example is the
-    distance between shoulder and hand: the alignment itself places the hand at the length of the arm in the
-    rest pose. The smaller the scale, the less the swing of the arm adds to this distance. Another example is
-    the distance between trunk and head: it equals the distance in the rest pose at every scale.
+    Some distances between cameras in different maps contain no information about the scale. One example is
+    the distance between shoulder and hand. At every scale, the alignment places the hand at the length of the
+    arm in the rest pose. A smaller scale only makes the swing of the arm smaller. Another example is the
+    distance between trunk and head. At every scale, this distance equals the distance in the rest pose.
 
     Args:
         bones: The graph's bones.
@@ -121,8 +121,8 @@ class _ScaleInformation:
     Attributes:
         uninformative: Names of cameras whose distance from a kinematic neighbour in another map contains no
             information about the scale.
-        sigma_log: Sigma of the scale's logarithm from the distances of the other cameras; infinite if there
-            are none.
+        sigma_log: Sigma of the scale's logarithm from the distances of the other cameras; infinite without
+            such distances.
     """
 
     uninformative: set[str]
@@ -134,12 +134,12 @@ def _scale_information(
 ) -> _ScaleInformation:
     """Return how well the distances between cameras determine the scale.
 
-    A distance between cameras in different maps carries information only if the limb bone swings about a
-    joint of its neighbour's bone. The amount depends on the distance between the two cameras, and on the
-    uncertainty of their mounts.
+    A distance between cameras in different maps contains information only if one camera is on a limb bone,
+    and if this bone swings about a joint of the other camera's bone. The amount of information depends on the
+    distance between the two cameras, and on the uncertainty of their mounts.
 
     Raises:
-        EstimationError: No distance carries information, and a camera that hardly swings is in a separate
+        EstimationError: No distance contains information, and a camera that hardly swings is in a separate
             map.
     """
     map_of = {track.camera: index for index, group in enumerate(groups) for track in group}
@@ -212,7 +212,8 @@ def require_common_time(main: CameraTrack, group: Sequence[CameraTrack]) -> None
     """Check that a camera of a further map was localised for a few seconds together with the trunk's camera.
 
     Raises:
-        EstimationError: No camera of the further map was.
+        EstimationError: No camera of the further map was localised for long enough together with the trunk's
+            camera.
     """
     at_ns = _instants(main)
     main_known = np.isfinite(_smoothed_path(main, at_ns)[:, 0])

@@ -87,7 +87,7 @@ class MapAlignmentProblem:
         self._covariance = np.zeros((0, 0))
 
     def solve(self) -> None:
-        """Move the maps until the cost no longer decreases, while the slack of the joints decreases."""
+        """Move the maps until the cost no longer decreases, once for each slack in `_SLACK_SCHEDULE`."""
         for slack in _SLACK_SCHEDULE:
             self._calibration.slack_factor = slack
             self._descend()
@@ -129,7 +129,7 @@ class MapAlignmentProblem:
                 break
 
     def sigmas(self, index: int) -> AlignmentSigma:
-        """Return the sigmas of a further map's rotation and of its cameras' positions at the samples."""
+        """Return the sigmas of a further map's rotation and of the sampled positions of the map's cameras."""
         centres, middle = self._centres(index)
         unknowns = slice(1 + 7 * index, 8 + 7 * index)
         values, vectors = np.linalg.eigh(self._covariance[unknowns, unknowns])
@@ -196,9 +196,9 @@ class MapAlignmentProblem:
         return np.array([np.log(self._scale / each.scale) / each.sigma_log for each in self._sources])
 
     def _directions(self) -> FloatArray:
-        """Return the movement (C,K,P,6) of each camera's pose per unit of each of P unknowns.
+        """Return the derivatives (C,K,P,6) of K poses of each camera with respect to the P unknowns.
 
-        A movement is a rotation (radians) and a translation (metres) in the axes of the main map.
+        A derivative consists of a rotation (radians) and a translation (metres) in the axes of the main map.
         """
         samples = self._calibration.samples
         centres = self._scale * samples.map_from_cam[..., :3, 3]

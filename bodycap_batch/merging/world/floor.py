@@ -27,8 +27,8 @@ _MIN_FLOOR_RATIO = 3.0
 """Minimum ratio of the number of points in the slab of a floor to the median number in all slabs. The points
 of other objects are spread evenly over the heights. Evidence: none."""
 _MAX_BELOW_RATIO = 0.2
-"""Maximum ratio of the number of points below a floor to the number of points in its slab. A surface that
-stands on the floor, such as a table, has the many points of the floor below it. Evidence: none."""
+"""Maximum ratio of the number of points below a floor to the number of points in its slab. A table top has
+the many points of the floor below it, so that it is not mistaken for the floor. Evidence: none."""
 _SEARCH_RATIO = 0.25
 """Maximum distance of the floor from its expected height, as a ratio to the trunk's standing height. The body
 gives the expected height. Evidence: none."""
@@ -38,14 +38,15 @@ walked on the floor. Evidence: none."""
 _MIN_PATH_POINTS = 5
 """Minimum number of points near the path in the slab of a floor. Evidence: none."""
 _MIN_PATH_SHARE = 0.5
-"""Minimum number of points in the slab of a floor, as a fraction of all points near the path at possible
-heights of the floor. Evidence: none."""
+"""Minimum fraction of the points near the path that lie in the slab of a floor. Only points at possible
+heights of the floor are used. Evidence: none."""
 _LEGLESS_HIP_M = 0.9
-"""Height (metres) of the hips of a skeleton without legs, if its zero pose does not give this height."""
+"""Assumed height (metres) of the hips above the floor, for a skeleton without legs. It is used only if the
+zero pose does not give this height."""
 _ANKLE_OVER_LEG = 0.039 / 0.491
-"""Ratio of the ankle's height above the sole to the length of the leg. The height of the ankle is at least
-this ratio times the leg length. In a skeleton whose feet end at the ankle, it is exactly this height.
-Source: R. Drillis, R. Contini, "Body segment parameters", 1966."""
+"""Ratio of the ankle's height above the sole to the length of the leg. The product of this ratio and the leg
+length is the minimum height of the ankle. In a skeleton whose feet end at the ankle, this product is the
+height of the ankle. Source: R. Drillis, R. Contini, "Body segment parameters", 1966."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,7 @@ class Floor:
 
 @dataclass(frozen=True, slots=True)
 class LegLengths:
-    """The vertical lengths of a straight leg, in metres.
+    """The vertical lengths (metres) of a straight leg, for the height of a standing body.
 
     Attributes:
         hip_drop_m: Vertical distance from the root down to the hip joint in the zero pose.
@@ -86,14 +87,15 @@ def floor_from_points(heights_m: FloatArray, up: Vertical, expected_m: float, st
     """Find the floor among the heights of the map's points.
 
     The floor is a slab with many points near the soles of the standing body, and few points below the slab.
-    The function searches it only if the vertical comes from the map: a tilt of two degrees spreads the points
-    of a floor over a decimetre.
+    The function searches for this slab only if the vertical comes from the map. Other verticals may be
+    tilted. A tilt of two degrees spreads the points of a floor over a decimetre.
 
     Args:
         heights_m: (P,) heights of the map's points along up, metres.
         up: The vertical.
         expected_m: Height of the soles according to the body, metres.
-        standing_m: Height (metres) of a trunk joint above the soles. It limits the search.
+        standing_m: Height (metres) of a trunk joint above the soles. The search range is proportional to this
+            height.
 
     Returns:
         The floor that was found in the map; otherwise a floor at the expected height.
@@ -122,7 +124,8 @@ def floor_beside_path(
         up: The vertical. It must come from the map, because a tilt of two degrees spreads the points of a
             floor over a decimetre.
         expected_m: Height of the soles according to the body, metres.
-        standing_m: Height (metres) of a trunk joint above the soles. It limits the search.
+        standing_m: Height (metres) of a trunk joint above the soles. The search range is proportional to this
+            height.
 
     Returns:
         The floor; None if the vertical does not come from the map, or if too few points lie at one height.
@@ -146,7 +149,7 @@ def floor_beside_path(
 def floor_from_feet(skeleton: SkeletonModel, world_from_joint: FloatArray, solved: BoolArray) -> Floor | None:
     """Return the floor at the height of the lowest soles.
 
-    The 2nd percentile of the ankles' heights over time gives the lowest position of the ankles.
+    The lowest position of the ankles is the 2nd percentile of their heights over time.
 
     Args:
         skeleton: The body.

@@ -36,13 +36,14 @@ TILT_LIMIT_DEG = 20.0
 combined sigma of two angles: the tilt of a chest, and the error of its camera's mount."""
 BENT_TILT_LIMIT_DEG = 35.0
 """Maximum angle (degrees) between the vertical and the up direction of a person who bends most of the time.
-At 45 degrees, a wall could be mistaken for the floor."""
+The limit is less than 45 degrees, because a wall could otherwise be mistaken for the floor."""
 _AGREEMENT_DEG = 1.0
 """Maximum misalignment (degrees) of a plane that agrees with a vertical. The misalignment is the angle by
 which the plane deviates from horizontal or from vertical, whichever is smaller."""
 _MIN_INFORMATION_SHARE = 0.12
-"""Minimum information about each of the two tilts of the vertical, as a fraction of the number of points of
-all planes. Each point counts as one unit for the tilts that its plane determines. Evidence: none."""
+"""Minimum information about the tilt of the vertical about each of two horizontal axes. Each point of a plane
+counts as one unit of information. The points of a floor count for both tilts, the points of a wall for one
+tilt. The constant is a fraction of the number of points of all planes. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,7 @@ class Plane:
 
 @dataclass(frozen=True, slots=True)
 class PlaneVertical:
-    """A vertical to which planes of the map are parallel or perpendicular.
+    """A vertical that was found from planes of the map. Most of the planes are horizontal or vertical.
 
     Attributes:
         up: (3,) unit vector that points up.
@@ -156,7 +157,9 @@ def _largest_plane(points: FloatArray, rng: np.random.Generator) -> Plane | None
 def vertical_from_planes(
     planes: Sequence[Plane], body_up: FloatArray, limit_deg: float
 ) -> PlaneVertical | None:
-    """Find the direction near the body's up direction that most planes are parallel or perpendicular to.
+    """Find the vertical that agrees with most planes and is near the body's up direction.
+
+    A plane agrees with a vertical if it is nearly parallel or perpendicular to this vertical.
 
     Args:
         planes: Planes of the map, from `find_planes`.
@@ -164,7 +167,8 @@ def vertical_from_planes(
         limit_deg: Radius of the search in degrees.
 
     Returns:
-        The vertical; None if there are no planes, or if the planes that agree do not determine both tilts.
+        The vertical; None if there are no planes, or if the planes that agree do not determine its tilts
+        about both horizontal axes.
     """
     if not planes:
         return None
@@ -198,7 +202,7 @@ def misalignment_deg(cosine: FloatArray) -> FloatArray:
 
 
 def _fixes_both_tilts(normals: FloatArray, counts: FloatArray, up: FloatArray, total: float) -> bool:
-    """Return whether planes determine both tilts of a vertical.
+    """Return whether planes determine the tilts of a vertical about both horizontal axes.
 
     Args:
         normals: (N,3) normals of the planes that agree with the vertical.

@@ -25,18 +25,19 @@ from bodycap_batch.merging.world.planes import (
 )
 
 _LEAN_SAMPLES = 3.0
-"""Weight of the trunk's tilt (its lean) over a whole capture, as a number of independent observations. The
+"""Number of independent observations that the trunk's tilt (its lean) over a whole capture counts as. The
 number is small because the posture's systematic bias is equal at all instants. Evidence: none."""
 _PLANE_SHARE_NATS = 6.0
-"""Cost (nats) of a vertical from planes if no point of the planes agrees with it. The cost is proportional
-to the fraction of points that do not agree. Evidence: none."""
+"""Maximum cost (nats) of planes that do not agree with a vertical from planes. The cost is this maximum times
+the fraction of the planes' points that do not agree. Evidence: none."""
 _WALK_NATS, _BODY_NATS = 1.5, 12.0
 """Costs (nats) of a vertical from the walk, and of a vertical that is based only on the tilt of the trunk.
 Because of these costs, a vertical from planes is preferred if it also agrees with the body. Evidence:
 none."""
 _SCENE_NATS = 4.0
-"""Cost (nats) of a vertical along which the trunk moves up and down by more than its standing height, as on
-stairs. A vertical with map points below the floor has an equal cost. Evidence: none."""
+"""Cost (nats) for each of two signs of a wrong vertical. First: along this vertical, the trunk moves up and
+down by more than its standing height (stairs are rare). Second: map points lie below the floor. Evidence:
+none."""
 _FLOOR_NATS = 2.0
 """Gain (nats) of a vertical for which the map has a horizontal plane at the expected height of the floor.
 Evidence: none."""
@@ -51,8 +52,8 @@ _STATED_SIGMAS = 3.0
 """Maximum angle between a vertical given in the job and a vertical from planes that replaces it. Its unit is
 the sigma of the given vertical."""
 _DISTINCT_DEG = 20.0
-"""Minimum angle (degrees) between the vertical and a rival. A smaller angle is an error of the same vertical.
-Evidence: none."""
+"""Minimum angle (degrees) between the vertical and a rival. A hypothesis at a smaller angle is treated as the
+same vertical with a small error. Evidence: none."""
 _SEARCH_DEG = 5.0
 """Radius (degrees) of the search about a plane's normal, or about a direction that is parallel to two planes.
 Evidence: none."""
@@ -60,17 +61,17 @@ _SAME_DEG, _MAX_FLOOR_TILT_DEG = 1.0, 5.0
 """First: minimum angle (degrees) between a new start of the search and all directions that were found before.
 Second: maximum angle (degrees) between a floor and the horizontal plane. Evidence: none."""
 _MIN_PLANE_SIGMA_DEG, _WALK_SIGMA_DEG, _BODY_SIGMA_DEG = 0.7, 2.0, 15.0
-"""Sigmas (degrees). First: minimum sigma of a vertical from planes. Second: sigma of a vertical from the
-walk. Third: minimum sigma of a vertical from the body of a walker. Planes: docs/decisions/merging.md. The
-path of a walking trunk is horizontal to two degrees. A rotation of the camera's mount looks like a tilt of
-the body."""
+"""Sigmas (degrees). First: minimum sigma of a vertical from planes. Evidence: docs/decisions/merging.md.
+Second: sigma of a vertical from the walk. The path of a walking trunk is horizontal to two degrees. Third:
+minimum sigma of a vertical from the body of a walker. This sigma allows for an error of the camera's mount,
+which looks like a tilt of the body."""
 _PLANE_SIGMA_LIMIT_DEG = 1.5
 """Maximum misalignment (degrees) of a plane that is used for the sigma of a vertical. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VerticalHypothesis:
-    """A direction that may be the vertical.
+    """A direction that may be the vertical. The most likely hypothesis becomes the vertical.
 
     Attributes:
         source: Origin of the direction: "map" (planes of the map), "walk", "body" or "marker board".
@@ -311,9 +312,9 @@ def _plane_sigma_deg(planes: Sequence[Plane], up: FloatArray) -> float:
 def _body_sigma_deg(body: TrunkOrientation, up: FloatArray, walks: bool) -> float:
     """Return the sigma (degrees) of a vertical that is based only on the body.
 
-    A walking person is upright. The sigma then consists of a rotation of the camera's mount, which looks like
-    a tilt of the trunk, and of half of the trunk's RMS tilt. A person who sits, stands or works may tilt the
-    trunk all the time. The sigma is then the spread of the verticals that the tilts allow.
+    A walking person is upright. The sigma then combines two angles: the error of the camera's mount, and half
+    of the trunk's RMS tilt. A person who sits, stands or works may tilt the trunk all the time. The sigma is
+    then the spread of the verticals that the tilts allow.
     """
     if not walks:
         return body.posterior_spread_deg(up)

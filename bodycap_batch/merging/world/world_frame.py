@@ -48,12 +48,12 @@ def world_from_solved_frame(
     """Return the rigid transform from the solved frame to the world.
 
     Args:
-        rotation: (3,3) rotation of the solved frame that makes up +z.
+        rotation: (3,3) rotation that takes the up direction of the solved frame to +z.
         hips_m: (3,) position of the hips at tick 0, after `rotation`. In the world, this position is above
             the origin.
         floor_m: Height of the floor in metres, after `rotation`. In the world, the floor is at z = 0.
-        heading_rad: Heading of the body in its first moving second, after `rotation`. In the world, this
-            heading is −y.
+        heading_rad: Heading of the body in its first moving second, after `rotation`. In the world, the body
+            faces −y in this second.
     """
     yaw = Rotation.from_euler("z", -0.5 * np.pi - heading_rad).as_matrix()
     origin = np.array([hips_m[0], hips_m[1], floor_m])
