@@ -136,8 +136,8 @@ def bundle_adjust(
         loss_px is not None and _mean_track_length(model) > _MAX_DIRECT_TRACK_LENGTH
     )
     if iterative:
-        # COLMAP uses conjugate gradients if a model has more images than these two limits. The smallest
-        # limits that COLMAP accepts are set, so conjugate gradients are always used here.
+        # COLMAP uses conjugate gradients if more images than these two limits are adjusted. To get conjugate
+        # gradients here, the limits are set to the smallest values that COLMAP accepts.
         adjustment.ceres.max_num_images_direct_dense_cpu_solver = 1
         adjustment.ceres.max_num_images_direct_sparse_cpu_solver = 2
         adjustment.ceres.solver_options.eta = _STEP_ACCURACY

@@ -1,5 +1,7 @@
-"""Reconstruct models without a previous map. Several initial pairs are tried, with less and less strict
-thresholds."""
+"""Reconstruct models without a previous map.
+
+Several initial pairs are tried, with thresholds that become less strict.
+"""
 
 from __future__ import annotations
 
@@ -132,7 +134,10 @@ def _with_registered_images(
     context: StageContext,
     total: int,
 ) -> Any:
-    """Register all images that fit in a copy of a model; return the copy if it is larger than the model."""
+    """Register all images that fit in a copy of a model.
+
+    Return the copy if it is at least as large as the model, else the model.
+    """
     extended = copy.deepcopy(model)
     register_images(workspace, settings, extended, progress_counter(context, total, context.check_cancelled))
     return min([extended, model], key=model_order)

@@ -93,8 +93,8 @@ def evaluate_pairs(workspace: Path, model: pycolmap.Reconstruction) -> list[Pair
 def find_misregistered_images(pairs: Sequence[PairConsistency]) -> set[int]:
     """Return the ids of misregistered images: a small set that explains nearly all inconsistent pairs.
 
-    In each step, the image with the largest fraction of matches in inconsistent pairs is added to the set,
-    and all pairs of this image are ignored in the following steps.
+    In each step, the image with the largest fraction of matches in inconsistent pairs is added to the set. In
+    the following steps, the inconsistent pairs of this image are ignored.
 
     This finds the images of a misregistered block, but not the correct images that match the block. The
     images of the block are inconsistent with most of their partners. A correct image is inconsistent only
