@@ -37,22 +37,22 @@ _MIN_TRACKS = 12
 _ROTATION_ROUNDS = 3
 """Number of rounds of the robust rotation fit. Evidence: none."""
 _NOVELTY_PER_MAX_GAP = 0.05
-"""Novelty that is added to a keyframe if the time since the previous keyframe is `max_gap_s`; it is
-proportional to that time. If two keyframes show equally little, the keyframe after the longer time is kept.
-Evidence: none."""
+"""Novelty that a keyframe gets for a time of `max_gap_s` since the previous keyframe. For a shorter time, the
+keyframe gets proportionally less. So of two keyframes with equally little new content, the keyframe after the
+longer time is kept. Evidence: none."""
 _MIN_RELATIVE_SURVIVAL = 0.5
-"""Minimum ratio of a candidate's track survival to the track survival of the oldest candidate. A candidate
-with a smaller ratio is not selected as keyframe. Evidence: none."""
+"""Minimum ratio of a candidate's track survival to the oldest candidate's track survival. A candidate with a
+smaller ratio is not selected as keyframe. Evidence: none."""
 _NOISE_SAMPLES = 20_000
-"""Approximate number of track steps from which the tracking noise is estimated. More steps do not change the
-estimate."""
+"""Approximate number of samples from which the tracking noise is estimated. Each sample is one corner tracked
+forward and backward. More samples do not change the estimate."""
 _RAYLEIGH_MEDIAN = 1.177
 """Ratio of the median of a Rayleigh distribution to its scale parameter sigma: sqrt(2 ln 2)."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """A recent frame that may still become a keyframe.
+    """A recent frame: when a keyframe is due, one of the recent frames is selected.
 
     Attributes:
         index: Frame index.
@@ -84,8 +84,8 @@ class _KeyframeTracker:
         px: (N,2) positions of the tracked corners in the newest frame, px of the reduced image.
         image: The reduced image of the newest frame.
         started: Number of corners that were detected in the last keyframe.
-        round_trips: Distances between each corner and its position after forward and backward tracking, px of
-            the full image; one array for each step.
+        round_trips: Distances (px of the full image) between the position of each corner and its position
+            after forward and backward tracking; one array for each step.
         kept_samples: Total number of distances in `round_trips`.
     """
 
@@ -133,7 +133,10 @@ class _KeyframeTracker:
         return len(self.px) / self.started if self.started else 0.0
 
     def parallax_px(self) -> float:
-        """Return the median displacement (px at the image centre) after the best rotation is removed."""
+        """Return the parallax since the last keyframe, px at the image centre.
+
+        The parallax is the median displacement of the corners after the best rotation is removed.
+        """
         if len(self.px) < _MIN_TRACKS:
             return 0.0
         rays = self._rays()
@@ -145,11 +148,14 @@ class _KeyframeTracker:
         return float(np.median(np.linalg.norm(second - first @ rotation.T, axis=1))) * self.camera.focal_px
 
     def noise_px(self) -> float:
-        """Return the standard deviation of a track step's noise along an image axis, px of the full image."""
+        """Return the tracking noise: the standard deviation along an image axis, px of the full image.
+
+        It is the noise of tracking a corner once, from one frame to the next.
+        """
         if not self.kept_samples:
             return 0.0
-        # The distance after forward and backward tracking has a Rayleigh distribution. Its noise is the sum
-        # of the noise of two track steps.
+        # The distance after forward and backward tracking has a Rayleigh distribution. The distance contains
+        # the noise of two steps (forward and backward), so the result is divided by sqrt(2).
         return float(np.median(np.concatenate(self.round_trips)) / (_RAYLEIGH_MEDIAN * np.sqrt(2.0)))
 
 
@@ -169,7 +175,7 @@ def select_keyframes(
         camera: The camera with its video.
         options: Thresholds. Thresholds in pixels are for an image with a long side of 640 px.
         context: Progress and cancellation.
-        keeper: Object that receives every frame and every keyframe; None: they are not passed to any object.
+        keeper: Object to which every frame and every keyframe are passed; None: no such object.
 
     Returns:
         The frame indices of the keyframes, the sharpness of every frame and the tracking noise.
@@ -233,7 +239,7 @@ def _is_due(tracker: _KeyframeTracker, gap_s: float, limit_px: float, options: K
     Args:
         tracker: Tracks from the last keyframe to the newest frame.
         gap_s: Time since the last keyframe, seconds.
-        limit_px: Maximum parallax without a new keyframe, px of the full image.
+        limit_px: Threshold of the parallax, px of the full image. With a larger parallax, a keyframe is due.
         options: Thresholds of the times and of the track survival.
     """
     return (
@@ -246,12 +252,13 @@ def _is_due(tracker: _KeyframeTracker, gap_s: float, limit_px: float, options: K
 def _limit_keyframes(selected: list[int], novelty: list[float], limit: int) -> list[int]:
     """Remove the least novel keyframes until `limit` keyframes are left.
 
-    The first and the last keyframe are always kept. If a keyframe is removed, its novelty is added to the
-    novelty of the next keyframe. In each step, the keyframe with the smallest sum is removed.
+    The first and the last keyframe are always kept. In each step, the novelty of each keyframe and the
+    novelty of the next keyframe are added. The keyframe with the smallest sum is removed, and its novelty is
+    added to the novelty of the next keyframe.
 
     Args:
         selected: Frame indices of the keyframes.
-        novelty: Novelty of each keyframe: a measure of what it shows and the previous keyframe does not show.
+        novelty: Novelty of each keyframe: a measure of the content that the previous keyframe does not show.
         limit: Maximum number of keyframes.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Find a marker board that stands in the room, in the images of keyframes."""
+"""Find a marker board in the images of keyframes. The board stands in the room."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def find_board_views(
     Args:
         capture: All cameras with their videos.
         frames: (K,) increasing indices of the frames to search, by camera name.
-        cameras: Intrinsics from the map, by camera name. They apply to the work size: the image size that all
-            stages work at.
+        cameras: Intrinsics from the map, by camera name, for images of the work size (the image size that all
+            stages work at).
         marker_board: The board to search for.
         context: Cancellation.
 

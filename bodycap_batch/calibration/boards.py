@@ -16,13 +16,13 @@ from bodycap_batch.core.errors import JobError
 
 GreyImage = npt.NDArray[np.uint8]
 MIN_CORNERS = 8
-"""Minimum number of corners in a view. Each corner has two coordinates, and the board's pose has six
-unknowns. With fewer corners, little information on the intrinsics remains. Evidence: none."""
+"""Minimum number of corners in a view. Eight corners give 16 coordinates. Six of them are needed for the
+board's pose, and the rest informs about the intrinsics. Evidence: none."""
 _WINDOW_RATIO = 0.3
-"""Ratio of half the side of the window for sub-pixel refinement to the smallest distance between corners. At
-this ratio, the window does not contain a second corner."""
+"""Half the side of the window for sub-pixel refinement, as a fraction of the smallest distance between
+corners. With this fraction, the window does not contain a second corner."""
 _MAX_WINDOW_PX = 15
-"""Maximum of half the side of the window for sub-pixel refinement, px. Evidence: none."""
+"""Maximum size (px) of the window for sub-pixel refinement, given as half its side. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,8 +50,8 @@ class CalibrationBoard:
             board.
         dictionary: OpenCV's name, without ``DICT_``, of the dictionary of a ChArUco board's markers.
         marker: Ratio of the side of a marker to the side of a square, for a ChArUco board.
-        legacy: True for a ChArUco board that was drawn by an OpenCV version before 4.6. Such a board differs
-            if its number of rows is even.
+        legacy: True for a ChArUco board that was drawn by an OpenCV version before 4.6. Boards with an even
+            number of rows have another pattern in these versions.
     """
 
     kind: Literal["chessboard", "charuco"]
@@ -141,8 +141,8 @@ class CalibrationBoard:
 def _refine_corners(image: GreyImage, corners: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Refine corners (R,C,2) to sub-pixel accuracy, in windows that contain no second corner.
 
-    The corners of OpenCV's detector have a common bias of about 0.1 px. Without refinement, this bias moves
-    the estimated principal point by 1 px. Evidence: docs/decisions/calibration.md.
+    All corners of OpenCV's detector are displaced by about 0.1 px in the same direction. Without refinement,
+    this error moves the estimated principal point by 1 px. Evidence: docs/decisions/calibration.md.
     """
     import cv2
 

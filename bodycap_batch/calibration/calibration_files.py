@@ -19,8 +19,8 @@ def write_calibration(result: CalibrationResult, path: Path, camera: str | None)
 
     Args:
         result: The calibration.
-        path: Path of the file. If `camera` is given, the file may exist, and the entry of this camera is
-            added or replaced. Without `camera`, an existing file is replaced.
+        path: Path of the file. If `camera` is given and the file exists, the entry of this camera is added
+            or replaced. If `camera` is None, an existing file is replaced.
         camera: Name of the camera to which the calibration applies; None: it applies to all cameras.
 
     Raises:

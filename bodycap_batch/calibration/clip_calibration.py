@@ -27,23 +27,23 @@ _MODELS: dict[str, tuple[str, ...]] = {
     "fisheye": ("OPENCV_FISHEYE",),
 }
 _MAX_PICTURES = 160
-"""Maximum number of pictures in which the board is searched. They take some seconds of computation.
-Evidence: none."""
+"""Maximum number of pictures in which the board is searched. The search in this number of pictures takes some
+seconds. Evidence: none."""
 _PICTURES_PER_S = 5.0
-"""Number of pictures for each second of a clip in which the board is searched. In a long clip it is smaller,
-because of `_MAX_PICTURES`. Evidence: none."""
+"""Number of pictures that are searched for the board in each second of a clip. In a long clip, fewer pictures
+are searched, because their total is limited to `_MAX_PICTURES`. Evidence: none."""
 _MAX_VIEWS = 40
 """Maximum number of views in the fit. Evidence: none."""
 MIN_VIEWS = 8
 """Minimum number of pictures in which the board must be found. Evidence: none."""
 _MAX_FISHEYE_ERROR_RATIO = 0.9
-"""Maximum ratio of the fisheye model's error to the other model's error if the fisheye model is selected.
-Evidence: none."""
+"""Maximum ratio of the fisheye model's error to the error of the model OPENCV. With a larger ratio, the model
+OPENCV is selected. Evidence: none."""
 _COVERAGE_CELLS = (8, 6)
 """Number of columns and number of rows of the grid that measures coverage. Evidence: none."""
 _MIN_COVERAGE = 0.5
-"""Minimum fraction of the grid cells that contain a corner. With a smaller fraction, the distortion is
-extrapolated in a large part of the picture, and the result has a note. Evidence: none."""
+"""Minimum fraction of the grid cells that contain a corner. With a smaller fraction, a large part of the
+picture has no corners and its distortion is extrapolated. The result then has a note. Evidence: none."""
 _MAX_FOCAL_SIGMA_RATIO = 0.005
 """Maximum ratio of the focal length's standard deviation to the focal length. With a larger ratio, the result
 has a note. Evidence: none."""
@@ -54,7 +54,7 @@ has a note. Evidence: none."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationResult:
-    """Estimated intrinsics with their errors.
+    """The result of a calibration from a clip: intrinsics, their errors, and notes for the user.
 
     Attributes:
         board: The board in the clip.
@@ -147,7 +147,7 @@ def calibrate_clip(
 
 
 def _frame_blocks(camera: CaptureCamera) -> list[tuple[int, int]]:
-    """Divide the frames of a clip into blocks, for `_sharpest_pictures`.
+    """Divide the frames of a clip into blocks. One picture of each block is searched for the board.
 
     Returns:
         First frame index and end index (last frame index plus one) of each block.
@@ -164,7 +164,7 @@ def _sharpest_pictures(
 ) -> Iterator[tuple[int, GreyImage]]:
     """Yield the frame index and the grey picture of the sharpest frame in each block.
 
-    Many other pictures are blurred, because a board in the hand is still only for moments.
+    Many pictures are blurred, because a board that is held in the hand is still only for moments.
     """
     ends = iter(stretches)
     end = next(ends)[1]
@@ -184,9 +184,9 @@ def _sharpest_pictures(
 def _best_fit(
     views: Sequence[BoardCorners], size: ImageSize, lens: CameraModelChoice, video: Path
 ) -> IntrinsicsFit:
-    """Fit the camera models of a choice to views and return the best fit.
+    """Fit each camera model that `lens` permits to the views, and return the best fit.
 
-    With ``auto``, the fisheye model is the best fit only if its error is clearly smaller.
+    If `lens` is ``auto``, the fisheye model is the best fit only if its error is clearly smaller.
     """
     fits = [fit for model in _MODELS[lens] if (fit := fit_intrinsics(model, views, size)) is not None]
     if not fits:

@@ -17,15 +17,17 @@ from bodycap_batch.core.arrays import FloatArray
 
 ImageSize = tuple[int, int]
 _FISHEYE_INITIAL_FOCALS = (0.5, 0.35, 0.7)
-"""Ratios of the initial focal lengths of the fisheye model to the picture's long side. Evidence: none."""
+"""Initial focal lengths of the fisheye model, as fractions of the picture's long side. Each value is tried.
+Evidence: none."""
 _MAX_VIEW_ERROR_RATIO = 3.0
 """Maximum ratio of a view's error to the median error of all views. A view with a larger ratio is an outlier:
 the picture is blurred or a corner is wrong. Evidence: none."""
 _MIN_OUTLIER_ERROR_PX = 0.3
-"""Minimum error of an outlier view, in px of a picture with a long side of 640 px. Evidence: none."""
+"""Minimum error of an outlier view, in px of a picture with a long side of 640 px. A view with a smaller
+error is always kept. Evidence: none."""
 _MIN_FIT_VIEWS = 6
-"""Minimum number of views after outliers are removed. With fewer views, the outliers are kept.
-Evidence: none."""
+"""Minimum number of views that must remain if outlier views are removed. If fewer views would remain, the
+outlier views are kept. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +94,7 @@ def fit_intrinsics(model: str, views: Sequence[BoardCorners], size: ImageSize) -
 
 
 def _with_kept_views(fit: IntrinsicsFit, kept: Sequence[int]) -> IntrinsicsFit:
-    """Return a copy of a fit, with the indices of the views that were used."""
+    """Return a copy of a fit in which `kept` holds the indices of the used views."""
     return IntrinsicsFit(
         model=fit.model,
         matrix=fit.matrix,
@@ -105,10 +107,10 @@ def _with_kept_views(fit: IntrinsicsFit, kept: Sequence[int]) -> IntrinsicsFit:
 
 
 def _opencv_points(views: Sequence[BoardCorners], *, fisheye: bool) -> tuple[list[Any], list[Any]]:
-    """Return the corners on the board and in the picture, in the form that OpenCV needs.
+    """Return the corners on the board and the corners in the picture, as lists with one array for each view.
 
-    Each view has one array of each kind. OpenCV's fisheye functions need arrays (1,N,3) and (1,N,2) in double
-    precision. The other functions need arrays (N,3) and (N,2) in single precision.
+    OpenCV's fisheye functions need arrays (1,N,3) and (1,N,2) in double precision. OpenCV's other functions
+    need arrays (N,3) and (N,2) in single precision.
     """
     if fisheye:
         return [view.board_m[None] for view in views], [view.px[None] for view in views]

@@ -13,8 +13,8 @@ from bodycap_batch.model.geometry import poses_at
 Association = Literal["interpolate", "nearest"]
 
 _SNAP_NS = 1_000_000
-"""Maximum time difference (nanoseconds) for a true pose that is used without a second true pose to
-interpolate. Derivation: timestamps in some files have only four decimals."""
+"""Maximum time difference (nanoseconds) between a given time and a true pose that is used without
+interpolation. Derivation: timestamps in some files have only four decimals."""
 
 
 def interpolate_truth(

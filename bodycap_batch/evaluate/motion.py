@@ -35,7 +35,8 @@ _ROLE_BY_TRUTH_NAME = {
         }.items()
     },
 }
-"""Anatomical role of each joint in the ground truth file ``gt/joints.npz``, by the joint's name there."""
+"""Anatomical role of each joint in the ground truth file ``gt/joints.npz``, by the joint's name in this
+file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +61,7 @@ class MotionOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionReport:
-    """Errors of the joints over all frames.
+    """The result of comparing a motion with the true motion: errors of the joints over all frames.
 
     Attributes:
         frames: Number of compared frames.
@@ -76,8 +77,8 @@ class MotionReport:
         angle_offset_free_deg: Angle (degrees) between estimated and true joint orientations, after a constant
             rotation offset of each joint is removed; None if the truth has no orientations.
         per_joint_m: Mean root-relative distance (metres) of each joint except the root, by role.
-        per_joint_deg: Mean angle (degrees) of each joint without the constant offset, by role; empty if the
-            truth has no orientations.
+        per_joint_deg: Mean of `angle_offset_free_deg` for each joint, by role; empty if the truth has no
+            orientations.
     """
 
     frames: int
@@ -182,7 +183,7 @@ def _joints_from_motion(motion: Motion) -> _JointPoses:
 
 
 def _compare_joints(estimate: _JointPoses, truth: _JointPoses, options: MotionOptions) -> MotionReport:
-    """Return the errors of the joints whose role occurs in both motions."""
+    """Compare the joints that have the same role in both motions, and return their errors."""
     selected = {*options.roles, options.root} if options.roles else set(truth.roles)
     roles = tuple(role for role in estimate.roles if role in truth.roles and role in selected)
     if options.root not in roles or len(roles) < 3:
@@ -225,7 +226,7 @@ def _compare_joints(estimate: _JointPoses, truth: _JointPoses, options: MotionOp
 def _match_joints(
     estimate: _JointPoses, truth: _JointPoses, roles: tuple[str, ...], options: MotionOptions
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the estimated and the true joint poses at all times T with truth, for J roles.
+    """Return the estimated and the true poses of J joints, at the T times of the estimate with truth.
 
     Returns:
         (T,J,3) estimated positions; (T,J,3) true positions; (T,J,3,3) estimated rotations; (T,J,3,3) true
@@ -253,9 +254,10 @@ def _match_joints(
 
 
 def _angles_without_offset(rotation: FloatArray, true_rotation: FloatArray) -> FloatArray:
-    """Return the angles (T,J), degrees, between rotations after removing a constant offset of each joint.
+    """Return the angles (T,J), degrees, between rotations after a constant offset of each joint is removed.
 
-    The offset of a joint is the chordal mean over time of the rotation from the estimate to the truth.
+    The rotation from the estimate to the truth is computed at each time. The chordal mean of these rotations
+    over time is the joint's offset.
 
     Args:
         rotation: (T,J,3,3) estimated rotations.
@@ -267,9 +269,9 @@ def _angles_without_offset(rotation: FloatArray, true_rotation: FloatArray) -> F
 
 
 def _procrustes_distances(positions: FloatArray, true_positions: FloatArray) -> FloatArray:
-    """Return the distances (T,J) between estimated and true positions (T,J,3) after aligning each frame.
+    """Return the distances (T,J) between estimated and true positions (T,J,3).
 
-    Each frame has a separate similarity alignment.
+    Before this, the estimate of each frame is aligned with the truth by a separate similarity alignment.
     """
     out = np.empty(positions.shape[:2])
     for frame, (source, target) in enumerate(zip(positions, true_positions, strict=True)):

@@ -1,4 +1,4 @@
-"""Compare the relative position of two cameras with the truth, and pose errors with their covariances."""
+"""Compare the relative position of two cameras with the truth. Compare pose errors with their covariances."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from bodycap_batch.model.geometry import align_points, invert, so3_log
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelativeCameraError:
-    """Errors of the vector from the reference camera to another camera.
+    """The result of comparing the vector from the reference camera to another camera with the true vector.
 
     Attributes:
         frames: Number of frames in which both cameras have an estimated pose and a true pose.
         vector_m: Error (metres) of the vector between the camera centres in the world, after one rigid
             alignment of both trajectories with the truth.
-        in_reference_m: Error (metres) of the other camera's centre in the reference camera's frame of
-            reference, without alignment.
+        in_reference_m: Error (metres) of the vector between the camera centres in the coordinates of the
+            reference camera, without alignment.
     """
 
     frames: int
@@ -50,10 +50,11 @@ def relative_camera_error(
         truths: True poses world_from_camera (metres) at common times, by camera name.
         camera: Name of the camera on the limb.
         reference: Name of the camera on the trunk.
-        options: Options with the association of true poses. All other options are ignored.
+        options: Options of the comparison. Only the options for the association of true poses are used.
 
     Raises:
-        JobError: A camera is missing, or fewer than three frames have all four poses.
+        JobError: A camera is missing, or fewer than three frames have an estimated pose and a true pose of
+            both cameras.
     """
     options = options or TrajectoryOptions()
     for name in (camera, reference):
@@ -92,7 +93,7 @@ def normalised_errors(
 ) -> FloatArray:
     """Return the normalised squared errors (N,) of N poses: squared Mahalanobis distances from the truth.
 
-    The mean of these errors is 6 if the covariances are correct.
+    The errors show whether the covariances are correct: their mean is then 6.
 
     Args:
         gauge_from_cam: (N,4,4) estimated poses.

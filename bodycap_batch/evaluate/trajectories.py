@@ -44,9 +44,9 @@ class TrajectoryOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorSummary:
-    """Statistics of an error.
+    """Statistics of one kind of error.
 
-    The name of the field that holds the statistics ends with the unit, for example ``ate_m``.
+    The unit is not stored here. It is the end of the name of the report's field, for example ``ate_m``.
     """
 
     rmse: float
@@ -69,7 +69,9 @@ class ErrorSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraScore:
-    """Errors of one camera, or of all cameras together. Errors are None if there are no poses to compare.
+    """Errors of one camera's trajectory, or of all trajectories together.
+
+    An error is None if there are no poses to compare.
 
     Attributes:
         frames: Number of frames of the video; None if unknown.
@@ -95,7 +97,7 @@ class CameraScore:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryReport:
-    """Errors of the trajectories of a capture.
+    """The result of comparing the trajectories of a capture with the true trajectories.
 
     Attributes:
         options: Options of the comparison.
@@ -267,9 +269,10 @@ def _pose_errors(pair: _MatchedPoses, alignment: Similarity, delta_s: float) -> 
 
 
 def _pairs_at_interval(times_ns: IntArray, delta_s: float) -> tuple[IntArray, IntArray]:
-    """Return the indices of the first and the second pose of pairs with a time difference of `delta_s`.
+    """Find the pairs of poses with a time difference of `delta_s`, within half a frame interval.
 
-    The time difference may deviate from `delta_s` by half a frame interval.
+    Returns:
+        (M,) index of the first pose of each pair; (M,) index of the second pose of each pair.
     """
     if len(times_ns) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)

@@ -60,8 +60,8 @@ def build_map(
         selections: Keyframes of each camera.
         options: The stage's options.
         context: Work folder, threads, progress. The database and the models are written to the work folder.
-        reach: Minimum and maximum distance (metres) between the two cameras of each pair on the body; None:
-            the distances are not checked.
+        reach: Minimum and maximum distance (metres) that the body permits between two cameras, for each pair
+            of cameras; None: the distances are not checked.
         skeletal_above: Maximum number of keyframes of a map that is built from all keyframes at once. A
             larger map is built from skeletal keyframes (the reduced set of keyframes, Snavely's skeletal
             set), and the other keyframes are resected.
@@ -100,8 +100,8 @@ def build_map_once(
     The arguments are the same as in `build_map`.
 
     Returns:
-        The map; an error if the map holds too few keyframes or contradicts its matches, else None. The error
-        is returned, not raised, because other intrinsics may give a usable map.
+        The map; the reason why the map is unusable (too few keyframes, or contradicted matches), or None if
+        the map is usable. The error is returned, not raised, because other intrinsics may give a usable map.
 
     Raises:
         EstimationError: No model was reconstructed.

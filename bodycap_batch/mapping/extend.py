@@ -44,16 +44,16 @@ def extend_map(
     *,
     skeletal_above: int = SKELETAL_ABOVE,
 ) -> MapResult:
-    """Add keyframes to a map: register the new keyframes while existing poses stay, then adjust all poses.
+    """Add keyframes to a map.
 
-    Keyframes that are misregistered after the registration are removed. In a large map, only the poses of
-    the new keyframes are adjusted.
+    First, the new keyframes are registered, and the existing poses do not change. Then misregistered
+    keyframes are removed. Last, all poses are adjusted; in a large map, only the poses of the new keyframes.
 
     Args:
         capture: All cameras.
         previous: The map so far. Its workspace is copied, not changed.
-        extra_frames: Frame indices by camera name. Frames that are not in the map are added as keyframes.
-            Frames that are keyframes of the map are removed from it and registered again.
+        extra_frames: Frame indices by camera name. A frame that is not in the map is added as a keyframe. A
+            frame that is already a keyframe of the map is removed from the map and registered again.
         options: The stage's options.
         context: Work folder, threads, progress.
         skeletal_above: Maximum number of keyframes of a map that is not large (`MappingContext.is_large`).

@@ -19,18 +19,18 @@ from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
 
 _INITIAL_PAIRS = 3
 """Maximum number of ranked pairs that are tried before COLMAP's own search for an initial pair. COLMAP's
-search requires an angle of 16 degrees between rays, and verifies hundreds of pairs if few pairs have it. The
-maps have the same accuracy. Evidence: docs/decisions/mapping.md."""
+search is slow if few pairs have its minimum angle between rays (16 degrees): it then verifies hundreds of
+pairs. Maps from ranked pairs have the same accuracy. Evidence: docs/decisions/mapping.md."""
 
 _LOGGED_CANDIDATES = 5
-"""Maximum number of ranked pairs that are logged if the first attempt failed. Each is logged with the most
-likely reason why it fails."""
+"""Maximum number of ranked pairs in the log if the first attempt failed. The log also holds the most likely
+reason why each pair fails."""
 
 
 def reconstruct_with_intrinsics(
     context: MappingContext, options: MapOptions, uncalibrated: Mapping[int, str], total: int
 ) -> tuple[list[Any], dict[str, Any]]:
-    """Reconstruct models, and reconstruct them again if uncalibrated cameras need other camera models.
+    """Reconstruct models. If uncalibrated cameras need other camera models, reconstruct the models again.
 
     Args:
         context: Workspace, intrinsics, mapper options.
@@ -74,9 +74,10 @@ def _reconstruct_from_pairs(
 
 
 def _initial_pairs(context: MappingContext, options: MapOptions) -> tuple[list[InitialPair], dict[str, Any]]:
-    """Return the initial pairs to try, and entries for the log on the pair that the user names.
+    """Return the initial pairs to try, and entries for the log.
 
-    The user's pair comes first, if its two keyframes have verified matches. The best ranked pairs follow.
+    If the user names a pair and its two keyframes have verified matches, this pair is the first one. The best
+    ranked pairs follow. The log entries describe the pair that the user names.
     """
     ranking = rank_initial_pairs(context.workspace, context.intrinsics)
     ranked = [pair for pair in ranking[:_INITIAL_PAIRS] if pair.is_usable]

@@ -46,7 +46,7 @@ def make_mapping_context(
 
 
 def common_times_ns(capture: Capture) -> dict[str, IntArray]:
-    """Return, by camera name, the common times of all its frames (N,), nanoseconds."""
+    """Return the times (N,) of all frames of each camera on the common clock, nanoseconds, by camera name."""
     return {camera.name: camera.common_times_ns() for camera in capture.cameras}
 
 

@@ -36,10 +36,10 @@ def refine_map(
 ) -> MapResult:
     """Correct a map for rolling shutters, with the camera motion that registration estimated.
 
-    Each keypoint is moved to its position at the instant of the image's middle row. The keypoint's velocity
-    follows from the poses of neighbouring frames. Then each model is adjusted. Readout times that are not
-    given in the job are estimated from the keyframes. The observations in the result are at their detected
-    positions; `Map.readout_s` holds the readout times for the same correction.
+    Readout times that are not given in the job are estimated from the keyframes. Each keypoint is moved to
+    its position at the instant of the image's middle row, with a velocity from the poses of neighbouring
+    frames. Then each model is adjusted. The observations in the result are at their detected positions again;
+    to repeat the correction, use the readout times in `Map.readout_s`.
 
     Args:
         capture: All cameras.

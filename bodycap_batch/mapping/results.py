@@ -25,8 +25,8 @@ def finalise_models(
         models: Reconstructions, changed in place.
         context: Workspace, mapper options.
         capture: All cameras.
-        resected: For each model, the ids of the images that were resected after the last robust adjustment
-            of the model. Only these images are adjusted. If it is None, all images are adjusted.
+        resected: For each model, the ids of the images to adjust: the images that were resected after the
+            model's last robust adjustment. None: all images of the model are adjusted.
 
     Returns:
         Number of points removed from all models.

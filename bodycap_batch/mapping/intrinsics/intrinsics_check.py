@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MAX_KEYFRAMES = 40
-"""Maximum number of keyframes in the adjustments of the checks. They are evenly spaced in the model.
+"""Maximum number of keyframes in an adjustment of a check. The keyframes are evenly spaced in the model.
 Evidence: none."""
 _ITERATIONS = 40
 """Maximum number of iterations of an adjustment in a check. Evidence: none."""
@@ -30,38 +30,41 @@ _TOLERANCE = 1e-4
 _LOSS_PX = 1.0
 """Width (px) of the Cauchy loss of an adjustment in a check. Evidence: none."""
 _MAX_FOCAL_CHANGE = 0.06
-"""Maximum relative change of the focal length that a check may find. After a larger change, the given
-calibration is a misfit: it does not fit the images. Evidence: docs/decisions/mapping.md."""
+"""Maximum relative change from the given focal length to the focal length that fits the map. With a larger
+change, the given calibration is a misfit: it does not fit the images.
+Evidence: docs/decisions/mapping.md."""
 _MAX_CENTRE_CHANGE = 0.03
-"""Maximum change of the principal point that a check may find, as a fraction of the image's long side. After
-a larger change, the given calibration is a misfit. Evidence: docs/decisions/mapping.md."""
+"""Maximum distance from the given principal point to the principal point that fits the map, as a fraction of
+the image's long side. With a larger distance, the given calibration is a misfit.
+Evidence: docs/decisions/mapping.md."""
 _MIN_REDUCTION_MISFIT = 0.05
-"""Minimum relative reduction of the cost by free focal lengths and principal points. After a smaller
-reduction, no calibration is a misfit. Evidence: docs/decisions/mapping.md."""
+"""Minimum relative reduction of the cost if focal lengths and principal points are free. With a smaller
+reduction, no calibration is treated as a misfit. Evidence: docs/decisions/mapping.md."""
 _FISHEYE, _FISHEYE_TWO_TERMS = "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"
 """The fisheye model with one radial term, and the fisheye model with two radial terms. The model with two
 terms is tried only if the model with one term was selected. Evidence: docs/decisions/mapping.md."""
 _CANDIDATES = ("RADIAL", _FISHEYE)
 """Camera models that are tried for uncalibrated cameras instead of the model with one radial term."""
 _MIN_REDUCTION_MODEL = 0.15
-"""Minimum relative reduction of the cost by another camera model. After a smaller reduction, the camera model
-is not changed. Evidence: docs/decisions/mapping.md."""
+"""Minimum relative reduction of the cost if another camera model is used. With a smaller reduction, the
+camera model is not changed. Evidence: docs/decisions/mapping.md."""
 _PRINCIPAL_POINT, _PIXEL_ASPECT = "decentred", "stretched"
 """Names of two more candidates. "decentred" has a free principal point, for cropped images. "stretched" has a
 separate focal length for each axis, for pixels that are not square."""
 _MIN_ASPECT_CHANGE = 0.02
-"""Minimum relative difference of the two focal lengths of a camera with pixels that are not square. The model
-with two focal lengths also has tangential distortion, so a lower cost is not sufficient evidence.
+"""Minimum relative difference between the two focal lengths of a camera. With a smaller difference, the
+pixels are treated as square. A lower cost is not sufficient evidence for pixels that are not square: the
+model with two focal lengths also has tangential distortion, which may be the cause of the lower cost.
 Evidence: docs/decisions/mapping.md."""
 _OBSERVATIONS_PER_PARAMETER = 10
-"""Minimum number of observations of a camera, for each parameter of its model, that determine the aspect of
-its pixels. Evidence: none."""
+"""Minimum ratio of a camera's number of observations to the number of parameters of its camera model. With
+fewer observations, the pixels are treated as square. Evidence: none."""
 _MIN_REDUCTION_CENTRE = 0.05
-"""Minimum relative reduction of the cost by a free principal point. After a smaller reduction, the principal
-point stays in the image's centre. Evidence: docs/decisions/mapping.md."""
+"""Minimum relative reduction of the cost if the principal point is free. With a smaller reduction, the
+principal point stays in the image's centre. Evidence: docs/decisions/mapping.md."""
 _MIN_REDUCTION_RECENTRED = 0.005
-"""Minimum relative reduction of the cost by a principal point that is refined a second time. It is smaller
-than the first threshold because the second map determines the principal point better.
+"""Minimum relative reduction of the cost if the principal point is refined a second time. This threshold is
+smaller than `_MIN_REDUCTION_CENTRE`, because the second map determines the principal point better.
 Evidence: docs/decisions/mapping.md."""
 _TANGENT_CUBIC = 1.0 / 3.0
 """Cubic coefficient of the tangent's Taylor series."""
@@ -81,8 +84,8 @@ def find_misfit_intrinsics(
         calibrated: Names of the calibrated cameras by database id.
 
     Returns:
-        Ratio of the focal length that fits the map to the given focal length, by camera name. Only cameras
-        with a large change of the focal length or of the principal point are included.
+        The cameras with a large change of the focal length or of the principal point: for each of them, by
+        camera name, the ratio of the focal length that fits the map to the given focal length.
 
     Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999.
     """
@@ -148,8 +151,8 @@ def select_camera_models(
         centre = name == _PRINCIPAL_POINT
         if name == _FISHEYE_TWO_TERMS and chosen.camera(numbers[0]).model_name != _FISHEYE:
             continue
-        # The models of all cameras change at once. If one camera had a wrong model, the map would be
-        # deformed, and the correct models of the other cameras would not fit the deformed map.
+        # The models of all cameras change at once. If one camera kept a wrong model, the map would stay
+        # deformed, and correct models of the other cameras would not fit the deformed map.
         trial = copy.deepcopy(plain if name in _CANDIDATES else chosen)
         for number in numbers:
             _change_model(trial.camera(number), name)
@@ -225,7 +228,8 @@ def update_camera_models(
         models: Reconstructions, the most reliable first; not changed.
         settings: The mapper's options.
         uncalibrated: Names of the uncalibrated cameras by database id.
-        decentred: None in the first call. In the second call, the camera ids that the first call returned.
+        decentred: Database ids of the cameras whose principal point moved, as the first call returned them;
+            None in the first call.
 
     Returns:
         The intrinsics that were written, by camera name; the ids of the cameras whose principal point moved.
@@ -325,7 +329,7 @@ def _adjustment_cost(
         free: Whether focal lengths are free.
         distortion: Whether distortion parameters are free.
         centre: Whether principal points are free.
-        constant: Database ids of the cameras whose intrinsics are constant in any case.
+        constant: Database ids of the cameras whose intrinsics always stay constant.
 
     Returns:
         The final cost; None if the adjustment failed.

@@ -30,18 +30,20 @@ _TRIAL_KEYFRAMES = 24
 """Maximum number of keyframes of each camera in a trial adjustment. The successive keyframes with the largest
 motion are used. Evidence: none."""
 _MAX_TRIALS = 4
-"""Maximum number of trial values of the readout time after 0. Evidence: none."""
-_CONVERGED_S = 0.001
-"""Step of the readout time (seconds). The search ends once the next step of every camera is smaller.
+"""Maximum number of trial values of the readout time, in addition to the first trial value 0.
 Evidence: none."""
+_CONVERGED_S = 0.001
+"""Maximum step of the readout time (seconds) at convergence. The search ends if the next step of every camera
+is smaller. Evidence: none."""
 _MAX_READOUT_FRAMES = 1.1
-"""Maximum estimated readout time, in frame intervals. The physical limit is 1; the rest is a margin for the
-uncertainty of the estimate."""
+"""Maximum estimated readout time, in frame intervals. The physical limit is one frame interval. The value is
+a little larger, because the estimate is uncertain."""
 _MIN_READOUT_S = 0.002
 """Minimum readout time (seconds) of a rolling shutter. A shutter with a smaller estimate is treated as
 global. Evidence: none."""
 _MIN_SIGMAS = 5.0
-"""Minimum ratio of an estimated readout time to its standard deviation. Evidence: none."""
+"""Minimum ratio of an estimated readout time to its standard deviation. With a smaller ratio, the estimate is
+not significant and the shutter is treated as global. Evidence: none."""
 _LOSS_PX = 1.0
 """Width (px) of the robust weight function of a residual. Evidence: none."""
 _MAX_RESIDUAL_PX = 8.0
@@ -50,7 +52,7 @@ _MAX_RESIDUAL_PX = 8.0
 
 @dataclass(frozen=True, slots=True)
 class Readout:
-    """A camera's readout time.
+    """A camera's readout time, and how it was determined.
 
     Attributes:
         seconds: Time (seconds) from the exposure of the sensor's first row to the exposure of the last row;
@@ -94,7 +96,9 @@ class _Keypoints:
 
 
 class RollingShutterModel:
-    """A model whose keypoints can be moved to their positions at the instant of the image's middle row.
+    """A model with the motion of its keypoints, to estimate readout times and to correct rolling shutters.
+
+    For the correction, each keypoint is moved to its position at the instant of the image's middle row.
 
     Args:
         model: COLMAP's reconstruction; not changed.
@@ -133,12 +137,12 @@ class RollingShutterModel:
         return out
 
     def move_keypoints(self, model: pycolmap.Reconstruction, readout_s: Mapping[str, float]) -> None:
-        """Move the keypoints of a copy of the model to their positions at the middle row's instant, in place.
+        """Move the keypoints in a copy of the model to their positions at the middle row's instant.
 
         Args:
             model: The copy of the model, changed in place.
-            readout_s: Readout time (seconds) of each camera, by camera name. With a readout time of 0, or
-                without a readout time, keypoints are at their detected positions.
+            readout_s: Readout time (seconds) of each camera, by camera name. If a camera has a readout time
+                of 0 or none, its keypoints are at their detected positions.
         """
         for item in self._keypoints:
             px = px_at_mid_row(
@@ -149,7 +153,7 @@ class RollingShutterModel:
                 points[feature].xy = xy
 
     def most_dynamic_subset(self) -> RollingShutterModel:
-        """Return a model with only the successive keyframes of each camera that have the largest motion."""
+        """Return a smaller model: for each camera, only the successive keyframes with the largest motion."""
         kept: set[int] = set()
         for name in self._intrinsics:
             keyframes = [item for item in self._keypoints if item.camera == name]
@@ -232,11 +236,12 @@ class RollingShutterModel:
         return out
 
     def undetermined(self, reason: str) -> dict[str, Readout]:
-        """Return a readout time for each camera, without an estimation.
+        """Return the readout times if no readout time can be estimated, by camera name.
+
+        A camera has the readout time that is given in the job, else a readout time of 0.
 
         Args:
-            reason: The reason why readout times could not be estimated. Cameras without a readout time in the
-                job get a readout time of 0 with this reason.
+            reason: The reason why no readout time could be estimated; it is stored with readout times of 0.
         """
         out = {}
         for name in self._intrinsics:
@@ -287,11 +292,13 @@ class RollingShutterModel:
 
 @dataclass(frozen=True, slots=True)
 class _ResidualSlope:
-    """The change of the residuals of an adjusted map with the readout time, as a linear function.
+    """A linear model of the residuals of an adjusted map, as a function of the readout time.
+
+    The readout time with the smallest residuals is computed from this model.
 
     Attributes:
-        correlation: Weighted sum of products of each residual and its derivative with respect to the readout
-            time, px²/s.
+        correlation: Weighted sum, over all residuals, of the residual times its derivative with respect to
+            the readout time, px²/s.
         information: Weighted sum of the squared derivatives, px²/s².
         variance: Weighted variance of the residuals at the readout time with the smallest residuals, px².
     """
@@ -310,7 +317,8 @@ class _ResidualSlope:
             step_s: Difference (seconds) of the readout times: second adjustment minus first adjustment.
         """
         change = (after - before) / (step_s if step_s else np.inf)
-        # The residuals of points that an adjustment moved far away do not depend on the readout time.
+        # If an adjustment moves a point far away, the residuals of the point are large. They do not depend on
+        # the readout time and are not used.
         small = np.maximum(np.abs(after), np.abs(before)) < _MAX_RESIDUAL_PX
         weight = np.where(small, 1.0 / (1.0 + (after / _LOSS_PX) ** 2), 0.0)
         information = float((weight * change * change).sum())
@@ -342,8 +350,8 @@ def estimate_readouts(
 ) -> tuple[RollingShutterModel, dict[str, Readout]]:
     """Estimate the readout time of each camera, and whether the sensor's rows are columns of the image.
 
-    If a trial adjustment fails, only the readout times that are given in the job are used. The result then
-    gives the reason.
+    If a trial adjustment fails, only the readout times that are given in the job are used. The returned
+    readout times then hold the reason of the failure.
 
     Args:
         rolling: The model.
@@ -376,7 +384,7 @@ def estimate_readouts(
 
 
 def map_with_readouts(scene: Map, readouts: Mapping[str, Readout]) -> Map:
-    """Add the readout times and row directions to a map that was corrected with them."""
+    """Return a copy of a corrected map that holds the readout times and row directions of the correction."""
     nonzero = {name: readout for name, readout in readouts.items() if readout.seconds}
     cameras = {
         name: replace(camera, sideways=name in nonzero and nonzero[name].sideways)

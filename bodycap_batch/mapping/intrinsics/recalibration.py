@@ -15,8 +15,8 @@ from bodycap_batch.model.map_diagnostics import RefinedIntrinsics
 from bodycap_batch.model.scene import Map, MapResult
 
 _MIN_KEYFRAME_RATIO = 0.95
-"""Minimum ratio of the number of keyframes in a better map to their number in the first map. It applies to
-the total and to each camera. Evidence: none."""
+"""Minimum number of keyframes in a better map, as a ratio to the number of keyframes in the first map. The
+minimum applies to all keyframes together and to the keyframes of each camera. Evidence: none."""
 
 
 def recalibrate_if_misfit(
@@ -59,8 +59,8 @@ def _recalibrate(
         result: The given map.
         capture: All cameras.
         build: Function that builds a map of a capture with changed intrinsics.
-        usable: Whether the given map is usable. If not, every new map that contains all cameras with
-            contradicted intrinsics is better.
+        usable: Whether the given map is usable. If it is not, a new map is better if it contains all cameras
+            whose given intrinsics contradict the given map.
     """
     misfits = result.diagnostics.misfit_factors or {}
     if not misfits:
@@ -91,9 +91,10 @@ def _recalibrate(
 
 
 def with_map_intrinsics(capture: Capture, previous: MapResult) -> Capture:
-    """Return the capture with the intrinsics that an earlier map of the same capture refined.
+    """Return the capture with the intrinsics that were refined with an earlier map of the same capture.
 
-    A camera may have no keyframes left in the earlier map. Then the intrinsics from the diagnostics are used.
+    If the earlier map has no keyframes of a camera, the camera's refined intrinsics are read from the map's
+    diagnostics.
     """
     mapped = previous.maps[0].cameras
     cameras = {
@@ -129,8 +130,8 @@ def with_intrinsics_to_refine(capture: Capture, cameras: Mapping[str, Camera]) -
 def _initial_guess(camera: Camera, factor: float) -> Camera:
     """Return initial intrinsics with the focal length that fits the map, and with zero distortion.
 
-    The distortion is estimated again too, so the model has one radial term. A pinhole model with a longer
-    focal length does not fit the images of a lens with barrel distortion.
+    The returned camera model has one radial term, because the mapper estimates the distortion again. A model
+    without distortion would not fit the images of a lens with barrel distortion.
     Evidence: docs/decisions/mapping.md.
 
     Args:

@@ -116,7 +116,9 @@ def add_keyframes(
     options: MapOptions,
     context: StageContext,
 ) -> None:
-    """Extract the SIFT features of keyframes and write both to the database, camera by camera.
+    """Extract the SIFT features of keyframes, and write the keyframes and their features to the database.
+
+    The cameras are processed one after the other.
 
     Args:
         workspace: Folder of the database.
@@ -182,7 +184,8 @@ def rewrite_without_cameras(workspace: Path, cameras: Collection[str]) -> None:
             image_id = write_image(database, ref, new_ids[camera_of[number]])
             database.write_keypoints(image_id, source.read_keypoints(number))
             database.write_descriptors(image_id, source.read_descriptors(number))
-            # A new id is never larger than the old id of the same image, so this file name is already free.
+            # A new id is never larger than the old id of the same image. So the file of the image that had
+            # this id was already renamed or removed.
             colour_file.rename(colours / f"{image_id}.npy")
     before.unlink()
 

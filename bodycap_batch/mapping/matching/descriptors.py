@@ -12,9 +12,9 @@ FloatDescriptors = npt.NDArray[np.float32]
 """(N,128) root-normalised SIFT descriptors as float32, for matrix products."""
 
 DESCRIPTOR_NORM = 512.0
-"""Euclidean length of a descriptor, in the unit of its bytes. The scalar product of two descriptors is a
-whole number below 2^24. A float32 sum of such numbers is exact in any order. So the matches do not depend on
-the number of threads or on the library."""
+"""Euclidean length of a descriptor, in the unit of its bytes. With this length, the scalar products of
+descriptors are whole numbers below 2^24. A float32 sum of such numbers is exact, in any order of its terms.
+So the matches do not depend on the number of threads or on the library."""
 
 MAX_MATCH_ANGLE_RAD = 0.7
 """Maximum angle (radians) between two matching descriptors. COLMAP's default."""

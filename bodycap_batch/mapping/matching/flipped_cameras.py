@@ -34,13 +34,13 @@ _MIN_MATCHES = 14
 """Minimum number of matches of an image pair. Image pairs with fewer matches are ignored.
 Evidence: docs/decisions/mapping.md."""
 _MIN_RATIO = 3.0
-"""Minimum ratio of stronger to weaker evidence, used in two places. A pair of cameras gives evidence only if
-the numbers of matches in the two orientations have at least this ratio. A contradiction between two pieces of
-evidence is ignored if their strengths have at least this ratio; the stronger evidence is then used.
+"""Minimum ratio of the stronger to the weaker of two numbers, used for two decisions. First: two cameras give
+evidence only if the numbers of matches in the two orientations differ by this ratio. Second: if two pieces of
+evidence contradict each other and their strengths differ by this ratio, the weaker one is ignored.
 Evidence: docs/decisions/mapping.md."""
 _MIN_TOTAL_MATCHES = 60
-"""Minimum number of matches of two cameras, over all their image pairs. Two cameras with fewer matches give
-no evidence. Evidence: none."""
+"""Minimum number of matches of two cameras, summed over all their image pairs, in the orientation with more
+matches. Two cameras with fewer matches give no evidence. Evidence: none."""
 _HINT = (
     "a front camera's setting, or an app, may flip the picture; flip it back: ffmpeg -i in -vf hflip out.mp4"
 )
@@ -66,9 +66,9 @@ def exclude_flipped_cameras(
     """Remove cameras with mirrored images from the database.
 
     Cameras whose images match are divided into two groups with opposite orientation. The smaller group is
-    excluded. Images alone cannot show why two groups see mirror images of each other: one group may film a
-    wall mirror, or the other half of a symmetric room. So all cameras are kept if both groups have the same
-    size, or if the evidence contradicts itself.
+    excluded. If both groups have the same size, or if the evidence contradicts itself, all cameras are kept.
+    In these cases the images may be correct: one group may film a wall mirror, or the other half of a
+    symmetric room.
 
     Args:
         workspace: Folder of the database with extracted features. The database is rewritten if cameras are
@@ -119,7 +119,9 @@ def excluded_camera_note(camera: str) -> str:
 
 
 def add_flip_hint(error: EstimationError | None, diagnostics: MapDiagnostics) -> EstimationError | None:
-    """Add the undecided groups of cameras, if there are any, to the start of an error's hint.
+    """Add a sentence on undecided groups of cameras to the start of an error's hint.
+
+    Without undecided groups, the error is returned unchanged.
 
     Returns:
         The error with the longer hint; None if `error` is None.
@@ -137,11 +139,12 @@ def _undecided_sentence(groups: CameraGroups) -> str:
 
 
 def _pair_evidence(workspace: Path, selections: Sequence[KeyframeSelection]) -> dict[tuple[str, str], int]:
-    """Return the evidence on the orientation of each pair of cameras, by pair of camera names.
+    """Return the evidence on the relative orientation of two cameras, by pair of camera names.
 
-    The evidence is the number of matches with the unchanged images minus the number of matches with the
-    mirrored images of the second camera. A negative number means that the two cameras see mirror images of
-    each other. Pairs of cameras without clear evidence are not in the result.
+    The images of the first camera are matched twice: with the unchanged images of the second camera and with
+    its mirrored images. The evidence is the first number of matches minus the second number. A negative
+    number means that the two cameras see mirror images of each other. The result holds only pairs of cameras
+    with clear evidence.
     """
     straight, mirrored = _sample_descriptors(workspace, selections)
     out = {}
@@ -168,9 +171,10 @@ def _stack(images: Sequence[CameraDescriptors]) -> CameraDescriptors:
 def _sample_descriptors(
     workspace: Path, selections: Sequence[KeyframeSelection]
 ) -> tuple[dict[str, CameraDescriptors], dict[str, CameraDescriptors]]:
-    """Return the `largest_descriptors` of some keyframes of each camera, twice, both by camera name.
+    """Return descriptors of some keyframes of each camera: unchanged and mirrored.
 
-    The first result holds the descriptors unchanged, the second result holds the mirrored descriptors.
+    Returns:
+        The `largest_descriptors` of the keyframes, by camera name; the same for the mirrored keyframes.
     """
     import pycolmap
 
@@ -196,11 +200,12 @@ def label_cameras(
 ) -> tuple[set[str], tuple[CameraGroups, ...]]:
     """Divide cameras into two groups with opposite orientation, given signed evidence on pairs of cameras.
 
-    Pairs of cameras are processed in the order of their evidence, the strongest first. A pair joins the
-    components of its two cameras into one component. If the two cameras are already in one component, the
-    pair's evidence may contradict their labels. Then its strength is compared with the strength of the
-    evidence that first joined these two cameras into one component. If the first evidence is less than
-    `_MIN_RATIO` times as strong, the component is undecided. A component with two groups of the same size is
+    At first, each camera is a separate component. Pairs of cameras are processed in the order of their
+    evidence, the strongest first. A pair joins the components of its two cameras into one component.
+
+    The two cameras of a pair may already be in one component, and the pair's evidence may contradict their
+    groups. This contradiction is ignored if the evidence that joined the two cameras is at least `_MIN_RATIO`
+    times as strong. Otherwise the component is undecided. A component with two groups of the same size is
     undecided too.
 
     Args:
@@ -209,8 +214,8 @@ def label_cameras(
             opposite orientation.
 
     Returns:
-        The cameras in the smaller group of each decided component; two groups of cameras that see mirror
-        images of each other, for each undecided component.
+        The cameras in the smaller groups of all decided components; the two groups with opposite orientation
+        of each undecided component.
     """
     components = {name: {name: 1} for name in cameras}
     strength: dict[tuple[str, str], int] = {}

@@ -34,18 +34,18 @@ matches."""
 _MAX_ERROR_PX = 4.0
 """Maximum epipolar error of an inlier, in px of an image with a long side of 640 px. COLMAP's default."""
 _MAX_TRIALS = 400
-"""Maximum number of random samples of a robust fit. If one match in three is correct, 400 samples of five
-matches contain on average 1.6 samples without a wrong match (0.33^5 x 400). COLMAP's maximum of 10,000
-samples costs time on every unrelated pair. Evidence: docs/decisions/mapping.md."""
+"""Maximum number of random samples of a robust fit. Each sample has five matches. If one match in three is
+correct, 1.6 of 400 samples have no wrong match on average (0.33^5 x 400). COLMAP's maximum of 10,000 samples
+would cost much time for pairs that show different places. Evidence: docs/decisions/mapping.md."""
 _CONFIDENCE = 0.999
-"""Minimum probability that a correct sample was drawn; a robust fit ends early at this probability.
-OpenCV's default."""
+"""Probability at which a robust fit ends early: the probability that at least one sample without a wrong
+match was drawn. OpenCV's default."""
 _MAX_TANGENT = 2.5
-"""Maximum absolute value of each coordinate of a ray at depth 1. It corresponds to an angle of 68 degrees
-from the optical axis. At larger angles the image plane is stretched too much to measure errors."""
+"""Maximum absolute value of x and of y of a ray with z = 1. The value 2.5 corresponds to an angle of 68
+degrees from the optical axis. At larger angles, x and y grow too fast with the angle to measure errors."""
 _PAIRS_PER_TRANSACTION = 512
-"""Number of pairs that are matched between two writes to the database. It affects only the memory and the
-work that is lost after a crash."""
+"""Number of pairs that are matched between two writes to the database. A larger number needs more memory, and
+more work is lost in a crash. The matches do not depend on this number."""
 _CV_ASSERTION_FAILED = -215
 """OpenCV's error code for a failed assertion."""
 
@@ -56,8 +56,8 @@ class KeyframeFeatures:
 
     Attributes:
         descriptors: (N,128) root-normalised descriptors as bytes.
-        rays: (N,2) undistorted image points at depth 1 if the camera is calibrated, else the detected pixels
-            (OpenCV's origin).
+        rays: (N,2) positions of the features. For a calibrated camera: undistorted image points at depth 1.
+            For an uncalibrated camera: detected positions, px (OpenCV's origin).
         error: Maximum epipolar error of an inlier, in the unit of `rays`.
         calibrated: True if the camera is calibrated; False if its intrinsics are only a first estimate.
     """
@@ -131,7 +131,11 @@ def _read_features(
 def _match_block(
     pairs: Sequence[Pair], features: Mapping[ImageRef, KeyframeFeatures], context: StageContext
 ) -> Iterator[IntArray]:
-    """Yield the verified matches (M,2) of each pair as indices of features, in the order of the pairs."""
+    """Match and verify pairs in several threads.
+
+    Yields:
+        (M,2) verified matches of each pair, as indices of features, in the order of `pairs`.
+    """
     parts = [pairs[start :: context.threads] for start in range(context.threads)]
 
     def work(part: Sequence[Pair]) -> list[IntArray]:
@@ -201,12 +205,14 @@ def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> 
             limit = 0.5 * (a.error + b.error)
             _, kept = cv2.findEssentialMat(first, second, np.eye(3), method, _CONFIDENCE, limit, _MAX_TRIALS)
         else:
-            # If only one camera is calibrated, the rays of its keyframe are scaled to undistorted pixels.
+            # If only one camera is calibrated, its rays are converted to undistorted pixels, because the
+            # positions in the other keyframe are pixels too.
             first, second = first * (_error_px(a) / a.error), second * (_error_px(b) / b.error)
             limit = 0.5 * (_error_px(a) + _error_px(b))
             _, kept = cv2.findFundamentalMat(first, second, method, limit, _CONFIDENCE, _MAX_TRIALS)
     except cv2.error as error:
-        # An assertion in OpenCV's local optimisation fails if no sample gives a two-view geometry.
+        # If no sample gives a two-view geometry, an assertion in OpenCV fails. Then no match is verified.
+        # Other errors are raised.
         if error.code != _CV_ASSERTION_FAILED:
             raise
         return none

@@ -30,34 +30,37 @@ from bodycap_batch.mapping.matching.retrieval import (
 from bodycap_batch.mapping.matching.skeletal_set import select_skeletal_keyframes
 
 _NEIGHBOUR_STEPS = (1, 2, 3, 4, 6, 9, 14)
-"""Distances in time order, as numbers of keyframes of one camera. A keyframe is matched with the keyframes at
-these distances before and after it. Evidence: none."""
-_SIMULTANEOUS = 2
-"""Number of keyframes of each other camera with which a keyframe is matched because they are nearest in time.
+"""Steps from a keyframe to other keyframes of the same camera, counted in keyframes. A keyframe is matched
+with the next keyframe, the second, third, fourth, sixth and so on, in both directions of time.
 Evidence: none."""
+_SIMULTANEOUS = 2
+"""Number of simultaneous partners. A keyframe is matched with this number of keyframes of each other camera:
+the keyframes that are nearest in time. Evidence: none."""
 _RETRIEVED = 64
-"""Maximum number of retrieved partners of a keyframe. The partners that `_RETRIEVED_PER_CAMERA` permits are
-always taken, even if their total is larger. Evidence: docs/decisions/mapping.md."""
+"""Maximum number of retrieved partners of a keyframe. This maximum does not apply to the partners that are
+taken first from each camera (`_RETRIEVED_PER_CAMERA`). Evidence: docs/decisions/mapping.md."""
 _RETRIEVED_PER_CAMERA = 8
-"""Maximum number of retrieved partners of a keyframe that are taken from each camera first. Only then are
-partners taken from all cameras by similarity. Evidence: none."""
+"""Maximum number of retrieved partners of a keyframe that are taken first from each camera. After these, the
+most similar keyframes of all cameras are taken. Evidence: none."""
 _MIN_LINKS = 24
-"""Minimum number of links of a keyframe to another camera or another time. A keyframe with fewer links is
-also matched with the neighbours of its partners. Evidence: docs/decisions/mapping.md."""
+"""Minimum number of links of a keyframe. A link is a verified pair with a keyframe of another camera or of a
+distant time. A keyframe with fewer links is also matched with the neighbours of its partners.
+Evidence: docs/decisions/mapping.md."""
 _MIN_LINK_MATCHES = 20
-"""Minimum number of verified matches of a pair that is a link. Evidence: docs/decisions/mapping.md."""
+"""Minimum number of verified matches of a link. A pair with fewer matches is not a link.
+Evidence: docs/decisions/mapping.md."""
 _NEAR_KEYFRAMES = 4
-"""Maximum distance, as a number of keyframes, of two keyframes of one camera that are near in time. They show
-the same part of the room, so their pair is not a link. The distance is short because a hand can come back
-to a place within a second."""
+"""Maximum number of steps, from keyframe to keyframe, between two keyframes of one camera that are near in
+time. Such keyframes show the same part of the room, so their pair is not a link. The number is small because
+a hand can come back to a place within a second."""
 _MAX_RETRY_PAIRS = 50_000
-"""Approximate maximum number of pairs that are tried for a camera without links to other cameras. They take
-some minutes of computing."""
+"""Approximate maximum number of pairs that are matched for a camera without a verified pair with another
+camera. Matching this number of pairs takes some minutes."""
 _EXHAUSTIVE_UP_TO = 120
-"""Maximum number of keyframes for which every pair is matched. Evidence: none."""
+"""Maximum number of keyframes of a capture in which every pair of keyframes is matched. Evidence: none."""
 _RESECTION_RETRIEVALS = 8
-"""Number of keyframes of the map with which a keyframe is matched before its resection, because they are the
-most similar to it. Evidence: docs/decisions/mapping.md."""
+"""Number of retrieved partners for a resection. Before a keyframe is resected, it is matched with this number
+of keyframes of the map: the most similar ones. Evidence: docs/decisions/mapping.md."""
 
 
 class PairGenerator:
@@ -69,8 +72,8 @@ class PairGenerator:
         workspace: Folder of the database with extracted features.
         new: Keyframes that are not matched yet.
         common_ns: Common time (nanoseconds) of every frame, by camera name.
-        options: The stage's options. ``pairs`` is "retrieval" or "exhaustive". Every pair is matched in any
-            case if there are at most `_EXHAUSTIVE_UP_TO` keyframes.
+        options: The stage's options. ``pairs`` is "retrieval" or "exhaustive". With at most
+            `_EXHAUSTIVE_UP_TO` keyframes, every pair is matched in both modes.
         context: Threads, progress, cancellation.
     """
 
@@ -169,9 +172,10 @@ class PairGenerator:
     def expansion_pairs(self, verified: Mapping[Pair, int], tried: Collection[Pair]) -> list[Pair]:
         """Return untried pairs near verified pairs, for keyframes with fewer than `_MIN_LINKS` links.
 
-        In such a pair, one keyframe of a verified pair is replaced by its neighbour in time. If two cameras
-        see the same place, they usually see a common place shortly before and after too. More links are
-        needed because a block of keyframes with few links can have an error of metres in the map.
+        In a returned pair, one keyframe of a verified pair is replaced by its neighbour in time. Such a pair
+        often has matches: if two cameras see a common place, they usually also do so shortly before and
+        after. Links are important: without enough links, a block of keyframes can be metres away from its
+        correct position in the map.
 
         Args:
             verified: Number of matches of every verified pair.
@@ -200,8 +204,8 @@ class PairGenerator:
     def unlinked_camera_pairs(self, verified: Mapping[Pair, int], tried: Collection[Pair]) -> list[Pair]:
         """Return untried pairs for cameras without any verified pair with another camera.
 
-        Every new keyframe of such a camera is paired with every keyframe of all other cameras. If there are
-        more than `_MAX_RETRY_PAIRS` pairs, evenly spaced keyframes are used instead.
+        Every new keyframe of such a camera is paired with every keyframe of all other cameras. If this gives
+        more than `_MAX_RETRY_PAIRS` pairs, only evenly spaced keyframes are paired.
 
         Args:
             verified: Number of matches of every verified pair.
@@ -232,7 +236,7 @@ class PairGenerator:
                 yield x, y
 
     def _is_link(self, a: int, b: int) -> bool:
-        """Return whether two rows belong to different cameras, or to one camera at distant times."""
+        """Return whether a pair of rows can be a link: different cameras, or distant times of one camera."""
         return bool(self._cameras[a] != self._cameras[b]) or abs(a - b) > _NEAR_KEYFRAMES
 
     def _sorted(self, rows: Collection[tuple[int, int]]) -> list[Pair]:

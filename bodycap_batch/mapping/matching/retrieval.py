@@ -24,7 +24,8 @@ RETRIEVAL_FEATURES = 128
 """Maximum number of features of an image that retrieval matches. The largest features are used, because they
 are still detected in blurred images and from a distance. Evidence: docs/decisions/mapping.md."""
 _BLOCK_SIZE = 32
-"""Number of images that one matrix product compares. It affects only the memory."""
+"""Number of images that one matrix product compares. A larger number needs more memory; the result is the
+same."""
 _VISUAL_WORDS = 64
 """Number of visual words of a VLAD descriptor. Evidence: none."""
 _SHORTLIST_SIZE = 128
@@ -32,11 +33,12 @@ _SHORTLIST_SIZE = 128
 It is twice the maximum number of retrieved partners in pair selection.
 Evidence: docs/decisions/mapping.md."""
 _SHORTLIST_SIZE_PER_CAMERA = 24
-"""Number of most similar images of each camera that are on the shortlist too. It is three times the number
-of retrieved partners of each camera in pair selection. Evidence: docs/decisions/mapping.md."""
+"""Number of images of each camera that are always on the shortlist of an image: the most similar images of
+this camera. It is three times the number of retrieved partners of each camera in pair selection.
+Evidence: docs/decisions/mapping.md."""
 _QUANTISATION_STEPS = 2048.0
-"""Number of steps from 0 to 1 to which a component of a unit VLAD vector is rounded. Sums of products of
-these whole numbers stay below 2^23, so a float32 holds them exactly."""
+"""Number of rounding steps between 0 and 1. Each component of a unit VLAD vector is rounded to a whole number
+of steps. Scalar products of the rounded vectors stay below 2^23, so float32 computes them exactly."""
 _EPSILON = 1e-9
 """Small number that is added to a norm, so that a division by the norm of a zero vector is defined."""
 
@@ -78,8 +80,8 @@ def count_preemptive_matches(
         context: Threads, progress, cancellation. The result does not depend on the number of threads.
 
     Returns:
-        (R,N) number of matches of each of the R images with each of the N images. It is 0 for an image with
-        itself, and for two images that were not compared.
+        (R,N) number of matches of each of the R images with each of the N images. The number is 0 for images
+        that were not compared, and for each image with itself.
 
     Source: Wu, "Towards linear-time incremental structure from motion", 3DV 2013 (preemptive matching).
     """
@@ -158,7 +160,8 @@ def _vlad_shortlists(
     """
     out = np.zeros((len(rows), len(vlad)), dtype=bool)
     groups = [np.flatnonzero(cameras == name) for name in np.unique(cameras)]
-    # Float sums of whole numbers are exact. The last digits of other float sums depend on the machine.
+    # Float sums of these whole numbers are exact. Without rounding, the last digits of the sums would depend
+    # on the machine.
     whole = np.round(_QUANTISATION_STEPS * vlad)
     for start in range(0, len(rows), _BLOCK_SIZE):
         context.check_cancelled()
@@ -173,8 +176,9 @@ def _vlad_shortlists(
 def _vlad_descriptors(images: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Return the VLAD descriptors (N,D) of N images, unit vectors.
 
-    The VLAD descriptor of an image is the sum, for each visual word, of the differences between the word and
-    the features nearest to the word. The visual words are evenly spaced among the features of all images.
+    A VLAD descriptor has one part for each visual word: the sum of the differences between the word and the
+    image's features that are nearest to this word. The visual words are features of the images, taken at
+    even spacing from the features of all images.
 
     Args:
         images: (N,128,128) `largest_descriptors` of every image.

@@ -19,12 +19,12 @@ from bodycap_batch.mapping.matching.descriptors import DESCRIPTOR_NORM
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
 
 _DETECTION_SCALE = 0.6
-"""Ratio of the size of the image in which features are detected to the size of the frame. OpenCV's detector
-doubles the size of this image first. Detection takes half the time of a detection in the full frame, and the
-map has the same accuracy. Evidence: docs/decisions/mapping.md."""
+"""Scale of the reduced image in which features are detected, relative to the frame. OpenCV's detector first
+doubles the size of the reduced image. Detection in the reduced image takes half the time of detection in the
+full frame, and the map has the same accuracy. Evidence: docs/decisions/mapping.md."""
 _MIN_LONG_SIDE_PX = 384
-"""Minimum long side (px) of the image in which features are detected. A frame is not reduced below this
-size. Evidence: none."""
+"""Minimum long side (px) of the reduced image in which features are detected. A smaller frame is not reduced.
+Evidence: none."""
 _CONTRAST_THRESHOLD = 0.02
 """Contrast threshold of the detector. It is half of OpenCV's default, because blurred walls and ceilings
 have little contrast. Evidence: docs/decisions/mapping.md."""

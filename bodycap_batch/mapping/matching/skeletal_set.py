@@ -20,7 +20,7 @@ _MIN_MATCHES = 16
 """Minimum number of matches of two keyframes that surely show the same part of the room: four times
 `MIN_RETRIEVAL_MATCHES`. Evidence: docs/decisions/mapping.md."""
 _MIN_SUPPORT = 6
-"""Minimum number of selected keyframes that every other keyframe must match.
+"""Minimum number of selected keyframes that each keyframe that is not selected must match.
 Evidence: docs/decisions/mapping.md."""
 
 
@@ -34,15 +34,17 @@ def select_skeletal_keyframes(
     """Select skeletal keyframes, against which all other keyframes can be resected.
 
     Keyframes are processed in time order. A keyframe is selected if it matches fewer than `min_support`
-    selected keyframes. A keyframe is also selected if it matches keyframes of several components of the
-    selection. Components become one component once `min_support` keyframes link them.
+    selected keyframes.
+
+    The selected keyframes form components. A keyframe is also selected if it matches keyframes of several
+    components. If `min_support` keyframes link two components, these become one component.
 
     Args:
         matches: (N,N) number of matches of all pairs of keyframes, symmetric.
         times: (N,) time of each keyframe, in any unit.
         min_matches: Minimum number of matches of two keyframes that surely show the same part of the room.
-        min_support: Minimum number of selected keyframes that every other keyframe must match, and number of
-            keyframes that must link two components to join them.
+        min_support: Minimum number of selected keyframes that each keyframe that is not selected must match.
+            This is also the number of keyframes that must link two components to join them.
 
     Returns:
         Indices of the selected keyframes, increasing.

@@ -19,10 +19,9 @@ _ROBUST_TOLERANCE = 1e-4
 slowly. Evidence: docs/decisions/mapping.md."""
 
 _MAX_DIRECT_TRACK_LENGTH = 14.0
-"""Maximum mean track length (keyframes) for which the robust adjustment uses a direct solver. For longer
-tracks it uses conjugate gradients. The time of the direct solver, which eliminates the points, grows with the
-square of the track length. The time of conjugate gradients grows linearly with the track length.
-Evidence: docs/decisions/mapping.md."""
+"""Maximum mean track length (keyframes) for a direct solver in the robust adjustment. For longer tracks,
+conjugate gradients are used, because the time of the direct solver grows with the square of the track length.
+The time of conjugate gradients grows linearly. Evidence: docs/decisions/mapping.md."""
 
 _STEP_ACCURACY = 1e-3
 """Relative error of a step at which conjugate gradients end. COLMAP's default is 0.1.
@@ -57,9 +56,9 @@ def adjust_robustly(
     The arguments are the same as in `bundle_adjust`. Most keypoints have an error of a quarter of a pixel,
     but one keypoint in ten has an error of a pixel or more; most of these keypoints are large or blurred.
     With a squared loss, these keypoints deform the map. So a Cauchy loss is used. Its width is the median
-    absolute residual along an image axis, which is the most likely width given the residuals. If all noise
-    were Gaussian, the error of the map would be 1.4 times as large as with a squared loss.
-    Evidence: docs/decisions/mapping.md.
+    absolute residual along an image axis: the most likely width, given the residuals. The disadvantage of
+    this loss: if all noise were Gaussian, the error of the map would be 1.4 times as large as with a squared
+    loss. Evidence: docs/decisions/mapping.md.
 
     Raises:
         EstimationError: The adjustment failed.
@@ -73,7 +72,7 @@ def adjust_robustly(
 
 
 def _mean_track_length(model: Any) -> float:
-    """Return the mean track length over all observations: each track is weighted by its own length."""
+    """Return the mean track length, in which the weight of each track is its number of observations."""
     length = np.array([model.point3D(point).track.length() for point in model.point3D_ids()], dtype=float)
     return float((length**2).sum() / max(1.0, length.sum()))
 
@@ -107,8 +106,9 @@ def bundle_adjust(
 ) -> None:
     """Adjust a model once.
 
-    By default, all poses are adjusted and the model gets a new gauge. If `only` is given, only the poses of
-    these images and the points that no other image observes are adjusted. All intrinsics are constant then.
+    By default, all poses are adjusted and the model gets a new gauge. If `only` is given, all intrinsics are
+    constant, and only two things are adjusted: the poses of the images in `only`, and the points that only
+    these images observe.
 
     Args:
         model: A reconstruction, changed in place.
@@ -136,8 +136,8 @@ def bundle_adjust(
         loss_px is not None and _mean_track_length(model) > _MAX_DIRECT_TRACK_LENGTH
     )
     if iterative:
-        # For more images than these two numbers, COLMAP uses conjugate gradients. The numbers here are the
-        # smallest that COLMAP accepts.
+        # COLMAP uses conjugate gradients if more images than these two limits are adjusted. To get conjugate
+        # gradients here, the limits are set to the smallest values that COLMAP accepts.
         adjustment.ceres.max_num_images_direct_dense_cpu_solver = 1
         adjustment.ceres.max_num_images_direct_sparse_cpu_solver = 2
         adjustment.ceres.solver_options.eta = _STEP_ACCURACY
@@ -148,8 +148,8 @@ def bundle_adjust(
         if model.exists_camera(camera_id):
             config.set_constant_cam_intrinsics(camera_id)
     if not iterative:
-        # The gauge is not fixed for conjugate gradients. A fixed gauge gives blocks of different sizes, and
-        # these make conjugate gradients slow.
+        # For conjugate gradients, the gauge stays free: a fixed gauge makes the matrix blocks unequal in
+        # size, and with unequal blocks conjugate gradients are slow.
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     summary = pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
     if not summary.is_solution_usable():

@@ -70,7 +70,7 @@ def _concatenate(parts: list[IntArray]) -> IntArray:
 
 
 def _gauge_id(map_from_cam: FloatArray) -> str:
-    """Return the id of a gauge: a digest of the keyframe poses (K,4,4) that define the gauge."""
+    """Return the id of a map's gauge: a digest of the map's keyframe poses (K,4,4)."""
     return hashlib.sha256(np.ascontiguousarray(map_from_cam).tobytes()).hexdigest()[:12]
 
 

@@ -21,7 +21,7 @@ number."""
 def progress_counter(
     context: StageContext, total: int, stop: Callable[[], None], done: int = 0
 ) -> Callable[[], None]:
-    """Return a function that increases the reported number of keyframes in the map by one at each call.
+    """Return a function that reports progress: each call adds one keyframe to the reported number.
 
     Args:
         context: Progress and cancellation.
@@ -50,10 +50,9 @@ def register_images(
 ) -> bool:
     """Register images of the database in a model, until no further image fits the model.
 
-    The model may be empty. The function follows COLMAP's pipeline except for the last step. If no further
-    image fits, COLMAP adjusts the whole model and tries once more. Then COLMAP adjusts the whole model again,
-    even if no image was added. This function omits the last adjustment.
-    Evidence: docs/decisions/mapping.md.
+    The model may be empty. If no further image fits, the whole model is adjusted and the function tries once
+    more, like COLMAP's pipeline. If no image was added then, COLMAP adjusts the whole model a second time.
+    This function omits the second adjustment. Evidence: docs/decisions/mapping.md.
 
     Args:
         workspace: Folder of the database.
@@ -61,8 +60,8 @@ def register_images(
         model: The model so far, changed in place.
         count_one: Function that is called after each registered image. If it raises an exception, the
             registration ends.
-        adjust_globally: Whether the whole model is adjusted after it has grown; if False, a new image is
-            only adjusted together with the map around it.
+        adjust_globally: True: the whole model is adjusted each time it has grown enough. False: only the map
+            around each new image is adjusted.
 
     Returns:
         False if the model is empty and has no usable initial pair, else True.
@@ -118,7 +117,9 @@ def resect_images(
     image_ids: Collection[int],
     count_one: Callable[[], None],
 ) -> set[int]:
-    """Register images in a model without any adjustment. The model must contain the places in the images.
+    """Register images in a model without any adjustment.
+
+    An image can only be registered if the model already contains the part of the room in the image.
 
     Args:
         workspace: Folder of the database.
@@ -160,9 +161,9 @@ def _open_mapper(
 
 
 def _relaxed_options(options: Any) -> Iterator[Any]:
-    """Yield mapper options with thresholds for the initial pair that become less strict, as in COLMAP.
+    """Yield mapper options in which the thresholds for the initial pair become less strict, as in COLMAP.
 
-    The minimum number of inliers and the minimum angle are halved alternately.
+    In each step, either the minimum number of inliers or the minimum angle is halved, alternately.
     """
     relaxed = copy.deepcopy(options)
     yield relaxed
@@ -174,7 +175,7 @@ def _relaxed_options(options: Any) -> Iterator[Any]:
 
 
 class _MapperRun:
-    """The reconstruction of one model."""
+    """One run of COLMAP's mapper: extends one model, image by image."""
 
     def __init__(
         self,
@@ -193,7 +194,10 @@ class _MapperRun:
         self._global = settings.get_global_bundle_adjustment()
 
     def initialise(self) -> bool:
-        """Start the model with the initial pair in the options; return False if no usable pair is given."""
+        """Start the model with the initial pair from the options.
+
+        Return False if the options hold no initial pair or if no model can start from the pair.
+        """
         pair = (self._settings.init_image_id1, self._settings.init_image_id2)
         if min(pair) < 0:  # In COLMAP, a negative id means that no initial pair is given.
             return False
@@ -233,9 +237,9 @@ class _MapperRun:
                 adjusted, last_try = self._size(), True
 
     def _register_next(self) -> int | None:
-        """Register the image that fits and observes most of the map, and return its id.
+        """Register one more image and return its id; return None if no image fits.
 
-        Return None if no image fits.
+        Among the images that fit, the image that observes most of the map is registered.
         """
         for image_id in self._mapper.find_next_images(self._options, structure_less=False):
             if self._mapper.register_next_image(self._options, image_id):

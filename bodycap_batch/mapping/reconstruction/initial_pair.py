@@ -23,8 +23,8 @@ _MAX_CANDIDATES = 200
 """Maximum number of pairs whose parallax and coverage are measured. Evidence: none."""
 _CANDIDATE_MATCHES = 50
 """Minimum number of matches of a candidate pair. The candidates are sorted by their number of matches, and
-evenly spaced candidates are measured. The pairs with the most matches alone would be unsuitable: they are
-neighbours in time, and the camera hardly moved between them. Evidence: none."""
+evenly spaced candidates are measured. It would be wrong to measure only the pairs with the most matches:
+these are neighbours in time, and the camera hardly moved between them. Evidence: none."""
 _ENOUGH_MATCHES = 100
 """Number of matches at which a pair gets the maximum score for matches. It is COLMAP's default minimum for
 the initial pair."""
@@ -49,7 +49,8 @@ class InitialPair:
         matches: Number of verified matches.
         parallax_rad: Median angle (radians) between matched rays, after the rotation that fits best is
             removed.
-        coverage: Fraction of the cells of a 4 x 4 grid that contain matches, mean of both images.
+        coverage: Fraction of the cells of a 4 x 4 grid in the image that contain matches. It is the mean of
+            the fractions in the two images.
     """
 
     ids: tuple[int, int]
@@ -124,14 +125,14 @@ def find_user_pair(
         workspace: Folder of the database.
         names: Two frames, each as ``camera:frame`` with the frame number in the camera's joined video.
         intrinsics: Intrinsics by camera name.
-        frame_numbers: `CaptureCamera.frame_numbers` of each camera, by camera name. They are needed because
-            the database has frame indices, not frame numbers.
+        frame_numbers: `CaptureCamera.frame_numbers` of each camera, by camera name, to convert the user's
+            frame numbers to the frame indices in the database.
 
     Returns:
         The pair, or None if the two keyframes are not a verified pair.
 
     Raises:
-        JobError: A camera has no keyframes, or both names lead to the same keyframe.
+        JobError: A camera has no keyframes, or one keyframe is nearest to both frames.
     """
     import pycolmap
 

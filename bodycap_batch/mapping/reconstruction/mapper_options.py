@@ -16,8 +16,9 @@ _ADJUSTMENT_TOLERANCE = 1e-5
 """Relative change of the cost at which a bundle adjustment ends. With COLMAP's default of 0, every adjustment
 uses the maximum number of iterations. Evidence: docs/decisions/mapping.md."""
 _GLOBAL_GROWTH = 1.4
-"""Ratio of the number of frames or points of the map to their number at the last global adjustment. At this
-ratio the map is adjusted globally again. COLMAP's default is 1.1. Evidence: docs/decisions/mapping.md."""
+"""Growth of the map at which it is adjusted globally again: ratio of the number of frames to the number of
+frames at the last global adjustment. The same ratio is used for points. COLMAP's default is 1.1.
+Evidence: docs/decisions/mapping.md."""
 _GLOBAL_REFINEMENTS = 2
 """Maximum number of rounds of a global adjustment. COLMAP's default is 5.
 Evidence: docs/decisions/mapping.md."""
@@ -37,8 +38,8 @@ def make_mapper_options(
 ) -> pycolmap.IncrementalPipelineOptions:
     """Return mapper options that give reproducible maps and keep calibrated intrinsics constant.
 
-    The mapper uses one thread. Several threads would add up residuals in an order that differs from run to
-    run, so the map would differ too.
+    The mapper uses one thread. With several threads, the residuals would be added in another order in each
+    run, so the map would differ from run to run.
 
     Args:
         options: The stage's options.

@@ -38,5 +38,5 @@ def keyframe_names(model: Any) -> set[str]:
 
 
 def model_order(model: Any) -> tuple[int, int]:
-    """Return a sort key that puts the model with the most keyframes first, then with the most points."""
+    """Return a sort key for models: most keyframes first; with equally many keyframes, most points first."""
     return -model.num_reg_images(), -model.num_points3D()

@@ -1,4 +1,7 @@
-"""Reconstruct models without a previous map, from several initial pairs and with relaxed thresholds."""
+"""Reconstruct models without a previous map.
+
+Several initial pairs are tried, with thresholds that become less strict.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +33,8 @@ strict; evidence for their values: none."""
 _MAX_SEARCH_TRIALS = 200
 """Maximum number of images that COLMAP tries in its own search for an initial pair. COLMAP's default."""
 _MIN_REGISTERED_RATIO = 0.25
-"""Minimum fraction of all keyframes in a model that starts from a given initial pair. If the model holds
-fewer, the next initial pair is tried. Evidence: none."""
+"""Minimum size of a model that starts from a given initial pair, as a fraction of all keyframes. If the model
+is smaller, the next initial pair is tried. Evidence: none."""
 
 
 def reconstruct(
@@ -95,8 +98,9 @@ def _reconstruct_from_pair(
 ) -> list[Any]:
     """Return the model that starts from a given pair, and models of the remaining keyframes, largest first.
 
-    Keyframes of the first model that fit the largest further model are also registered in the further model.
-    COLMAP does this too, because a part of the room may be connected to the rest on one side only.
+    A keyframe can be in two models: all keyframes of the first model that fit the largest further model are
+    also registered in the further model. COLMAP does this too, because a part of the room may be connected to
+    the rest on one side only.
     """
     import pycolmap
 
@@ -130,7 +134,10 @@ def _with_registered_images(
     context: StageContext,
     total: int,
 ) -> Any:
-    """Register all images that fit in a copy of a model; return the copy or the model, the larger of both."""
+    """Register all images that fit in a copy of a model.
+
+    Return the copy if it is at least as large as the model, else the model.
+    """
     extended = copy.deepcopy(model)
     register_images(workspace, settings, extended, progress_counter(context, total, context.check_cancelled))
     return min([extended, model], key=model_order)

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 _NO_PROJECTION_PX = 1e3
-"""Residual (px) of a point that has no projection. It has the size of a point far outside the image."""
+"""Residual (px) that is used if a point has no projection. It is as large as the residual of a point that is
+projected far outside the image."""
 
 
 def image_residuals_px(model: pycolmap.Reconstruction, image: Any, feature: IntArray) -> FloatArray:

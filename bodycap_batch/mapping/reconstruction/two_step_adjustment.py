@@ -35,9 +35,9 @@ def adjust_in_two_steps(
 ) -> None:
     """Adjust a large model in place; the result approximates `adjust_and_filter` and `adjust_robustly`.
 
-    One adjustment of all keyframes would take hours. So the skeletal keyframes are adjusted together first,
-    as a separate map. Then all other keyframes are adjusted, while the points of the separate map stay
-    constant. Points that no skeletal keyframe observes are free in the second step.
+    One adjustment of all keyframes would take hours. So first the skeletal keyframes and their points are
+    adjusted as a separate model. Then all other keyframes are adjusted, together with the points that no
+    skeletal keyframe observes. The points of the first step stay constant in the second step.
 
     Args:
         model: A reconstruction, changed in place. The adjustment gives it a new gauge.

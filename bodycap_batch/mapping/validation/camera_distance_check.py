@@ -26,13 +26,14 @@ _MAX_GAP_NS = 1_000_000_000
 """Maximum time (nanoseconds) between two keyframes for an interpolation of the camera's position. In a longer
 time, a limb can move anywhere."""
 _SLACK_SIGMAS = 2.0
-"""Number of standard deviations by which a distance may be outside the reach. Evidence: none."""
+"""Half the width of a distance's confidence interval, in standard deviations. A distance is out of reach only
+if its whole interval is out of reach. Evidence: none."""
 _MIN_RUN = 3
-"""Minimum number of successive keyframes out of reach that are a violation. Shorter runs are treated as noise
-of the keyframes' poses."""
+"""Minimum length of a violation: number of successive keyframes of a camera that are out of reach. Shorter
+runs are treated as noise of the keyframes' poses."""
 _SMALLEST_UNIT = 1e-300
-"""Smallest length (map units) of a lower limit of a distance. The limit stays positive, so its logarithm is
-defined."""
+"""Small length (map units) that is added to the minimum lower end of a distance's confidence interval. So the
+lower end is positive even for a distance of 0, and its logarithm is defined."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +57,8 @@ class DistanceCheck:
     def is_conclusive(self) -> bool:
         """Whether a scale was found at which most distances are within reach.
 
-        If there is no such scale, the given body or the map is wrong. The check cannot decide which of them.
+        If there is no such scale, either the given body or the map is wrong, and the check cannot decide
+        which.
         """
         return self.metres_per_unit is not None and self.within_reach >= MIN_WITHIN_REACH
 
@@ -115,13 +117,16 @@ def check_distances(scene: Map, common_ns: Mapping[str, IntArray], reach: Reach)
 
 
 def find_best_scale(low: FloatArray, high: FloatArray) -> tuple[float, float]:
-    """Return the value that lies in the most intervals, and the fraction of the intervals that contain it.
+    """Find the value that lies in as many intervals as possible.
 
-    If several neighbouring values lie in the same intervals, the middle of their range is returned.
+    If a range of values lies in the same intervals, the middle of the range is returned.
 
     Args:
         low: (N,) lower ends of the intervals.
         high: (N,) upper ends of the intervals.
+
+    Returns:
+        The value; the fraction of the intervals that contain the value.
 
     Source: the maximum of a sweep over sorted end points.
     """
@@ -136,7 +141,7 @@ def find_best_scale(low: FloatArray, high: FloatArray) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class _Distances:
-    """Distances between two cameras.
+    """Distances between two cameras at several instants, with their uncertainty.
 
     Attributes:
         pair: Camera names in alphabetical order.
@@ -194,7 +199,10 @@ def _distances_at_keyframes(
 
 
 def _keep_long_runs(scene: Map, mask: BoolArray) -> BoolArray:
-    """Return the mask (K,) of keyframes; runs of fewer than `_MIN_RUN` keyframes of a camera become False."""
+    """Return a copy of a mask (K,) of keyframes, without short runs.
+
+    If a camera has fewer than `_MIN_RUN` successive keyframes that are True, they become False.
+    """
     out = np.zeros(len(mask), dtype=bool)
     for camera in sorted(scene.cameras):
         rows = scene.keyframes_of(camera)

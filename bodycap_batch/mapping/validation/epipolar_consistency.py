@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MAX_ERROR_PX = 8.0
-"""Maximum epipolar error (px) of a match that the map's poses explain. It is twice the maximum error in
-verification, because a map is slightly deformed."""
+"""Maximum epipolar error (px) of a match that the map's poses explain. It is twice the maximum error that
+the verification of pairs permits, because a map is slightly deformed."""
 _MIN_PAIR_MATCHES = 30
 """Minimum number of matches of an evaluated pair. Some verified pairs with fewer matches are wrong.
 Evidence: none."""
@@ -93,10 +93,12 @@ def evaluate_pairs(workspace: Path, model: pycolmap.Reconstruction) -> list[Pair
 def find_misregistered_images(pairs: Sequence[PairConsistency]) -> set[int]:
     """Return the ids of misregistered images: a small set that explains nearly all inconsistent pairs.
 
-    In each step, the image with the largest fraction of matches in inconsistent pairs is added to the set.
-    Its pairs no longer make other images inconsistent. So a misregistered block of images is found, but its
-    correct partners are not: the block is inconsistent with most of its partners, and each partner is
-    inconsistent only with the block.
+    In each step, the image with the largest fraction of matches in inconsistent pairs is added to the set. In
+    the following steps, the inconsistent pairs of this image are ignored.
+
+    This finds the images of a misregistered block, but not the correct images that match the block. The
+    images of the block are inconsistent with most of their partners. A correct image is inconsistent only
+    with the block, and its pairs with the block are ignored once the block is in the set.
     """
     total: dict[int, int] = {}
     wrong: dict[int, dict[int, int]] = {}

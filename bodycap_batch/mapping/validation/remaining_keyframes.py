@@ -24,11 +24,12 @@ def resect_remaining(
     """Adjust models robustly, then resect the keyframes that no model contains.
 
     An adjustment of all keyframes together would need hundreds of passes over millions of observations. So
-    after resection only the resected keyframes are adjusted. The poses of the other keyframes and the points
-    that these observe stay constant. Misregistered keyframes are removed.
+    after resection only the resected keyframes are adjusted. The poses of the other keyframes stay constant,
+    and so do the points that the other keyframes observe. Misregistered keyframes are removed.
 
     Args:
-        models: Reconstructions from some of the keyframes; changed in place and sorted, the largest first.
+        models: Reconstructions from some of the keyframes. They are changed in place, and the list is sorted,
+            the largest model first.
         generator: Generator of pairs among all keyframes.
         tried: Pairs that were already matched.
         context: Workspace, intrinsics, mapper options.

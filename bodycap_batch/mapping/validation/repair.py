@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 _ROUNDS = 2
 """Maximum number of rounds of a repair. Evidence: none."""
 _MIN_PAIR_BUDGET = 2000
-"""Number of untried pairs that a round of a repair may match, even if fewer pairs were matched before. If
-there are more untried pairs, only the pairs of misregistered keyframes are matched. Evidence: none."""
+"""Number of untried pairs that a round of a repair may always match. A round may match more pairs only if at
+least as many pairs were matched before. Otherwise only the pairs of misregistered keyframes are matched.
+Evidence: none."""
 
 
 def repair_model(
@@ -44,7 +45,7 @@ def repair_model(
 
     Args:
         model: The largest model; not changed.
-        tried: Pairs that were already matched. The pairs that the repair matches are added to it.
+        tried: Pairs that were already matched; the pairs that the repair matches are added to this set.
         context: Workspace, intrinsics, mapper options.
         keyframes: Keyframes that the model should contain; by default all keyframes in the database.
 
@@ -68,8 +69,8 @@ def repair_model(
             break
         untried = _untried_pairs(ids, wrong | missing, tried)
         if len(untried) > max(_MIN_PAIR_BUDGET, len(tried)):
-            # If many keyframes are missing, most of them show too little of the room to be registered.
-            # To match them would take most of the time, so only misregistered keyframes are matched.
+            # If many keyframes are missing, most of the missing keyframes show too little of the room to be
+            # registered, and matching them takes long. So only misregistered keyframes are matched.
             untried = _untried_pairs(ids, wrong, tried)
         tried |= set(untried)
         verified = match_pairs(context.workspace, untried, context.intrinsics, context.stage)
@@ -129,15 +130,15 @@ def remove_without_adjustment(
 def _remove_images(model: Any, image_ids: set[int]) -> tuple[Any, list[str]]:
     """Return the model without some images, and the sorted names of the removed images.
 
-    Points that only these images observe are removed too. Later, registration estimates the poses of the
-    removed frames from the remaining points.
+    Points that only the removed images observe are removed too. The poses of the removed frames are not lost:
+    registration (stage 3) estimates them later from the remaining points.
     """
     removed = sorted(model.image(number).name for number in image_ids)
     return sub_model(model, registered_ids(model) - image_ids) if removed else model, removed
 
 
 def _untried_pairs(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pair]) -> list[Pair]:
-    """Return all pairs of the given images with any image that were not matched yet.
+    """Return all pairs that contain one of the given images and were not matched yet.
 
     Args:
         ids: Database ids of all keyframes.
@@ -152,7 +153,7 @@ def _untried_pairs(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pai
 def re_register_images(
     model: pycolmap.Reconstruction, image_ids: Collection[int], context: MappingContext, total: int
 ) -> Any:
-    """Remove some images from a model, then register these and all new images of the database.
+    """Remove some images from a model. Then register these images and all new images of the database.
 
     Args:
         model: A reconstruction; not changed.

@@ -1,4 +1,7 @@
-"""Remove points that only one camera observed, and only for a moment. Many are on the wearer's sleeve."""
+"""Remove points that only one camera observed, and only for a moment.
+
+Many of these points are not in the room, but on the wearer's sleeve.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MIN_STATIC_POINTS = 20
-"""Minimum number of static points that determine the pose of a keyframe without other points.
-Evidence: docs/decisions/mapping.md."""
+"""Minimum number of static points that determine the pose of a keyframe. If a keyframe has fewer static
+points, its transient points are kept. Evidence: docs/decisions/mapping.md."""
 
 
 def remove_transient_points(model: pycolmap.Reconstruction, times_ns: Mapping[str, IntArray]) -> int:
@@ -53,7 +56,8 @@ def remove_transient_points(model: pycolmap.Reconstruction, times_ns: Mapping[st
 def _is_static(images: list[int], refs: Mapping[int, Any], times_ns: Mapping[str, IntArray]) -> bool:
     """Return whether a point is static: several cameras observe it, or one camera observes it for long.
 
-    One camera must observe the point over a time of more than `MIN_STATIC_SPAN_NS`.
+    If only one camera observes the point, the time from the first to the last observation must be longer than
+    `MIN_STATIC_SPAN_NS`.
 
     Args:
         images: Ids of the images that observe the point.
