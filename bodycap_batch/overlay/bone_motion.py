@@ -13,7 +13,7 @@ from bodycap_batch.model.skeleton_presets import split_side
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bones:
-    """All bones at one time.
+    """The positions of all bones at one time, ready to be projected or drawn.
 
     Attributes:
         ends_in_world: (B,2,3) near and far end of each bone in the world, metres.
@@ -26,7 +26,7 @@ class Bones:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoneMotion:
-    """The bones of a motion at each tick.
+    """The bones of a motion at each tick (time step), for overlays and the preview.
 
     Attributes:
         joints: (B,) index of the joint that rotates each bone.

@@ -18,7 +18,7 @@ line. Evidence: none."""
 _MIN_DEPTH_M = 0.03
 """Metres: minimum depth of a visible part of a bone. A nearer part is inside the camera's own housing."""
 _MAX_OUTSIDE = 2.0
-"""Maximum distance from the image, in image widths or heights. Parts of a bone that are farther outside are
+"""Maximum distance of a drawn bone from the image, in image widths or heights. Bone parts farther outside are
 omitted. Evidence: none."""
 
 

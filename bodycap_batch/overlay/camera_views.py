@@ -16,7 +16,7 @@ from bodycap_batch.model.scene import FrameStatus, Map, Registration
 _MAX_INLIER_ERROR_PX = 4.0
 """Pixels at 640 px image width: maximum reprojection error of an inlier.
 
-Origin: about the inlier limit of registration for tracks with a noise of 0.5 px."""
+Origin: for tracks with a noise of 0.5 px, registration uses about the same limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +40,7 @@ class ObservedPoints:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraView:
-    """One camera in one frame of reference: its lens, its poses and its observations of map points.
+    """The results of one camera that overlays and the preview show, in one frame of reference.
 
     Attributes:
         camera: Camera name.
@@ -50,8 +50,8 @@ class CameraView:
         frame_from_cam: (N,4,4) poses in the frame of reference; NaN for a lost frame.
         status: (N,) status of each frame.
         points: (P,3) all points of the camera's map, in the frame of reference.
-        observation_start: (N+1,) index of each frame's first observation in the two arrays below. The last
-            value is the number of observations.
+        observation_start: (N+1,) index of each frame's first observation in `observed_point` and
+            `observed_px`. The last value is the number of observations.
         observed_point: (M,) point index of each observation.
         observed_px: (M,2) pixel of each observation, with COLMAP's origin.
     """

@@ -28,7 +28,8 @@ red."""
 _LARGE_ERROR_PX = 3.0
 """Pixels at 640 px image width: minimum reprojection error that is drawn fully red. Evidence: none."""
 _COLOUR_STEPS = 6
-"""Number of colours from green to red. OpenCV is called separately for each colour."""
+"""Number of colours from green to red. The number is small, because OpenCV is called separately for each
+colour."""
 SUBPIXEL_BITS = 4
 """Number of fractional bits in OpenCV's fixed-point coordinates: sixteenths of a pixel."""
 
@@ -78,7 +79,7 @@ def draw_overlay(
 
 
 def _draw_points(image: RgbImage, points: ObservedPoints, scale: float, large_error_px: float) -> None:
-    """Draw points, with one pair of OpenCV calls for all points of a colour.
+    """Draw points. All points of one colour need only two OpenCV calls.
 
     A dot is a line of length zero. The line to the observed pixel is omitted if the dot covers that pixel.
     """

@@ -19,9 +19,9 @@ _MAX_ANGLE_RAD = float(np.deg2rad(89.0))
 def max_field_angle_rad(lens: Camera) -> float:
     """Return the maximum angle off the optical axis, in radians, at which the lens model is valid.
 
-    Up to this angle the distance from the principal point grows with the angle. A polynomial lens model is
-    not monotonic outside the image to which it was fitted. It would project a point at a larger angle into
-    the image, to a wrong pixel.
+    Up to this angle the distance from the principal point grows with the angle. At larger angles, a
+    polynomial lens model may not be monotonic. The model would then project a point outside the field of view
+    to a wrong pixel in the image.
     """
     return _max_angle_rad(lens.model, lens.width_px, lens.height_px, tuple(lens.params.tolist()))
 

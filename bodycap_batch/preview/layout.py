@@ -17,8 +17,7 @@ _LABEL_HEIGHT = 22
 _MARGIN = 4
 """Pixels: space between two videos."""
 _MAX_SEARCHED = 10
-"""Maximum number of videos for which all partitions into rows are tried. For ten videos these are 2^9
-partitions."""
+"""Maximum number of videos for which all partitions into rows are tried. Ten videos have 2^9 partitions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +48,15 @@ def lay_out_videos(aspects: Sequence[float]) -> list[tuple[Box, Box]]:
         row has fewer videos than the row above it.
     """
     layouts = [_place_rows(aspects, ends) for ends in _partitions(len(aspects))]
-    # Lengths are summed instead of areas: a large video must not compensate for many unreadably small videos.
+    # The square roots of the areas are summed. If areas were summed, a large video could compensate for many
+    # unreadably small videos.
     return max(layouts, key=lambda boxes: sum(sqrt(box.width * box.height) for box, _ in boxes), default=[])
 
 
 def _partitions(count: int) -> list[tuple[int, ...]]:
-    """Return partitions of the videos into rows, each as the ends of its rows.
+    """Return partitions of the videos into rows.
+
+    A partition lists, for each row, the number of videos up to the end of this row.
 
     For many videos, only partitions into rows of equal length are returned. Their last row may be shorter.
     """

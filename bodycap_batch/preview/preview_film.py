@@ -35,21 +35,21 @@ from bodycap_batch.preview.tiles import WORLD, VideoTile, draw_tile, nearest_fra
 from bodycap_batch.preview.viewpoint import Viewpoint, follow_target
 
 _BODY_RADIUS_M = 1.05
-"""Metres: radius around the middle of the body that must be visible. It includes the head, and a hand of a
-stretched arm."""
+"""Metres: radius of the region around the middle of the body that must be visible. This region includes the
+head, and the hand of a stretched arm."""
 _PATH_PIECES = 1500
-"""Number of pieces in a drawn camera path. A long path has at least this number and at most about twice this
-number. Evidence: none."""
+"""Minimum number of straight pieces in the drawing of a long camera path. The maximum number is about twice
+as large. Evidence: none."""
 _MAX_CLOCK_S = 1e8
-"""Seconds: maximum time that is shown unchanged. A larger time comes from a clock that counts from 1970, and
-is shown relative to the start."""
+"""Seconds: maximum common time that the caption shows unchanged. A larger time comes from a clock that counts
+from 1970. The caption shows such a time relative to the start."""
 _STROKE_LEGEND = "solid: measured · dashed: inferred"
 _DOT_LEGEND = "dots: map points, green where they fit, red where not"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreviewInputs:
-    """The content of the preview.
+    """Everything that the preview shows, and the file to write.
 
     Attributes:
         path: The file to write.
@@ -165,7 +165,7 @@ def make_tiles(inputs: PreviewInputs, timeline: PreviewTimeline) -> list[VideoTi
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _RoomView:
-    """The constant content of the room's view, and the viewpoint in each frame of the preview."""
+    """Draws the room. Holds the constant content and the viewpoint of each frame of the preview."""
 
     cloud: ColouredPoints
     grid: FloatArray | None
@@ -221,7 +221,7 @@ class _RoomView:
 
 
 def _rotation_to_z_up(poses: FloatArray) -> FloatArray:
-    """Return the rotation (3,3) that makes the mean upward direction of the images the Z axis.
+    """Return the rotation (3,3) that rotates the mean upward direction of the images to the Z axis.
 
     Args:
         poses: (N,4,4) camera poses.

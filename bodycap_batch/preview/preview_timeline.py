@@ -10,9 +10,10 @@ import numpy as np
 from bodycap_batch.core.arrays import IntArray, set_array
 
 MAX_FRAMES = 720
-"""Maximum number of frames in the preview: 48 seconds at 15 frames per second, a minute at 12.
+"""Maximum number of frames in the preview: 48 seconds at 15 frames per second, or 60 seconds at 12 frames per
+second.
 
-A person has the patience for that time, and rendering takes little time compared with mapping."""
+A viewer watches a film of this length to its end. Rendering it takes little time compared with mapping."""
 MIN_FPS = 12
 """Minimum frame rate at which the preview is played, frames per second. If the motion or the videos have a
 lower rate, the preview is played at their rate. Evidence: none."""
@@ -49,7 +50,8 @@ def make_timeline(start_ns: int, stop_ns: int, fps: float) -> PreviewTimeline:
             second, third ... frame is shown.
     """
     rate = Fraction(fps).limit_denominator(1001)
-    # The rate may come from rounded times. Adding a hundredth of a frame ensures that the last frame is used.
+    # The rate may be computed from rounded times. A hundredth of a frame is added, so that rounding never
+    # removes the last frame.
     available = int(Fraction(stop_ns - start_ns, 10**9) * rate + Fraction(1, 100)) + 1
     stride = max(1, round(fps / _TARGET_FPS), -(-available // MAX_FRAMES))
     shown_rate = rate / stride

@@ -20,7 +20,7 @@ GRID_COLOUR, _SHADOW_COLOUR = (70, 76, 90), (12, 13, 16)
 _OUTLINE_COLOUR = (15, 16, 19)
 """RGB colour of the dark border around measured bones."""
 _MAX_POINTS = 40_000
-"""Maximum number of points drawn in each image. This number takes a few milliseconds."""
+"""Maximum number of points drawn in each image. These points are drawn in a few milliseconds."""
 _BONE_RADIUS_M = 0.022
 """Metres: radius of a drawn bone. Evidence: none."""
 _MIN_POINT_DEPTH, _MIN_LINE_DEPTH = 0.35, 0.05

@@ -80,9 +80,9 @@ class VideoTile:
 def resize_image(image: RgbImage, size: tuple[int, int]) -> RgbImage:
     """Return an image (H,W,3) resized to the width and height in `size`.
 
-    The image is halved while it is at least twice too large. It is then interpolated to its final size.
-    Averaging directly to the final size has hardly less aliasing, and takes five times as long: 3 ms for
-    640×480.
+    The image is halved while it is at least twice as large as `size`. It is then interpolated to its final
+    size. Averaging directly to the final size has hardly less aliasing, and takes five times as long: 3 ms
+    for 640×480.
     """
     import cv2
 
@@ -179,7 +179,7 @@ def describe_status(status: FrameStatus, points: ObservedPoints | None) -> tuple
     if not status.localised or points is None:
         return f"lost: {_LOSS_REASONS.get(status, status.value)}", RED
     name = {FrameStatus.KEYFRAME: "keyframe", FrameStatus.RIG: "carried by the rig"}.get(status, "")
-    if not len(points.px):  # recovery stores no observations
+    if not len(points.px):  # recovery stores no observations for the frames that it poses
         return name or "found again", AMBER
     text = f"{len(points.px)} points, {float(points.error_px.mean()):.1f} px"
     return f"{name} · {text}" if name else text, GREEN

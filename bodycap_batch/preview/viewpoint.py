@@ -12,12 +12,12 @@ from bodycap_batch.model.geometry import transform_points
 _FIELD_RAD = float(np.deg2rad(42.0))
 """Radians: field of view over the shorter side of the image. Evidence: none."""
 _ELEVATION_RAD = float(np.deg2rad(17.0))
-"""Radians: angle between the horizontal plane and the direction in which the camera looks down. Evidence:
+"""Radians: downward tilt of the camera's viewing direction, measured from the horizontal plane. Evidence:
 none."""
 _AZIMUTHS_RAD = tuple(float(np.deg2rad(side)) for side in (35, -35, 75, -75, 110, -110, 145, -145))
 """Radians: candidate azimuths of the camera, the preferred azimuths first.
 
-At azimuth zero the camera is in front of a body that faces -Y. A body starts to walk in this direction."""
+At azimuth zero the camera is in front of a body that faces -Y. A body starts to walk towards -Y."""
 _MIN_SHARE_OF_BEST = 0.6
 """Minimum number of visible points of the selected azimuth, as a fraction of the maximum over all azimuths.
 The first candidate with this number is selected. Evidence: none."""
@@ -27,8 +27,8 @@ Evidence: none."""
 _SWAY_PERIOD_S = 24.0
 """Seconds of the preview: period of the camera's slow rotation. Evidence: none."""
 _SMOOTHING_SIGMA_S = 1.0
-"""Seconds: sigma of the Gaussian that smooths the target's path. The steps of a walking body are shorter, so
-they do not shake the camera."""
+"""Seconds: sigma of the Gaussian that smooths the target's path. A step of a walking body takes less time
+than this, so steps do not shake the camera."""
 _SAMPLED_TARGETS = 8
 """Approximate number of target positions at which an azimuth's visible points are counted. Evidence: none."""
 _MARGIN = 1.1
@@ -82,7 +82,8 @@ def follow_target(
     smooth_target = _smooth_path(target, seconds)
     focal_px = 0.5 * min(size) / np.tan(0.5 * _FIELD_RAD)
     deviation = float(np.linalg.norm(target - smooth_target, axis=1).max(initial=0.0))
-    # A body is taller than wide. It is wholly visible even if it deviates sideways by 0.4 of its reach.
+    # A body is taller than wide: its sideways extent is at most 0.6 of the reach. A sideways deviation of up
+    # to 0.4 of the reach therefore does not increase the distance.
     distance = _MARGIN * max(reach, 0.6 * reach + deviation) / np.tan(0.5 * _FIELD_RAD)
     phase = 2.0 * np.pi * seconds / _SWAY_PERIOD_S
 

@@ -46,9 +46,9 @@ def register_frames(
 ) -> Registration:
     """Estimate the pose of every frame of one camera against the map.
 
-    Map points are tracked from each keyframe into the frames up to both neighbouring keyframes, including
-    these. A frame may have two tracks of one point, from two keyframes. Both are used, because their errors
-    are independent. No map points are added.
+    Map points are tracked from each keyframe forward to the next keyframe and backward to the previous
+    keyframe. A point may therefore have two tracks in a frame, from two keyframes. Both tracks are used,
+    because their errors are independent. No map points are added.
 
     Args:
         camera: The camera.
@@ -102,7 +102,7 @@ def register_in_rig(
 
     Args:
         own: The camera with its registration.
-        others: The other cameras on its segment, exposed at the same instants.
+        others: The other cameras on the same body segment, exposed at the same instants.
         maps: The maps that the camera was registered against.
         selection: The keyframes of the camera.
         options: Minimum number of inliers and maximum relative sigma of a pose.

@@ -13,29 +13,30 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp, transform_points
 
 _RAY_STEP = 1e-4
-"""Step of the central differences, in units of the ray (x/z, y/z). It is about 16 times the cube root of the
-float64 precision, the step with the smallest error for a function of unit scale. Evidence: none."""
+"""Step of the central differences, in units of the ray (x/z, y/z). For a function of unit scale, the cube
+root of the float64 precision (6e-6) is the step with the smallest error. This step is 16 times larger.
+Evidence: none."""
 _CHUNK_FRAMES = 48
-"""Number of frames solved together. More frames hide numpy's overhead; fewer frames stay in the processor's
-cache."""
+"""Number of frames solved together. More frames reduce numpy's overhead per frame; fewer frames fit into the
+processor's cache."""
 _BATCH_ROWS = 1 << 14
-"""Maximum number of observations undistorted at a time. The camera model needs ten times the memory of its
-result."""
+"""Maximum number of observations that are undistorted in one call. Undistortion temporarily needs ten times
+the memory of its result."""
 _MAX_ITERATIONS = 20
 """Maximum number of Gauss–Newton iterations. Evidence: none."""
 _CONVERGED_PX = 1e-2
-"""Pixels: threshold of convergence. An iteration that moves the projected points by less is the last
-iteration. Origin: a third of the standard error of 200 points with 0.5 px of noise. Evidence:
+"""Pixels: threshold of convergence. Iteration ends when the projected points move by less than this. Origin:
+a third of the standard error of the mean of 200 points with 0.5 px of noise. Evidence:
 docs/decisions/registration.md."""
 _MAX_STEP_RAD = 0.5
 """Radians: maximum rotation in one iteration. Origin: the linearisation is not valid for larger rotations.
 Evidence: none."""
 _CUTOFF_MEDIANS = 3.0
-"""Cut-off of a residual, as a multiple of the frame's median residual. It is used while it is larger than the
-inlier limit, that is, while the pose is still bad. Evidence: none."""
+"""Cut-off of residuals in early iterations, as a multiple of the frame's median residual. It is only used
+while it exceeds the inlier limit, because the pose is then still inaccurate. Evidence: none."""
 MIN_COUNTED_WEIGHT = 0.05
-"""Minimum weight of an observation for the noise estimate and for RANSAC. RANSAC uses all observations if too
-few have this weight. Evidence: none."""
+"""Minimum weight of an observation that is used for the noise estimate and for RANSAC. If too few
+observations have this weight, RANSAC uses all observations. Evidence: none."""
 _LOSS_SCALE = 0.25
 """Scale of the Cauchy loss, as a fraction of the cut-off. Evidence: docs/decisions/registration.md."""
 _DAMPING = 1e-10
@@ -60,7 +61,8 @@ class Observations:
         points: (M,3) observed points in the gauge.
         rays: (M,2) undistorted observed pixels at depth 1: x/z, y/z.
         px_from_ray: (M,2,2) derivative of the pixel with respect to the ray.
-        weight: (M,) inverse variance of each observation, relative to the best observations.
+        weight: (M,) inverse variance of each observation, relative to the inverse variance of the best
+            observations.
         member: (M,) index of the observing camera of a rig; None for a single camera.
         cam_from_rig: (C,4,4) poses of the cameras in the rig; None for a single camera. If they are given,
             the estimated poses are the poses of the rig.
@@ -117,8 +119,8 @@ class PoseQuality:
         noise_px: (F,) median absolute residual along one image axis, multiplied by the root of the weight.
             Only inliers with a weight of at least `MIN_COUNTED_WEIGHT` are used.
         depth: (F,) median depth of the inliers, in the unit of the gauge.
-        information: (F,6,6) Gauss–Newton information of a left perturbation of cam_from_gauge, for 1 px of
-            noise.
+        information: (F,6,6) Gauss–Newton information matrix of each pose, for 1 px of noise. It refers to a
+            left perturbation of cam_from_gauge.
     """
 
     inliers: IntArray
@@ -173,8 +175,8 @@ def refine_poses(
 ) -> FloatArray:
     """Minimise the reprojection error of each frame under a Cauchy loss, cut off at `limit_px`.
 
-    The loss is as wide as the residuals at first, and narrows as they shrink. The poses therefore converge
-    even if the first residuals exceed the limit. Frames are independent of each other.
+    The loss is wide while the residuals are large, and becomes narrower as the residuals decrease. The poses
+    therefore converge even if the first residuals exceed the limit. Frames are independent of each other.
 
     Args:
         observations: Observations of F frames.
@@ -245,7 +247,7 @@ def find_inliers(
 ) -> BoolArray:
     """Return a mask (M,) of the observations that agree with poses (F,4,4) within a limit.
 
-    It is False for all observations of a frame whose pose is NaN.
+    The mask is False for all observations of a frame whose pose is NaN.
     """
     out = np.zeros(len(observations.rays), dtype=bool)
 
@@ -304,10 +306,10 @@ def _gauss_newton_step(
 
 
 def _segment_medians(value: FloatArray, owner: IntArray, starts: IntArray, counts: IntArray) -> FloatArray:
-    """Return the lower median of the `counts` smallest values of each frame.
+    """Return, for each frame, the lower median of its `counts` smallest values.
 
-    The values of all frames are sorted together. A multiple of the frame's number is added to each value
-    before, so that the frames stay separate.
+    The values of all frames are sorted together. Before sorting, an offset for its frame is added to each
+    value, so that the values of the frames stay separate.
 
     Args:
         value: (M,) values, ordered by frame.
@@ -325,8 +327,8 @@ def _rows_of_frames(observations: Observations, frames: IntArray) -> tuple[IntAr
     """Return the rows of the selected frames.
 
     Returns:
-        Row indices (M,), the position (F,) of each frame's first row among them, and the number (M,) of each
-        row's frame.
+        Row indices (M,); the position (F,) of each frame's first row in these indices; for each row, the
+        number (M,) of its frame.
     """
     counts = observations.bounds[frames + 1] - observations.bounds[frames]
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
@@ -367,7 +369,7 @@ def linearise(
 
 
 def _camera_to_rig_jacobian(jacobian: FloatArray, member: IntArray, cam_from_rig: FloatArray) -> None:
-    """Replace derivatives with respect to a camera's perturbation by derivatives with respect to its rig's.
+    """Convert derivatives with respect to a camera's pose to derivatives with respect to the rig's pose.
 
     Args:
         jacobian: (2,6,N) derivatives, changed in place; rotation first.
@@ -388,7 +390,7 @@ def _residuals(
     """Return the residuals, the projected points and the derivative of the pixel with respect to the ray.
 
     Returns:
-        Residuals (2,N) as in `linearise`; a tuple of x/z, y/z and 1/z (N,) each, and z (N,); px_from_ray
+        Residuals (2,N) as in `linearise`; a tuple of four arrays (N,): x/z, y/z, 1/z and z; px_from_ray
         (2,2,N). For unusable observations px_from_ray is 0.
     """
     x, y, z = transform_points(observations.camera_poses(rows, cam_from_gauge), observations.points[rows]).T

@@ -10,13 +10,14 @@ _WINDOW_FRAMES = 3
 """Number of successive lost frames in a window. Only the sharpest frame of each window is requested.
 Evidence: none."""
 _END_OFFSET_FRAMES = 1
-"""Distance in frames between a lost interval and the frame with a pose that is requested on either side. With
-1 it is the adjacent frame."""
+"""Distance (number of frames) from a lost interval to the frame with a pose that is requested next to it. A
+distance of 1 means the adjacent frame."""
 _MIN_BUDGET = 20
-"""Number of frames that may be requested in every round. Evidence: none."""
+"""Number of frames that may always be requested in a round, even if few frames were offered before. Evidence:
+none."""
 _BUDGET_RATIO = 0.5
-"""Maximum number of frames requested in one round, as a fraction of the number of frames offered before.
-Origin: it bounds the growth of the map in one round. Evidence: none."""
+"""Maximum number of frames requested in one round, as a fraction of the number of frames offered to the
+mapper before. The limit bounds the growth of the map. Evidence: none."""
 
 
 def lost_intervals(localised: BoolArray) -> list[tuple[int, int]]:

@@ -14,8 +14,8 @@ from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, ransac_pose
 from bodycap_batch.registration.tracking.klt import Tracks
 
 _MIN_TRACKS = 15
-"""Minimum number of tracks between two keyframes for a decision. Origin: about the minimum number of inliers
-of a pose. Evidence: none."""
+"""Minimum number of tracks between two keyframes that are needed to test the poses of the keyframes. Origin:
+about the minimum number of inliers of a pose. Evidence: none."""
 _MAX_MEDIAN_ERROR = 4.0
 """Maximum median distance between tracked and predicted pixels, as a multiple of the inlier limit. If the
 median between two keyframes is larger, the tracks may contradict the poses. Evidence:
@@ -25,14 +25,14 @@ _UNSEEN_ERROR_PX = 1e5
 
 
 _MIN_OTHER_POSE_RATIO = 0.5
-"""Minimum fraction of the tracks into a keyframe that must agree on another pose of this keyframe. Only then
-do the tracks contradict the map. Tracks that have slipped do not agree on any pose. Evidence:
+"""Minimum fraction of the tracks arriving in a keyframe that must agree on another pose of this keyframe.
+Otherwise the tracks have probably slipped, and do not contradict the map. Evidence:
 docs/decisions/registration.md."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Interval:
-    """The interval between two successive keyframes of a camera.
+    """Result of testing the poses of two successive keyframes with the tracks between them.
 
     Both attributes are False in two cases: there are too few tracks, or the tracks disagree with the poses
     but no other pose explains them.
@@ -48,7 +48,7 @@ class _Interval:
 
 @dataclass(frozen=True, slots=True)
 class _ArrivingTracks:
-    """Tracks that start in one keyframe and arrive in another.
+    """Tracks that start in one keyframe and arrive in another, with their deviation from the map.
 
     Attributes:
         target: (N,) index of the keyframe that the track arrives in, among the camera's keyframes.
@@ -70,9 +70,10 @@ def find_misplaced_keyframes(
 ) -> IntArray:
     """Find misregistered keyframes: keyframes whose pose contradicts the tracks from their neighbours.
 
-    Points tracked from one keyframe to the next must arrive at the pixels that the map predicts. If they
-    arrive elsewhere, the keyframes on one side of the interval are misregistered. It is the side with fewer
-    points that other keyframes share. A side consists of all keyframes that consistent intervals connect.
+    Points tracked from one keyframe to the next must arrive at the pixels that the map predicts. If the
+    points arrive elsewhere, the keyframes on one side of the interval are misregistered. A side is a group of
+    keyframes that are connected by consistent intervals. The side that shares fewer points with other
+    keyframes is treated as misregistered.
 
     Args:
         camera: Camera name.
@@ -123,7 +124,7 @@ def _arriving_tracks(camera: str, scene_map: Map, rows: IntArray, tracks: Tracks
 def _check_interval(
     lens: Camera, scene_map: Map, arriving: _ArrivingTracks, number: int, criteria: AcceptanceCriteria
 ) -> _Interval:
-    """Compare the tracks between a keyframe and the next keyframe with the poses of both.
+    """Compare the tracks between two successive keyframes with the poses of these keyframes.
 
     Tracks in both directions are compared.
 

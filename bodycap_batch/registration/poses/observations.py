@@ -18,11 +18,12 @@ from bodycap_batch.registration.poses.static_points import static_points
 from bodycap_batch.registration.tracking.klt import Tracks
 
 _POINT_VARIANCE_RATIO = 6.0
-"""Ratio of two variances: the variance that the position error of a point adds to its observations, over the
-variance of a track. It holds for a point that one keyframe sees. The added variance is inversely proportional
-to the number of keyframes. Evidence: docs/decisions/registration.md."""
+"""Variance that the position error of a point adds to an observation, as a multiple of the variance of a
+track. The value holds for a point that one keyframe sees. With more keyframes, the added variance is divided
+by their number. Evidence: docs/decisions/registration.md."""
 _TRANSIENT_WEIGHT = 0.01
-"""Weight factor of observations whose point is not static. Evidence: docs/decisions/registration.md."""
+"""Factor on the weight of the observations of points that are not static. Evidence:
+docs/decisions/registration.md."""
 BLOCK_FRAMES = 1200
 """Maximum number of frames in a block. Only the observations of one block are held in memory at a time. The
 poses do not depend on this number. Evidence: docs/decisions/registration.md."""
@@ -62,7 +63,7 @@ class RigMember:
 
 @dataclass(slots=True)
 class PointReliability:
-    """How often each point was observed in frames with a pose, and how often it agreed with the pose.
+    """Counts of each point's observations, from which the reliability of the point is computed.
 
     C is the number of cameras, P the number of points.
 
@@ -76,14 +77,14 @@ class PointReliability:
 
     @staticmethod
     def zero(count: int) -> PointReliability:
-        """Return a reliability in which all `count` numbers of observations are zero."""
+        """Return a reliability with `count` entries, in which all numbers of observations are zero."""
         return PointReliability(np.zeros(count, np.int64), np.zeros(count, np.int64))
 
     def add(self, keys: IntArray, has_pose: BoolArray, agrees: BoolArray) -> None:
-        """Add observations to the numbers; observations in frames without a pose are ignored.
+        """Add observations to the counts. Observations in frames without a pose are ignored.
 
         Args:
-            keys: (M,) index by camera and point of each observation.
+            keys: (M,) combined index of camera and point for each observation.
             has_pose: (M,) True if the frame of the observation has a pose.
             agrees: (M,) True if the observation agrees with that pose.
         """
@@ -93,10 +94,10 @@ class PointReliability:
     def agreement(self, keys: IntArray) -> FloatArray:
         """Return the fraction (M,) of each point's observations that agree with a pose.
 
-        It is 1 for a point with fewer than `_MIN_OBSERVED` observations.
+        The fraction is 1 for a point with fewer than `_MIN_OBSERVED` observations.
 
         Args:
-            keys: (M,) index by camera and point of each requested fraction.
+            keys: (M,) combined index of camera and point for each requested fraction.
         """
         ratio = self.agreed / np.maximum(self.observed, 1)
         return np.asarray(np.where(self.observed < _MIN_OBSERVED, 1.0, ratio)[keys])
@@ -104,7 +105,9 @@ class PointReliability:
 
 @dataclass(slots=True)
 class RigObservations:
-    """The cameras of a rig and the map. If all frames fit into one block, its observations are cached.
+    """Provides the observations of a rig's cameras, one block of frames after another.
+
+    If all frames fit into one block, the observations of this block are cached.
 
     C is the number of cameras, P the number of points.
 
@@ -232,14 +235,14 @@ class FrameBlock:
 
     @property
     def point_keys(self) -> IntArray:
-        """(M,) index by camera and point, as `PointReliability` uses it."""
+        """(M,) combined index of camera and point for each observation, as used in `PointReliability`."""
         return self.member * len(self.rig.scene_map.points) + self.point
 
     def px_at_mid_row(self, path: FloatArray) -> FloatArray:
         """Return the pixels (M,2) moved to the instant of the middle row.
 
         Args:
-            path: (F,4,4) poses map_from_rig of all frames; NaN if there is none.
+            path: (F,4,4) poses map_from_rig of all frames; NaN for a frame without a pose.
         """
         out = self.px.copy()
         scene_map, times_ns = self.rig.scene_map, self.rig.members[0].camera.times_ns

@@ -20,25 +20,26 @@ from bodycap_batch.registration.poses.batched_pnp import (
 )
 
 _MIN_INLIER_WEIGHT_RATIO = 0.3
-"""Minimum ratio of the inliers' weight to the weight of all observations, for an accepted pose. Evidence:
-none."""
+"""Minimum inlier weight ratio of an accepted pose: the weight of the inliers divided by the weight of all
+observations. Evidence: none."""
 _MIN_NOISE_PX = 0.3
-"""Pixels: smallest assumed noise of an observation. It is used if the residuals are smaller. Evidence:
-none."""
+"""Pixels: smallest assumed noise of an observation. It replaces a smaller noise estimate from the residuals.
+Evidence: none."""
 MAP_COVARIANCE_SCALE = 5.0
-"""Ratio of the variance of a pose to the variance that its residuals suggest.
+"""Factor on the covariance of a pose that is computed from its residuals.
 
-The map points around a frame are displaced together. The residuals of one frame cannot show this error.
-Evidence: docs/decisions/registration.md."""
+The map points that a frame sees have a common position error. The residuals of one frame cannot show this
+error, so the computed covariance is too small. Evidence: docs/decisions/registration.md."""
 _UNCONSTRAINED_VARIANCE = 1e12
 """Variance assumed for a pose that the observations do not determine. It exceeds every limit."""
 _WEIGHT_RATIO_FLOOR = 1e-3
-"""Smallest inlier weight ratio that sigmas are divided by. It prevents a division by zero."""
+"""Lower limit of the inlier weight ratio when sigmas are divided by this ratio. It prevents a division by
+zero."""
 _MAX_TRIALS = 2000
 """Maximum number of RANSAC iterations. Evidence: none."""
 TRUSTED_WEIGHT_RATIO = 0.6
-"""Minimum inlier weight ratio of a pose that is accepted without RANSAC. RANSAC never found a better pose
-than such a pose."""
+"""Minimum inlier weight ratio of a pose for which RANSAC is not tried. For such poses, RANSAC never found a
+better pose."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +63,7 @@ class AcceptanceCriteria:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FramePose:
-    """The estimated pose of one frame, or the reason why it has none.
+    """The estimated pose of one frame, or the reason why the frame has no pose.
 
     Attributes:
         status: Status of the frame. `REGISTERED`, `KEYFRAME` and `RIG` have a pose; any other status is the
@@ -268,8 +269,8 @@ def accept_poses(
 def _covariance(quality: PoseQuality, min_noise_px: float) -> FloatArray:
     """Return covariances (F,6,6) from the information and the noise of the inliers.
 
-    If the information matrix is singular, the variances are huge. Observations that disagree with a pose are
-    evidence against it. The sigmas therefore grow as the inlier weight ratio falls. Evidence:
+    If the information matrix is singular, the variances are huge. Observations that disagree with a pose make
+    this pose less certain. The sigmas therefore grow as the inlier weight ratio falls. Evidence:
     docs/decisions/registration.md.
 
     A left perturbation of cam_from_gauge is a right perturbation of gauge_from_cam with the opposite sign.

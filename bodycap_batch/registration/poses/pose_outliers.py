@@ -12,14 +12,14 @@ _MIN_SCALE_RATIO = 10.0
 """Minimum deviation of an outlier, as a multiple of the typical second difference around it. This ratio does
 not depend on the map's scale or on the speed. Evidence: none."""
 _MIN_NEIGHBOUR_RESPONSE = 0.5
-"""Minimum response of the neighbours of an outlier: the fraction of the frame's second difference that the
-second differences of both neighbours cancel. It is 1 at a single outlier and 0 at a jerk of the camera.
-Origin: halfway."""
+"""Minimum response of the two neighbours of an outlier. The response is the fraction of the outlier's second
+difference that the neighbours' second differences cancel. It is 1 at a single outlier and 0 at a jerk of the
+camera. Origin: the middle of 0 and 1."""
 _SLOW_SPAN_NS, _MIN_NEIGHBOUR_RESPONSE_SLOW = 90_000_000, 0.8
-"""_SLOW_SPAN_NS: maximum time in nanoseconds between the two neighbours for the threshold above.
-_MIN_NEIGHBOUR_RESPONSE_SLOW: minimum response of neighbours that are farther apart in time. A fast gesture
-then also bends the path at a single frame, but the response of the neighbours is smaller than at an outlier.
-Evidence: docs/decisions/registration.md."""
+"""_SLOW_SPAN_NS: maximum time in nanoseconds between the two neighbours at which _MIN_NEIGHBOUR_RESPONSE is
+used. _MIN_NEIGHBOUR_RESPONSE_SLOW: minimum response if this time is longer. During a longer time, a fast
+gesture may also bend the path at a single frame. The response of a gesture is smaller than the response of an
+outlier. Evidence: docs/decisions/registration.md."""
 _GAP_MIN_SIGMAS = 4.0
 """Minimum deviation of an outlier next to a lost interval, in standard deviations. Evidence:
 docs/decisions/registration.md."""
@@ -27,7 +27,8 @@ _GAP_MIN_SCALE_RATIO = 5.0
 """Minimum deviation of an outlier next to a lost interval, as a multiple of the typical second difference.
 Evidence: docs/decisions/registration.md."""
 _RUN_LENGTHS = (2, 3)
-"""Tested numbers of successive outliers. A longer run may be motion."""
+"""Numbers of successive poses that are tested together as a run of outliers. A longer run may be real
+motion."""
 _MAX_RUN_SPAN_NS = 140_000_000
 """Nanoseconds: maximum time from the frame before a run to the frame after it. Origin: three poses at 30 Hz.
 In a longer time a body can move there and back."""
@@ -35,8 +36,8 @@ _MIN_KINK_RATIO = 2.0
 """Minimum deviation of a run, as a multiple of the deviation that a sudden stop of the body explains.
 Evidence: none."""
 _MAX_EXTRAPOLATION_RATIO = 0.5
-"""Maximum extrapolation error at the pose after the run, as a fraction of the deviation. The error is larger
-if the path moves aside and stays there; such a run is not an outlier. Evidence: none."""
+"""Maximum extrapolation error at the pose after the run, as a fraction of the run's deviation. If the error
+is larger, the path has moved aside and stays there. The run is then not an outlier. Evidence: none."""
 _SECOND_MIN_RESPONSE, _FIRST_MAX_RESPONSE, _SECOND_MAX_RESPONSE = 0.25, 0.45, 1.0
 """Thresholds of the response after a lost interval. The response is the fraction of the second pose's second
 difference that the third pose's second difference cancels. The first pose may be wrong if the response is
@@ -46,8 +47,8 @@ Evidence for the thresholds between these values: none."""
 _SCALE_WINDOW = 12
 """Number of frames on either side that determine the typical second difference. Evidence: none."""
 ISOLATED_INLIER_FACTOR = 4
-"""Minimum number of inliers of an isolated pose, as a multiple of the usual minimum number. Evidence:
-none."""
+"""Minimum number of inliers of an isolated pose that is kept, as a multiple of the minimum number for other
+poses. Evidence: none."""
 _MAX_ISOLATED_RUN = 2
 """Maximum number of successive poses that are treated as isolated. Evidence: none."""
 _MIN_ISOLATING_GAP = 3
@@ -59,8 +60,8 @@ def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArra
 
     The test uses second differences. The second difference of a frame is the offset of its centre from the
     midpoint of the centres before and after it. A single outlier changes its own second difference by its
-    full deviation. It changes the second differences of both neighbours by half of that, with the opposite
-    sign. A body that stops suddenly changes mainly one second difference.
+    full deviation. It changes the second differences of both neighbours by half of this deviation, with the
+    opposite sign. A body that stops suddenly changes mainly one second difference.
 
     Next to a lost interval only one side can be tested. The limits are lower there, because more poses are
     wrong. A deviation of several frames that lasts longer than `_MAX_RUN_SPAN_NS` is treated as motion.
@@ -72,7 +73,7 @@ def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArra
         times_ns: (N,) times of the frames in nanoseconds, increasing.
 
     Returns:
-        Mask (N,) of the frames whose pose is an outlier. It does not depend on the scale of the map.
+        Mask (N,) of the frames whose pose is an outlier. The mask does not depend on the scale of the map.
     """
     size = np.linalg.norm(_second_differences(centres, sigma)[0], axis=1)
     in_run = np.zeros(len(centres), dtype=bool)
@@ -135,14 +136,15 @@ def _outlier_runs(
         smallest > np.maximum(_MIN_KINK_RATIO * kink, extrapolation_error / _MAX_EXTRAPOLATION_RATIO)
     )
     for row in np.flatnonzero(candidate).tolist():
-        # The deviation from the line if every frame of the run had the typical second difference.
+        # The expected deviation from the line: every frame of the run is assumed to have the typical second
+        # difference.
         local = _local_scale(size, before[row], behind[row] + 1, _SCALE_WINDOW) * 0.25 * steps**2
         out[run[row]] |= smallest[row] > _MIN_SCALE_RATIO * local
     return out
 
 
 def _local_scale(size: FloatArray, start: int, stop: int, window: int) -> float:
-    """Return the typical second difference: the median length of `window` second differences on either side.
+    """Return the typical length of a second difference: the median over `window` frames on either side.
 
     The frames from `start` to `stop` are not used. The result is infinite if too few second differences are
     known.

@@ -1,4 +1,4 @@
-"""Relate the cameras of a rig to each other by the registrations of the single cameras."""
+"""Determine the relative poses of the cameras of a rig from the registrations of the single cameras."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def rig_members(
 
     Args:
         own: The camera at the origin of the rig.
-        others: The other cameras on the segment.
+        others: The other cameras on the same body segment.
         relative: Relative pose between `own` and each other camera. Cameras whose relative pose is not rigid
             are excluded.
     """
@@ -99,7 +99,7 @@ def initial_rig_poses(
 
     Args:
         own: The camera at the origin of the rig, with its registration.
-        others: The other cameras on the segment, with their registrations.
+        others: The other cameras on the same body segment, with their registrations.
         members: The cameras of the rig, from `rig_members`.
     """
     out = np.full((len(own.camera.times_ns), 4, 4), np.nan)

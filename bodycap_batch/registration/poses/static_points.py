@@ -1,4 +1,4 @@
-"""Find the static points of a map: points that another camera saw too, or one camera for a longer time."""
+"""Find the static points of a map: points seen by several cameras, or by one camera for a long time."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from bodycap_batch.model.static_span import MIN_STATIC_SPAN_NS
 
 _MIN_KEYFRAME_RATIO = 0.5
 """Minimum fraction of a camera's keyframes that must see enough static points. If the fraction is smaller,
-the test is not applied. Evidence: none."""
+all points are treated as static for this camera. Evidence: none."""
 _MIN_STATIC_POINTS = 12
-"""Minimum number of static points that a keyframe must see, to be in that fraction. The keyframes of a single
-camera that always moves on see fewer. The test is not applied to such a camera. Evidence: none."""
+"""Number of static points in a keyframe that is enough for `_MIN_KEYFRAME_RATIO`. If a single camera never
+returns to the same place, its keyframes see fewer static points. Evidence: none."""
 
 
 def static_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:

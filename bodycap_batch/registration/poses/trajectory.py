@@ -1,4 +1,4 @@
-"""Estimate the poses of all frames against the map, and repeat this with weights from the solution before."""
+"""Estimate the poses of all frames, and repeat the estimation with weights from the previous solution."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from bodycap_batch.registration.poses.pose_outliers import (
 from bodycap_batch.registration.tracking.klt import Tracks, camera_pixel_scale
 
 _MIN_STATIC_INLIERS = 6
-"""Minimum number of inliers on static points. A pose with fewer is probably a pose relative to the wearer's
-sleeve, and is rejected. Evidence: none."""
+"""Minimum number of inliers on static points. A pose with fewer such inliers is rejected. It was probably
+estimated from points on the wearer's sleeve. Evidence: none."""
 _MAP_NOISE_PX = 0.6
 """Pixels at 640 px image width: standard deviation of a map point's projection. Evidence: none."""
 _INLIER_SIGMAS = 3.5
 """Maximum reprojection error of an inlier, in standard deviations of an observation. Origin: it covers 99.8 %
 of a 2D normal distribution."""
 _BLUR_WINDOW_FRAMES = 15
-"""Number of frames before and after a frame with which its sharpness is compared. Evidence: none."""
+"""Number of frames on each side of a frame. The sharpness of the frame is compared with theirs. Evidence:
+none."""
 _REPEATS = 1
-"""Number of repeated solutions without a rolling shutter. Each repetition weights the points by their
-agreement with the poses before."""
+"""Number of repeated solutions for a global shutter. Each repetition weights the points by their agreement
+with the previous poses."""
 _REPEATS_ROLLING = 2
-"""Number of repeated solutions with a rolling shutter. The correction of the pixels needs poses, because
-the velocities of points in the image follow from poses. Pixels and poses are therefore computed in turn,
-twice."""
+"""Number of repeated solutions for a rolling shutter. Each repetition first corrects the pixels with the
+previous poses, because these determine the velocities of points in the image."""
 
 
 def acceptance_criteria(
@@ -280,7 +280,8 @@ def _reject_outliers(
     for frame, pose in enumerate(poses):
         if pose.gauge_from_cam is not None and pose.covariance is not None:
             centres[frame] = pose.gauge_from_cam[:3, 3]
-            # Neighbouring frames share the error of the map. It is therefore removed from the sigma.
+            # Neighbouring frames share the error of the map. This common error is therefore removed from the
+            # sigma.
             sigma[frame] = np.sqrt(np.trace(pose.covariance[3:, 3:]) / MAP_COVARIANCE_SCALE)
     accepted = _reject(poses, find_outlier_poses(centres, sigma, times_ns), FrameStatus.POSE_JUMP)
     localised = np.array([pose.gauge_from_cam is not None for pose in accepted], dtype=bool)

@@ -35,27 +35,27 @@ _LEVELS = (
     SearchLevel(pyramid_level=1, patch_side=21, search_radius=8, min_score=0.7, limit_px=6.0),
     SearchLevel(pyramid_level=0, patch_side=31, search_radius=8, min_score=0.75, limit_px=4.0),
 )
-"""Searches from coarse to fine. The last search uses the largest image of the pyramid. Its errors are a
-quarter smaller than in the image of half that size. Evidence for this: docs/decisions/registration.md; for
+"""Searches from coarse to fine. The last search uses the largest image of the pyramid. The pose errors are
+then a quarter smaller than with the half-size image (evidence: docs/decisions/registration.md). Evidence for
 the other values: none."""
 _CELL_SIDE_PX = 40.0
 """Pixels at 640 px image width: side of a cell of the image grid. It is about the side of a patch."""
 _FULL_WEIGHT_PER_CELL = 2.0
-"""Maximum number of matches in one cell that have their full weight. More matches share this weight, because
-overlapping patches have common errors. Evidence: docs/decisions/registration.md."""
+"""Maximum sum of the weights of the matches in one cell. With more matches, each match has a lower weight,
+because overlapping patches have common errors. Evidence: docs/decisions/registration.md."""
 _MIN_NOISE_PX = 1.0
-"""Pixels at 640 px image width: smallest assumed noise of a patch match. The residuals of few matches in a
-blurred frame may be smaller by chance. Evidence: none."""
+"""Pixels at 640 px image width: smallest assumed noise of a patch match. In a blurred frame with few matches,
+the residuals may be smaller by chance. Evidence: none."""
 _MIN_MATCHES = 8
 """Minimum number of matches for a pose. Evidence: none."""
 _SUFFICIENT_INLIERS, _SUFFICIENT_WEIGHT_RATIO = 25, 0.6
-"""Minimum number of inliers and minimum inlier weight ratio of a sufficient pose. After a sufficient pose no
-further expected pose is tried. Evidence: none."""
+"""Minimum number of inliers and minimum inlier weight ratio of a pose that ends the search in a frame. The
+remaining expected poses are then not tried. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseEstimate:
-    """A pose from patch matches or from tracking.
+    """A pose with its uncertainty and its support, from patch matches or from tracking.
 
     Attributes:
         cam_from_map: (4,4) pose.
@@ -106,9 +106,9 @@ class PoseEstimate:
         return self.inliers >= min_inliers and self.inlier_weight_ratio >= min_inlier_weight_ratio
 
     def conditioned_on_centre(self, position: PositionEstimate) -> tuple[FloatArray, FloatArray]:
-        """Return the pose and its covariance for another position of the camera centre.
+        """Return the pose and its covariance after the camera centre is moved to another position.
 
-        The rotation changes as far as it is correlated with the centre.
+        The rotation changes too, according to its correlation with the centre.
 
         Args:
             position: The other position, with its uncertainty.
@@ -158,7 +158,7 @@ class SearchFrame:
 
 @dataclass(frozen=True, slots=True)
 class NeighbourPose:
-    """Pose of the camera in the frame before or after.
+    """Pose of the camera in the previous or next frame. It determines the motion blur in the searched frame.
 
     Attributes:
         pose: (4,4) cam_from_map.
@@ -179,8 +179,8 @@ class GuidedLocaliser:
         criteria: The conditions that a pose must meet.
         exposure_ratio: Exposure time as a fraction of the frame interval.
         readout_ratio: Readout time as a fraction of the frame interval.
-        is_unmasked: Function from pixels (N,2) to a mask (N,) of the pixels that the camera's mask leaves
-            visible.
+        is_unmasked: Function from pixels (N,2) to a mask (N,) of the pixels that the camera's mask does not
+            cover.
     """
 
     lens: Camera

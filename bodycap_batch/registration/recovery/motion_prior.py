@@ -11,25 +11,25 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 
 _PERCENTILE = 80.0
-"""Percentile of a camera's third and fourth differences that is used as their sigma. It is high, because lost
-intervals occur in the faster movements. Evidence: none."""
+"""Percentile that is used as the sigma of a camera's third and fourth differences. The percentile is high,
+because frames are lost mainly during fast movements. Evidence: none."""
 _MAX_INTERVAL_DEVIATION = 0.1
 """Maximum deviation of a frame interval from the median interval, as a fraction of the median. Differences
 across an interval with a larger deviation are not used. Evidence: none."""
 _ITERATIONS = 5
 """Number of iterations of reweighted least squares. Evidence: none."""
 _LOSS_WIDTH = 4.0
-"""Squared Mahalanobis distance at which a position, or a residual of the motion, has half of its weight.
-Evidence: none."""
+"""Width of the Cauchy loss: the squared Mahalanobis distance at which a position or a motion residual has
+half of its full weight. Evidence: none."""
 _VELOCITY_SIGMA_JERKS, _ACCELERATION_SIGMA_JERKS = 30.0, 4.0
 """Sigma of an unknown velocity and sigma of an unknown acceleration, in units of the camera's jerk sigma.
 Evidence: none."""
 MAX_DISAGREEMENT = 11.3
 """Maximum squared Mahalanobis distance between a found centre and its smoothed position. If the distance is
-larger, one of the two is wrong, and it is unknown which. Origin: 99 % of a chi-squared variable with three
-degrees of freedom."""
+larger, the centre or the smoothed position is wrong, and the smoothed position is not used. Origin: 99 % of a
+chi-squared variable with three degrees of freedom."""
 _NEIGHBOURS = 4
-"""Number of neighbouring frames that determine a cubic: two frames before and two frames after."""
+"""Number of neighbouring frames that determine a cubic path: two frames before and two frames after."""
 _PRIOR = 1e-9
 """Information of a weak prior on every centre, as a fraction of the mean information. It only prevents a
 singular matrix."""
@@ -60,8 +60,8 @@ class MotionStatistics:
 
     Attributes:
         jerk_sigma: Sigma of the third difference of the centre over successive frames.
-        cubic_residual_sigma: Sigma of the distance of a centre from the cubic through the two centres before
-            and the two centres after it.
+        cubic_residual_sigma: Sigma of the distance between a centre and a cubic path. This path passes
+            through the two centres before and the two centres after the centre.
     """
 
     jerk_sigma: float
@@ -152,8 +152,7 @@ def smooth_centres(
 ) -> SmoothedCentres:
     """Smooth the centres of successive frames, given observed positions and the statistics of the motion.
 
-    A Cauchy loss weights the positions and the residuals of the motion. A position may be wrong, and a hand
-    may stop suddenly.
+    A Cauchy loss reduces the weight of outliers: a position may be wrong, and a hand may stop suddenly.
 
     Args:
         frames: (N,) indices of successive frames.

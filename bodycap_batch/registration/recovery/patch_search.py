@@ -24,14 +24,14 @@ Evidence: none."""
 _MARGIN_PX = 4.0
 """Pixels: minimum distance of a searched point from the border of the image. Evidence: none."""
 _MIN_COSINE = 0.6
-"""Minimum cosine of the angle between the lines of sight of the frame and of the keyframe. The surface of a
-patch is assumed to face the camera. This holds only for similar directions. Evidence: none."""
+"""Minimum cosine of the angle between two lines of sight to a point: from the frame and from the keyframe.
+The warp of a patch is only valid for similar directions. Evidence: none."""
 _MAX_LOG_SCALE = 0.8
-"""Maximum absolute logarithm of the distance ratio: the distance of the point from the keyframe over its
-distance from the frame. Evidence: none."""
+"""Maximum absolute logarithm of the distance ratio. This ratio is the distance between point and keyframe,
+divided by the distance between point and frame. Evidence: none."""
 _SCALE_PENALTY, _SHARPNESS_REWARD = 0.3, 0.1
-"""Factors in the score of a keyframe, relative to the cosine: of the absolute logarithm of the distance
-ratio, and of the sharpness. Evidence: none."""
+"""Weights in the score of a keyframe: of the absolute logarithm of the distance ratio, and of the sharpness.
+The cosine of the viewing angle has weight 1. Evidence: none."""
 _MAX_BLUR_PX = 40.0
 """Pixels at 640 px image width: maximum length of rendered motion blur. Evidence: none."""
 _MAX_BLUR_SAMPLES = 5
@@ -42,10 +42,10 @@ samples is limited, the distance is larger. Evidence: none."""
 _WARP_STEP_PX = 4.0
 """Pixels: step of the finite differences that determine the warp of a patch. Evidence: none."""
 _MIN_DEPTH_RATIO = 0.25
-"""Minimum depth of a point, as a fraction of the median depth. A nearer point is usually wrong, and would
-have the largest influence on the pose. Evidence: none."""
+"""Minimum depth of a point, as a fraction of the median depth. The position of a nearer point is usually
+wrong, and would have a large influence on the pose. Evidence: none."""
 _MIN_CONTRAST = 3.0
-"""Minimum standard deviation of the grey values of a patch. Evidence: none."""
+"""Minimum contrast of a patch: the standard deviation of its grey values. Evidence: none."""
 _LEVELS = 3
 """Number of levels of an image pyramid."""
 
@@ -85,7 +85,7 @@ class Pyramid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeyframePatches:
-    """The map and the images of its keyframes.
+    """The map and the images of its keyframes, from which patches around map points are taken.
 
     Attributes:
         scene_map: The map.
@@ -104,7 +104,7 @@ class KeyframePatches:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedView:
-    """The expected view of a frame.
+    """The expected view of a frame, in which map points are searched.
 
     Attributes:
         lens: The camera model.
@@ -129,7 +129,7 @@ class PredictedView:
 
 @dataclass(frozen=True, slots=True)
 class SearchLevel:
-    """Size and range of a search.
+    """Parameters of one search: patch size, search range and limits.
 
     Attributes:
         pyramid_level: Index of the pyramid level.
@@ -245,7 +245,8 @@ def match_patches(
     step = view.pyramid.step_px[level.pyramid_level]
     motion = _image_motion(view, points, px)
     images, is_inside = _render_patches(patches, rows, warp, _motion_blur(view, motion), level, step)
-    # During the readout a point moves little in the image, so its row hardly changes.
+    # The row of the point at mid-row time is used as its real row. During the readout a point moves little,
+    # so both rows are nearly equal.
     expected_px = px_at_mid_row(lens, px, motion, -view.readout_ratio)
     found_px, score = np.full((len(rows), 2), np.nan), np.zeros(len(rows))
     target = view.pyramid.levels[level.pyramid_level].astype(np.float32)

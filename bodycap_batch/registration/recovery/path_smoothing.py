@@ -22,9 +22,9 @@ from bodycap_batch.registration.recovery.motion_prior import (
 def smooth_weak_centres(path: Trajectory, adjustable: BoolArray | None = None) -> Trajectory:
     """Move the centres of weakly observed frames towards the path of the frames around them.
 
-    Few points remain in a fast movement. A centre may then be less certain than its prediction from the
-    neighbouring frames. Such a centre is replaced by the weighted mean of the centre and its prediction. The
-    rotation changes as far as it is correlated with the centre.
+    During a fast movement, few points are observed. A centre may then be less certain than its prediction
+    from the neighbouring frames. Such a centre is replaced by the weighted mean of the centre and its
+    prediction. The rotation changes too, according to its correlation with the centre.
 
     At the end of a lost interval the path is known on one side only. Lost frames are therefore recovered
     before the path is smoothed. Evidence: docs/decisions/registration.md.
@@ -63,5 +63,5 @@ def smooth_weak_centres(path: Trajectory, adjustable: BoolArray | None = None) -
 
 
 def smooth_if_final(path: Trajectory) -> Trajectory:
-    """Smooth the weak centres of a trajectory if no recovery follows; recovery needs the measured poses."""
+    """Smooth the weak centres of a trajectory, unless recovery follows: it needs the measured poses."""
     return smooth_weak_centres(path) if (~path.localised).sum() < LEAST_LOST else path

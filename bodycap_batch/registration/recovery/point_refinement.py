@@ -17,18 +17,18 @@ from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
 from bodycap_batch.registration.poses.pnp import MAP_COVARIANCE_SCALE
 
 _WELL_SUPPORTED_FACTOR = 4
-"""Minimum number of inliers of a well-supported pose, as a multiple of the usual minimum number. A
-well-supported pose next to a lost interval is kept. Evidence: docs/decisions/registration.md."""
+"""Minimum number of inliers of a pose that is kept next to a lost interval, as a multiple of the minimum
+number for other poses. Evidence: docs/decisions/registration.md."""
 _MAX_BOUNDARY_FRAMES = 8
-"""Maximum number of frames removed at each end of a lost interval. It preserves the poses of a camera that
-always sees few points. Evidence: none."""
+"""Maximum number of frames removed at each end of a lost interval. Without this limit, a camera that always
+sees few points would lose all poses. Evidence: none."""
 _NOISE_PX = 0.8
 """Pixels at 640 px image width: standard deviation of an observation. Evidence: none."""
 _LOSS_SIGMAS, _MAX_SIGMAS = 2.0, 5.0
-"""Standard deviations of a residual. At _LOSS_SIGMAS an observation has half of its weight. Beyond
-_MAX_SIGMAS an observation is removed after the refinement. Evidence: none."""
+"""Thresholds on the residual of an observation, in standard deviations. At _LOSS_SIGMAS the observation has
+half of its weight. Beyond _MAX_SIGMAS it is removed after the refinement. Evidence: none."""
 _ITERATIONS, _COARSE_ITERATIONS = 10, 4
-"""Number of Gauss–Newton iterations, and number of the first iterations, which have strong damping. Evidence:
+"""Number of all Gauss–Newton iterations, and number of strongly damped iterations at the start. Evidence:
 none."""
 _COARSE_DAMPING, _FINE_DAMPING = 1e-3, 1e-6
 """Damping of the first iterations and damping of the later iterations, as a fraction of a point's mean
@@ -43,16 +43,16 @@ def remove_weak_boundary_poses(path: Trajectory, min_inliers: int) -> Trajectory
     """Remove poses next to lost intervals that too few points support.
 
     A keyframe next to a lost interval sees mainly points that it helped to triangulate. These points agree
-    with its pose even if the pose is wrong. The removed frames are searched again like any lost frame.
-    Evidence: docs/decisions/registration.md.
+    with its pose even if the pose is wrong. Recovery searches the frames of the removed poses again, like all
+    lost frames. Evidence: docs/decisions/registration.md.
 
     Args:
         path: The trajectory, from tracking.
         min_inliers: Minimum number of inliers of any pose.
 
     Returns:
-        The trajectory in which the removed frames have the status `UNCONFIRMED`, or `path` itself if no pose
-        is removed. Poses with the status `RIG` are kept.
+        The trajectory, or `path` itself if no pose is removed. Frames whose pose was removed have the status
+        `UNCONFIRMED`. Poses with the status `RIG` are kept.
     """
     weak = path.inliers < _WELL_SUPPORTED_FACTOR * min_inliers
     weak &= np.array([status is not FrameStatus.RIG for status in path.status], dtype=bool)
@@ -179,7 +179,7 @@ def _refine_points_gauss_newton(
     Returns:
         Mask (M,) of the observations that agree with the refined points.
 
-    Source: Gauss–Newton under a Cauchy loss. The weight of an observation depends on the noise of its pixel
+    Method: Gauss–Newton with a Cauchy loss. The weight of an observation depends on the noise of its pixel
         and on the covariance of its keyframe's pose.
     """
     keyframe = scene_map.obs_keyframe[rows]

@@ -61,7 +61,8 @@ def prepare_recovery(
     Weak poses are removed from all cameras. The map points are refined with the remaining poses.
 
     Args:
-        own: The camera with its own registration, not with the registration of its rig.
+        own: The camera to recover, with a registration from this camera alone. A registration from all
+            cameras of its rig is not permitted.
         others: Trajectories of the other cameras.
         scene_map: The map.
         selection: The keyframes of the camera.
@@ -69,9 +70,9 @@ def prepare_recovery(
         threads: Number of threads that solve frames. The result does not depend on it.
 
     Returns:
-        The map in the same gauge, and the registration. Both are unchanged in two cases: no pose is removed,
-        so that refined points bring no gain; or the remaining poses do not permit a recovery. Evidence:
-        docs/decisions/registration.md.
+        The map in the same gauge, and the registration. The map and the registration are unchanged in two
+        cases. First, if no pose is removed: refined points then bring no gain. Second, if the remaining poses
+        do not permit a recovery. Evidence: docs/decisions/registration.md.
     """
     before = [own.registration.trajectory, *(path for path in others if path.gauge == scene_map.gauge)]
     paths = [remove_weak_boundary_poses(path, options.min_inliers) for path in before]

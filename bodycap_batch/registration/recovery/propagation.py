@@ -37,13 +37,14 @@ _MIN_INLIERS, _MIN_INLIER_WEIGHT_RATIO = 10, 0.45
 Evidence: none."""
 _SEED_MIN_INLIERS, _SEED_MIN_INLIER_WEIGHT_RATIO = 15, 0.5
 """Minimum number of inliers and minimum inlier weight ratio of the pose of a seed (a keyframe inside the lost
-interval). They are higher, because no predicted motion supports this pose. Evidence: none."""
+interval). These minimums are higher than in other lost frames, because no predicted motion supports the pose.
+Evidence: none."""
 _MAX_PREDICTION_DISTANCE = 16.0
 """Maximum squared Mahalanobis distance between the found and the predicted centre. Origin: 99.9 % of a
 chi-squared variable with three degrees of freedom."""
 _MAX_MISSES = 3
-"""Maximum number of successive frames without a pose that a propagation skips. It ends at the next frame
-without a pose, because the error of the prediction then exceeds the search range. Evidence: none."""
+"""Maximum number of successive frames without a found pose. After one more such frame the propagation ends,
+because the error of the prediction exceeds the search range. Evidence: none."""
 _SEED_SIGMA_JERKS = 40.0
 """Sigma of a seed's centre along each axis, in units of the camera's jerk sigma. Evidence: none."""
 _INITIAL_FRAMES = 6
@@ -63,7 +64,8 @@ class LostInterval:
         start: First lost frame.
         stop: One past the last lost frame.
         times: (N,) times of all frames of the camera, in units of the frame interval.
-        pyramids: Image pyramids of the frames to search, and of the frame on either side, by frame.
+        pyramids: Image pyramids by frame: of the frames to search, and of one frame on either side of the
+            interval.
         poses: Poses of the camera's localised frames, by frame.
         tracked_frames: Indices of the frames with a pose from tracking.
         seed_poses: Poses cam_from_map (4,4) of the seeds, by frame. A seed is a keyframe in the interval
@@ -89,7 +91,7 @@ class LostInterval:
 
 @dataclass(slots=True)
 class _PropagationState:
-    """State of a propagation after its last frame.
+    """State of a propagation after its last searched frame, used to predict the pose of the next frame.
 
     Attributes:
         frame: Index of the last frame.
@@ -121,8 +123,8 @@ class Propagation:
     def run(self) -> dict[int, PoseEstimate]:
         """Return the best pose found for each frame.
 
-        Poses are propagated inward from both ends of the interval and outward from the seeds. The best pose
-        is the pose with the highest support.
+        Poses are propagated inward from both ends of the interval, and forward and backward from the seeds.
+        The best pose of a frame is the pose with the highest support.
         """
         interval = self.interval
         for direction, end in ((1, interval.start - 1), (-1, interval.stop)):

@@ -41,10 +41,11 @@ from bodycap_batch.registration.recovery.search_images import (
 _SMOOTHING_MARGIN = 8
 """Number of frames on either side of an interval that are smoothed together with it. Evidence: none."""
 _MIN_INLIER_WEIGHT_RATIO = 0.5
-"""Minimum ratio of the inliers' weight to the weight of all matches, for an accepted pose. Evidence: none."""
+"""Minimum inlier weight ratio of an accepted pose: the weight of the inliers divided by the weight of all
+matches. Evidence: none."""
 _MAX_PASSES = 5
-"""Maximum number of passes over the lost intervals. Each pass starts from the poses of the pass before, and
-reaches frames farther inside. Evidence: docs/decisions/registration.md."""
+"""Maximum number of passes over the lost intervals. Each pass starts from the poses of the previous pass, and
+reaches frames deeper inside the intervals. Evidence: docs/decisions/registration.md."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,8 +54,8 @@ class RecoveryInputs:
 
     Attributes:
         capture: All cameras. The first camera is the camera to recover.
-        registrations: All cameras with their registrations, in the order of `capture`. They may be loaded one
-            after another: only one registration is held at a time.
+        registrations: All cameras with their registrations, in the order of `capture`. `recover_lost_frames`
+            holds only one of them at a time, so an iterable may load them one after another.
         maps: The maps that the cameras were registered against.
         selection: The keyframes of the camera to recover.
         in_rig: True if the poses were estimated from all cameras of a rig. The preparation is then skipped,
@@ -200,7 +201,7 @@ class _IntervalSearch:
         localiser: Estimates the pose of a frame near an expected pose.
         times: (N,) times of the frames, in units of the frame interval.
         statistics: How smoothly the camera moves.
-        seed_rows: Row indices in the map of the keyframes that are lost frames, by frame.
+        seed_rows: Row indices in the map by frame, for the lost frames that are keyframes.
         tracked_frames: Indices of the frames with a pose from tracking.
     """
 
@@ -238,7 +239,7 @@ class _IntervalSearch:
 
 
 def _extended_intervals(has_pose: BoolArray, before: BoolArray) -> list[tuple[int, int]]:
-    """Return the intervals [start, stop) that are still lost and adjacent to a new pose.
+    """Return the lost intervals [start, stop) that are adjacent to a pose found in the last pass.
 
     Args:
         has_pose: (N,) True for frames that have a pose now.
@@ -322,7 +323,7 @@ def _localised_poses(path: Trajectory) -> dict[int, PoseEstimate]:
 
 
 def _seed_keyframes(scene_map: Map, camera: str, lost: BoolArray) -> dict[int, int]:
-    """Return the row indices in the map of a camera's keyframes that are lost frames, by frame."""
+    """Return the row indices in the map, by frame, of a camera's lost frames that are keyframes."""
     rows = scene_map.keyframes_of(camera)
     frames = scene_map.keyframe_frame[rows]
     return {int(frame): int(row) for row, frame in zip(rows, frames, strict=True) if lost[frame]}

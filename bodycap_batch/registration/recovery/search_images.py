@@ -24,14 +24,14 @@ from bodycap_batch.registration.recovery.patch_search import (
 )
 
 _MAX_KEYFRAMES = 600
-"""Maximum number of keyframes held in memory. Each needs half a megabyte. Origin: the memory limit of the
-task."""
+"""Maximum number of keyframes held in memory. Each keyframe needs half a megabyte. Origin: the memory limit
+of the task."""
 _MAX_DISTANCE_FRAMES = 90
-"""Maximum distance in frames between a searched frame and the nearest end of its interval or seed. Evidence:
-none."""
+"""Maximum distance (number of frames) between a searched frame and the nearest end of its lost interval, or
+the nearest seed. Evidence: none."""
 _MAX_FRAMES = 400
-"""Maximum number of frames of one interval held in memory. The frames nearest to an end or a seed are
-selected. Origin: the memory limit of the task."""
+"""Maximum number of frames of one lost interval held in memory. The frames nearest to an end of the interval
+or to a seed are selected. Origin: the memory limit of the task."""
 _EXPOSURE_CANDIDATES = (0.0, 0.3, 0.6)
 """Candidates for the exposure time, as fractions of the frame interval. Evidence: none."""
 _EXPOSURE_FRAMES = 4
@@ -85,7 +85,7 @@ def read_keyframe_patches(
 def read_pyramids(
     camera: CaptureCamera, start: int, stop: int, seed_frames: list[int], max_frames: int = _MAX_FRAMES
 ) -> dict[int, Pyramid]:
-    """Decode the frames of a lost interval that are near its ends or a seed, and the frame on either side.
+    """Decode the frames near the ends and the seeds of a lost interval, and one frame on either side.
 
     Args:
         camera: The camera.
@@ -114,7 +114,7 @@ def estimate_exposure(camera: CaptureCamera, localiser: GuidedLocaliser, path: T
 
     Args:
         camera: The camera.
-        localiser: Localiser of this camera. Its exposure time is ignored.
+        localiser: Localiser of this camera. The exposure time in it is ignored.
         path: Trajectory of this camera.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Decide which frame ranges of a video are tracked, and use the tracks of an earlier round again."""
+"""Decide which frame ranges of a video are tracked, and reuse earlier tracks in the other ranges."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from bodycap_batch.model.scene import FrameStatus, Registration
 from bodycap_batch.registration.tracking.klt import KeyframePoints, Tracks, track_range
 
 _MIN_RANGE_FRAMES = 15
-"""Minimum number of frames in the last part of a split range. A shorter part does not justify a separate
-video decoder. Evidence: none."""
+"""Minimum number of frames in the last part of a frame range that is split between threads. A shorter part is
+not worth opening another video decoder. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackCache:
-    """The tracks of an earlier round.
+    """The tracks of an earlier round of registration, kept to avoid repeated tracking.
 
     Attributes:
         tracks: The tracked observations.
@@ -118,7 +118,7 @@ def _track_ranges(
 def _split_by_thread(
     ranges: list[tuple[int, int]], keyframes: list[int], threads: int
 ) -> list[tuple[int, int]]:
-    """Split ranges at keyframes if they are longer than an equal part for each thread."""
+    """Split long ranges at keyframes, so that the threads can share the frames about equally."""
     total = sum(stop - start for start, stop in ranges)
     thread_frames = -(-total // max(1, threads))
     out = []
@@ -133,7 +133,7 @@ def _split_by_thread(
 
 
 def _merge_ranges(intervals: list[tuple[int | None, int | None]], count: int) -> list[tuple[int, int]]:
-    """Merge intervals that share a keyframe into ranges [start, stop) of frames, keyframes included."""
+    """Merge intervals that share a keyframe into ranges [start, stop) of frames. Keyframes are included."""
     ranges: list[tuple[int, int]] = []
     for first, last in intervals:
         start, stop = first or 0, count if last is None else last + 1
@@ -145,14 +145,14 @@ def _merge_ranges(intervals: list[tuple[int | None, int | None]], count: int) ->
 
 
 def _reusable(tracks: Tracks, intervals: list[tuple[int | None, int | None]], count: int) -> Tracks:
-    """Select the tracks that lie inside some intervals and start from the keyframes at their ends.
+    """Select the tracks inside the given intervals that start from a keyframe at an end of their interval.
 
     A keyframe belongs to two intervals. Its tracks into an interval that is tracked again are removed.
     Otherwise these tracks would be used twice.
     """
     kept_frames = np.zeros(
         (count, 2), dtype=np.int64
-    )  # number of frames before and after each keyframe in which its tracks are kept
+    )  # number of frames before and after each keyframe that keep its tracks
     for first, last in intervals:
         if first is not None:
             kept_frames[first, 1] = (count if last is None else last) - first

@@ -35,8 +35,8 @@ _MAX_BUFFERED_FRAMES = 90
 """Maximum number of frames held in memory for tracking backward from a keyframe. It bounds the memory if
 keyframes are far apart."""
 _MIN_TRACKS = 6
-"""Minimum number of tracks from one keyframe that are continued. Origin: fewer tracks are too few for a
-pose."""
+"""Minimum number of tracks from one keyframe. If fewer remain, none of them is continued, because they are
+too few for a pose."""
 _MAX_CLOSURE_PX = 2.0
 """Pixels at 640 px image width: maximum distance between a track that arrives at the next keyframe and the
 keyframe's own observation of the same point. A track within this distance is treated as correct. Evidence:
@@ -69,7 +69,9 @@ class KeyframePoints:
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """Tracked observations of map points. The keyframe feature that a track starts from identifies its point.
+    """Tracked observations of map points.
+
+    The map point is given by the keyframe feature that the track starts from.
 
     Attributes:
         frame: (M,) index of the observing frame.
@@ -87,8 +89,8 @@ class Tracks:
     def join_and_clear(parts: list[Tracks]) -> Tracks:
         """Concatenate tracks, ordered by frame, keyframe and feature, and clear the list.
 
-        The memory of the list's tracks is released field by field, because a long video has many
-        observations. Evidence: docs/decisions/registration.md.
+        The arrays are concatenated one field at a time, and the source arrays of this field are released. A
+        long video would otherwise need too much memory. Evidence: docs/decisions/registration.md.
         """
         if not parts:
             none = np.zeros(0, np.int64)
@@ -107,7 +109,7 @@ class Tracks:
         feature = feature[order]
         px = px[order]
         for field in (frame, keyframe, feature, px):
-            field.flags.writeable = False  # so that a registration does not copy them
+            field.flags.writeable = False  # a registration does not copy read-only arrays
         return Tracks(frame, keyframe, feature, px)
 
     def in_frames(self, first: int, stop: int) -> Tracks:
@@ -170,7 +172,7 @@ def grid_sample(cell: IntArray, score: IntArray, count: int) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class _VideoFrame:
-    """A video frame at full size and at reduced size."""
+    """A video frame at full size for tracking and at reduced size for estimating image motion."""
 
     camera: CaptureCamera
     index: int
@@ -179,7 +181,7 @@ class _VideoFrame:
 
     @property
     def scale(self) -> float:
-        """Factor on pixel thresholds for the size of this image."""
+        """Factor that converts pixel thresholds at 640 px image width to this image's size."""
         return pixel_scale(self.grey.shape[1], self.grey.shape[0])
 
 
@@ -209,8 +211,8 @@ class _ActiveTracks:
     def advance(self, first: _VideoFrame, second: _VideoFrame, motion: ImageMotion | None) -> bool:
         """Follow the tracks from the first frame into the second; return False if too few remain."""
         guess = None if motion is None else apply_homography(self.px, motion.homography)
-        # A slipped track is rejected by the pose later. The slow check by tracking back is only done if many
-        # tracks may slip.
+        # The check by tracking back is slow. It is only done if many tracks may slip to other points. A
+        # single slipped track is rejected later, when the pose is estimated.
         with_check = motion is None or not motion.is_reliable
         tracked = track_points(first.grey, second.grey, self.px, guess, with_check=with_check)
         keep = tracked.ok & second.camera.is_unmasked(tracked.px)
@@ -229,7 +231,8 @@ class _BufferedFrame:
     Attributes:
         frame: The frame.
         motion: Image motion from the next frame to this frame; None if it is unknown.
-        rows: (N,) rows of the forward tracks that reach this frame, in the points of their keyframe.
+        rows: (N,) row indices, in the points of the start keyframe, of the forward tracks that reach this
+            frame.
         px: (N,2) pixels of these tracks in this frame.
     """
 
@@ -302,8 +305,8 @@ def _close_tracks(
     """Use forward tracks that arrive at the next keyframe as backward tracks of this keyframe.
 
     A forward track is used if it arrives near the keyframe's own observation of the same point. Its pixels
-    are shifted by a constant offset, so that the track ends exactly at this observation. It replaces a track
-    backward from the keyframe, because that would follow the same path.
+    are shifted by a constant offset, so that the track ends exactly at this observation. A separate backward
+    track from the keyframe would follow the same path, and is not made.
 
     Args:
         active: Forward tracks that have reached the next keyframe.
@@ -361,5 +364,5 @@ def _track_back(
 
 
 def camera_pixel_scale(camera: CaptureCamera) -> float:
-    """Return the factor on pixel thresholds for the image size of a camera."""
+    """Return the factor that converts pixel thresholds at 640 px width to a camera's image size."""
     return pixel_scale(camera.camera.width_px, camera.camera.height_px)
