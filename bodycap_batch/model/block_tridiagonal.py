@@ -84,8 +84,8 @@ class BlockTridiagonal:
     """A factorised matrix, for solving linear systems and for computing blocks of the inverse matrix.
 
     The matrix is symmetric, positive definite and block-tridiagonal. The factors are dense, even for a
-    sparse matrix. For a large matrix, only the factors of one segment of successive blocks are kept. The factors
-    of the other segments are computed again when they are needed.
+    sparse matrix. For a large matrix, only the factors of one segment of successive blocks are kept. The
+    factors of the other segments are computed again when they are needed.
 
     Args:
         block_row: Function that returns the blocks of a row, given the number of the row.

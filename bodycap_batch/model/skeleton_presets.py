@@ -38,7 +38,8 @@ The nominal rotation is then chosen from the camera's name. The sigma is larger 
 docs/decisions/export.md."""
 
 NOMINAL_SIGMA_M = 0.029
-"""Sigma, metres per axis, of a mount's nominal position, if the job does not give the position. Derivation: 5 cm for the three axes together, because straps move and bodies differ."""
+"""Sigma, metres per axis, of a mount's nominal position, if the job does not give the position. Derivation:
+5 cm for the three axes together, because straps move and bodies differ."""
 
 NOMINAL_ERROR_RAD = float(np.radians(15.0 / np.sqrt(3.0)))
 """Expected error, radians per axis, of a mount's nominal rotation, if the job does not give the rotation.
