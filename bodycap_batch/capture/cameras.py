@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _MIN_KEPT_RATIO = 0.75
-"""Minimum fraction of the requested frames that must have a stored copy for the copies to be read. With fewer
-copies, all requested frames are decoded from the video, because nearly the whole video must then be decoded
-in any case. Evidence: none."""
+"""Minimum fraction of the requested frames that have a stored copy, for reading the copies. With fewer
+copies, all requested frames are decoded from the video. The reason is that nearly the whole video must then
+be decoded anyway. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaptureCamera:
-    """One camera of a capture.
+    """One camera of a capture: its frames, their times and the intrinsics, with methods to decode the frames.
 
     The chapters are the successive video files of one recording. The joined video contains all chapters.
 
@@ -60,9 +60,10 @@ class CaptureCamera:
         videos: Video file of each chapter, with the list of its frames.
         mask: (H,W) mask at the work size, True where the room is visible; None if the room is visible
             everywhere.
-        kept: Copies of frames at the work size, which are read instead of the video; None without copies.
-        threads: Number of threads of the decoder. 0 stands for the environment variable OMP_NUM_THREADS; if
-            it is not set, for all processors.
+        kept: Stored copies of frames at the work size. They are read instead of the video. None if there are
+            no copies.
+        threads: Number of threads of the decoder. For 0, the number is taken from the environment variable
+            OMP_NUM_THREADS. If this variable is not set, all processors are used.
     """
 
     name: str
@@ -252,5 +253,5 @@ class Capture:
 
 
 def _identity(planes: tuple[Planes, Colours]) -> tuple[Planes, Colours]:
-    """Return the planes unchanged. This replaces `work_planes` if the planes were already computed."""
+    """Return the planes unchanged: the function for a frame whose planes have already been computed."""
     return planes

@@ -64,7 +64,8 @@ def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
     """Decode the first frame that can be decoded.
 
     Returns:
-        The frame, and True if the codec stores the frames in another order than the order of presentation.
+        The frame, and a flag: True if the codec stores the frames in an order different from the order in
+        which they are shown.
 
     Raises:
         CaptureError: No frame can be decoded.
@@ -89,8 +90,8 @@ def open_stream(container: InputContainer, video: VideoFile, threads: int = 0) -
     Args:
         container: The opened file.
         video: The video.
-        threads: Number of threads of the decoder. 0 stands for the environment variable OMP_NUM_THREADS; if
-            it is not set, for all processors.
+        threads: Number of threads of the decoder. For 0, the number is taken from the environment variable
+            OMP_NUM_THREADS. If this variable is not set, all processors are used.
     """
     stream = video_stream(container, video.path)
     stream.thread_type = "AUTO"
@@ -99,7 +100,7 @@ def open_stream(container: InputContainer, video: VideoFile, threads: int = 0) -
 
 
 class _ForwardDecoder:
-    """Decoder of a video in the forward direction only.
+    """Decoder that reads a video in the forward direction only and can skip frames.
 
     Args:
         video: The video.
@@ -131,10 +132,10 @@ class _ForwardDecoder:
         self._container.close()
 
     def advance(self, index: int) -> VideoFrame | None:
-        """Decode up to the frame with this index.
+        """Decode the video up to the frame with this index, and return this frame.
 
         Returns:
-            The frame, or None if the decoder does not return a frame with exactly this index.
+            The frame; None if the decoder does not return a frame with exactly this index.
         """
         if not self.sequential:
             key_frames = self._key_index[: int(np.searchsorted(self._key_index, index, side="right"))]
@@ -153,7 +154,7 @@ class _ForwardDecoder:
         return None
 
     def _seek(self, index: int) -> None:
-        """Seek to the key frame with this index, or to an earlier key frame if the container is inexact."""
+        """Seek to the key frame with this index. Some containers seek to an earlier key frame instead."""
         self._container.seek(int(self._video.pts[index]), stream=self._stream, backward=True)
         self._frames = self._decoded()
 

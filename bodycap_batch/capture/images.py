@@ -14,9 +14,11 @@ if TYPE_CHECKING:
 
 Image = npt.NDArray[np.uint8]
 Planes = npt.NDArray[np.uint8]
-"""Planes (1.5·H,W) of an image with even sides: luma, then both chroma planes at half resolution."""
+"""Planes of an image with even width W and height H, in one array (1.5·H,W).
+
+The luma comes first, then both chroma planes at half resolution."""
 Colours = tuple[int, int]
-"""Colour range and colour matrix of luma and chroma, as numbers of FFmpeg."""
+"""Colour range and colour matrix of an image in luma and chroma, each given as FFmpeg's number."""
 
 _LUMA_FORMATS = frozenset(
     f"{family}{layout}" for family in ("yuv", "yuvj") for layout in ("420p", "422p", "444p", "440p", "411p")
@@ -44,8 +46,8 @@ def work_image(
         orientation: Display matrix of the frame.
         size: Width and height of the result, pixels.
         colour: True for an RGB image, False for a grey image.
-        shown: Width and height, pixels, of the image in a frame that was padded to even sides. None if the
-            frame is not padded.
+        shown: Width and height of the image without padding, pixels, if the frame was padded to even sides.
+            None if the frame is not padded.
 
     Returns:
         The image in full range, contiguous: (H,W,3) for RGB or (H,W) for grey.
@@ -79,9 +81,9 @@ def _expand_range(luma: Image) -> Image:
 def work_planes(frame: VideoFrame, orientation: Orientation, size: tuple[int, int]) -> tuple[Planes, Colours]:
     """Convert a decoded frame to upright planes at the work size, padded to even sides.
 
-    The planes keep the colour range of the frame. They contain exactly the values of the frame if the frame
-    has the work size, 8 bits and chroma at half resolution (4:2:0). For other formats, the luma is correct to
-    one level.
+    The planes keep the colour range of the frame. If the frame has the work size, 8 bits and chroma at half
+    resolution (4:2:0), the planes contain exactly the values of the frame. For other formats, the error of
+    the luma is at most one grey level.
 
     Args:
         frame: The decoded frame.

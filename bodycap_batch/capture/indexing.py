@@ -34,8 +34,9 @@ _MIN_PIXEL_ASPECT = Fraction(2, 5)
 """Minimum plausible pixel aspect, width over height. The maximum is the inverse of this value. Origin: HDV
 and AVCHD have 4:3; television and anamorphic lenses have pixel aspects between 1:2 and 2:1."""
 _SQUARE_TOLERANCE = 0.004
-"""Maximum difference between 1 and the pixel aspect of a pixel that is treated as square. Origin: image sizes
-are rounded to even numbers. Resampling would blur every image to correct less than one pixel."""
+"""Maximum difference of the pixel aspect from 1. With a smaller difference, the pixels are treated as square.
+Origin: image sizes are rounded to even numbers. Resampling would blur every image to correct an error of less
+than one pixel."""
 
 
 def index_video(path: Path, threads: int = 0) -> VideoFile:
@@ -124,7 +125,7 @@ def _scan_packets(
 
 
 def _nominal_fps(pts: IntArray, time_base: Fraction, rate: Fraction | None) -> float:
-    """Return the frame rate of the container; without one, the inverse of the median frame interval."""
+    """Return the container's frame rate; if there is none, the inverse of the median frame interval."""
     if rate:
         return float(rate)
     steps = np.diff(pts)
@@ -142,7 +143,7 @@ def _pixel_aspect(stated: Fraction | None) -> Fraction:
 
 
 def _creation_time(metadata: dict[str, str]) -> float | None:
-    """Return the creation time in Unix seconds; None if it is missing, or if the clock was not set."""
+    """Return the creation time, Unix seconds. Return None if it is missing or if the clock was not set."""
     text = metadata.get("creation_time", "")
     try:
         stamp = datetime.fromisoformat(text.replace("Z", "+00:00"))

@@ -23,13 +23,13 @@ from bodycap_batch.formats.mp4 import TIME_BASE_HZ, Quality, VideoWriter
 KEPT_NAME = "kept"
 """Name of the stored `KeptFrames` in a keyframe artefact, and name of the video file with the copies."""
 _FPS = 30
-"""Nominal frame rate, Hz, of the video with the copies. It has no meaning, because frames are identified by
-their number."""
+"""Nominal frame rate, Hz, of the video with the copies. Any value is possible, because the frames are
+identified by their numbers, not by their times."""
 _FRAME_TICKS = TIME_BASE_HZ // _FPS
 """Time between two frames of the video with the copies, in units of its time base."""
 _LARGE_RATIO = 2.0
-"""Minimum ratio of the number of pixels in a frame of the video to the number of pixels at the work size for
-all frames to be kept. With a larger ratio, decoding the video again costs more than writing and reading the
+"""Minimum number of pixels in a frame of the video, divided by the number of pixels at the work size, for
+storing copies of all frames. For such a large video, decoding again costs more than writing and reading the
 copies. Evidence: docs/decisions/capture.md."""
 _GROUP_FRAMES = 12
 """Number of frames from one codec key frame to the next (GOP length), if all frames are kept. Evidence:
@@ -40,7 +40,7 @@ _IDENTITY_ORIENTATION = ((1, 0), (0, 1))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeptFrames:
-    """The kept frames of a camera, stored in a separate video.
+    """The kept frames of a camera, stored in a separate video that can be decoded quickly.
 
     Attributes:
         path: Path of the video with the copies.
@@ -60,7 +60,7 @@ class KeptFrames:
         set_array(self, "frames", (len(self.frames),), np.int64)
 
     def holds(self, indices: IntArray) -> BoolArray:
-        """Return a mask (N,) that is True for the camera's frames (N,) that are kept."""
+        """Return a mask (N,) that is True where the frame with the given index (N,) is kept."""
         return np.isin(indices, self.frames)
 
     def read(
@@ -154,7 +154,7 @@ class FrameKeeper:
             self._add(shot)
 
     def add_keyframe(self, shot: FrameCandidate) -> None:
-        """Write a keyframe if `keep_all` is False; otherwise do nothing, because `add_frame` writes it."""
+        """Write a keyframe if `keep_all` is False. Otherwise do nothing: `add_frame` writes all frames."""
         if not self.keep_all:
             self._add(shot)
 
@@ -181,7 +181,7 @@ class FrameKeeper:
             size = (planes.shape[1], planes.shape[0] * 2 // 3)
             quality: Quality = "near" if self.keep_all else "exact"
             self._writer = VideoWriter(self._path, _FPS, size, quality, colours)
-        if colours == self._colours:  # a chapter with another colour range is read from the video
+        if colours == self._colours:  # frames with other colours are not kept
             self._writer.add_planes(planes)
             self._frames.append(shot.index)
 

@@ -26,7 +26,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> BoolArray:
         size: Width and height of the picture, pixels.
 
     Returns:
-        (H,W) mask, read-only, that is True where the room is visible.
+        Read-only mask (H,W) that is True where the room is visible.
 
     Raises:
         CaptureError: The mask is missing, is not an image, has another aspect ratio than the picture, or is

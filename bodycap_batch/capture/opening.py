@@ -21,8 +21,8 @@ from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera, with_two_focal_lengths
 
 _GUESSED_FOV_DEG = 70.0
-"""Assumed field of view, degrees, along the long side of the image, if it is unknown. It is the field of view
-of the widest common lenses of webcams and phones. Mapping refines this value."""
+"""Field of view, degrees, along the long side of the image, that is assumed if the true value is unknown. The
+widest common lenses of webcams and phones have this field of view. Mapping refines the value."""
 _FULL_FRAME_MM = 36.0
 """Width of a 35 mm film frame, millimetres. The definition of the 35 mm equivalent focal length uses this
 width."""
@@ -54,7 +54,7 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         threads: Number of threads of the decoder, as in `CaptureCamera`.
 
     Raises:
-        CaptureError: As for `open_capture`.
+        CaptureError: For the same reasons as in `open_capture`.
     """
     videos = tuple(index_video(path, threads) for path in config.video)
     _check_one_format(videos)
@@ -100,7 +100,7 @@ def work_size(
     Args:
         shown_size: Width and height that a player shows, in square pixels.
         work_px: Maximum length of the long side of the work size, pixels.
-        turned_size: Width and height that a player shows, in stored pixels. The work size is not
+        turned_size: Width and height after the display rotation, in stored pixels. The work size is not
             larger than this size. None if the stored pixels are square.
 
     Returns:
@@ -117,8 +117,8 @@ def work_size(
 def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Camera:
     """Return the intrinsics of a calibration at the work size.
 
-    If the calibration was made with stored pixels that are not square, it is stretched in the same way as the
-    images.
+    The stored pixels of some videos are not square. A calibration that was made with such pixels is stretched
+    in the same way as the images.
 
     Raises:
         CaptureError: The aspect ratio of the calibration differs from the aspect ratio of the video.
@@ -175,10 +175,10 @@ def _is_quarter_turned(video: VideoFile) -> bool:
 
 
 def _shown_rolling_shutter_s(rolling_shutter_s: float, video: VideoFile) -> float:
-    """Return the readout time in the direction of the shown rows, or columns for a video rotated by 90°.
+    """Return the readout time of the shown image, with a sign for the direction of the readout.
 
-    It is negative if the sensor reads the shown image in the opposite direction, as for a sensor that is
-    mounted upside down.
+    The time is positive if the sensor reads the shown image from top to bottom; for a video rotated by 90°,
+    from left to right. It is negative for the opposite direction, for example if the camera was upside down.
     """
     return rolling_shutter_s * (video.orientation[1][1] or video.orientation[0][1])
 

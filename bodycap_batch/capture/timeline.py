@@ -21,8 +21,9 @@ _NS = 1_000_000_000
 _MAX_BYTES = 256 << 20
 """Maximum size, bytes, of a sidecar file that is read."""
 _CLOCK_RESOLUTION_NS = 2 * _NS
-"""Maximum error, nanoseconds, of the time between the creation times of two files. Creation times are whole
-seconds. In addition, cameras record the start of writing instead of the start of the exposure."""
+"""Maximum error, nanoseconds, of the difference between the creation times of two files. Creation times are
+rounded to whole seconds. In addition, they are the time at which the camera began to write the file, not the
+time of the first exposure."""
 _MAX_ABS_NS = 1 << 62
 """Maximum absolute value, nanoseconds, of a timestamp; about 146 years. With this limit, sums of times and
 offsets fit into 64 bits."""
@@ -30,12 +31,12 @@ offsets fit into 64 bits."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timeline:
-    """The frame times of the joined chapters of one camera.
+    """The frame times of one camera, after joining its chapters.
 
     Attributes:
         times_ns: (N,) time of every frame on the clock of the camera, nanoseconds.
-        usable: (N,) False for a frame that is not later than all earlier frames, because a chapter repeats
-            the end of the previous chapter.
+        usable: (N,) True if the frame is later than all earlier frames. Otherwise the chapter of the frame
+            repeats the end of the previous chapter, and the frame is not used.
         notes: Notes for the user about gaps and overlaps between chapters.
     """
 
@@ -154,7 +155,7 @@ def _container_times(videos: tuple[VideoFile, ...]) -> list[IntArray]:
 def _missing_between_ns(before: VideoFile, video: VideoFile) -> int:
     """Return the time that is missing between two chapters, according to their creation times.
 
-    It is 0 if the creation times are unknown, or if the difference is within their error.
+    The missing time is 0 if the creation times are unknown, or if it is not longer than their error.
     """
     if before.created_s is None or video.created_s is None:
         return 0

@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 Orientation = tuple[tuple[int, int], tuple[int, int]]
-"""Signed permutation matrix that converts stored to shown coordinates: shown = orientation · stored, with x
-to the right and y down."""
+"""Matrix (2,2) that converts the coordinates of a stored image to the coordinates of the shown image: shown =
+orientation · stored. x points to the right and y down. The matrix is a signed permutation."""
 
 COPY_AGAIN = "copy it again from the camera's card, or leave this camera out"
-"""Hint for a damaged file."""
+"""Hint of the error about a damaged file."""
 MAY_READ = "let the user who runs this read the file and enter its folders (chmod)"
-"""Hint for a file that the user has no permission to read."""
+"""Hint of the error about a file that the user has no permission to read."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VideoFile:
-    """The video stream of one file, with the list of its frames.
+    """The video stream of one file, with all that is needed to decode its frames and to compute their times.
 
     Attributes:
         path: Path of the file.
@@ -43,8 +43,8 @@ class VideoFile:
         orientation: (2,2) display matrix of integers: shown = orientation · stored, with y down.
         created_s: Creation time from the metadata, Unix seconds; None if it is unknown.
         focal_35mm: 35 mm equivalent focal length from the metadata, millimetres; None if it is unknown.
-        is_counted: True if the decoder returns no timestamps (AVI with B-frames). Frames are then identified
-            by counting them from the start.
+        is_counted: True if the frames must be identified by counting them from the start, because the decoder
+            returns no timestamps (AVI with B-frames).
         is_interlaced: True if a frame contains two half pictures of different times.
         pixel_aspect: Width of a stored pixel over its height. For example, it is 4/3 if 1440 stored columns
             are shown as 1920 columns.
@@ -119,7 +119,7 @@ def video_stream(container: InputContainer, path: Path) -> VideoStream:
     """Return the stream with the camera's pictures. Streams that contain only a cover picture are ignored.
 
     Raises:
-        CaptureError: There is no such stream, or there is no decoder for the stream.
+        CaptureError: There is no stream with the camera's pictures, or there is no decoder for this stream.
     """
     import av
 
@@ -135,7 +135,7 @@ def video_stream(container: InputContainer, path: Path) -> VideoStream:
 
 
 def error_reason(error: Exception) -> str:
-    """Return a short message for an error of a library."""
+    """Return a short description of an error that a library raised."""
     return str(getattr(error, "strerror", "") or error)
 
 

@@ -50,8 +50,8 @@ def frozen_array(
 def _is_frozen(value: npt.ArrayLike, dtype: npt.DTypeLike) -> TypeGuard[npt.NDArray[Any]]:
     """Return True if `value` can be used without a copy.
 
-    It must be read-only and contiguous, have the dtype, and own its data. Copies are avoided because the
-    arrays of a long recording take hundreds of megabytes.
+    For this, `value` must be a read-only, contiguous array of type `dtype` that owns its data. Copies are
+    avoided because the arrays of a long recording take hundreds of megabytes.
     """
     if not isinstance(value, np.ndarray) or value.dtype != dtype:
         return False
@@ -75,7 +75,7 @@ def set_array(
 
 
 def runs(mask: BoolArray) -> list[tuple[int, int]]:
-    """Return the longest possible runs [start, stop) of successive True values in a mask (N,), in order."""
+    """Return the ranges [start, stop) of successive True values in a mask (N,), in increasing order."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
 

@@ -1,6 +1,7 @@
 """The resources and callbacks that a stage may use in addition to its inputs and options.
 
-They never affect a result. Therefore they are not a part of the key of a stored artefact.
+These resources and callbacks never affect a result. Therefore the key of a stored result does not contain
+them.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from bodycap_batch.core.errors import Cancelled
 
 
 def _no_progress(done: int, total: int, what: str = "") -> None:
-    """Ignore a progress report."""
+    """Do nothing. This is the progress callback of a stage whose progress is not shown."""
 
 
 def _not_cancelled() -> bool:
@@ -22,7 +23,7 @@ def _not_cancelled() -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageContext:
-    """Resources and callbacks of one run of a stage.
+    """What a stage may use while it runs: a temporary folder, threads, and callbacks.
 
     Attributes:
         work_dir: Folder for temporary files. Only this run uses the folder.

@@ -13,7 +13,7 @@ EXIT_BUG = 70
 """Exit code after an unexpected exception. Source: EX_SOFTWARE of sysexits.h."""
 
 EXIT_CANCELLED = 130
-"""Exit code after a stop on request. Source: shells report 128 + SIGINT (2)."""
+"""Exit code after the user stopped the program. Source: shells report 128 + SIGINT (2)."""
 
 
 class BodycapError(Exception):
@@ -65,7 +65,7 @@ class BodycapError(Exception):
 
 
 class JobError(BodycapError):
-    """The job file, the command line, or a file that the job file or the command line names is wrong."""
+    """There is an error in the job file, in the command line, or in a file that one of them names."""
 
     exit_code = 2
 
@@ -89,7 +89,7 @@ class StoreError(BodycapError):
 
 
 class DiskAway(StoreError):
-    """The disk does not answer, for example an unreachable network disk. A later attempt may succeed."""
+    """A disk does not respond, for example an unreachable network disk. A later attempt may succeed."""
 
 
 class Cancelled(BodycapError):

@@ -10,9 +10,9 @@ import gc
 def release_memory() -> None:
     """Return to the operating system the memory that this process has freed.
 
-    glibc keeps freed memory, and this increases the peak memory of the next step. Other C libraries have no
-    ``malloc_trim``. With such a library, only Python's garbage collector runs. Evidence:
-    docs/decisions/export.md.
+    The C library glibc keeps freed memory for later use, which increases the peak memory of the next step.
+    Other C libraries have no function ``malloc_trim``. With another library, this function only runs Python's
+    garbage collector. Evidence: docs/decisions/export.md.
     """
     gc.collect()
     with contextlib.suppress(OSError, AttributeError):

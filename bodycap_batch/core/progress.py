@@ -14,15 +14,16 @@ class Event:
     """One progress event of a job.
 
     Attributes:
-        kind: Kind of the event. A task started, made progress, finished, was reused from the store, failed
-            or was stopped, or the event is a note for the user.
+        kind: Kind of the event: a task started, made progress, finished, was reused from the store, failed or
+            was stopped; or a note for the user.
         stage: Stage name.
         camera: Camera name; "" if the stage concerns all cameras.
         done: Number of finished units.
         total: Number of all units; 0 if the number is unknown.
         what: Name of the unit (``frames``, ``pairs`` …), or the text of a note.
         seconds: Duration of a finished task, seconds.
-        round: Number of the round of map extension, counted from 0.
+        round: Number of the round, counted from 0. In each round after the first, keyframes are added to the
+            map.
     """
 
     kind: Kind

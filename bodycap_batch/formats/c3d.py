@@ -16,7 +16,7 @@ _MM_PER_M = 1000.0
 
 _TOLERANCE_M = 1e-5
 """Maximum difference, metres, between a coordinate that is read back and the coordinate that was written.
-Derivation: the format has single precision, which is 1 µm at a distance of 10 m."""
+Derivation: the format stores single-precision numbers. Their rounding error is 1 µm at a distance of 10 m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -31,7 +31,7 @@ _COLMAP_MODEL_IDS = {
     "RADIAL_FISHEYE": 9,
     "THIN_PRISM_FISHEYE": 10,
 }
-"""Identification number of each camera model in the binary format. Source: COLMAP, sensor/models.h."""
+"""By name of the camera model, its number in COLMAP's binary files. Source: COLMAP, sensor/models.h."""
 
 _POINT2D = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 """Type of one 2D point of an image in images.bin: pixel position, and id of the 3D point."""
@@ -56,16 +56,16 @@ def write_colmap_model(
 ) -> tuple[Path, ...]:
     """Write a map as cameras.bin, images.bin and points3D.bin.
 
-    The images contain only 2D points that observe a 3D point of the map. Ids start at 1. Cameras are ordered
-    by name, and images by camera and frame. Points have the order of the map.
+    An image contains only those 2D points that belong to a 3D point of the map. Ids start at 1. Cameras are
+    ordered by name, and images by camera and frame. Points are in the same order as in the map.
 
     Args:
         folder: Folder for the files of the model.
         scene: The map.
         target_from_map: Similarity from the map to another frame of reference, usually the world. None for
             the identity.
-        frame_numbers: By camera name, the number in the video of each frame index. Image names contain these
-            numbers. For a camera without an entry, image names contain the frame index.
+        frame_numbers: By camera name, (N,) number of each frame in the video. The names of the images contain
+            these numbers. For a camera without an entry, the names contain the frame index.
 
     Returns:
         The paths of the written files.

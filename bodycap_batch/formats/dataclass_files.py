@@ -69,7 +69,7 @@ def read_dataclass(cls: type[T], folder: Path, name: str) -> T:
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
-    """Write arrays as an uncompressed .npz file. The bytes of the file depend only on names and arrays."""
+    """Write arrays as an uncompressed .npz file. Equal names and arrays always give equal bytes."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
             buffer = io.BytesIO()
@@ -85,7 +85,7 @@ def read_npz(path: Path) -> Arrays:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Location:
-    """The position of a value in the stored instance.
+    """The position of a value in the dataclass instance that is written or read.
 
     Attributes:
         folder: Folder that the stored paths are relative to.
@@ -161,7 +161,10 @@ def _decode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911
 
 
 def _strip_none(hint: Any) -> Any:
-    """Return X for the type hint ``X | None``, Any for another union, and any other type hint unchanged."""
+    """Return the type X for the type hint ``X | None``.
+
+    For any other union, return Any. Return a type hint that is not a union unchanged.
+    """
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
         return kinds[0] if len(kinds) == 1 else Any

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
 TIME_BASE_HZ = 15360
-"""Number of timestamp units per second. Derivation: a multiple of the usual frame rates 24, 30, 60 and 120
-Hz, and FFmpeg's default for 30 Hz."""
+"""Number of timestamp units per second. Derivation: the number is a multiple of the usual frame rates 24, 30,
+60 and 120 Hz. It is also FFmpeg's default for 30 Hz."""
 
 _FAST_X264_PARAMS = "bframes=0:rc-lookahead=0:weightp=0:8x8dct=0"
 """Options of x264 for fast encoding: no look-ahead, no weighted prediction, no large transforms. Evidence:
@@ -35,8 +35,8 @@ _ENCODER_OPTIONS = {
 """Options of the encoder for each quality of `VideoWriter`."""
 
 _CONTAINER_OPTIONS = {"small": {"movflags": "+faststart"}}
-"""Options of the MP4 container for each quality. The option puts the index at the start of the file, so that
-a web page can play the video while it loads."""
+"""Options of the MP4 container, by quality of `VideoWriter`. The option ``+faststart`` puts the index at the
+start of the file, so that a web page can play the video while the file loads."""
 
 Quality = Literal["high", "lossless", "exact", "near", "small"]
 _STUDIO_RANGE_CHROMA = np.round((np.arange(256) - 128.0) * (224.0 / 255.0) + 128.0).astype(np.uint8)
@@ -55,8 +55,8 @@ class VideoWriter:
         quality: Quality of the video. "high": good quality. "lossless": no losses, except that the chroma has
             half the resolution. "exact": like "lossless", and every frame can be decoded without other
             frames. "near": hardly visible losses. "small": small file.
-        colours: Colour range and colour matrix of the images given to `add_planes`, as numbers of FFmpeg.
-            They are stored in the file. None if they are not stored.
+        colours: Colour range and colour matrix of the images given to `add_planes`, as FFmpeg's numbers, to
+            be stored in the file. None to store neither.
 
     Raises:
         StoreError: The file cannot be written.
@@ -158,8 +158,8 @@ def yuv420_from_rgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     height, width = image.shape[:2]
     planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)
     half = cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    # cvtColor uses the chroma of only one of four pixels. Then thin coloured lines flicker. Therefore the
-    # chroma is replaced by the chroma of the mean of the four pixels.
+    # For the chroma of four pixels, cvtColor uses only one of the pixels. Then thin coloured lines flicker.
+    # Therefore the chroma is computed from the mean of the four pixels.
     _, red, blue = cv2.split(cv2.cvtColor(half, cv2.COLOR_RGB2YCrCb))
     for plane, chroma in zip(planes[height:].reshape(2, -1), (blue, red), strict=True):
         plane[:] = cv2.LUT(chroma, _STUDIO_RANGE_CHROMA).ravel()

@@ -26,8 +26,8 @@ _HEADER_BYTES = 512
 """Maximum size of the header, bytes. Derivation: Open3D's header has fewer than 300 bytes."""
 
 _MAX_SAMPLES_PER_STEP = 100
-"""Maximum number of points between two successive camera centres. With this limit, a wrong pose does not make
-the file huge. Evidence: none."""
+"""Maximum number of points that are added between two successive camera centres. Without this limit, one
+wrong pose far away could make the file huge. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,8 +60,9 @@ def add_camera_paths(
         paths: By camera name, (N,3) camera centres in the order of time, in the frame and unit of the cloud;
             NaN for a lost frame.
         spacing: Maximum distance between two neighbouring points of a path, in the unit of the cloud.
-        colours: By camera name, the colour of the path. None to assign colours to the cameras of `paths`. If
-            the job has other cameras too, the colours must be given, so that they are the same in all files.
+        colours: By camera name, the colour of the path. None to assign colours to the cameras of `paths`.
+            Give the colours if the job has more cameras than `paths`. Otherwise a camera could have another
+            colour than in the other files of the job.
 
     Returns:
         The point cloud with the paths.

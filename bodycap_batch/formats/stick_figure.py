@@ -14,8 +14,8 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.model.skeleton import SkeletonModel, rest_pose
 
 _WAIST_RATIO = 0.15
-"""Position of the octahedron's largest width, as a fraction of the length of the bone from its start.
-Evidence: none; it only affects the appearance."""
+"""Distance from the start of a bone to the place where its octahedron is widest, as a fraction of the bone's
+length. Evidence: none; it only affects the appearance."""
 
 _MIN_BONE_M = 1e-4
 """Minimum length, metres, of a bone that gets an octahedron. Evidence: none; the limit is far below the
@@ -26,8 +26,8 @@ _HALF_WIDTH_RATIO = 0.08
 appearance."""
 
 _HALF_WIDTH_RANGE_M = (0.008, 0.03)
-"""Minimum and maximum of half the width of the octahedron, metres. Evidence: none; they only affect the
-appearance."""
+"""Smallest and largest value of half the width of an octahedron, metres. Evidence: none; the values only
+affect the appearance."""
 
 _FACES = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [5, 1, 2], [5, 2, 3], [5, 3, 4], [5, 4, 1]])
 

@@ -20,8 +20,8 @@ _FIGURE_COLOR_RGB = (0.86, 0.39, 0.10)
 """Colour of the stick figure, RGB, 0 to 1."""
 
 _EXTENT_MARGIN_M = 0.3
-"""Margin, metres, around the joint centres in the extent (bounding box) of the figure. Derivation: the
-distance between the ends of head, hands and feet and their joints is smaller than this margin."""
+"""Margin, metres, between the joint centres and the bounding box of the figure. Derivation: head, hands and
+feet extend beyond their joints by less than this margin."""
 
 
 def write_usd(path: Path, motion: Motion) -> Path:
@@ -85,14 +85,14 @@ def _joint_tokens(skeleton: SkeletonModel) -> list[str]:
 
 
 def _usd_matrices(poses: FloatArray) -> Any:
-    """Convert poses (J,4,4) to USD matrices, which are transposed because they multiply row vectors."""
+    """Convert poses (J,4,4) to USD matrices. USD multiplies row vectors, so the matrices are transposed."""
     from pxr import Gf, Vt
 
     return Vt.Matrix4dArray([Gf.Matrix4d(*pose.T.reshape(-1).tolist()) for pose in poses])
 
 
 def _define_skeleton(stage: Any, model: SkeletonModel, tokens: list[str]) -> Any:
-    """Add the skeleton to the stage and return it. Its rest pose and its bind pose are the T-pose."""
+    """Add the skeleton to the stage and return the added skeleton. Rest pose and bind pose are the T-pose."""
     from pxr import UsdSkel
 
     rest = rest_pose(model)

@@ -20,8 +20,8 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 from bodycap_batch.core.arrays import FloatArray, IntArray
 
 _FACTOR_BYTES = 1e7
-"""Maximum memory, bytes, for the factors that are kept. It is enough for the factors of 50 ticks with nine
-bones. With three times this memory, the solver took 20 MB more and was not faster."""
+"""Maximum memory, bytes, for the Cholesky factors that are kept. This memory holds the factors of 50 ticks
+with nine bones. With a limit three times as large, the solver needed 20 MB more and was not faster."""
 
 
 class _BlockRow(NamedTuple):
@@ -81,17 +81,18 @@ def _solve_triangular(lower: FloatArray, rhs: FloatArray, *, transposed: bool = 
 
 
 class BlockTridiagonal:
-    """A symmetric positive definite block-tridiagonal matrix, factorised.
+    """A factorised matrix, for solving linear systems and for computing blocks of the inverse matrix.
 
-    The factors are dense, even if the matrix is sparse. For a large matrix, only the factors of one segment
-    of successive blocks are kept. The factors of the other segments are computed again when they are needed.
+    The matrix is symmetric, positive definite and block-tridiagonal. The factors are dense, even for a
+    sparse matrix. For a large matrix, only the factors of one segment of successive blocks are kept. The
+    factors of the other segments are computed again when they are needed.
 
     Args:
         block_row: Function that returns the blocks of a row, given the number of the row.
         bounds: (K+1,) index of the first unknown of each block in the order of the blocks, followed by the
             number of unknowns.
-        order: (C,) index that the caller gives to each unknown, in the order of the blocks. None if the
-            caller uses the order of the blocks.
+        order: (C,) the caller's index of each unknown, listed in the order of the blocks. None if the caller
+            numbers the unknowns in the order of the blocks.
         factor_bytes: Maximum memory, bytes, for the factors that are kept.
 
     Raises:
@@ -212,7 +213,7 @@ class BlockTridiagonal:
             yield from self._segment_factors(number)[::-1]
 
     def _segment_factors(self, number: int) -> list[_Factor]:
-        """Return the factors of a segment; compute the factors again if they were not kept."""
+        """Return the factors of a segment. Factors that were not kept are computed again."""
         if number != self._kept_segment:
             self._factorise(number)
         return self._factors
@@ -221,7 +222,7 @@ class BlockTridiagonal:
         """Compute the factors of a segment and keep them.
 
         Returns:
-            The matrix that the Schur complement subtracts from the first diagonal block of the next segment.
+            The matrix to subtract from the first diagonal block of the next segment (Schur complement).
         """
         self._kept_segment, self._factors = number, []
         update = self._schur_updates[number]

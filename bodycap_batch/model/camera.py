@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 CV2_PIXEL_OFFSET_PX = 0.5
-"""Offset, pixels, that converts OpenCV's pixel coordinates to COLMAP's when it is added. OpenCV puts (0, 0)
-at the centre of the first pixel."""
+"""Offset, pixels, that is added to OpenCV's pixel coordinates to get COLMAP's pixel coordinates. In OpenCV,
+the centre of the first pixel is at (0, 0)."""
 
 _FOCAL_INDICES = {
     "SIMPLE_PINHOLE": (0,),
@@ -51,8 +51,8 @@ _PARAM_COUNT = {
 """Number of parameters of each COLMAP camera model. Source: COLMAP, sensor/models.h."""
 
 _MIN_DEPTH = 1e-9
-"""Minimum depth of a point that is projected, in the unit of the points. Derivation: the limit avoids a
-division by zero."""
+"""Minimum depth, in the unit of the points, of a point that is projected to the image. Derivation: the limit
+avoids a division by zero."""
 
 CAMERA_MODELS = tuple(_PARAM_COUNT)
 
@@ -68,7 +68,7 @@ def parameter_count(model: str) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Camera:
-    """Intrinsics of one camera at one image size.
+    """Intrinsics of one camera at one image size, for projecting points and for computing viewing rays.
 
     Attributes:
         model: Name of the COLMAP camera model.
@@ -136,8 +136,8 @@ class Camera:
             px: (N,2) pixels.
 
         Returns:
-            The points (N,2) of the rays at depth 1: undistorted image coordinates. NaN for a pixel for which
-            the camera model has no inverse.
+            The undistorted image coordinates (N,2): the x and y of each ray at depth 1. NaN for a pixel for
+            which the camera model has no inverse.
         """
         pixels = np.ascontiguousarray(px, dtype=np.float64).reshape(-1, 2)
         if len(pixels) == 0:
@@ -147,8 +147,9 @@ class Camera:
     def scaled(self, width_px: int, height_px: int) -> Camera:
         """Return the intrinsics of the same camera at another image size.
 
-        Scaling is exact because COLMAP's pixel coordinates start at the corner of the image. The exception is
-        a model with one focal length and different scale factors in width and height: their mean is used.
+        Scaling is exact because COLMAP's pixel coordinates start at the corner of the image. There is one
+        exception: if the scale factors of width and height differ, and the model has only one focal length,
+        this focal length is multiplied by the mean of both factors.
         """
         scale_x, scale_y = width_px / self.width_px, height_px / self.height_px
         params = self.params.copy()
@@ -170,15 +171,15 @@ _TWO_FOCAL_MODEL = {
     "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", 1),
     "RADIAL_FISHEYE": ("OPENCV_FISHEYE", 2),
 }
-"""For each camera model with one focal length: the corresponding model with two focal lengths, and the number
-of distortion parameters that both models share."""
+"""By name of a camera model with one focal length: the name of the corresponding model with two focal
+lengths, and the number of distortion parameters. This number is the same in both models."""
 
 
 def with_two_focal_lengths(camera: Camera) -> Camera:
     """Return the same intrinsics in a camera model that has a separate focal length for each axis.
 
-    Only such a camera can be scaled exactly by different factors in width and height. A model without a
-    counterpart with two focal lengths is returned unchanged.
+    Only a camera with two focal lengths can be scaled exactly by different factors in width and height. If
+    there is no corresponding model with two focal lengths, the camera is returned unchanged.
     """
     if camera.model not in _TWO_FOCAL_MODEL:
         return camera

@@ -106,7 +106,7 @@ def rotation_angle_rad(rotation: FloatArray) -> FloatArray:
 def nearest_rotation(matrix: FloatArray) -> FloatArray:
     """Return the rotations that are nearest to matrices (...,3,3) in the Frobenius norm.
 
-    The nearest rotation to a sum of rotations is their chordal mean.
+    If a matrix is a sum of rotations, the nearest rotation is the chordal mean of these rotations.
 
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point
         patterns", PAMI 1991; Hartley et al., "Rotation averaging", IJCV 2013.
@@ -165,15 +165,14 @@ def poses_at(
         times_ns: (N,) times of the given poses, increasing.
         poses: (N,4,4) given poses.
         at_ns: (M,) requested times.
-        max_gap_ns: Maximum time between two neighbouring poses. The poses are not interpolated over a longer
-            time.
-        snap_ns: Maximum time between a requested time and the nearest given pose for the nearest pose to be
-            returned where interpolation is impossible: in a gap that is too long, and outside the range of
-            `times_ns`.
+        max_gap_ns: Maximum time between two neighbouring given poses for interpolation between them.
+        snap_ns: Maximum time between a requested time and the nearest given pose, for requested times without
+            interpolation. Within this limit, the nearest given pose is returned unchanged. There is no
+            interpolation in a gap longer than `max_gap_ns` and outside the range of `times_ns`.
 
     Returns:
-        The poses (M,4,4) at the requested times, the identity if there is no pose, and a mask (M,) that is
-        True where there is a pose.
+        The poses (M,4,4) at the requested times, and a mask (M,) that is True where there is a pose. Where
+        there is no pose, the identity is returned.
     """
     out = np.tile(np.eye(4), (len(at_ns), 1, 1))
     if len(times_ns) == 0:

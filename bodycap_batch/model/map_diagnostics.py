@@ -22,7 +22,7 @@ CameraGroups = tuple[tuple[str, ...], tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True)
 class RefinedIntrinsics:
-    """The intrinsics of a camera that were refined together with a map.
+    """The refined intrinsics of a camera, estimated together with a map.
 
     Attributes:
         model: COLMAP's name of the camera model.
@@ -42,15 +42,15 @@ class MapDiagnostics:
             of both groups are kept, because it is unknown which group is mirrored.
         flipped_cameras: Names of the cameras that were excluded because their images are mirrored.
         excluded_from_pair: Names of the excluded cameras that belong to the user's initial image pair. If
-            there are any, the pair was not used.
-        misfit_factors: By camera name, the ratio of the focal length that fits the map to the given focal
-            length. It contains only cameras whose given intrinsics the map contradicts. None before the
-            check.
+            there is such a camera, mapping did not use the user's pair.
+        misfit_factors: By camera name, the focal length that fits the map, divided by the given focal length.
+            A camera has an entry only if the map contradicts its given intrinsics. None before this was
+            checked.
         recalibrated: Names of the cameras whose given intrinsics were replaced by refined intrinsics.
         refined_intrinsics: By camera name, the refined intrinsics of the recalibrated cameras.
         extensions: For each extension of the map, the entry that describes the extension in the log.
-        reach: Result of the check of the distances between cameras, as entries of the log. None if the
-            distances were not checked.
+        reach: Result of comparing the distances between the cameras with the distances that the body permits,
+            as entries of the log. None if the distances were not checked.
         details: All entries of the log in the order of the log, including the entries of the other fields.
     """
 
@@ -119,6 +119,6 @@ class MapDiagnostics:
 
 
 def _groups(groups: Sequence[Sequence[str]]) -> CameraGroups:
-    """Convert two lists of camera names to tuples."""
+    """Convert a pair of lists of camera names to a pair of tuples."""
     one, other = groups
     return tuple(one), tuple(other)

@@ -29,8 +29,8 @@ _STANDING_RATE_HZ = 30.0
 def standing_sigma_m(fps: float) -> float:
     """Return the sigma, metres, of the movement of a standing foot's ankle from one tick to the next.
 
-    The sigma is proportional to 1 / √fps. Therefore the sigma of the movement in one second does not depend
-    on the rate.
+    The sigma is proportional to 1 / √fps. Therefore the sigma of the whole movement in one second is the same
+    for any number of ticks per second.
 
     Args:
         fps: Ticks per second of the timeline.
@@ -40,7 +40,7 @@ def standing_sigma_m(fps: float) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraClock:
-    """The relation between a camera's timestamps and the common clock.
+    """The relation between a camera's timestamps and the common clock, for converting camera times.
 
     Attributes:
         nominal_fps: Nominal frame rate of the camera, frames per second. Dropped frames do not change the
@@ -58,12 +58,13 @@ class CameraClock:
             raise ValueError(f"nominal_fps must be positive, not {self.nominal_fps}")
 
     def common_times_ns(self, times_ns: IntArray, row_fraction: FloatArray | None = None) -> IntArray:
-        """Return the common times (N,) at which poses hold, nanoseconds.
+        """Return the common time (N,), nanoseconds, at which the pose of each frame is valid.
 
         Args:
             times_ns: (N,) camera time of each frame, nanoseconds. The middle row is exposed at this time.
-            row_fraction: (N,) mean image row of the observations behind each pose, as a fraction of the image
-                height. None if each pose holds at the exposure of the middle row.
+            row_fraction: (N,) mean image row of the observations that each pose was estimated from, as a
+                fraction of the image height. The pose is valid at the exposure of this row. None if each pose
+                is valid at the exposure of the middle row.
         """
         shift_s = np.full(len(times_ns), self.offset_s)
         if row_fraction is not None:
@@ -101,15 +102,15 @@ class MergeInputs:
         skeleton: The skeleton in its zero pose, metres: a preset scaled to the stature, or the user's file.
         mounts: One mount per camera, used as the prior: the nominal pose with a large sigma, or the pose
             given in the job with a small sigma.
-        skeleton_is_measured: True if the bone lengths are those of the subject. The skeleton then determines
-            the metric scale.
+        skeleton_is_measured: True if the bone lengths were measured on the subject. The skeleton then
+            determines the metric scale.
         height_m: Stature of the subject, metres; None if it is not given.
         activity: ``walk`` adds the soft rules of walking; ``generic`` adds no rules.
         map_points: By gauge, the (P,3) points of the map in this gauge. Planes and the floor are found in
             these points.
-        row_fraction: By camera name, (N,) mean image row of the observations behind each pose, as a fraction
-            of the image height; NaN if the frame is not localised. The poses of a camera without an entry
-            hold at the exposure of the middle row.
+        row_fraction: By camera name, (N,) mean image row of the observations that each pose was estimated
+            from, as a fraction of the image height; NaN if the frame is not localised. Without an entry for
+            the camera, each pose is valid at the exposure of the middle row.
         board_views: Observations of the job's marker board in keyframes.
     """
 
@@ -156,9 +157,10 @@ class SolvedBody:
             the solution of the graph. Any other joint has its rest rotation relative to the parent.
         solved: (J,) True if the joint was a variable of the graph.
         observed: (T,J) True if cameras measured the joint at the tick.
-        trajectories: The trajectories of the cameras in use, in the gauge "world". The covariances are those
-            of the measurements, in metres. The camera centres were solved together with the body
-            (`MergeOptions.camera_paths`). Poses with gross errors are removed and have the status POSE_JUMP.
+        trajectories: The trajectories of the cameras in use, in the gauge "world". The camera centres were
+            solved together with the body (`MergeOptions.camera_paths`). The covariances describe the
+            measurements, not the solution; lengths are in metres. Poses with gross errors are removed and
+            have the status POSE_JUMP.
         mounts: The solved mounts, with their sigmas.
         standing: (T,J) True if the joint is the ankle of a foot that stands at the tick. None if foot contact
             was not detected.
@@ -192,8 +194,8 @@ class SolvedBody:
 class MergeResult(SolvedBody):
     """The result of the merging stage: the body and the cameras in the world (metres, z up).
 
-    Every output contains `motion`: the page, the video and all files. The poses of the graph are kept only
-    for figures that describe the solution of the graph.
+    The page, the video and all exported files show `motion`. The joint poses from the factor graph are kept
+    only to compute figures about the solution of the graph.
 
     Attributes:
         motion: The motion of the skeleton with rigid bones that is nearest to the solution of the graph.
@@ -203,9 +205,9 @@ class MergeResult(SolvedBody):
             has no entry.
         unused_cameras: By name of a camera whose map could not be linked to the body, the reason.
         report: Sources, values, residuals and doubts. It is stored as plain JSON values.
-        joint_covariance_m2: (T,J,3,3) covariance, in world axes, of the vector from the centre of the first
-            solved joint to the centre of each joint. It contains the errors of measurements, mounts and
-            scale, but not the error of the world axes. NaN if the joint was not solved.
+        joint_covariance_m2: (T,J,3,3) covariance of the position of each joint relative to the first solved
+            joint, in world axes. It contains the errors of measurements, mounts and scale, but not the error
+            of the world axes. NaN if the joint was not solved.
     """
 
     motion: Motion
@@ -225,9 +227,9 @@ class MergeResult(SolvedBody):
             set_array(self, "joint_covariance_m2", (*self.observed.shape, 3, 3), finite=False)
 
     def joint_sigma_m(self) -> FloatArray:
-        """Return the sigmas (T,J) of the joint positions relative to the first solved joint.
+        """Return the sigmas (T,J) of the joint positions, metres per axis.
 
-        They are in metres per axis, and NaN for a joint that was not solved.
+        The positions are relative to the first solved joint. The sigma of a joint that was not solved is NaN.
         """
         if self.joint_covariance_m2 is None:
             return np.full(self.observed.shape, np.nan)

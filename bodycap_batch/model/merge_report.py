@@ -35,7 +35,7 @@ class ScaleSourceReport:
         name: Name of the source.
         metres_per_map_unit: Scale from this source, metres per map unit.
         relative_sigma: Sigma of the logarithm of this scale.
-        off: Logarithm of the ratio of this scale to the selected scale.
+        off: Natural logarithm of this scale divided by the selected scale.
         used: False if the source was rejected, or replaced by a better source.
     """
 
@@ -63,7 +63,7 @@ class BodyScaleReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LimbScalesReport:
-    """The metric scales from single limbs.
+    """The metric scales from single limbs, for checking whether the limbs agree on the scale.
 
     Attributes:
         alone: For each limb, the scale that follows from this limb only.
@@ -78,7 +78,7 @@ class LimbScalesReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleReport:
-    """The metric scale.
+    """The selected metric scale, with its sources and its uncertainty.
 
     Attributes:
         source: Names of the sources in use, joined in one text.
@@ -88,8 +88,8 @@ class ScaleReport:
         chi2: Chi-square of the scales of the sources about their mean.
         degrees_of_freedom: Number of degrees of freedom of the chi-square.
         body_alone: The scale that follows from the bone lengths only.
-        trunk_over_floor_m: Height of the reference camera's joint above the floor, metres; None if no floor
-            was found.
+        trunk_over_floor_m: Height above the floor, metres, of the joint that the reference camera is mounted
+            on; None if no floor was found.
         known_to: Sentence about the uncertainty of the scale, with advice.
         limbs: The scales from single limbs; None if fewer than two limbs can be used.
     """
@@ -122,8 +122,8 @@ class OtherVerticalReport:
         name: Source of this candidate.
         off_deg: Angle between this candidate and the selected vertical, degrees.
         sigma_deg: Sigma of this candidate, degrees.
-        less_likely_nats: Negative log-likelihood of this candidate minus the negative log-likelihood of the
-            selected vertical, nats.
+        less_likely_nats: Log-likelihood of the selected vertical minus the log-likelihood of this candidate,
+            nats.
     """
 
     name: str
@@ -134,15 +134,16 @@ class OtherVerticalReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VerticalReport:
-    """The vertical.
+    """The selected vertical direction, with its source and its uncertainty.
 
     Attributes:
         source: Source of the selected vertical.
         sigma_deg: Sigma of the selected vertical, degrees.
         body_off_deg: Angle between the selected vertical and the vertical from the body, degrees. None if the
             vertical from the body was selected.
-        plane_points_share: Fraction of the planes' points that agree with the selected vertical, 0 to 1.
-        others: Candidates from other sources, which were not selected.
+        plane_points_share: Fraction, 0 to 1, of the points on planes whose plane agrees with the selected
+            vertical.
+        others: The candidates from other sources. They were not selected.
         known_to: Sentence about the uncertainty of the vertical, with advice.
     """
 
@@ -156,10 +157,10 @@ class VerticalReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FloorReport:
-    """The floor.
+    """The floor that was found, and the number of points that support it.
 
     Attributes:
-        source: Source of the floor.
+        source: Name of the method that found the floor.
         points: Number of map points that support the floor.
     """
 
@@ -169,12 +170,12 @@ class FloorReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunnerUpRollReport:
-    """The second best roll of a camera in its mount.
+    """The second best roll of a camera in its mount, for judging how clear the choice of the roll was.
 
     Attributes:
         roll_deg: The second best roll, degrees.
-        half_squared_sigmas_more: Cost of this roll minus the cost of the selected roll. The cost is half the
-            sum of squared residuals, each divided by its sigma.
+        half_squared_sigmas_more: Cost of this roll minus the cost of the selected roll. For the cost, each
+            residual is divided by its sigma and squared. The cost is half the sum of these squares.
     """
 
     roll_deg: float
@@ -183,7 +184,7 @@ class RunnerUpRollReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MountReport:
-    """A solved mount.
+    """The solved mount of one camera: its pose on the bone, the uncertainty, and the change from the prior.
 
     Attributes:
         role: Anatomical name of the bone that the camera is mounted on.
@@ -235,9 +236,9 @@ class ClockReport:
 
     Attributes:
         shift_s: Seconds to add to the camera's timestamps for the best fit.
-        scatter_left: Ratio of the scatter of the camera's positions relative to the trunk after the shift to
-            the scatter before the shift, 0 to 1.
-        offset_s: Clock offset that includes the shift, seconds.
+        scatter_left: Scatter after the shift divided by the scatter before the shift, 0 to 1. The scatter is
+            computed from the camera's positions relative to the trunk.
+        offset_s: Clock offset of the camera after adding the shift, seconds.
         says: Sentence about the clock for the user.
     """
 
@@ -249,7 +250,7 @@ class ClockReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwappedSidesReport:
-    """The cameras on limbs that are on the wrong side of the body.
+    """The cameras on limbs that were found on the wrong side of the body, as if left and right were swapped.
 
     Attributes:
         cameras: By camera name, the fraction of its time that the camera is on the wrong side, 0 to 1.
@@ -262,7 +263,7 @@ class SwappedSidesReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlignedCameraReport:
-    """The sigmas of the pose of an aligned map: degrees and metres, per axis."""
+    """The sigmas of the pose of a map that was aligned with another map: degrees and metres, per axis."""
 
     sigma_deg: float
     sigma_m: float
@@ -270,11 +271,11 @@ class AlignedCameraReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HingeReport:
-    """A hinge that the motion violates.
+    """A hinge joint, such as the elbow, that the motion bends out of the hinge's plane.
 
     Attributes:
-        sigma_m: Sigma, metres, of the distance between the hinge's plane and the far end of the bone below
-            the hinge.
+        sigma_m: Sigma, metres, that the solver used for the distance of a point from the hinge's plane. The
+            point is the far end of the bone below the hinge.
         known_to: Sentence about the violation, with advice.
     """
 
@@ -288,8 +289,9 @@ class ActivityReport:
 
     Attributes:
         name: Name of the activity.
-        rules_active: By name of the rule, the fraction of the ticks at which the rule is violated, 0 to 1.
-        rules_pressed_m: By name of the rule, percentiles of the violation at these ticks, metres.
+        rules_active: By name of the rule, the fraction of ticks, 0 to 1, at which the rule is violated.
+        rules_pressed_m: By name of the rule, percentiles of the size of the violation, metres. Only the ticks
+            at which the rule is violated are used.
     """
 
     name: str
@@ -299,13 +301,14 @@ class ActivityReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolverReport:
-    """The solution of the motion graph.
+    """The size of the factor graph of the motion, and the remaining errors of its solution.
 
     Attributes:
         ticks: Number of ticks.
         bones: Number of bones.
-        iterations: Number of iterations.
-        half_squared_error: By kind of factor, half the sum of squared residuals, each divided by its sigma.
+        iterations: Number of iterations of the solver.
+        half_squared_error: By kind of factor, the remaining error. For this error, each residual is divided
+            by its sigma and squared. The error is half the sum of these squares.
     """
 
     ticks: int
@@ -333,8 +336,8 @@ class MergeReport:
             two bones that meet at the joint.
         joint_sigma_m: By role of a joint, then by ``observed`` or ``filled``, percentiles of the sigma of the
             joint's centre, metres per axis.
-        hinge_off_plane_m: By role of the joint at the far end of the bone below a hinge, percentiles of the
-            distance, metres, of this joint from the hinge's plane.
+        hinge_off_plane_m: By role of a joint, percentiles of its distance, metres, from the plane of a hinge.
+            The joint is at the far end of the bone below the hinge.
         loose_hinges: By role of the bone below a hinge, the violation of the hinge. Hinges that the motion
             does not violate have no entry.
         activity: The soft rules of the activity.

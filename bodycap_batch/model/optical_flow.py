@@ -22,23 +22,24 @@ REFERENCE_WIDTH_PX = 640.0
 scaled with the long side."""
 
 BLUR_SHARPNESS_RATIO = 0.6
-"""Minimum ratio of the sharpness of a frame to the sharpness of the frames around it. A frame with a smaller
-ratio is treated as blurred. Evidence: none."""
+"""Minimum sharpness of a frame, divided by the sharpness of the neighbouring frames. A frame below this
+minimum is treated as blurred. Evidence: none."""
 
 _WINDOW_PX = 21
-"""Side, pixels, of the square around a point that is compared between two images. Evidence: none."""
+"""Side length, pixels, of the square window around a tracked point. The tracker compares the content of this
+window in both images. Evidence: none."""
 _LEVELS = 4
 """Number of pyramid levels above the full image if no expected positions are given. Evidence: none."""
 _GUIDED_LEVELS = 2
 """Number of pyramid levels above the full image if expected positions are given. Evidence: none."""
 _UNCHECKED_LEVELS = 0
-"""Number of pyramid levels above the full image if expected positions are given and tracks are not checked.
-More levels would only increase the cost and the number of wrong matches."""
+"""Number of pyramid levels above the full image if expected positions are given and tracks are not checked by
+tracking back. More levels would only increase the cost and the number of wrong matches."""
 _ITERATIONS = 20
 """Maximum number of Lucas–Kanade iterations on each pyramid level. Evidence: none."""
 _EPSILON_PX = 0.02
-"""Minimum movement of a point, pixels, in an iteration. A smaller movement ends the iterations. Evidence:
-none."""
+"""Minimum movement, pixels, of a point from one iteration to the next. The iterations end after a smaller
+movement. Evidence: none."""
 _MAX_ROUND_TRIP_PX = 1.0
 """Maximum distance, pixels, between a point and its position after tracking forwards and back. Evidence:
 none."""
@@ -46,13 +47,13 @@ _COARSE_WIDTH_PX = 320.0
 """Long side, pixels, of the reduced images in which the motion of the whole image is estimated. Evidence:
 none."""
 _COARSE_WINDOW_PX = 15
-"""Side, pixels of the reduced image, of the square around a point that is compared. Evidence: none."""
+"""Side length of the square window around a tracked point, in pixels of the reduced image. Evidence: none."""
 _COARSE_LEVELS = 3
 """Number of pyramid levels above the reduced image if no expected positions are given. Evidence: none."""
 _COARSE_POINTS = 48
 """Maximum number of points that are tracked for the motion of the whole image. Evidence: none."""
 _MIN_COARSE_POINTS = 12
-"""Minimum number of points for the estimation of a homography. Evidence: none."""
+"""Minimum number of tracked points for estimating a homography. Evidence: none."""
 _COARSE_ERROR_PX = 2.5
 """Maximum error, pixels of the reduced image, of an inlier of the homography. Evidence: none."""
 _COARSE_MAX_TRIALS = 300
@@ -67,8 +68,8 @@ _PIECE_SIDE_RATIO = 0.35
 _PIECE_ROWS, _PIECE_COLUMNS = 2, 3
 """Numbers of rows and columns of image pieces. Evidence: none."""
 _MAX_PIECES = 2
-"""Maximum number of image pieces whose shifts are used as expected shifts of the points. The pieces with the
-best matches are used. Evidence: none."""
+"""Maximum number of image pieces whose shifts are tried as expected shift of the tracked points. The pieces
+with the best matches are used. Evidence: none."""
 _MIN_CONTRAST = 4.0
 """Minimum standard deviation, grey levels, of an image piece. A piece with less contrast is not searched.
 Evidence: none."""
@@ -111,10 +112,11 @@ def track_points(
         second: (H,W) uint8 image in which the points are searched.
         px: (N,2) float32 points in the first image.
         guess_px: (N,2) expected positions in the second image; None if they are unknown.
-        with_check: True to track the points back to the first image too, and to reject points that do not
-            return to their start. False to skip this check; if expected positions are given, only their
-            surroundings are then searched, at a quarter of the cost.
-        window_px: Side, pixels, of the square around a point that is compared.
+        with_check: True to check each point: it is also tracked back to the first image, and rejected if it
+            does not return to its start. False to skip this check. Without the check, only the surroundings
+            of `guess_px` are searched, if it is given. This reduces the cost to a quarter.
+        window_px: Side length, pixels, of the square window around a point. The tracker compares the content
+            of this window in both images.
 
     Source: Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000; the check is Kalal,
         Mikolajczyk, Matas, "Forward-backward error", ICPR 2010.
@@ -132,7 +134,7 @@ def track_points(
         return TrackedPoints(found_px, is_found, np.zeros(len(px), np.float32))
     returned_px = np.full_like(tracked, np.inf)
     if is_found.any():
-        # Tracking back starts at the found position minus the guessed shift. If it started at the original
+        # Tracking back starts at the found position minus the expected shift. If it started at the original
         # point, the check would always succeed.
         return_guess = None if guess is None else tracked[is_found] - (guess - start)[is_found]
         returned, refound = _lucas_kanade(second, first, tracked[is_found], return_guess, (window_px, levels))
@@ -153,7 +155,8 @@ def _lucas_kanade(
         second: (H,W) image in which the points are searched.
         start: (N,2) points in the first image.
         guess: (N,2) expected positions in the second image; None if they are unknown.
-        size: Side, pixels, of the square that is compared, and number of pyramid levels above the full image.
+        size: Side length, pixels, of the square window around a point, and number of pyramid levels above the
+            full image.
 
     Returns:
         Positions (N,2) in the second image, and a mask (N,) that is True for the points that were found.
@@ -345,13 +348,13 @@ def fit_rotation(first: FloatArray, second: FloatArray, iterations: int = 4) -> 
     Args:
         first: (N,3) unit directions before the rotation.
         second: (N,3) unit directions after the rotation.
-        iterations: Number of iterations of reweighting.
+        iterations: Number of times that the weights are computed again.
 
     Returns:
         The rotation (3,3) from `first` to `second`.
 
-    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976; iteratively
-        reweighted with Cauchy weights, whose scale is the median residual.
+    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976. For robustness,
+        Cauchy weights are used. Their scale is the median residual.
     """
     weight = np.ones(len(first))
     rotation = np.eye(3)

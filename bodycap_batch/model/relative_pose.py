@@ -21,15 +21,19 @@ from bodycap_batch.model.scene import Trajectory
 _MAX_ITERATIONS = 100
 """Maximum number of iterations for the average of rotations."""
 _CONVERGED_RAD = 1e-9
-"""Angle, radians, in the iterative average of rotations. The iterations end when a step is smaller. It is
-also the lower limit of a residual in the weight 1/residual, so that the weight stays finite."""
+"""Smallest angle, radians, that is distinguished from zero in the iterative average of rotations.
+
+The iterations end after a step with a smaller angle. Residuals with a smaller angle are replaced by this
+angle, so that the weight 1/residual stays finite."""
 MIN_INSTANTS = 30
 """Minimum number of instants with a pose of both cameras: the frames of one second. Fewer instants do not
 determine the relative pose."""
 _MAX_SPREAD_RATIO = 1.5
-"""Maximum ratio of the scatter of the relative rotation to the scatter that the covariances of the poses
-explain. In a rigid rig the ratio is below 1: the covariances also contain the error of the map, but this
-error is common to both cameras. Evidence: docs/decisions/registration.md."""
+"""Maximum scatter of the relative rotation, divided by the scatter that is expected from the covariances.
+
+Two cameras with a larger ratio are not a rigid rig. In a rigid rig, the ratio is even below 1. The reason is
+that the covariances also contain the error of the map, and this error is common to both cameras. Evidence:
+docs/decisions/registration.md."""
 _MEDIAN_NORM_3D = 1.538
 """Median length of a vector of three independent standard normal variables."""
 _SAME_INSTANT_RATIO = 0.25
@@ -37,13 +41,13 @@ _SAME_INSTANT_RATIO = 0.25
 a fraction of the frame interval. Derivation: the timestamps are rounded, and the next exposure is a whole
 frame interval later."""
 _MAX_INTERPOLATION_FRAMES = 1.5
-"""Maximum time between two poses that are interpolated, in frame intervals. Only the poses of successive
-frames are this near."""
+"""Maximum time between two poses, in frame intervals, for interpolation between them. With this limit, only
+poses of successive frames are interpolated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelativePose:
-    """The pose of one camera relative to another.
+    """The pose of one camera relative to another camera, and the figures that show whether it is constant.
 
     Attributes:
         cameras: Names of the first and the second camera.
@@ -52,7 +56,8 @@ class RelativePose:
         instants: Number of instants with a pose of both cameras.
         spread_rad: Median angle, radians, between the relative rotation at single instants and the mean
             relative rotation.
-        explained_rad: Median angle, radians, that the covariances of both trajectories explain.
+        explained_rad: Value of `spread_rad`, radians, that is expected from the covariances of both
+            trajectories.
         spread: Median distance between the relative translation at single instants and the mean relative
             translation, in the unit of the gauge.
     """
@@ -129,7 +134,7 @@ def estimate_relative_pose(first: Trajectory, second: Trajectory, offset_ns: int
 
 
 def _rotation_variance(path: Trajectory) -> float:
-    """Return the median over all poses of the variance of the rotation about one axis, rad²."""
+    """Return the variance, rad², of a pose's rotation about one axis: the median of all poses."""
     covariance = path.covariance[path.localised][:, :3, :3]
     return float(np.median(np.trace(covariance, axis1=1, axis2=2))) / 3.0
 

@@ -22,24 +22,25 @@ _MAX_GAP_FRAMES = 3.0
 velocity. After a longer time without frames, the velocity would be wrong; only the other neighbour is then
 used. Evidence: docs/decisions/registration.md."""
 _MIN_POINTS = 30
-"""Minimum number of observations of a frame that is used. Origin: a camera motion has six unknowns, and
-the observations must determine them well. Evidence: none."""
+"""Minimum number of observations in a frame. Frames with fewer observations are not used. Origin: a camera
+motion has six unknowns, and the observations must determine these unknowns well. Evidence: none."""
 _MAX_RESIDUAL_PX = 4.0
-"""Maximum residual, pixels in an image of width 640, of an observation that is used. Evidence: none."""
+"""Maximum residual of an observation, in pixels of an image with a width of 640 pixels. Observations with a
+larger residual are not used. Evidence: none."""
 _LOSS_PX = 0.5
 """Scale of the Cauchy loss, pixels. Evidence: none."""
 _BATCH_ROWS = 1 << 14
-"""Number of observations that are projected at a time. Each observation needs a separate pose, so the limit
-bounds the memory."""
+"""Number of observations in one batch of projections. Each observation needs a copy of a pose, so small
+batches limit the memory."""
 _SCREENED_OBSERVATIONS = 100_000
-"""Approximate number of observations that are used, from frames spread over the video. This number is enough
-for a decision."""
+"""Approximate number of observations that are used to decide whether a camera has a rolling shutter. They are
+taken from frames spread over the whole video."""
 _MIN_APPARENT_S = 0.0005
-"""Minimum readout time, seconds, estimated from the residuals of a camera with a rolling shutter. Origin:
-with a global shutter, the estimate is less than 0.0003 s."""
+"""Minimum readout time, seconds, that shows a rolling shutter. The readout time is estimated from residuals.
+Origin: for a camera with a global shutter, the estimate is less than 0.0003 s."""
 _MIN_SIGMAS = 8.0
-"""Minimum ratio of the estimated readout time to its standard deviation for a rolling shutter. Evidence:
-none."""
+"""Minimum ratio of the estimated readout time to the standard deviation of the estimate. A smaller ratio does
+not show a rolling shutter. Evidence: none."""
 
 
 def image_velocity(
@@ -55,8 +56,8 @@ def image_velocity(
         points: (M,3) observed map point of each observation, in the map frame.
 
     Returns:
-        The velocities (M,2), px/s. A velocity is zero if no neighbouring frame is usable, because it has no
-        pose or is far in time, and if the point is behind the camera.
+        The velocities (M,2), px/s. A velocity is zero if the point is behind the camera, or if no
+        neighbouring frame is usable. A neighbouring frame is usable if it has a pose and is near in time.
     """
     has_pose: BoolArray = np.asarray(np.isfinite(map_from_cam).all(axis=(1, 2)))
     cam_from_map = np.full_like(map_from_cam, np.nan)
@@ -113,7 +114,7 @@ def _project_in_frames(
 
 
 def row_delay(camera: Camera, px: FloatArray) -> FloatArray:
-    """Return the exposure time (M,) of pixels (M,2) relative to the frame time, in readout times.
+    """Return the exposure time (M,) of each pixel minus the frame time, as a multiple of the readout time.
 
     The values are between −½ and ½.
     """
@@ -122,17 +123,18 @@ def row_delay(camera: Camera, px: FloatArray) -> FloatArray:
 
 
 def mean_row_fraction(registration: Registration, camera: Camera) -> FloatArray:
-    """Return the mean image row of the observations behind each pose, as a fraction of the image height.
+    """Return the mean image row of the observations in each frame, as a fraction of the image height.
 
-    If the rows of the sensor are the columns of the image, the mean column is returned, as a fraction of the
-    image width.
+    If the rows of the sensor are the columns of the image, the function returns the mean image column, as a
+    fraction of the image width.
 
     Args:
         registration: The poses and observations of one camera.
         camera: The camera model of this camera.
 
     Returns:
-        (N,) fraction for each frame: 0.5 for a pose without observations, NaN for a frame without a pose.
+        (N,) fraction for each frame: 0.5 for a frame with a pose but without observations, NaN for a frame
+        without a pose.
     """
     frame_count = len(registration.trajectory.status)
     observed = np.bincount(registration.obs_frame, minlength=frame_count)
@@ -144,7 +146,7 @@ def mean_row_fraction(registration: Registration, camera: Camera) -> FloatArray:
 
 
 def px_at_mid_row(camera: Camera, px: FloatArray, velocity_px_s: FloatArray, readout_s: float) -> FloatArray:
-    """Move observed pixels to where they would be at the exposure of the middle row.
+    """Compute where observed pixels would be if the whole image were exposed together with its middle row.
 
     Args:
         camera: The camera model.
@@ -202,12 +204,14 @@ def estimate_residual_readout(
 ) -> tuple[float, float]:
     """Estimate the part of the readout time that is still visible in the residuals.
 
-    With a rolling shutter, the residuals (observed minus projected) are proportional to the image row,
-    counted from the middle, times the image velocity. A part of this effect looks like a small camera motion,
-    and the pose has absorbed this part. Therefore the image motion of a small camera motion is fitted to the
-    effect and to the residuals of each frame, and subtracted from both. The map absorbs another part of the
-    effect. The estimate is therefore a lower bound of the readout time. It is good enough for a test, but not
-    for a correction.
+    A rolling shutter shifts each observation. The shift is proportional to the image velocity and to the
+    distance of the image row from the middle row. The residuals (observed minus projected) show only a part
+    of these shifts:
+
+    - The estimated pose has absorbed the part that looks like a small camera motion. Therefore a small camera
+      motion is fitted in each frame, both to the expected shifts and to the residuals, and is subtracted.
+    - The map has absorbed another part. Therefore the estimate is only a lower bound of the readout time. It
+      is good enough for detecting a rolling shutter, but not for correcting it.
 
     Args:
         camera: The camera model.
@@ -242,9 +246,10 @@ def estimate_residual_readout(
 
 
 def _camera_motion_basis(x: FloatArray) -> FloatArray:
-    """Return the image motions (2N,6) that a small camera motion causes at N pixels.
+    """Return the image motions (2N,6) that six basic small camera motions cause at N pixels.
 
-    The columns are the two shifts, scale, roll and the two tilts. Each pixel has two rows.
+    There is one column for each camera motion: two shifts, scale, roll and two tilts. Each pixel has two
+    rows: its motions along x and y.
     """
     out = np.zeros((2 * len(x), 6))
     out[0::2, 0] = out[1::2, 1] = 1.0

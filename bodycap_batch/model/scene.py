@@ -19,8 +19,9 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 
 _FEATURE_STRIDE = 1 << 24
-"""Number of feature indices reserved for each frame in a key that combines frame and feature. Derivation: the
-number is larger than the number of SIFT features of any image, and 2^39 frames still fit into 64 bits."""
+"""Factor of the frame index in a key that combines frame and feature: key = frame · factor + feature.
+Derivation: the factor is larger than the number of SIFT features of any image. Keys of 2^39 frames still fit
+into 64 bits."""
 
 
 class FrameStatus(StrEnum):
@@ -65,7 +66,8 @@ class KeyframeSelection:
         frames: (K,) frame indices of the keyframes, increasing.
         frame_count: Number N of frames of the video.
         sharpness: (N,) sharpness of each frame in an arbitrary unit; a larger value means a sharper frame.
-        noise_px: Standard deviation of the tracked positions, pixels, measured by tracking forwards and back.
+        noise_px: Standard deviation, pixels, of the error of tracked positions. It is measured by tracking
+            points forwards and back.
     """
 
     camera: str
@@ -87,16 +89,16 @@ class KeyframeSelection:
 class Map:
     """A sparse reconstruction: keyframe poses, points and observations in one gauge.
 
-    The map has K keyframes, P points and M observations. Its frame of reference is called ``map``. The work
-    size is the image size that all stages work at.
+    The map has K keyframes, P points and M observations. In names such as ``map_from_cam``, ``map`` is the
+    frame of reference of the map. The work size is the image size that all stages work at.
 
     Attributes:
         gauge: Identifier of the gauge. Each adjustment of the map creates a new gauge.
         cameras: By camera name, the intrinsics after mapping, at the work size.
         keyframe_camera: (K,) camera name of each keyframe.
         keyframe_frame: (K,) frame index of each keyframe in the video of its camera.
-        map_from_cam: (K,4,4) poses of the keyframes. For a camera with a rolling shutter, the poses hold at
-            the exposure of the middle row.
+        map_from_cam: (K,4,4) poses of the keyframes. For a camera with a rolling shutter, each pose is valid
+            at the exposure of the middle row.
         points: (P,3) points in the map frame, in the unit of the gauge.
         colors: (P,3) colours of the points, uint8 RGB.
         point_error_px: (P,) mean reprojection error of each point.
@@ -164,7 +166,8 @@ class Map:
     def mean_error_px(self) -> float:
         """Return the mean reprojection error, pixels; NaN if the map has no observations.
 
-        Each observation contributes the mean error of its point.
+        The mean is taken over all observations. The error of an observation is taken as the mean error of its
+        point.
         """
         return float(self.point_error_px[self.obs_point].mean()) if len(self.obs_point) else float("nan")
 
@@ -181,8 +184,8 @@ class Trajectory:
         times_ns: (N,) timestamp of each frame on the clock of the camera, nanoseconds.
         gauge_from_cam: (N,4,4) camera poses in the gauge; NaN for lost frames.
         covariance: (N,6,6) covariance of each pose in the axes of the camera: rotation (rad) first, then
-            translation (unit of the gauge). It is the covariance of a right perturbation, as in
-            GTSAM's Pose3. NaN for lost frames.
+            translation (unit of the gauge). As in GTSAM's Pose3, the perturbation multiplies the pose from
+            the right. NaN for lost frames.
         status: (N,) status of each frame.
         inliers: (N,) number of PnP inliers of each frame.
         error_px: (N,) mean reprojection error of the inliers, pixels; NaN for a frame without inliers.
@@ -223,7 +226,8 @@ class MapResult:
 
     Attributes:
         maps: The maps, the largest map first. Each map has a separate gauge.
-        workspace: Folder with ``database.db`` and ``sparse/<n>``. An extension of the map needs both.
+        workspace: Folder with COLMAP's ``database.db`` and the models ``sparse/<n>``. They are needed to add
+            keyframes to the map later.
         log: Diagnostics as plain JSON values: the initial pairs that were tried, the models, the image pairs
             that were matched, and the keyframes without a pose.
     """
@@ -246,8 +250,9 @@ class Registration:
         trajectory: Pose and status of each frame.
         obs_frame: (M,) index of the frame that contains each tracked observation.
         obs_keyframe: (M,) frame index of the keyframe in which the track of each observation starts.
-        obs_feature: (M,) index of the feature in this keyframe at which the track of each observation starts.
-            Keyframe and feature identify the track even after the map has changed.
+        obs_feature: (M,) index of the feature in the keyframe `obs_keyframe` at which the track of each
+            observation starts. `obs_keyframe` and `obs_feature` together identify the track. They remain
+            valid after the map has changed.
         obs_px: (M,2) tracked pixels, float32, with COLMAP's origin.
         wanted_keyframes: (W,) indices of the frames that mapping should add to the map as keyframes. These
             are frames where tracking failed, and misregistered keyframes whose pose should be estimated

@@ -16,22 +16,22 @@ from bodycap_batch.model.geometry import make_transform
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SkeletonModel:
-    """A tree of J joints in its zero pose.
+    """The skeleton of a body: a tree of J joints in its zero pose.
 
     Attributes:
         name: Name of the preset or the file.
         joints: (J,) joint names. The root comes first, and every parent comes before its children.
         parents: (J,) index of the parent of each joint; −1 for the root.
-        offsets_m: (J,3) joint centres in the frames of the parents, metres. For the root, it is the position
-            in the world of the standing body.
+        offsets_m: (J,3) joint centres in the frames of the parents, metres. For the root: its position in the
+            world when the body stands.
         end_offsets_m: (J,3) far ends of the bones in the frames of their joints, metres. NaN for joints with
             children.
         roles: (J,) anatomical (HumanIK) name of each joint; "" for a joint without a role.
         bvh_channels: (J,) channel names of each joint from a BVH file; () for the default order.
         tpose_rotation: (J,3,3) parent_from_joint rotations of the T-pose; None if the T-pose is the zero
             pose.
-        file_rotation: (J,3,3) world_from_joint rotations of the T-pose in the original file. None if this
-            skeleton was not made by `with_tpose_as_zero_pose`.
+        file_rotation: (J,3,3) world_from_joint rotations of the T-pose in the original file. Only a skeleton
+            from `with_tpose_as_zero_pose` has this value; otherwise None.
     """
 
     name: str
@@ -74,8 +74,8 @@ class Mount:
         joint_from_cam: (4,4) nominal or estimated pose of the camera in the frame of this joint, metres.
         sigma_rad: Standard deviation of the rotation, radians per axis.
         sigma_m: Standard deviation of the position, metres per axis.
-        by_name: True if only the name of the camera was used to choose the rotation and its standard
-            deviation.
+        by_name: True if the rotation and its standard deviation were chosen only from the name of the camera,
+            because the job does not give a rotation.
     """
 
     camera: str
@@ -102,9 +102,9 @@ class Motion:
             pose, all rotations are the identity.
         observed: (T,J) True if cameras measured the joint at the tick; False if only priors determine its
             pose.
-        hips_in_root_m: (T,3) positions of the root's first child in the frame of the root, metres. This is
-            used for a root on the floor and hips that move freely relative to the root. None if every bone
-            has a constant length.
+        hips_in_root_m: (T,3) positions of the hips in the frame of the root, metres. It is used for skeletons
+            whose root is on the floor; the hips, the root's first child, then move freely relative to the
+            root. None for all other skeletons: their bones have constant lengths.
     """
 
     skeleton: SkeletonModel
@@ -163,10 +163,11 @@ def forward_kinematics(
 
 
 def rest_pose(skeleton: SkeletonModel) -> FloatArray:
-    """Return the joint poses (J,4,4) in the world of the skeleton standing at the origin in its T-pose.
+    """Return the joint poses (J,4,4) in the world when the skeleton stands at the origin in its T-pose.
 
-    A skeleton without a separate T-pose stands in its zero pose. The height of the root is the height of its
-    offset. If this height is not positive, the body is raised until its lowest point touches the floor.
+    A skeleton without a separate T-pose stands in its zero pose. The height of the root is taken from its
+    entry in `offsets_m`. If this height is not positive, the body is raised until its lowest point touches
+    the floor.
     """
     count = len(skeleton.joints)
     local = skeleton.tpose_rotation

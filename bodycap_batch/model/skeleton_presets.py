@@ -18,8 +18,8 @@ from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.skeleton import Mount, SkeletonModel, rest_pose
 
 PRESETS = ("upper_body", "full_body")
-"""Names of the presets. Both names give the whole skeleton, because the cameras determine which joints are
-estimated."""
+"""Names of the preset skeletons. Both presets contain all joints of the body. The cameras, not the preset,
+determine which joints are estimated."""
 
 MEAN_HEIGHT_M = 1.70
 """Stature, metres, that is used if no stature is given. It lies between the means of adult women and men in
@@ -31,25 +31,27 @@ _STATURE_RANGE_M = (0.5, 2.8)
 a margin. A stature in centimetres or feet is outside this range and is therefore refused."""
 
 NOMINAL_SIGMA_RAD = float(np.radians(15.0))
-"""Sigma, radians per axis, that weights the nominal rotation of a mount that only the camera's name
-determines. It is larger than the expected error `NOMINAL_ERROR_RAD`, so that the posture of the body has more
-influence on the rotation. Evidence: docs/decisions/export.md."""
+"""Sigma, radians per axis, of the prior on a mount's rotation, if the job does not give the rotation.
+
+The nominal rotation is then chosen from the camera's name. The sigma is larger than the expected error
+`NOMINAL_ERROR_RAD`, so that the posture of the body has more influence on the rotation. Evidence:
+docs/decisions/export.md."""
 
 NOMINAL_SIGMA_M = 0.029
-"""Sigma, metres per axis, of the nominal position of a mount that only the camera's name determines.
-Derivation: 5 cm for the three axes together, because straps move and bodies differ."""
+"""Sigma, metres per axis, of a mount's nominal position, if the job does not give the position. Derivation:
+5 cm for the three axes together, because straps move and bodies differ."""
 
 NOMINAL_ERROR_RAD = float(np.radians(15.0 / np.sqrt(3.0)))
-"""Expected error, radians per axis, of the nominal rotation of a mount that only the camera's name
-determines. Derivation: 15° for the three axes together."""
+"""Expected error, radians per axis, of a mount's nominal rotation, if the job does not give the rotation.
+Derivation: 15° for the three axes together."""
 
 STATED_SIGMA_RAD = float(np.radians(5.0))
-"""Sigma, radians per axis, of a mount rotation that is given in the job without an accuracy. Derivation: 15°
-are three sigmas."""
+"""Sigma, radians per axis, of a mount rotation, if the job gives the rotation but not its accuracy.
+Derivation: 15° are three sigmas."""
 
 STATED_SIGMA_M = 0.015
-"""Sigma, metres per axis, of a mount position that is given in the job without an accuracy. Derivation:
-4.5 cm are three sigmas."""
+"""Sigma, metres per axis, of a mount position, if the job gives the position but not its accuracy.
+Derivation: 4.5 cm are three sigmas."""
 
 _UP, _FORWARD, _LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 """Unit vectors of a standing body in the axes of the skeleton: z up, −y forward."""
@@ -60,12 +62,12 @@ _NEXT_ROLE = {
     "UpLeg": "Leg",
     "Leg": "Foot",
 }
-"""For each part of a limb, the part whose joint is at the far end of the bone. Hands and feet have no entry;
-their bones end at the farthest point of the hand or foot."""
+"""By part of a limb, the next part of the limb. The bone of a part ends at the joint of the next part. Hands
+and feet have no entry; their bones end at the farthest point of the hand or foot."""
 
 _MIN_BONE_M = 1e-6
-"""Minimum length, metres, of a bone that has a direction. Derivation: the limit is far below the length of
-any real bone and above rounding errors."""
+"""Minimum length, metres, of a bone. A shorter bone is treated as a bone without direction. Derivation: the
+limit is far below the length of any real bone and above rounding errors."""
 
 
 @cache
@@ -240,12 +242,13 @@ _ARTICULATED = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase", "Ne
 """Parts of the body that move relative to their parent. The spine is treated as rigid."""
 
 _REACH_MARGIN_RATIO = 0.15
-"""Margin of the reach, as a fraction of the smallest and the largest distance. It decreases the smallest
-distance and increases the largest distance, because bodies differ from the skeleton. Evidence: none."""
+"""Margin for the possible distances between two cameras, as a fraction of the distance. The smallest distance
+is decreased by this fraction, and the largest distance is increased by it, because bodies differ from the
+skeleton. Evidence: none."""
 
 _REACH_MARGIN_M = 0.05
-"""Margin of the reach, metres. It decreases the smallest distance and increases the largest distance, because
-straps slip. Evidence: none."""
+"""Margin, metres, for the possible distances between two cameras. It is subtracted from the smallest distance
+and added to the largest distance, because straps slip. Evidence: none."""
 
 _MIN_DISTANCE_M = 0.08
 """Minimum distance, metres, between two cameras on different bones. Derivation: the distance of each camera
@@ -253,7 +256,7 @@ from its bone is 4 to 5 cm (mounts.yaml)."""
 
 
 def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple[str, str, float, float]]:
-    """Return the reach of each pair of cameras: the range of distances that are possible in any posture.
+    """Return the smallest and the largest possible distance of each pair of cameras, over all postures.
 
     Args:
         skeleton: The skeleton.
@@ -264,9 +267,9 @@ def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple
         distance, largest distance). The distances are in metres, rounded to centimetres. They include the
         margins `_REACH_MARGIN_RATIO` and `_REACH_MARGIN_M`.
 
-    Source: the extreme lengths of a chain of ball joints. The largest distance is reached if all links form
-        one straight line. The smallest distance is reached if the longest link points in one direction and
-        all other links point in the opposite direction.
+    Derivation: the joints between two cameras form a chain of ball joints. The largest distance occurs if all
+        links form one straight line. The smallest distance occurs if the longest link points in one direction
+        and all other links point in the opposite direction.
     """
     rest = rest_positions(skeleton)
     rows = []

@@ -7,16 +7,16 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 
 _GIMBAL_LOCK_COSINE = 1e-7
-"""Minimum cosine of the second angle. With a smaller cosine, the rotation is treated as gimbal lock.
-Derivation: the errors of the first and the third angle are 1e-16 divided by the cosine. At this minimum, they
-are 1e-9 rad."""
+"""Minimum cosine of the second Euler angle. A rotation with a smaller cosine is treated as gimbal lock.
+Derivation: the errors of the first and the third angle are 1e-16 rad divided by the cosine. At the minimum
+cosine, these errors are 1e-9 rad."""
 
 _FULL_TURN_RAD = 2.0 * np.pi
 """Angle of a full turn, radians."""
 
 
 def rotation_from_angles(axes: str, angles_rad: FloatArray) -> FloatArray:
-    """Multiply rotations about the axes in the given order. The rotation about the first axis is leftmost.
+    """Return the product of rotations about single axes. The rotation about the first axis is leftmost.
 
     Args:
         axes: K letters X, Y or Z. A letter may occur more than once.
@@ -79,9 +79,9 @@ def _principal_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
         rotation: (...,3,3) rotations.
 
     Returns:
-        The angles (...,3), radians, and the gimbal lock (...). The gimbal lock is sign(b) for a rotation in
-        gimbal lock, and 0 for any other rotation. In gimbal lock, the first number is not a but the sum
-        c + sign(b) · a, and the third number is 0.
+        The angles (...,3), radians, and a number (...) that marks gimbal lock: it is 0 without gimbal lock,
+        and sign(b) in gimbal lock. In gimbal lock, the first of the three angles is the sum c + sign(b) · a,
+        and the third is 0.
     """
     cos_b = np.hypot(rotation[..., 0, 0], rotation[..., 0, 1])
     b = np.arctan2(rotation[..., 0, 2], cos_b)
@@ -94,7 +94,7 @@ def _principal_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _nearest_equivalent(principal: FloatArray, locked: FloatArray, previous: FloatArray) -> FloatArray:
-    """Return the equivalent angles that are nearest to the angles of the previous tick.
+    """Return the angles of the same rotation that are nearest to the angles of the previous tick.
 
     Args:
         principal: (J,3) angles from `_principal_angles`, radians.
@@ -127,7 +127,8 @@ def _split_locked_sum(angles: FloatArray, locked: FloatArray, previous: FloatArr
     because adding π to a and c changes the sum only by full turns.
 
     Args:
-        angles: (J,3) triples of this tick, radians, from `_principal_angles` or equivalent.
+        angles: (J,3) angles of this tick, radians, from `_principal_angles`, or other angles of the same
+            rotations.
         locked: (J,) gimbal lock from `_principal_angles`.
         previous: (J,3) angles of the previous tick, radians.
 

@@ -13,7 +13,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
 
 _CHANNELS = {name.lower(): name for axis in "XYZ" for name in (f"{axis}position", f"{axis}rotation")}
-"""By the name of a channel in lower case, the spelling in the BVH specification."""
+"""By lower-case name of a channel, the name with the spelling of the BVH specification."""
 
 _MAX_JOINTS = 10_000
 """Maximum number of joints. Derivation: a production skeleton with face and fingers has a few hundred joints,
@@ -77,7 +77,7 @@ def parse_bvh(path: Path) -> BvhFile:
 
 @dataclass
 class _LineReader:
-    """Reader of the statements of a file. It stores the number of the current line."""
+    """Reader that returns the statements of a file one by one. Its errors name the current line."""
 
     path: Path
     source: Iterator[bytes]
@@ -220,7 +220,7 @@ def _read_channels(lines: _LineReader, rest: str) -> tuple[str, ...]:
 
 
 def _unique_name(name: str, joints: list[FileJoint]) -> str:
-    """Return a unique name: a number is appended to `name` if an earlier joint has the same name."""
+    """Return `name`, with a number appended if an earlier joint already has this name."""
     taken = {joint.name for joint in joints}
     free, number = name, 2
     while free in taken:

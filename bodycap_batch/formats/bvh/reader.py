@@ -21,26 +21,29 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel
 logger = logging.getLogger(__name__)
 
 _MAX_METRE_EXTENT = 10.0
-"""Maximum extent, file units, of the zero pose of a file in metres. A file with a larger extent is in
-centimetres. Derivation: the extent of a body is 1 to 2 m, which is 100 to 200 cm."""
+"""Limit for the extent of the zero pose, file units. If the extent is smaller, the file is in metres;
+otherwise it is in centimetres. Derivation: the extent of a body is 1 to 2 m, which is 100 to 200 cm."""
 
 _MOTION_THRESHOLD = 1e-3
-"""Minimum change, file units, of the position of a joint that moves relative to its parent. A position with a
-smaller change is treated as constant. Derivation: 10 µm for a file in centimetres. This is larger than the
-rounding error with the usual six decimals."""
+"""Maximum change, file units, of a joint's position relative to the parent that is treated as no change.
+Derivation: 10 µm for a file in centimetres. This is larger than the rounding error of numbers with the usual
+six decimals."""
 
 _WARNING_THRESHOLD = 1.0
-"""Minimum change, file units, of the position of a joint relative to its parent for a warning. Derivation: 1
-cm for a file in centimetres, which is visible."""
+"""Minimum change, file units, of a joint's position relative to the parent that gives a warning. Derivation:
+1 cm for a file in centimetres; such a change is visible."""
 
 
 def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, Motion | None]:
     """Read a BVH file and convert it to world axes and metres.
 
-    Position channels replace the OFFSET, as in Blender and MotionBuilder. The position channels of the root
-    give the motion of the root. If the first child of the root is the hips, its position channels give the
-    motion of the hips relative to the root. For any other joint, constant position channels give the offset
-    of the joint. If they change, the OFFSET is used.
+    Position channels replace the OFFSET, as in Blender and MotionBuilder:
+
+    - Root: the position channels give the motion of the root.
+    - Hips, if they are the first child of the root: the position channels give the motion of the hips
+      relative to the root.
+    - Any other joint: constant position channels give the offset of the joint. Position channels that change
+      are ignored, and the OFFSET is used.
 
     Args:
         path: Path of the file.
@@ -83,8 +86,8 @@ def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, M
 def rate_from_frame_time(frame_time: str) -> float:
     """Return the frame rate, frames per second, for a Frame Time.
 
-    A rounded Frame Time gives the nominal frame rate. For example, 0.033333 means 30 Hz and not 30.0003 Hz.
-    Without this correction, the error of the time would be 0.04 s per hour.
+    If the Frame Time is a rounded value, the nominal frame rate is returned. For example, 0.033333 means
+    30 Hz and not 30.0003 Hz. Without this correction, the times would be wrong by 0.04 s after one hour.
 
     Args:
         frame_time: Value of the Frame Time as text, seconds.
@@ -104,7 +107,7 @@ def rate_from_frame_time(frame_time: str) -> float:
 
 
 def _channel_slices(joints: list[FileJoint]) -> list[slice]:
-    """Return for each joint the columns of its channels in the values of a frame."""
+    """Return, for each joint, the slice of a frame's values that belongs to the channels of the joint."""
     ends = np.cumsum([len(joint.channels) for joint in joints]).tolist()
     return [slice(end - len(joint.channels), end) for end, joint in zip(ends, joints, strict=True)]
 

@@ -32,8 +32,8 @@ _ARM_WORDS = {
     (2,): "forearm lowerarm lowarm loarm elbow radius",
     (3,): "hand wrist palm",
 }
-"""Words in the names of arm joints. The key is the slots (indices of `_ARM`) that a word may mean, the most
-likely slot first. The value is the words, separated by spaces."""
+"""Words that occur in the names of arm joints, separated by spaces. The key of each entry lists the slots
+(indices of `_ARM`) that these words may mean, with the most likely slot first."""
 
 _LEG_WORDS = {
     (0,): "upleg upperleg thigh femur hip",
@@ -43,8 +43,8 @@ _LEG_WORDS = {
     (2, 3): "foot",
     (3,): "toe toes toebase ball",
 }
-"""Words in the names of leg joints. The key is the slots (indices of `_LEG`) that a word may mean, the most
-likely slot first. The value is the words, separated by spaces."""
+"""Words that occur in the names of leg joints, separated by spaces. The key of each entry lists the slots
+(indices of `_LEG`) that these words may mean, with the most likely slot first."""
 
 _HIPS_WORDS = {"hips", "hip", "pelvis", "waist", "root"}
 _SPINE_WORDS = {
@@ -62,28 +62,28 @@ _NECK_WORDS = {"neck", "lowerneck", "upperneck"}
 _HEAD_WORDS = {"head", "skull"}
 
 _ARM_SCORES = (9.0, 10.0, 10.0, 10.0)
-"""Score of each slot of the arm for which a joint is found. The score of the collar bone is lower, because
-some skeletons have no collar bone. Evidence: none; only the order of the scores is important."""
+"""Score that is added for each slot (part) of the arm if a joint is found for it. The score of the collar
+bone is lower, because some skeletons have no collar bone. Evidence: none; only the order of the scores is
+important."""
 
 _LEG_SCORES = (10.0, 10.0, 10.0, 9.0)
-"""Score of each slot of the leg for which a joint is found. The score of the toes is lower, because some
-skeletons have no toes. Evidence: none; only the order of the scores is important."""
+"""Score that is added for each slot (part) of the leg if a joint is found for it. The score of the toes is
+lower, because some skeletons have no toes. Evidence: none; only the order of the scores is important."""
 
 _SECOND_CHOICE_COST = 0.1
-"""Score that is subtracted if a word is used with its second meaning. For the third meaning, it is subtracted
-twice. Derivation: it is smaller than the difference between two slot scores, so it affects only the choice
-between otherwise equal scores."""
+"""Score that is subtracted if a word in a joint name is interpreted with its second meaning. For the third
+meaning, it is subtracted twice. Derivation: it is smaller than the difference between two slot scores.
+Therefore it affects only the choice between selections with otherwise equal scores."""
 
 _MIN_OFFSET_M = 1e-9
-"""Minimum length, metres, of the offset of a joint with a bone. A joint with a shorter offset is a helper
-joint.
-Derivation: zero, except for rounding errors."""
+"""Minimum distance, metres, between a joint and its parent. A joint with a shorter distance is treated as a
+helper joint without a bone. Derivation: zero, except for rounding errors."""
 
 _WORD_PATTERN = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 
 
 def _slots_by_word(words: dict[tuple[int, ...], str]) -> dict[str, tuple[int, ...]]:
-    """Return the candidate slots by word."""
+    """Return a mapping from each word to the slots that the word may mean."""
     return {word: slots for slots, text in words.items() for word in text.split()}
 
 
@@ -172,10 +172,10 @@ def _ancestors(joint: int, parents: Sequence[int]) -> list[int]:
 def _best_chain(
     candidates: Sequence[tuple[int, ...]], ancestors: Sequence[list[int]], scores: tuple[float, ...]
 ) -> dict[int, int]:
-    """Select joints along one path of the tree for the slots of a limb, with the largest sum of scores.
+    """Select the joints of a limb: at most one joint for each slot, with the largest sum of scores.
 
-    The slots must increase along the path. If several selections have the same sum, the joints nearest to the
-    trunk are selected.
+    The selected joints are on one path of the tree, and their slots increase along the path. If several
+    selections have the same sum, the joints nearest to the trunk are selected.
 
     Args:
         candidates: (J,) slots that each joint may have, the most likely slot first.
@@ -206,7 +206,8 @@ def _assign_trunk(
     """Add Hips, Spine, Spine1, Neck and Head to the roles of the limbs.
 
     Args:
-        found: By role, the index of the joint. The new roles are added to this mapping.
+        found: By role, the index of the joint with this role. The roles of the trunk are added to this
+            mapping.
         bases: (J,) name of each joint in lower case; "" for joints with a side.
         ancestors: (J,) ancestors of each joint, from its parent to the root.
         has_bone: (J,) False for helper joints of zero length.
@@ -272,7 +273,7 @@ def _joints_between(upper: int | None, lower: int | None, ancestors: Sequence[li
 def _choose_joint(
     word: str, among: Sequence[int], bases: Sequence[str], has_bone: Sequence[bool]
 ) -> int | None:
-    """Choose one of the joints in `among`.
+    """Choose the joint in `among` that fits the name `word` best.
 
     The order of preference is: a joint with the name `word` and a bone, the first joint with a bone, the
     first joint.

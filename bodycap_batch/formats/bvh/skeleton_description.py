@@ -18,16 +18,16 @@ _DIRECTIONS = {
 """By name, the unit vectors of the six directions of the body, in world axes."""
 
 _MAX_NAMED_DIRECTION_DEG = 10.0
-"""Maximum angle, degrees, between a bone and one of the six directions for the bone to be described as
-parallel to this direction. Evidence: none."""
+"""Maximum angle, degrees, between a bone and one of the six directions, for describing the bone with this
+direction only, without an angle. Evidence: none."""
 
 _MIN_HEIGHT_DIFFERENCE_M = 0.2
-"""Minimum height difference, metres, between head and hips, and between hips and feet, in a standing pose.
-Derivation: both differences are larger for a child with a stature of 1 m."""
+"""Minimum height, metres, of the head above the hips, and of the hips above the feet, in a standing pose.
+Derivation: both heights are larger even for a child with a stature of 1 m."""
 
 _MIN_BONE_M = 1e-6
-"""Minimum length, metres, of a bone that has a direction. Derivation: the rounding error of six decimals is
-smaller in a BVH file in centimetres."""
+"""Minimum length, metres, of a bone. A shorter bone is treated as a bone without direction. Derivation: the
+rounding error of numbers with six decimals is smaller, if the BVH file is in centimetres."""
 
 _NEXT_PART = {
     "Shoulder": "Arm",
@@ -37,10 +37,10 @@ _NEXT_PART = {
     "Leg": "Foot",
     "Foot": "ToeBase",
 }
-"""For each part of a limb, the part whose joint is at the far end of the bone."""
+"""By part of a limb, the next part of the limb. The bone of a part ends at the joint of the next part."""
 
 _OPTIONAL_PARTS = ("Shoulder", "ToeBase")
-"""Parts that a skeleton may lack without a warning."""
+"""Parts of limbs that many skeletons do not have. There is no warning if these parts are missing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,8 +53,8 @@ class JointDescription:
         parent: Name of the parent; "" for the root.
         bone_m: Length of the bone, metres. The bone ends at the next joint of the limb. If there is no next
             joint, it ends at the only child, or at the End Site.
-        points: Direction of the bone in the T-pose: ``left``, ``down, 20° left`` …; "" for a bone without
-            length.
+        points: Direction that the bone points in, in the T-pose: ``left``, ``down, 20° left`` …; "" for a
+            bone without length.
         note: Note about the joint; "" if there is no note.
     """
 
@@ -116,8 +116,8 @@ def _bone_vector(skeleton: SkeletonModel, rest: FloatArray, joint: int) -> Float
 def describe_direction(vector: FloatArray) -> str:
     """Describe a direction in words, for example ``left`` or ``down, 20° left``.
 
-    The first word is the nearest of six directions. The angle is the angle from this direction. The last word
-    is the second nearest direction.
+    The first word is the nearest of the six directions. The angle is the deviation from this nearest
+    direction, and the last word is the direction of the deviation.
 
     Args:
         vector: (3,) direction in world axes, of any length except zero.

@@ -20,11 +20,12 @@ from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
 NO_ROLE = "none"
-"""The word that a user writes in place of a role for a joint without a role."""
+"""Word that a user writes in the job instead of a role to say that a joint has no role."""
 
 _MIN_WIDTH_M = 0.02
-"""Minimum horizontal distance, metres, between a left and a right joint for computing the facing direction.
-Derivation: the limit is far above rounding errors and far below the width of shoulders or hips."""
+"""Minimum horizontal distance, metres, between a left and a right joint. The direction that the body faces is
+computed only from joints with a larger distance. Derivation: the limit is far above rounding errors and far
+below the width of shoulders or hips."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +72,7 @@ def read_rig(path: Path | str, options: RigOptions | None = None) -> tuple[Skele
 def _override_roles(path: Path, skeleton: SkeletonModel, user_roles: Mapping[str, str]) -> tuple[str, ...]:
     """Return the roles of all joints, with the roles given by the user.
 
-    If the user gives a role to a joint, any other joint that had this role has no role any more.
+    A role that the user gives to one joint is removed from any other joint.
     """
     roles = list(skeleton.roles)
     for name, role in user_roles.items():
@@ -101,7 +102,7 @@ def _suggest_name(word: str, names: tuple[str, ...]) -> str:
 
 
 def _tpose_rotations(path: Path, skeleton: SkeletonModel, motion: Motion | None, frame: int) -> FloatArray:
-    """Return the local rotations (J,3,3) of a frame, after rotating the whole body to face −Y."""
+    """Return the local rotations (J,3,3) of a frame. The whole body is rotated so that it faces −Y."""
     count = 0 if motion is None else len(motion.root_in_world_m)
     if motion is None or not 0 <= frame < count:
         hint = f"frames count from 0; the file has {count}"

@@ -108,7 +108,7 @@ def _hierarchy_lines(
     ends = file_from_world_points(np.nan_to_num(skeleton.end_offsets_m), units)
     if not any(skeleton.bvh_channels):
         offsets[0] = (
-            0.0  # some readers add the root's position to the OFFSET, other readers ignore the OFFSET
+            0.0  # with OFFSET zero, readers that add it to the position agree with readers that ignore it
         )
     if motion.hips_in_root_m is not None:
         offsets[1] = 0.0

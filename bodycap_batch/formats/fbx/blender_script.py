@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 _COMPARED_FRAMES = 20
-"""Number of frames whose joints are reported. Evidence: none; the number is enough to find a wrong frame rate
-or a wrong axis."""
+"""Number of frames whose joint centres are written to the report. Evidence: none; this number of frames is
+enough to detect a wrong frame rate or a wrong axis."""
 
 
 def convert(source: str, target: str, fps: float, frames: int) -> None:
@@ -41,8 +41,8 @@ def convert(source: str, target: str, fps: float, frames: int) -> None:
     bpy.ops.import_scene.gltf(filepath=source, disable_bone_shape=True)
     scene.frame_start, scene.frame_end = 0, frames - 1
     header = export_fbx_bin.fbx_header_elements
-    # The header would contain the current time, and equal motions would give different bytes. Therefore the
-    # time is replaced by a constant.
+    # Blender writes the current time into the header. Then equal motions would give different bytes.
+    # Therefore the time is replaced by a constant.
     export_fbx_bin.fbx_header_elements = functools.partial(header, time=dt.datetime(1970, 1, 1))
     bpy.ops.export_scene.fbx(
         filepath=target,

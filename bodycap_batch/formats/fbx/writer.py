@@ -17,14 +17,14 @@ from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion
 
 POSITION_TOLERANCE_M = 1e-4
-"""Maximum distance, metres, between a joint that is read back from the file and the joint of the motion.
-Derivation: FBX and GLB have single precision, and an animator cannot see such a distance."""
+"""Maximum distance, metres, between a joint that is read back from the file and the same joint in the motion.
+Derivation: FBX and GLB store single-precision numbers, and an animator cannot see such a small distance."""
 
 _CONVERT_SCRIPT = Path(__file__).with_name("blender_script.py")
 
 _BEFORE_BLENDER_IMPORT = so3_exp([-np.pi / 2, 0.0, 0.0])
-"""Rotation of the whole scene in the GLB file. It cancels the rotation by 90° about X of Blender's glTF
-importer, so that the axes of the joints are unchanged."""
+"""Rotation of the whole scene in the GLB file. Blender's glTF importer rotates the scene by 90° about X. Both
+rotations cancel, so the axes of the joints are unchanged."""
 
 
 def write_fbx(path: Path, motion: Motion) -> Path:
@@ -63,7 +63,7 @@ def write_fbx(path: Path, motion: Motion) -> Path:
 
 
 def _max_joint_difference_m(report: dict[str, Any], motion: Motion) -> float:
-    """Return the largest distance, metres, between joints in Blender's report and joints of the motion.
+    """Return the largest distance, metres, between a joint in Blender's report and in the motion.
 
     The distance is infinite if the joint names or the frame ranges differ.
     """

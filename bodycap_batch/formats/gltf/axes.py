@@ -26,12 +26,12 @@ ELEMENT_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 """Number of components of each accessor type. Source: glTF 2.0 specification, 3.6.2."""
 
 ELEMENT_ARRAY_BUFFER, ARRAY_BUFFER = 34963, 34962
-"""Numbers of the targets of a buffer view: vertex indices, and vertex attributes. Source: glTF 2.0
+"""Numbers that state what a buffer view contains: vertex indices, or vertex attributes. Source: glTF 2.0
 specification, 5.11."""
 
 
 def poses_in_file_axes(world_from_joint: FloatArray) -> FloatArray:
-    """Convert poses (...,4,4) from world axes to file axes, both for the joint and for its parent."""
+    """Convert poses (...,4,4) from world axes to file axes. The axes of the joint are converted too."""
     rotation = FILE_FROM_WORLD @ world_from_joint[..., :3, :3] @ FILE_FROM_WORLD.T
     return make_transform(rotation, world_from_joint[..., :3, 3] @ FILE_FROM_WORLD.T)
 

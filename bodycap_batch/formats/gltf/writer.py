@@ -43,8 +43,8 @@ def write_glb(
     Args:
         path: Path of the file, which is replaced atomically.
         motion: The motion, in world axes and metres.
-        file_from_up: (3,3) rotation of the whole scene, for a converter that reverses this rotation. None for
-            no rotation.
+        file_from_up: (3,3) additional rotation of the whole scene; None for no rotation. It is used if a
+            converter, such as Blender, reverses this rotation.
 
     Raises:
         StoreError: The file cannot be written.
@@ -96,7 +96,7 @@ def write_glb(
 
 
 class _BinaryBuffer:
-    """The binary part of the file: successive arrays, each with a separate buffer view and accessor."""
+    """Collects the arrays of a GLB file for its binary part. Each array has a buffer view and an accessor."""
 
     def __init__(self) -> None:
         self.data = bytearray()
