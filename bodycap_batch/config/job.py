@@ -201,7 +201,7 @@ def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> J
     """Check the types strictly and return the job.
 
     The data are validated as JSON. A list is therefore accepted for a tuple, but the text "5" is not accepted
-        for a number.
+    for a number.
     """
     try:
         return Job.model_validate_json(json.dumps(_with_lists(data)), strict=True)

@@ -37,9 +37,9 @@ _PROGRESS_PERIOD_S = 0.2
 """Minimum time (seconds) between two reports of progress. A display that changes faster is hard to read.
 Evidence: none."""
 _GRACE_S = 3.0
-"""Time (seconds) between the end of standard input, by which the parent asks the child to stop, and the
-moment at which the child kills itself. The parent waits equally long (`child_process.KILL_AFTER_S`).
-Evidence: none."""
+"""Time (seconds) that a stage has to stop by itself after the parent has closed standard input. When this
+time is over, the child kills itself. The parent waits equally long (`child_process.KILL_AFTER_S`). Evidence:
+none."""
 RELEASE_PERIOD_S = 0.5
 """Minimum time (seconds) between two releases of freed memory. In a process with much memory, one release
 takes about 50 ms. Evidence: docs/decisions/pipeline.md."""

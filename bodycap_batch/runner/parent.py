@@ -17,7 +17,7 @@ _HINT = "run the job first (`bodycap run`); if it was run before, `bodycap why` 
 
 
 class NotStored(StoreError):
-    """Error for an artefact that is not stored and that the runner's rules forbid to compute.
+    """Error: an artefact is not stored, and the runner's rules do not allow to compute it.
 
     Attributes:
         tasks: The tasks that would compute the missing artefacts.

@@ -25,7 +25,7 @@ _POLL_S = 0.1
 
 
 class Slots:
-    """Cores and memory of one machine, which tasks reserve in the order of their priority and release.
+    """Cores and memory of one machine. Tasks reserve both in the order of their priority.
 
     A task that needs more than the machine has reserves everything, so it runs alone.
 

@@ -139,7 +139,7 @@ def in_use(store: Store, *, wait: bool = False) -> Iterator[None]:
     """Prevent the cleaning of the store while it is in use.
 
     If the store is being cleaned already, wait for the end of the cleaning if `wait` is True; otherwise raise
-        `StoreBusy`.
+    `StoreBusy`.
     """
     kind = fcntl.LOCK_SH if wait else fcntl.LOCK_SH | fcntl.LOCK_NB
     with _locked(store, kind, "the store is being cleaned", "start again when `bodycap gc` has ended"):
