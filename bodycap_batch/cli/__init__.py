@@ -1,4 +1,4 @@
-"""The `bodycap` command; it converts errors to messages and exit codes."""
+"""The entry point of the `bodycap` command. Errors are converted to messages and exit codes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The words after ``bodycap``; None for the command line of this process.
 
     Returns:
-        The exit code. If `arguments` is None, the function does not return: the process exits with the exit
+        The exit code. If `arguments` is None, the function does not return: the process exits with this exit
         code.
     """
     with raise_on_signal():

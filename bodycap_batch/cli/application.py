@@ -1,4 +1,4 @@
-"""The typer application with which all commands register."""
+"""The typer application. The modules of the commands register their commands with it."""
 
 from __future__ import annotations
 

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from bodycap_batch.runner.dask_cluster import Cluster
 
 _MAX_CLUSTER_JOBS = 32
-"""Maximum number of jobs that run at the same time on a cluster. Each job is only a waiting thread on this
-machine; the scheduler orders the tasks of all jobs by priority. Evidence: none."""
+"""Maximum number of jobs that run at the same time on a cluster. On this machine, each job needs only a
+thread that waits. The scheduler orders the tasks of all jobs by priority. Evidence: none."""
 
 
 _INTEGER = re.compile(r"-?[0-9]{1,9}")
@@ -117,7 +117,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
 
 @contextmanager
 def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator[tuple[Executor, int]]:
-    """Yield the executor of the tasks, and the number of jobs to run at the same time by default."""
+    """Yield the executor of the tasks, and the default number of jobs that run at the same time."""
     if kind == "local":
         from bodycap_batch.runner.pool import LocalPool
 
@@ -162,7 +162,8 @@ def _with_worker_note(cluster: Cluster) -> Cluster:
 def _batch_results_folder(job: Job, folder: Path) -> Path:
     """Return the results folder of a job.
 
-    By default, it is a folder in the batch's folder `folder`, with the name of the job.
+    If the job gives no `out`, the results folder is a subfolder of `folder` (the batch's folder) with the
+    job's name.
     """
     busy_jobs = default_out() / job.name
     return folder / job.name if job.out in (None, busy_jobs) else results_folder(job)
@@ -185,7 +186,7 @@ def _batch_jobs(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJo
 
 
 class _BatchReporter:
-    """Prints the events of all jobs, as plain lines or as JSON lines."""
+    """Prints the events and the outcomes of all jobs of a batch, as plain lines or as JSON lines."""
 
     def __init__(self, *, as_json: bool) -> None:
         self._as_json = as_json
@@ -235,7 +236,7 @@ class _BatchReporter:
 
 
 def _shown_name(job: Path) -> str:
-    """Return the name of a job for lists of jobs. The name of a ``job.yaml`` includes its folder."""
+    """Return the name of a job for lists of jobs. For a ``job.yaml``, it includes the folder's name."""
     from bodycap_batch.config.folder import JOB_FILES
 
     return f"{job.resolve().parent.name}/{job.name}" if job.name in JOB_FILES else job.name

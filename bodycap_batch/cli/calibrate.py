@@ -19,7 +19,7 @@ from bodycap_batch.core.progress import Event
 
 
 class CameraModelOption(StrEnum):
-    """Choices of the camera model to fit."""
+    """Values of the command-line option that selects the camera model to fit."""
 
     AUTO = "auto"
     PINHOLE = "pinhole"
@@ -103,7 +103,7 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
 def _board_size(
     chessboard: str | None, charuco: str | None
 ) -> tuple[Literal["chessboard", "charuco"], int, int]:
-    """Return the kind, the number of columns and the number of rows of the board given by the options."""
+    """Return the kind of the board in the options, its number of columns and its number of rows."""
     if charuco is not None and chessboard is None:
         return ("charuco", *_parse_size(charuco, "--charuco"))
     if chessboard is not None and charuco is None:

@@ -22,7 +22,7 @@ _TRUTH_FILES = ("joints.npz", "motion.bvh")
 
 
 class Align(StrEnum):
-    """Choices of the transform that aligns the estimate with the truth."""
+    """Values of the option that selects how the estimate is aligned with the truth."""
 
     SIM3 = "sim3"
     SE3 = "se3"
@@ -98,11 +98,12 @@ def _evaluate_trajectories(
 
 
 def _evaluate_motion(estimate: Path, truth: Path) -> dict[str, Any]:
-    """Evaluate all joints, and separately the joints that the run's metrics.json lists as measured."""
+    """Evaluate all joints. Also evaluate only the joints that the run's metrics.json lists as measured."""
     from bodycap_batch.evaluate import MotionOptions, evaluate_motion
 
     figures = _motion_figures(estimate.parent)
-    # The times of a BVH file start at zero; the times of a capture's true joints are on the common clock.
+    # The times in the estimated BVH file start at zero; the times of true joints (.npz) are on the common
+    # clock.
     offset_s = float(figures.get("start_s", 0.0)) if truth.suffix == ".npz" else 0.0
     reports = {"motion": evaluate_motion(estimate, truth, MotionOptions(offset_s=offset_s))}
     joints = figures.get("joints", {}).values()
@@ -114,7 +115,7 @@ def _evaluate_motion(estimate: Path, truth: Path) -> dict[str, Any]:
 
 
 def _motion_figures(results: Path) -> dict[str, Any]:
-    """Return the block `motion` of the metrics.json in a results folder; empty if it does not exist."""
+    """Return the block `motion` of metrics.json in a results folder; empty without such a block."""
     try:
         return dict(json.loads((results / "metrics.json").read_text(encoding="utf-8"))["motion"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -161,10 +162,10 @@ _MOTION_ROWS = (
     ("angle_deg", "angles, degrees", 1),
     ("angle_offset_free_deg", "angles less a constant, degrees", 1),
 )
-"""Rows of a table: the key of a value, its label with the unit, and the factor that converts it to this
-unit."""
+"""Rows of the table of joint errors. Each row holds the key of a value, the label with the unit, and the
+factor that converts the value to this unit."""
 _RELATIVE_ROWS = (("vector_m", "vector, cm"), ("in_reference_m", "in its frame, cm"))
-"""Rows of the table for a pair of cameras: the key of a value, and its label with the unit."""
+"""Rows of the table for a pair of cameras. Each row holds the key of a value, and the label with the unit."""
 
 
 def _camera_line(name: str, score: dict[str, Any]) -> str:

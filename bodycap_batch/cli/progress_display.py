@@ -16,11 +16,12 @@ if TYPE_CHECKING:
     from rich.progress import Progress, Task, TaskID
 
 _LINE_PERIOD_S = 5.0
-"""Time (seconds) after which a stage prints its next line. Evidence: none."""
+"""Maximum time (seconds) between two progress lines of a stage. Evidence: none."""
 _LINE_PAUSE_S = 1.0
-"""Minimum time (seconds) between two lines of a stage. Evidence: none."""
+"""Minimum time (seconds) between two progress lines of a stage. Evidence: none."""
 _LINE_PROGRESS = 0.1
-"""Fraction of a stage after which the stage prints its next line. Evidence: none."""
+"""Progress (fraction of the whole stage) since the last line that makes a stage print its next line.
+Evidence: none."""
 
 
 class ProgressDisplay(Protocol):
@@ -76,7 +77,7 @@ class ProgressLines:
         """Do nothing: there is nothing to close."""
 
     def __call__(self, event: Event) -> None:
-        """Print one event. Progress is printed only if the last line of its stage is not too recent."""
+        """Print one event. Progress is printed only if a new progress line of the stage is due."""
         with self._lock:
             if event.kind == "progress":
                 pace = self._pace.setdefault(f"{event.label} {event.what}", _LinePacer())
@@ -91,7 +92,7 @@ class ProgressLines:
 
 
 class _LinePacer:
-    """Decides when a stage prints its next line, and measures the speed of the stage."""
+    """Decides when a stage prints its next progress line, and measures the speed of the stage."""
 
     def __init__(self) -> None:
         self._first: tuple[float, int] | None = None
@@ -173,7 +174,7 @@ def _make_rich_progress() -> Progress:
     from rich.text import Text
 
     class Rate(ProgressColumn):
-        """Column with the number of units per second."""
+        """Column of a progress bar: the number of units (for example frames) that are done per second."""
 
         def render(self, task: Task) -> Text:
             """Return the speed; empty if it is unknown or the stage has finished."""
@@ -181,7 +182,7 @@ def _make_rich_progress() -> Progress:
             return Text("" if speed is None or task.finished else f"{speed:.3g}/s", style="dim")
 
     class Count(ProgressColumn):
-        """Column with the number of finished units and the total."""
+        """Column of a progress bar: the number of finished units and the total number of units."""
 
         def render(self, task: Task) -> Text:
             """Return both numbers; empty if the total is unknown or the stage has finished."""

@@ -63,7 +63,7 @@ def report(
 def job_from_path(path_argument: Path) -> tuple[Path, Path | None]:
     """Return the job to load for a path, and the results folder.
 
-    The results folder is None if the path is not a results folder. Then the path itself is the job.
+    If the path is not a results folder, the path itself is the job, and the returned results folder is None.
     """
     if (path_argument / "run.json").is_file() and (path_argument / "job.yaml").is_file():
         return path_argument / "job.yaml", path_argument.resolve()

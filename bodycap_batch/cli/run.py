@@ -132,7 +132,8 @@ def _print_summary(summary: RunSummary, job: Job, display: ProgressDisplay, *, v
             cost = f"{stage.seconds:8.1f} s {stage.peak_memory_mb:7.0f} MB"
             typer.echo(f"{cost}  {stage.stage} {stage.camera}{' (kept)' if stage.reused else ''}".rstrip())
     if not summary.files:
-        # Name the last stage that the user can name; rig, recover and others are steps within registration.
+        # Report the last stage with a name that the user knows. Stages such as rig and recover belong to
+        # registration.
         reached = next(stage.stage for stage in reversed(summary.stages) if stage.stage in STAGE_ORDER)
         typer.echo(f"{job.name}: stopped after {reached}, as requested; run it again for the rest")
         return

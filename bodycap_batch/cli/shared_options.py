@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share, and the default folders for them."""
+"""Options and arguments that several commands share, and the default folders for results and stores."""
 
 from __future__ import annotations
 
@@ -68,12 +68,12 @@ def default_out() -> Path:
 
 
 def results_folder(job: Job) -> Path:
-    """Return the results folder of a job: the job's `out`, else a folder with the job's name in ``out/``."""
+    """Return the results folder of a job: the job's `out`, else the folder ``out/<name of the job>``."""
     return job.out or default_out() / job.name
 
 
 def default_store(out_dir: Path) -> Path:
-    """Return the default folder of the store for a results folder.
+    """Return the default folder of the store that a results folder uses.
 
     All results folders in ``out/`` share the store ``out/.store``. Any other results folder has a separate
     store inside it.

@@ -26,7 +26,7 @@ def raise_on_signal() -> Iterator[None]:
 
 @contextmanager
 def event_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that SIGINT and SIGTERM set. The work must check the event and end itself."""
+    """Yield an event that SIGINT and SIGTERM set. The caller must check the event and stop its work."""
     event = threading.Event()
     with _handle_signals(event.set):
         yield event

@@ -23,10 +23,10 @@ SpoolArgument = Annotated[
 ]
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the job in `bodycap status`.")]
 _AGE_UNITS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
-"""Units of a job's age: length (seconds) and symbol of each unit."""
+"""Units for the display of a job's age: the length (seconds) and the symbol of each unit."""
 _MAX_CAUSE_LENGTH = 200
-"""Maximum number of characters of a failure's cause in the table. A longer text would make the row hard to
-read."""
+"""Maximum number of characters that the table shows of the cause of a failure. A longer text would make the
+row hard to read."""
 
 
 @app.command(short_help="List the jobs of a watched folder and their states.")

@@ -97,7 +97,7 @@ def _stored_inputs(job: Job, out_dir: Path, store: Path) -> ReportInputs:
 
 
 class _StoredMarks:
-    """The points and skeleton to draw over each video frame. The first call reads them from the store."""
+    """Finds the points and skeleton to draw over video frames. The first call reads them from the store."""
 
     def __init__(self, job: Job, out_dir: Path, store: Path) -> None:
         self._of = (job, out_dir, store)
@@ -106,7 +106,7 @@ class _StoredMarks:
         self._looked = False
 
     def __call__(self, camera: str, first: int) -> list[dict[str, Any]]:
-        """Return the points and skeleton for `FRAMES_PER_PART` frames of a camera, from the frame `first` on.
+        """Return the points and skeleton to draw over `FRAMES_PER_PART` frames, starting with frame `first`.
 
         The list is empty if the store does not hold the results.
         """

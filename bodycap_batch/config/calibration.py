@@ -25,12 +25,12 @@ _CENTRE_INDEX = {
     "SIMPLE_RADIAL_FISHEYE": 1,
     "RADIAL_FISHEYE": 1,
 }
-"""Index of the principal point's x in the parameters, for each camera model with one focal length. For all
-other models the index is 2."""
+"""Index, in a camera model's parameters, of the x coordinate of the principal point. The table lists the
+models with one focal length. For all other models the index is 2."""
 
 
 class Calibration(BaseModel):
-    """Intrinsics of a camera at the size of the calibration images (upright, as a player shows them)."""
+    """Intrinsics of a camera for the size of its upright calibration images (as a player shows them)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -55,7 +55,7 @@ class Calibration(BaseModel):
     @field_validator("pixel_origin", mode="before")
     @classmethod
     def _first_word(cls, value: object) -> object:
-        """Accept the whole sentence in a calib.json: ``OpenCV (centre of the first pixel = 0, 0)``."""
+        """Keep only the first word of a text such as ``OpenCV (centre of the first pixel = 0, 0)``."""
         return value.split(maxsplit=1)[0].lower() if isinstance(value, str) and value.strip() else value
 
     @model_validator(mode="after")
@@ -97,8 +97,8 @@ def read_calibration(path: Path, camera: str) -> CalibrationEntry:
     """Read the entry of one camera in a calibration file.
 
     The file holds one calibration for all cameras, or ``{"cameras": {name: {...}}}``. In the second form,
-    values at the same level as ``cameras`` apply to all cameras. Keys: model, params, width, height,
-    pixel_origin; offsets_s (by camera name) or offset_s; rolling_shutter_s. Other keys are ignored.
+    values beside the key ``cameras`` apply to all cameras. Keys: model, params, width, height, pixel_origin;
+    offsets_s (by camera name) or offset_s; rolling_shutter_s. Other keys are ignored.
 
     Args:
         path: Path of the calibration file.

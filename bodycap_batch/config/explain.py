@@ -1,4 +1,4 @@
-"""Convert the validation errors of a job to messages with line, field and advice."""
+"""Convert the validation errors of a job to messages that give the line, the field and advice."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _EXPECTED = {
     "model_type": "a block of `key: value` lines",
     "path_type": "a path",
 }
-"""Description of the expected value, by the type of pydantic's error."""
+"""Description of the value that a field expects, for each error type of pydantic."""
 
 
 class Problem(typing.NamedTuple):
@@ -81,14 +81,15 @@ def problems_of(error: ValidationError, model: type[BaseModel], data: object) ->
         data: The refused data.
     """
     errors = error.errors(include_url=False)
-    # If all items of a list are wrong, pydantic also reports that the list is too short. This is omitted.
+    # If all items of a list are wrong, pydantic also reports that the list is too short. This second report
+    # is omitted.
     reported = [e for e in errors if e["type"] != "too_short" or not _has_deeper(e, errors)]
     problems = _without_misspelt([_problem_of(details, model, data) for details in reported])
     return [p if p.hint else p._replace(hint=_description(p.location, model)) for p in problems]
 
 
 def _without_misspelt(problems: list[Problem]) -> list[Problem]:
-    """Return the problems without missing keys whose misspelling is reported already."""
+    """Return the problems, but omit a missing key if a misspelling of this key is reported already."""
     intended = {
         (*problem.location[:-1], problem.hint.removeprefix(_DID_YOU_MEAN).strip("'?"))
         for problem in problems
@@ -122,7 +123,7 @@ def _problem_of(details: Any, model: type[BaseModel], data: object) -> Problem:
 
 
 def _location_in(loc: Sequence[str | int], data: object, *, missing: bool) -> Location:
-    """Return a location without the parts that pydantic adds for the members of a union."""
+    """Return a location in the job, without the parts that pydantic inserts for members of union types."""
     kept: list[str | int] = []
     for position, part in enumerate(loc):
         inside = (isinstance(data, dict) and part in data) or (
@@ -137,7 +138,7 @@ def _location_in(loc: Sequence[str | int], data: object, *, missing: bool) -> Lo
 
 
 def _description(location: Location, model: type[BaseModel]) -> str:
-    """Return the description of the field at a location, or else of the nearest enclosing field."""
+    """Return the description of the field at a location; without one, that of the nearest enclosing field."""
     while location:
         fields = _fields_at(location[:-1], model)
         text = fields[str(location[-1])].description if str(location[-1]) in fields else None

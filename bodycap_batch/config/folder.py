@@ -30,15 +30,15 @@ JOB_FILES = ("job.yaml", "job.yml")
 """File names that the job file of a folder may have."""
 RUN_FILE = "run.json"
 """Name of the file that records a run. A folder with this file holds results. A ``job.yaml`` in such a folder
-is a result too, not a job to run."""
+belongs to the results; it is not a job to run."""
 _GOPRO = re.compile(r"^(G[HXPSLOT])(PR|[0-9]{2})([0-9]{4})$", re.IGNORECASE)
 
 
 def natural_key(path: Path) -> tuple[tuple[int, int | str], ...]:
-    """Return the key for sorting the chapters of a video: numbers are sorted by value.
+    """Return a sort key for the chapters of a video; it sorts numbers in the names by their value.
 
-    GoPro's names are sorted by video, then by chapter. ``GX020123`` is chapter 2 of video 0123. On older
-    GoPros, the first chapter of video 0123 is ``GOPR0123`` and the second chapter is ``GP010123``.
+    Names of GoPro files are sorted by video, then by chapter. ``GX020123`` is chapter 2 of video 0123. On
+    older GoPros, the first chapter of video 0123 is ``GOPR0123`` and the second chapter is ``GP010123``.
     """
     gopro = _GOPRO.match(path.stem)
     if gopro:
@@ -126,8 +126,8 @@ def folder_capture(folder: Path) -> dict[str, object]:
 
     Raises:
         CaptureError: The folder holds no video, or it cannot be read.
-        JobError: Two cameras have the same name. Or there are several cameras, and a camera's name is not a
-            known place on the body.
+        JobError: Two cameras have the same name, or one of several cameras has a name that is not a known
+            place on the body.
     """
     videos = videos_in(folder)
     _refuse_missing_videos(folder)
@@ -159,8 +159,8 @@ def _camera_block(folder: Path, name: str, path: Path) -> dict[str, object]:
 def _refuse_missing_videos(folder: Path) -> None:
     """Refuse a folder in which the videos of a camera are missing.
 
-    Otherwise the body would be solved without this camera. A video is missing if its link is broken. The
-    videos of a camera are missing if a folder with the name of a mount is empty.
+    Without this check, the body would be solved without the camera. A video counts as missing if it is a
+    broken symbolic link, or if a folder that has the name of a mount is empty.
     """
     for path in sorted(folder.iterdir()):
         if path.is_symlink() and not path.exists() and path.suffix.lower() in VIDEO_SUFFIXES:

@@ -30,13 +30,13 @@ from bodycap_batch.config.yaml_source import YamlSource, read_yaml
 from bodycap_batch.core.errors import CaptureError, JobError
 
 _HEIGHT_M = (0.4, 2.6)
-"""Minimum and maximum stature (metres) on the command line: the limits of ``height_m`` in a job file.
-Evidence: none."""
+"""Minimum and maximum stature (metres) on the command line; equal to the limits of ``height_m`` in a job
+file. Evidence: none."""
 _LISTS = ("video", "timestamps")
-"""Names of the camera's fields that may hold one path instead of a list of paths."""
+"""Names of the fields of a camera in which a job file may give a single path instead of a list of paths."""
 _NAME_LENGTH = 100
-"""Maximum number of characters of a job's name. The name of a folder may be longer; it is shortened.
-Evidence: none."""
+"""Maximum number of characters of a job's name. If the job is named after a folder with a longer name, the
+name is shortened. Evidence: none."""
 
 Prepare = Callable[[Mapping[str, Any], Path], None]
 """Function that renders a synthetic capture. Its arguments are the options of `capture.synthetic` and the
@@ -70,8 +70,9 @@ def load_job(
             loaded. Paths in a YAML file are relative to the folder of the file; if the file is a symbolic
             link, they are relative to the folder of the link's target.
         overrides: Values of the command line.
-        prepare: Function that renders the videos of a job with `capture.synthetic` before they are opened.
-        policy: The files that the job may name; None for the user's own job, which may name any file.
+        prepare: Function that renders the videos of a job with `capture.synthetic`. It is called before the
+            videos are opened.
+        policy: The rules for the files that the job may name. None allows any file, for the user's own job.
         limits: Maximum size and depth of the YAML file; None for the default limits.
 
     Returns:
@@ -82,7 +83,8 @@ def load_job(
         CaptureError: A calibration or a folder of videos cannot be used.
     """
     full = path.resolve()
-    # A job file that was dropped alone must not use the files in its folder: they belong to other users.
+    # A job file that was submitted without a folder must not use the files beside it: they belong to other
+    # users.
     alone = policy is not None and policy.folder is None and not full.is_dir()
     try:
         full = _job_source(full, policy)
@@ -98,7 +100,7 @@ def load_job(
 
 
 def _job_source(full: Path, policy: PathPolicy | None) -> Path:
-    """Return the job file in a folder; return the path itself if it is a file or holds no job file."""
+    """Return the job file in the folder `full`; return `full` itself if it is a file or has no job file."""
     found = job_file_in(full) if full.is_dir() else None
     if found is None:
         return full
@@ -178,10 +180,10 @@ def _top_mapping(source: YamlSource) -> dict[str, Any]:
 
 
 def _with_videos_beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the data of a job file; if they name no cameras, add the videos in the job file's folder.
+    """Return the data of a job file. If no cameras are named, add the videos in the job file's folder.
 
-    The videos are used as in a folder without a job file. Data with an unknown key are returned unchanged:
-    the key may be a misspelt ``cameras``.
+    The cameras are named after these videos, as for a folder without a job file. Data with an unknown key are
+    returned unchanged, because the unknown key may be a misspelt ``cameras``.
     """
     capture = data.get("capture", {})
     if not isinstance(capture, dict) or "cameras" in capture:
@@ -198,7 +200,8 @@ def _with_videos_beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
 def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> Job:
     """Check the types strictly and return the job.
 
-    The check reads the data as JSON: a list may become a tuple, but the text "5" is not accepted as a number.
+    The data are validated as JSON. A list is therefore accepted for a tuple, but the text "5" is not accepted
+    for a number.
     """
     try:
         return Job.model_validate_json(json.dumps(_with_lists(data)), strict=True)
@@ -207,7 +210,7 @@ def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> J
 
 
 def _with_lists(data: dict[str, Any]) -> dict[str, Any]:
-    """Replace a single path by a list with this path, because the strict check does not convert values."""
+    """Replace a single path by a list with one path, because the strict validation does not convert it."""
     capture = data.get("capture")
     if not isinstance(capture, dict) or not isinstance(capture.get("cameras"), list):
         return data
@@ -316,10 +319,10 @@ def _resolved_camera(camera: CameraConfig, index: int, capture: CaptureConfig, b
 
 
 def _chapters(camera: CameraConfig, base: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """Return the video files of a camera in order, and the sidecar files with their timestamps.
+    """Return the video files of a camera in order, and the sidecar files with the videos' timestamps.
 
-    The sidecar of a folder of chapters is preferred, then the sidecars of the chapters
-    (``<video>.timestamps.txt``), then ``<camera>.timestamps.txt``.
+    The first of these that exists is used: the sidecar of a folder of chapters, the sidecars of the chapters
+    (``<video>.timestamps.txt``), the file ``<camera>.timestamps.txt``.
     """
     videos: list[Path] = []
     beside: list[Path] = []

@@ -11,13 +11,13 @@ from bodycap_batch.config.yaml_source import MAX_BYTES, MAX_DEPTH
 from bodycap_batch.core.errors import JobError
 
 _MAX_YAML_DEPTH = 100
-"""Maximum value (levels) of ``yaml_depth``. Blocks are read recursively, and Python limits the recursion to
-1,000 levels."""
+"""Maximum value (levels) that an operator may set for ``yaml_depth``. Blocks are read recursively, and Python
+limits recursion to 1,000 levels."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Limits of one job. Each attribute is a maximum.
+    """Limits that one job of another user must respect. Each attribute is a maximum.
 
     Attributes:
         yaml_kb: Maximum size of the job file, in units of 1024 bytes.

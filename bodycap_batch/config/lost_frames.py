@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 LEAST_LOST = 3
-"""Minimum number of lost frames of a camera for recovery to run. Recovering fewer frames does not justify
-decoding all keyframes again.
-Evidence: none."""
+"""Minimum number of lost frames of a camera; with fewer lost frames, recovery does not run for this camera. A
+recovery of fewer frames does not justify that all keyframes are decoded again. Evidence: none."""
 LEAST_POSED = 20
-"""Minimum number of localised frames of a camera for recovery to run. Fewer frames do not determine the
-motion prior.
-Evidence: none."""
+"""Minimum number of localised frames of a camera; with fewer localised frames, recovery does not run for this
+camera. Fewer frames do not determine the prior of the camera's motion. Evidence: none."""

@@ -24,8 +24,8 @@ NO_SKELETON = "none"
 """Value of ``skeleton`` for a job that computes the camera paths and the map, but no body."""
 SKELETON_PRESETS = (NO_SKELETON, "upper_body", "full_body")
 _MAX_SECONDS = 4e9
-"""Maximum absolute value (seconds) of a time. Unix times are smaller, and the sum of two such times in
-nanoseconds fits into int64."""
+"""Maximum absolute value (seconds) of a time in a job. Unix times are smaller than this maximum. The sum of
+two times of this size, in nanoseconds, fits into int64."""
 
 
 class _Block(BaseModel):
@@ -154,7 +154,7 @@ class CaptureConfig(_Block):
 
 
 class Job(_Block):
-    """Everything that a run needs. If a job file names no cameras, the videos in its folder are used."""
+    """A job: everything that a run needs. Without named cameras, the videos in the job's folder are used."""
 
     capture: CaptureConfig
     name: str = Field("", max_length=100, description="names the results; default: the file's or folder's")

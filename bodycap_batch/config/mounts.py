@@ -37,7 +37,7 @@ _SIDES = {"left": "Left", "right": "Right", "l": "Left", "r": "Right"}
 
 
 def _names() -> Iterator[tuple[str, tuple[str, str]]]:
-    """Yield every known spelling of a mount, with its pair (mount, role)."""
+    """Yield each known spelling of a mount's name with the pair (preferred name, role of the bone)."""
     for role, spellings in _CENTRAL_SPELLINGS.items():
         for spelling in spellings:
             yield spelling, (_MOUNT_NAME[role], role)

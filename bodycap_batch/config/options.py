@@ -1,4 +1,4 @@
-"""The typed options of each stage. The key of a stage's artefact holds only the options of this stage."""
+"""The typed options of each stage. The key of an artefact holds only the options of the artefact's stage."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 FrameName = Annotated[str, StringConstraints(pattern=r"^.+:\d{1,9}$")]
-"""Name of one frame: ``camera:frame``. Frames are counted from 0 at the start of the camera's joined
-chapters; ``start_s`` does not change this count."""
+"""Name of one frame: ``camera:frame``. Frame 0 is the first frame of the camera's first chapter; the count
+continues through all chapters. ``start_s`` does not change the count."""
 
 FileFormat = Literal["ply", "bvh", "glb", "fbx", "usd", "c3d", "trc", "tum", "csv", "npz", "colmap"]
 NamePreset = Literal["hik", "mixamo", "biped", "unreal"]

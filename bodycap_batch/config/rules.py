@@ -1,4 +1,4 @@
-"""Rules for a job that its types do not check: names, mounts, skeleton, times, rig, marker board."""
+"""Rules for a job that the types of its fields do not check: names, mounts, skeleton, times, rig, board."""
 
 from __future__ import annotations
 
@@ -16,18 +16,20 @@ from bodycap_batch.config.options import MARKER_COUNTS
 from bodycap_batch.model.skeleton_presets import split_side
 
 _FREE_LIMB = {"Arm": "arm", "ForeArm": "arm", "Hand": "arm", "Leg": "leg", "Foot": "leg"}
-"""Limb of each bone that moves freely relative to the trunk, by the bone's role without its side."""
+"""Limb (arm or leg) that a bone belongs to, by the bone's role without its side. Only bones that move freely
+relative to the trunk are listed."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._\-]*")
 _UNFILLED = re.compile(r"<[^<>]*>")
 _MAX_NAME_BYTES = 255
 """Maximum length (bytes) of a file name on common file systems."""
 _ROTATION_TOLERANCE = 5e-3
-"""Maximum deviation (no unit) of the elements of R·Rᵀ from the identity, for a rotation R given in the job,
-and of a quaternion's length from 1. Rounding to three decimals causes smaller deviations."""
+"""Maximum deviation (no unit) of a rotation given in the job. For a matrix R, it limits the deviation of each
+element of R·Rᵀ from the identity; for a quaternion, the deviation of the length from 1. Rounding to three
+decimals causes smaller deviations."""
 
 
 def problems_in(job: Job) -> list[Problem]:
-    """Return the problems of a job that its types do not exclude; no file is opened."""
+    """Return the problems of a job that the types of its fields do not exclude. No file is opened."""
     problems: list[Problem] = []
     for index, camera in enumerate(job.capture.cameras):
         for found in (*_camera_names(job, index), *_mount(job, camera), *_pose(camera), *_paths(camera)):
@@ -39,7 +41,8 @@ def problems_in(job: Job) -> list[Problem]:
 def skeleton_of(job: Job) -> str:
     """Return the skeleton of a job.
 
-    If the job does not give a skeleton: none if all cameras are mounted on one bone, else the upper body.
+    If the job does not give a skeleton, the result is ``none`` if all cameras are mounted on one bone, and
+    the preset of the upper body otherwise.
     """
     if job.skeleton is not None:
         return job.skeleton
@@ -114,7 +117,7 @@ def _paths(camera: CameraConfig) -> Iterator[Problem]:
 
 
 def _unusable(field: str, path: Path) -> Iterator[Problem]:
-    """Yield a problem if common file systems do not accept the path."""
+    """Yield a problem if common file systems do not accept the path `path` of the job's field `field`."""
     if "\0" in str(path) or any(len(part.encode(errors="replace")) > _MAX_NAME_BYTES for part in path.parts):
         yield Problem((field,), f"{str(path)[:40]!r} cannot be a path", "check the path")
 

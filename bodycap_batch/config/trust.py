@@ -35,7 +35,8 @@ class PathPolicy:
             base: Folder that relative paths start from.
 
         Raises:
-            JobError: A path contains ``..``, or it is outside the allowed folders, also by a symbolic link.
+            JobError: A path contains ``..``, or a path leads outside the allowed folders, directly or through
+                a symbolic link.
         """
         for field, path in _paths_of(job):
             if ".." in path.parts:
@@ -46,7 +47,7 @@ class PathPolicy:
         """Check every file of a resolved job, including the chapters and sidecar files that were found.
 
         Raises:
-            JobError: A file is outside the allowed folders, for example by a symbolic link.
+            JobError: A file is outside the allowed folders, for example because of a symbolic link.
         """
         for field, path in _paths_of(job):
             self.require(path, field)

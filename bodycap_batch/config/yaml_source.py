@@ -29,7 +29,7 @@ _WORDS: dict[str, bool | None] = {"": None, "~": None, "null": None, "Null": Non
 _WORDS |= {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
 _TAB_INDENT = re.compile(r" *\t")
 _MAX_INT = 1 << 63
-"""Smallest absolute value of a number that is refused. It does not fit into int64."""
+"""Smallest absolute value of a number that is refused. An integer of this size does not fit into int64."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,8 +39,8 @@ class YamlSource:
     Attributes:
         path: Path of the file.
         data: Content of the file: dicts with text keys, lists, texts, numbers, booleans, None.
-        lines: Line number (from 1) of each value, by location: the line of the value's key, or of the list
-            item.
+        lines: Line number (counted from 1) of each value, by the value's location. It is the line of the
+            value's key, or the line of the item in a list.
     """
 
     path: Path
@@ -48,7 +48,7 @@ class YamlSource:
     lines: dict[Location, int]
 
     def line_of(self, location: Location) -> int | None:
-        """Return the line of a location, or else of the nearest enclosing value; None if no line is known."""
+        """Return the line of a location, or of the nearest enclosing value with a known line, or None."""
         while location not in self.lines:
             if not location:
                 return None
@@ -60,8 +60,8 @@ def read_yaml(path: Path, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DE
     """Read a YAML file of at most `max_bytes`, nested at most `max_depth` levels deep.
 
     Raises:
-        JobError: The file is unreadable, too large or nested too deep, or is not YAML. Or it holds the same
-            key twice, an anchor, an alias or a tag. The error names the line if it is known.
+        JobError: The file is unreadable, too large, nested too deep, or not YAML. The error is also raised
+            for a repeated key, an anchor, an alias or a tag. The error names the line if the line is known.
     """
     try:
         if path.stat().st_size > max_bytes:
@@ -128,7 +128,7 @@ def _syntax_error(error: yaml.MarkedYAMLError, text: str, path: Path) -> JobErro
 
 
 def _value(node: yaml.Node, location: Location, lines: dict[Location, int], path: Path) -> object:
-    """Return a node as plain values, and record the line of the node and of all values inside it."""
+    """Return a YAML node as plain values; record in `lines` the lines of the node and of its values."""
     lines.setdefault(location, node.start_mark.line + 1)
     if isinstance(node, yaml.MappingNode):
         return _mapping(node, location, lines, path)

@@ -71,7 +71,8 @@ class Batch:
 
     Args:
         settings: Function that returns the settings of a job. Its arguments are the job and the folder of the
-            job's results; the folder is None as long as it is unknown. All settings share one executor.
+            job's results. The folder is None as long as the folder is unknown. The settings of all jobs must
+            share one executor.
         results: Function that returns the folder for the results of a resolved job.
         max_jobs: Maximum number of jobs that run at the same time.
     """
@@ -86,7 +87,7 @@ class Batch:
         self._results = results
         self._max_jobs = max_jobs
         self._owners: dict[Path, Path] = {}
-        """Path of the job that writes into a folder of results, by folder."""
+        """For each folder of results, the path of the job that writes into this folder."""
         self._lock = threading.Lock()
 
     def run(self, jobs: Sequence[BatchJob]) -> Iterator[Outcome]:
@@ -119,7 +120,7 @@ class Batch:
         return run_job(resolved, out_dir=out_dir, settings=self._settings(job, out_dir))
 
     def _claim_folder(self, out_dir: Path, path: Path) -> None:
-        """Refuse a job that would write its results into the same folder as another job of the batch."""
+        """Refuse a job if another job of the batch already writes its results into the same folder."""
         with self._lock:
             other = self._owners.setdefault(out_dir.resolve(), path)
         if other != path:

@@ -1,4 +1,4 @@
-"""The stages of one job: each method creates a stage's typed tasks, runs them and returns their artefacts."""
+"""The stages of one job: each method creates the tasks of a stage, runs them and returns artefacts."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ ByCamera = Mapping[str, Artefact]
 
 
 class Flow:
-    """The stages of one job; a context manager that waits for its threads at the end.
+    """Runs the stages of one job; a context manager that waits for its threads at the end.
 
     Args:
         job: A resolved job.
@@ -127,9 +127,9 @@ class Flow:
 
         Args:
             scene_map: The artefact of the map.
-            keyframes: The keyframes' artefact of each camera, by camera name.
-            previous: The registration of each camera against an earlier round of the map, by camera name; the
-                tracks of these registrations are reused. None in the first round.
+            keyframes: The artefact with the keyframes of each camera, by camera name.
+            previous: The artefact of each camera's registration against an earlier round of the map, by
+                camera name. The tracks of these registrations are reused. None in the first round.
         """
         cameras = self._job.capture.cameras
         return self.runner.run_all(
@@ -152,10 +152,11 @@ class Flow:
     def extend_map(
         self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
     ) -> tuple[Artefact, ByCamera]:
-        """Add keyframes where frames were lost and register again, until no further frame is localised.
+        """Add keyframes at times of lost frames and register again, until no further frame is localised.
 
         Returns:
-            The last map that did not reduce the number of localised frames, and the registrations against it.
+            The artefact of the extended map, and the registrations against this map. A round that reduces the
+            number of localised frames is not used.
         """
         for _ in range(self._job.registration.rounds):
             summaries = {name: read_summary(artefact.path) for name, artefact in registrations.items()}
@@ -167,7 +168,8 @@ class Flow:
             gained = _localised_frames(again) - _localised_frames(registrations)
             if gained < 0:
                 break
-            # The new map is used even if no frame is gained: misregistered keyframes have new poses in it.
+            # The new map is used even if no further frame is localised: misregistered keyframes have new
+            # poses in the new map.
             scene_map, registrations = extended, again
             if gained == 0:
                 break
@@ -193,14 +195,14 @@ class Flow:
         return refined, self.register(refined, keyframes, registrations)
 
     def solve_rigs(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
-        """Solve the cameras of each synchronised rig again, from what all the rig's cameras observe."""
+        """Solve the poses of each synchronised rig again, from the observations of all cameras of the rig."""
         solved = self.runner.run_all(self._rig_tasks(scene_map, registrations, keyframes))
         for artefact in solved.values():
             self.runner.report_notes(artefact, "registration")
         return {**registrations, **solved}
 
     def recover(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
-        """Recover lost frames of the cameras that have enough lost frames and enough localised frames."""
+        """Recover the lost frames of each camera that has enough lost frames and enough localised frames."""
         recovered = self.runner.run_all(self._recovery_tasks(scene_map, registrations, keyframes))
         return {**registrations, **recovered}
 
@@ -237,9 +239,9 @@ class Flow:
         """Write the result files and return their artefact.
 
         Args:
-            keyframes: The keyframes' artefact of each camera, by camera name.
+            keyframes: The artefact with the keyframes of each camera, by camera name.
             scene_map: The artefact of the map.
-            registrations: The registration of each camera, by camera name.
+            registrations: The artefact of each camera's registration, by camera name.
             merged: The artefact of the skeleton's motion; None if there is no motion.
             failure: The reason why the motion that the job asks for is missing; None if no motion is missing.
         """
@@ -303,7 +305,7 @@ class Flow:
     def _extend(
         self, scene_map: Artefact, wanted: Mapping[str, Sequence[int]], keyframes: ByCamera
     ) -> Artefact:
-        """Add the wanted frames of each camera to the map as keyframes; return the new map's artefact."""
+        """Add the requested frames of each camera to the map as keyframes; return the new map's artefact."""
         self._map_round += 1
         task = ExtendTask(
             options=self._job.map,
@@ -340,7 +342,7 @@ class Flow:
         registrations: ByCamera,
         keyframes: ByCamera,
     ) -> CameraGroupTask:
-        """Return the task of solving the camera `own` with the help of `cameras`; `own` comes first in it."""
+        """Return the task that solves camera `own` with the help of `cameras`; it lists `own` first."""
         ordered = [own, *(camera for camera in cameras if camera.name != own.name)]
         names = [camera.name for camera in ordered]
         return CameraGroupTask(

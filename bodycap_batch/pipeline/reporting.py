@@ -17,7 +17,7 @@ from bodycap_batch.tasks.report import ReportTask
 
 
 def stored_for_report(job: Job, *, out_dir: Path, settings: Settings) -> ReportTask:
-    """Find the stored results from which a job's report is made; nothing is computed.
+    """Find the stored results that a job's report needs; nothing is computed.
 
     Args:
         job: A resolved job.
@@ -38,8 +38,8 @@ def stored_for_report(job: Job, *, out_dir: Path, settings: Settings) -> ReportT
 def _find_stored(job: Job, out_dir: Path, settings: Settings) -> tuple[StageResults, BodycapError | None]:
     """Return the stored results of all stages up to the export.
 
-    If a stage is not stored, the results end before this stage. The error that names the first missing stage
-    is then returned too; otherwise None.
+    If the results of a stage are not stored, the returned results end before this stage. In this case, the
+    error that names the stage is returned too; otherwise None.
     """
     results = StageResults()
     with Flow(job, replace(settings, compute=False, redo=frozenset()), logs=out_dir / "logs") as flow:

@@ -14,8 +14,8 @@ from bodycap_batch.store.artefacts import disk_errors, sync_folder
 from bodycap_batch.store.digests import remove_abandoned, temporary_beside, write_atomically
 
 PARTIAL = "partial"
-"""Subfolder of the results for a job that did not finish: for results without the skeleton that the job asks
-for, or for the report of a job without results."""
+"""Name of the subfolder for the results of a job that did not finish. The subfolder holds the results without
+the skeleton that the job asks for, or only the report of a job without results."""
 
 
 def publish(files: Mapping[str, Path], folder: Path) -> None:

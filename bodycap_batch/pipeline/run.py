@@ -60,8 +60,8 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
 
     Args:
         job: A resolved job.
-        out_dir: Folder of the results. Results of an earlier run stay there until this run publishes new
-            results. This happens before the video of the new results is rendered.
+        out_dir: Folder of the results. Results of an earlier run stay in this folder until this run publishes
+            new results. The new results may be published before their video is rendered.
         settings: Settings of the run: store, threads, listener, cancellation.
 
     Returns:
@@ -94,7 +94,7 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
 def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     """Run the stages one after another, put their artefacts into `results`, and yield each stage's name.
 
-    The name is yielded after the stage has finished. A caller that leaves the loop ends the job there.
+    The name is yielded after the stage has finished. If the caller stops iterating, no further stage runs.
     """
     flow.check()
     yield "check"
@@ -131,12 +131,12 @@ def _run_until(
 ) -> BodycapError | None:
     """Run the stages up to the last stage that the user wants.
 
-    If the video of the results is still being rendered when the report is finished, the results are published
-    without it.
+    If the report is finished before the video of the results, the results are published without the video
+    first.
 
     Returns:
-        The error that stopped the stages, if it allows a report or finished results to be published; None if
-        no error occurred. All other errors are raised.
+        The error that stopped the stages; None if no error occurred. The error is returned only if a report
+        or finished results can still be published. Otherwise the error is raised.
     """
     try:
         for stage in run_stages(job, flow, results):
@@ -159,10 +159,10 @@ def _is_about_data(error: BodycapError) -> bool:
 
 
 def _combined_error(failure: EstimationError | None, stopped_by: BodycapError | None) -> BodycapError | None:
-    """Return the error that a job ends with; the message of a second error is added to its hint.
+    """Return the error to raise at the end of a job. The message of a second error is added to the hint.
 
-    An error that the machine or the program caused is returned before the error of the missing skeleton. Any
-    other error is only added as a hint.
+    If both errors are given, `stopped_by` is returned if the machine or the program caused it. Otherwise
+    `failure` is returned.
 
     Args:
         failure: The reason why the skeleton is missing; None if it is not missing.
@@ -178,7 +178,7 @@ def _combined_error(failure: EstimationError | None, stopped_by: BodycapError | 
 def _publish_failure_report(
     flow: Flow, results: StageResults, error: BodycapError, out_dir: Path, settings: Settings
 ) -> None:
-    """Publish the report of a job that an error stopped before it had results."""
+    """Publish the report of a job that was stopped by an error before results were written."""
     try:
         results.reported = flow.report(results, error)
         settings.require_owner()

@@ -29,8 +29,8 @@ class Settings:
 
     Attributes:
         store: The store of the artefacts.
-        threads: Number of cores that the job may keep busy. With an `executor`, each task of the job may keep
-            this number of cores busy.
+        threads: Number of cores that all tasks of the job may use together. With an `executor`, each single
+            task may use this number of cores.
         listener: Receives the events of the job.
         cancelled: Called several times a second; True stops the job.
         may_commit: Called before each artefact is committed and before results are published. False stops the
@@ -43,8 +43,8 @@ class Settings:
         until: Name of the last stage to run; "" runs all stages. Results are published only if the last stage
             of the job runs.
         priority: Priority of the job's tasks; waiting tasks with a higher number run first.
-        results_ready: Called with the folder of the results, if they are published before their video is
-            ready.
+        results_ready: Called with the folder of the results if the results are published before their video
+            is ready.
         limits: Maximum sizes of the videos; None (no limits) for a job that the user runs directly.
         turns: The artefacts that jobs of this process are computing; None if the process runs only this job.
     """
@@ -105,8 +105,8 @@ class StageRecord:
         round: Round of the map, counted from 0.
         reused: True if the artefact was stored already and this run reused it.
         seconds: Duration (seconds) of the computation.
-        cpu_seconds: Processor time (seconds) of all threads; None if an old program version, which did not
-            record it, computed the task.
+        cpu_seconds: Processor time (seconds) of all threads; None if the task was computed by an old program
+            version that did not record this time.
         peak_memory_mb: Peak memory (MB) of the child process.
         artefact: Folder of the artefact, relative to the store.
     """

@@ -25,10 +25,10 @@ from bodycap_batch.tasks.report import ReportTask
 
 @dataclass(slots=True)
 class StageResults:
-    """The artefacts of a job's stages. `run_stages` sets each field when its stage has finished.
+    """The artefacts of a job's stages. `run_stages` sets the field of a stage after the stage has finished.
 
     Attributes:
-        stage: Name of the stage that is running, or that ran last.
+        stage: Name of the running stage, or of the last stage that ran.
         keyframes: The keyframes' artefact of each camera, by camera name.
         map: The artefact of the map.
         registrations: The registration of each camera, by camera name.

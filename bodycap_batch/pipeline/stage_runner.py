@@ -1,4 +1,4 @@
-"""Run the tasks of one job: at the same time where possible, recorded, and all stopped after a failure."""
+"""Run the tasks of one job, in parallel if possible. Each task is recorded; a failure stops all tasks."""
 
 from __future__ import annotations
 
@@ -77,12 +77,12 @@ class StageRunner:
         return first + [max(1, self._settings.threads // last)] * last
 
     def expect_frames(self, frames: int, large_frames: int) -> None:
-        """Set the numbers of frames of the job; they determine the estimate of the disk space that it needs.
+        """Set the numbers of frames of the job, from which the required disk space is estimated.
 
         Args:
             frames: Number of frames of all cameras.
-            large_frames: Number of these frames that are much larger than the image size that all stages work
-                at.
+            large_frames: Number of those frames whose size in the video is much larger than the work size
+                (the image size that all stages work at).
         """
         self._frame_counts = (frames, large_frames)
 
@@ -91,8 +91,8 @@ class StageRunner:
 
         Args:
             task: The task.
-            preload: Names of modules that idle child processes load while this task is computed; one list for
-                each child process.
+            preload: Modules that idle child processes load while this task is computed: one list of module
+                names for each child process.
 
         Raises:
             BodycapError: The task failed. `NotStored`: the artefact is missing and nothing may be computed.
@@ -136,7 +136,7 @@ class StageRunner:
         return {task.camera: future.result() for task, future in zip(ordered, futures, strict=True)}
 
     def keep_only_these(self) -> None:
-        """Keep only the references to artefacts that this run used; drop the references of earlier runs."""
+        """Keep only the references to artefacts that this run used; remove references of earlier runs."""
         self._references.keep_only(record.artefact for record in self.records)
 
     def report_notes(self, artefact: Artefact, stage: str) -> None:
@@ -150,14 +150,14 @@ class StageRunner:
             self._settings.listener(Event(kind="note", stage=stage, what=f"note: {text}"))
 
     def _require_room(self, task: Task) -> None:
-        """Refuse to start a task if the disk space is too small; it may have shrunk since the job's check."""
+        """Refuse to start a task if the disk space has become too small since the job's check."""
         if task.key.stage != "check":
             for folder in self._folders:
                 for note in require_room(folder, *self._frame_counts):
                     self._note(note)
 
     def _stop(self, futures: Sequence[Future[Artefact]]) -> None:
-        """Stop all running tasks after a failure. Later tasks, such as the report of the failure, may run."""
+        """Stop all running tasks after a failure. Tasks that start later, such as the report, may run."""
         self._stop_all.set()
         for future in futures:
             future.cancel()

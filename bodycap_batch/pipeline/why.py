@@ -27,7 +27,8 @@ _INPUTS = {
     "body": "the body: {}",
     "extra": "the frames wanted of {}",
 }
-"""Text for a changed input of a task, by the name of the input's field in the task's dataclass."""
+"""Description of a changed input of a task, by the name of the input's field in the task's dataclass. ``{}``
+is replaced by the names of the changed parts."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +51,7 @@ class Step:
 
 
 def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
-    """List a job's tasks: first the tasks with stored results, then the tasks that would run and the reason.
+    """List a job's tasks: first the tasks with stored results, then the tasks that would run, and why.
 
     Nothing is computed. The later stages that depend on a task that would run are listed too.
 
@@ -81,7 +82,7 @@ def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
 
 
 def _missing_preview(results: StageResults) -> Sequence[Task]:
-    """Return the task of the preview, if it would run; a separate thread has looked it up in the store."""
+    """Return the preview's task if it would run, else nothing. A thread has looked it up in the store."""
     if results.preview is None:
         return ()
     failure = results.preview.exception()
@@ -96,7 +97,7 @@ def _depends_on(stage: str, first: str, job: Job) -> bool:
 
 
 def _position(stage: str) -> int:
-    """Return a stage's position in `STAGE_ORDER`; a stage that runs during registration has its position."""
+    """Return a stage's position in `STAGE_ORDER`; a stage during registration has registration's position."""
     return STAGE_ORDER.index(stage if stage in STAGE_ORDER else "registration")
 
 
@@ -119,8 +120,8 @@ def _reason(task: Task, store: Store) -> str:
 def _changed_names(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """Return the names of the key's values that differ.
 
-    Another version of the program may name its inputs differently. In this case only names that occur in both
-    keys are compared.
+    An artefact of another program version may name its inputs differently. In this case, only the names that
+    occur in both keys are compared.
     """
     same_program = before.get("algorithm") == now["algorithm"]
     names = {*before, *now} if same_program else {*before} & {*now}

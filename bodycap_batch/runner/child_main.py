@@ -37,26 +37,27 @@ _PROGRESS_PERIOD_S = 0.2
 """Minimum time (seconds) between two reports of progress. A display that changes faster is hard to read.
 Evidence: none."""
 _GRACE_S = 3.0
-"""Time (seconds) that a stage has to stop by itself after the parent has closed standard input. The parent
-waits for the same time (`child_process.KILL_AFTER_S`). Evidence: none."""
+"""Time (seconds) that a stage has to stop by itself after the parent has closed standard input. When this
+time is over, the child kills itself. The parent waits equally long (`child_process.KILL_AFTER_S`). Evidence:
+none."""
 RELEASE_PERIOD_S = 0.5
-"""Minimum time (seconds) between two releases of freed memory. A release takes about 50 ms in a large
-process. Evidence: docs/decisions/pipeline.md."""
+"""Minimum time (seconds) between two releases of freed memory. In a process with much memory, one release
+takes about 50 ms. Evidence: docs/decisions/pipeline.md."""
 FULL_DISK_BYTES = 8 << 20
-"""Minimum free space (bytes) on the disk. With less space, a full disk is reported as the cause of an
-unexpected failure, because libraries hide the error ENOSPC. Evidence: none."""
+"""Minimum free space (bytes) of a disk that is not full. If less space is free after an unexpected failure,
+the full disk is reported as the cause, because libraries hide the error ENOSPC. Evidence: none."""
 
 
 def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
-    """Run the task file that `arguments` name; without a file, follow orders until standard input closes.
+    """Run the task file given in `arguments`; without a file, follow orders until standard input closes.
 
     An order is one JSON line. ``{"task": file, "log": file}`` runs a task and writes the task's printed
-    output to the log. ``{"import": [modules]}`` loads modules while the child has no task. A task that is
-    ordered meanwhile waits until the modules are loaded.
+    output to the log. ``{"import": [modules]}`` loads modules while the child has no task. If a task is
+    ordered while modules are loading, the task waits until the modules are loaded.
 
     Args:
         arguments: The path of the task file; empty to follow orders.
-        stages: The function that runs the tasks of a stage, by stage name.
+        stages: For each stage name, the function that runs the stage's tasks.
 
     Returns:
         The exit code: 0 without an error, the exit code of a typed error, or 70 for a bug.
@@ -78,7 +79,7 @@ def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Parent:
-    """The connection of one task to the parent process.
+    """The connection to the parent process, which a task uses to send messages and to ask for permission.
 
     Attributes:
         messages: Writer of the messages to the parent.
@@ -124,7 +125,7 @@ def import_ahead(modules: Sequence[str]) -> None:
 
 
 def _redirect_prints(log: Path) -> None:
-    """Append standard output and error, including the output of native libraries, to a file from now on."""
+    """Redirect standard output and standard error, also of native libraries, to the end of a file."""
     with log.open("ab") as stream:
         for number in (1, 2):
             os.dup2(stream.fileno(), number)
@@ -159,7 +160,7 @@ def _run(task: Task, store: Store, function: TaskFunction, parent: _Parent) -> N
 class DiskFailures:
     """Context manager that converts an error of a stage into `StoreError` if a failing disk caused it.
 
-    This must happen before the draft is removed: the removal frees disk space.
+    Exit this context before the draft is removed. The removal frees disk space and would hide a full disk.
     """
 
     def __init__(self, store: Store) -> None:
@@ -173,7 +174,8 @@ class DiskFailures:
             raise store_error(error, self._store.root) from error
         if isinstance(error, CaptureError | JobError) and (away := _disk_away(error)) is not None:
             raise away from error
-        # A writer that finds the disk full reports its own file. The new error names the store's folder.
+        # If a writer finds the disk full, its error names the file that it wrote. The new error names the
+        # store's folder.
         other = isinstance(error, Exception) and not isinstance(error, BodycapError)
         if (other or isinstance(error, StoreError)) and self._store.free_bytes() < FULL_DISK_BYTES:
             raise disk_full(self._store.root) from error
@@ -183,7 +185,7 @@ def _disk_away(error: BodycapError) -> DiskAway | None:
     """Return a `DiskAway` error if the file that `error` names is on a disk that does not answer, else None.
 
     FFmpeg reports EIO for broken files too, and it treats a file that becomes unreachable like a file that
-    ends early. In both cases this function reads the file to find the cause.
+    ends early. After either kind of error, this function reads the file to find the cause.
     """
     if error.path is None:
         return None
@@ -214,7 +216,7 @@ def disk_full(root: Path) -> StoreError:
 
 
 def _report_unexpected(error: Exception, root: Path, messages: _MessageWriter) -> int:
-    """Report a bug or a lack of memory to the parent, and return the exit code. The child ends afterwards."""
+    """Report a bug or a lack of memory to the parent; return the exit code with which the child must end."""
     if isinstance(error, MemoryError):
         full = BodycapError("out of memory", hint="close other programs, or lower work_px in the job")
         messages.send("error", error=full.to_dict(), ends=True)
@@ -227,7 +229,7 @@ def _report_unexpected(error: Exception, root: Path, messages: _MessageWriter) -
 
 
 def _pin_threads(threads: int) -> None:
-    """Set the number of threads of OpenCV. Other libraries use one thread; stages start their own threads."""
+    """Set the number of threads that OpenCV uses. All other libraries use one thread."""
     os.environ["OPENCV_FOR_THREADS_NUM"] = str(threads)
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(threads)
@@ -266,7 +268,7 @@ class _MessageWriter:
             self._stream.flush()
 
     def send_progress(self, done: int, total: int, what: str = "") -> None:
-        """Send the progress, except shortly after an earlier report; the report of the end is always sent."""
+        """Send the progress if the last report is old enough; the end (`done` = `total`) is always sent."""
         now = time.monotonic()
         if done < total and now - self._last < _PROGRESS_PERIOD_S:
             return
@@ -277,8 +279,8 @@ class _MessageWriter:
 class StepReporter:
     """Reports the progress of a stage, and releases freed memory when the stage starts another step.
 
-    The C library keeps freed memory. Without the release, the peak memory of a stage would be nearly the sum
-    of the memory of all its steps.
+    The C library keeps freed memory. Without releases, the peak memory of a stage would be almost the sum of
+    the memory that each step needs.
 
     Args:
         report: Called as ``report(done, total, what)``.
@@ -309,9 +311,10 @@ class StepReporter:
 
 
 class _OrderReader:
-    """Reads the orders from standard input. If standard input closes, the parent asks to stop or has ended.
+    """Reads the orders from standard input, and ends the process some time after standard input closes.
 
-    The process then kills itself after `_GRACE_S`.
+    Standard input closes if the parent asks the child to stop, or if the parent has ended. The process kills
+    itself `_GRACE_S` later.
     """
 
     def __init__(self) -> None:

@@ -16,12 +16,12 @@ from typing import Any, BinaryIO
 import bodycap_batch
 
 CHILD_COMMAND = (sys.executable, "-P", "-m", "bodycap_batch.tasks")
-"""Command line of a child, without the task file. It names the package of the stages, which belongs to a
-higher layer; this package must not import it."""
+"""Command line of a child, without the task file. The command names the package `tasks`, which belongs to a
+higher layer. The package `runner` must not import the package `tasks`."""
 KILL_AFTER_S = 3.0
 """Time (seconds) that a child has to end by itself before it is killed. Evidence: none."""
 _POLL_S = 0.2
-"""Time (seconds) between two checks of the parent whether the job was stopped. Evidence: none."""
+"""Time (seconds) between two checks in which the parent asks whether the job was stopped. Evidence: none."""
 _THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -31,7 +31,7 @@ _THREAD_VARIABLES = (
 
 
 class Child:
-    """One child process in its own process group.
+    """Starts and controls one child process, in its own process group.
 
     Attributes:
         loaded: Names of the modules that the child was asked to load.
@@ -55,7 +55,7 @@ class Child:
         return self._process.returncode
 
     def order(self, order: Mapping[str, Any]) -> None:
-        """Send one order. If the child has ended, nothing happens here; `follow` then returns None."""
+        """Send one order to the child. If the child has ended, do nothing; `follow` then returns None."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.write(json.dumps(order).encode() + b"\n")
@@ -131,7 +131,7 @@ def _environment() -> dict[str, str]:
 
 
 def describe_end(returncode: int) -> str:
-    """Describe the end of a child that sent no last message, from its exit code."""
+    """Describe, from the exit code, how a child ended that sent no last message."""
     if returncode >= 0:
         return f"the stage's process ended with code {returncode} and no message"
     try:
@@ -142,7 +142,7 @@ def describe_end(returncode: int) -> str:
 
 
 def crash_hint(returncode: int) -> str:
-    """Return advice for the user after a child that ended without a last message, from its exit code."""
+    """Return advice for the user, from the exit code of a child that sent no last message."""
     if returncode == -signal.SIGKILL:
         return (
             "probably out of memory: close other programs, or lower work_px in the job; run it again to go on"

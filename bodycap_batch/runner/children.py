@@ -31,7 +31,7 @@ class TaskEnvironment:
         progress: Called as ``progress(done, total, what)``.
         cancelled: Called several times a second; True stops the task.
         may_commit: Called before the artefact is committed; False stops the task.
-        preload: Names of modules that idle children load at the same time; one list for each child.
+        preload: Modules that idle children load while the task runs: one list of module names for each child.
     """
 
     store: Store
@@ -49,14 +49,14 @@ class Executor(Protocol):
         """Compute and commit the task's artefact. Raises `BodycapError`, and `Cancelled` if it is stopped."""
 
     def close(self, logs: Path) -> None:
-        """Release what the job with this folder of logs needed, after the job has ended."""
+        """Release the resources of a job that has ended; `logs` is the job's folder of logs."""
 
 
 class Children:
     """Child processes, each of which runs one task after another.
 
-    Each child therefore loads the libraries only once. A child ends when `close` is called, after a crash or
-    a bug, and when its parent process ends.
+    Because a child runs several tasks, it loads the libraries only once. A child ends when `close` is called,
+    after a crash or a bug, and when its parent process ends.
 
     Args:
         command: The child's command line, without the task file.
@@ -78,13 +78,13 @@ class Children:
             log.unlink()
 
     def prepare(self, logs: Path, work: Sequence[Sequence[str]]) -> None:
-        """Let idle children load modules, one child for each list; start new children if too few are idle.
+        """Let idle children load modules: one child per list. If too few children are idle, start new ones.
 
         A later task runs in the child that has loaded most of the task's modules.
 
         Args:
             logs: Folder for the logs of the children.
-            work: Names of the modules to load; one list for each child.
+            work: The modules to load: one list of module names for each child.
         """
         taken = []
         for modules in work:
@@ -152,8 +152,8 @@ class Children:
     def _take(self, modules: Collection[str], logs: Path) -> tuple[Child, bool]:
         """Return a child for a task that needs `modules`, and whether the child is new.
 
-        The idle child that has loaded most of `modules` is preferred. If several children have loaded equally
-        many, the child with the fewest other modules is preferred.
+        The idle child that has loaded most of `modules` is preferred. If several children have loaded the
+        same number of these modules, the child that has loaded the fewest other modules is preferred.
         """
         with self._lock:
             if self._idle:

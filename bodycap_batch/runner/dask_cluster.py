@@ -29,21 +29,22 @@ if TYPE_CHECKING:
 SCHEMES = ("tcp://", "tls://")
 QUEUES = ("slurm", "pbs")
 MEMORY = "memory"
-"""Name of the Dask resource with which a worker declares its memory (MB). The tasks that run on the worker at
-the same time reserve at most this memory."""
+"""Name of the Dask resource with which a worker declares its memory (MB). Tasks reserve parts of this memory
+while they run on the worker."""
 _POLL_S = 0.2
-"""Time (seconds) between two checks of a waiting job whether it was stopped. Evidence: none."""
+"""Time (seconds) between two checks in which a waiting job asks whether it was stopped. Evidence: none."""
 _PROGRESS_PERIOD_S = 1.0
-"""Minimum time (seconds) between two reports of a task's progress. Each report takes a few milliseconds of
-the worker, the scheduler and the client. Evidence: none."""
+"""Minimum time (seconds) between two reports of a task's progress. Each report takes a few milliseconds on
+the worker, on the scheduler and on the client. Evidence: none."""
 _WORKERS_PERIOD_S = 2.0
-"""Minimum time (seconds) between two requests for the scheduler's list of workers. The list changes, but a
-request for each task would take longer than submitting the task. Evidence: none."""
+"""Minimum time (seconds) between two requests for the scheduler's list of workers. The list must be renewed,
+because workers come and go. A request for each task would take longer than the submission of the task.
+Evidence: none."""
 _CLIENT_LEFT = ("closing", "closed")
 _WORKER_ENDS = ("closing", "closed", "failed")
 _ALLOWED_FAILURES = 1
-"""Maximum number of repetitions of a task after its worker died. A task whose worker dies twice is given up.
-Evidence: none."""
+"""Maximum number of times that a task is repeated because its worker died. After the second death of its
+worker, the task fails. Evidence: none."""
 
 
 class Cluster:
@@ -64,8 +65,8 @@ class Cluster:
         self._progress: dict[str, Callable[[int, int, str], None]] = {}
         self._lock = threading.Lock()
         self._turns = Turns()
-        # This lock is separate from `_lock`, for which Dask's thread waits in `_receive_progress`. While the
-        # scheduler is asked, Dask's thread must not wait: it receives the scheduler's answer.
+        # Lock for requests to the scheduler. It must not be `_lock`: Dask's thread waits for `_lock` in
+        # `_receive_progress`, and this thread must be free to receive the scheduler's answer.
         self._asking = threading.Lock()
         self._largest_memory: float | None = None
         self._last_asked = -math.inf
@@ -122,8 +123,8 @@ class Cluster:
         """Return the resources that a task reserves; None if no worker declares its memory.
 
         A task that needs more memory than any worker has reserves all memory of the largest worker. This
-        method waits for the first worker: without a worker, the largest memory is unknown, and a task without
-        a reservation could run at the same time as other large tasks.
+        method waits for the first worker, because the largest memory is unknown without a worker. A task
+        without a reservation could run at the same time as other large tasks.
         """
         while (largest := self._largest_worker(task)) is None:
             if environment.cancelled():
@@ -181,11 +182,12 @@ def start_queue(kind: str, workers: int, cores: int, memory_mb: int) -> Any:
     """Start workers through the job queue of a computing centre.
 
     Args:
-        kind: Kind of the job queue: ``slurm``, ``pbs``, or ``local`` for tests without a queue. Queue,
-            account and times come from Dask's configuration (``~/.config/dask/jobqueue.yaml``).
+        kind: Kind of the job queue: ``slurm``, ``pbs``, or ``local`` for tests without a queue. The name of
+            the queue, the account and the time limits come from Dask's configuration
+            (``~/.config/dask/jobqueue.yaml``).
         workers: Number of workers.
-        cores: Number of threads of each task. A worker runs one task at a time, so each worker gets this
-            number.
+        cores: Number of threads of each task. Each worker gets this number of cores, because a worker runs
+            one task at a time.
         memory_mb: Memory (MB) of each worker.
 
     Returns:
@@ -300,7 +302,7 @@ def _dask_error(failure: BaseException, task: Task, environment: TaskEnvironment
 
 
 def _lost(task: Task) -> BodycapError:
-    """Return the error for a task whose scheduler can no longer be reached."""
+    """Return the error of a task for the case that the scheduler can no longer be reached."""
     return BodycapError(
         f"{task.label}: the scheduler was lost",
         hint="start it again, and the same batch: finished stages are kept",

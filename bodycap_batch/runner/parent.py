@@ -17,7 +17,7 @@ _HINT = "run the job first (`bodycap run`); if it was run before, `bodycap why` 
 
 
 class NotStored(StoreError):
-    """Error: an artefact is not stored, and the rules forbid computing it.
+    """Error: an artefact is not stored, and the runner's rules do not allow to compute it.
 
     Attributes:
         tasks: The tasks that would compute the missing artefacts.
@@ -30,12 +30,12 @@ class NotStored(StoreError):
 
 
 def always() -> bool:
-    """Return True: the default for `Rules.may_commit`."""
+    """Return True: the default of `Rules.may_commit`, which permits every commit."""
     return True
 
 
 def allow(task: Task) -> None:
-    """Do nothing, and so allow every task: the default for `Rules.before`."""
+    """Do nothing: the default of `Rules.before`, which allows every task."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +93,7 @@ class Runner:
 
         Args:
             task: The task.
-            preload: Names of modules that idle children load meanwhile (see `TaskEnvironment`).
+            preload: Modules that idle children load while the task runs (see `TaskEnvironment`).
 
         Raises:
             BodycapError: The error of the task; `StoreError` if the disk fails; `Cancelled` if the task is

@@ -21,11 +21,11 @@ from bodycap_batch.runner.task import Task
 from bodycap_batch.runner.turns import Turns
 
 _POLL_S = 0.1
-"""Time (seconds) between two checks of a waiting task whether it was stopped. Evidence: none."""
+"""Time (seconds) between two checks in which a waiting task asks whether it was stopped. Evidence: none."""
 
 
 class Slots:
-    """Cores and memory that tasks reserve and release; the waiting task of highest priority comes first.
+    """Cores and memory of one machine. Tasks reserve both in the order of their priority.
 
     A task that needs more than the machine has reserves everything, so it runs alone.
 
@@ -59,7 +59,8 @@ class Slots:
         with self._changed:
             heapq.heappush(self._waiting, position)
             try:
-                # Strictly in order: otherwise small tasks could overtake a large task again and again.
+                # Only the first task in the order may start: otherwise small tasks could overtake a large
+                # task again and again.
                 while self._waiting[0] != position or not self._fits(need):
                     self._changed.wait(_POLL_S)
                     if cancelled():
@@ -79,8 +80,8 @@ class LocalPool:
 
     Args:
         cores: Maximum number of threads of all running tasks.
-        memory_mb: Maximum memory (MB) of all running tasks, as declared by the tasks. None for four fifths of
-            the machine's memory.
+        memory_mb: Maximum memory (MB) of all running tasks, as declared by the tasks. None to use four fifths
+            of the machine's memory.
         command: Command line of the child processes.
     """
 

@@ -61,7 +61,7 @@ def run_order(
 
 
 def _children_of(command: tuple[str, ...]) -> Children:
-    """Return the children that this process starts with a command line; they end when this process ends."""
+    """Return this process's `Children` for a command line; the child processes end with this process."""
     with _lock:
         return _children.setdefault(command, Children(command))
 

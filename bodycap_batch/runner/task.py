@@ -22,10 +22,11 @@ class Task:
     """One artefact to be computed. Only `key` identifies the artefact.
 
     Attributes:
-        key: The key of the artefact: identifies everything that the artefact is computed from.
-        arguments: The stage's typed task as JSON values: options and paths. The key identifies their content.
-        program: The code that computes the artefact. A worker on another machine must have the same program;
-            None disables this check.
+        key: The key of the artefact. The key identifies everything that the artefact is computed from.
+        arguments: The stage's typed task as JSON values: options, and paths of the inputs. The key identifies
+            the content of the inputs.
+        program: The code that computes the artefact. A worker on another machine refuses the task if its
+            program differs. None disables this check.
         camera: Name of the camera that the task concerns; "" if it concerns no single camera.
         round: Round of the map, counted from 0.
         threads: Number of threads that the task may keep busy.

@@ -1,4 +1,4 @@
-"""Compute a task only once if several jobs need it. The other jobs wait, and keep no worker busy."""
+"""Compute a task only once if several jobs need its artefact. One job computes; the other jobs wait."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from bodycap_batch.runner.children import STOPPED, Executor, TaskEnvironment
 from bodycap_batch.runner.task import Task
 
 _POLL_S = 0.1
-"""Time (seconds) between two checks of a waiting job whether it was stopped. Evidence: none."""
+"""Time (seconds) between two checks in which a waiting job asks whether it was stopped. Evidence: none."""
 
 
 class Turns:
-    """Lets only one job of this process compute an artefact at a time; other jobs that need it wait."""
+    """Lets only one job of this process compute an artefact; other jobs that need this artefact wait."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -24,9 +24,9 @@ class Turns:
 
     @contextmanager
     def taken(self, task: Task, environment: TaskEnvironment) -> Iterator[bool]:
-        """Wait until no other job computes the task's artefact; then yield True if the artefact is stored.
+        """Wait until no other job computes the task's artefact; then yield whether the artefact is stored.
 
-        False is also yielded for a task that must replace its stored artefact.
+        If the task must replace its stored artefact, False is yielded although the artefact is stored.
 
         Raises:
             Cancelled: The job was stopped while it waited.
@@ -65,5 +65,5 @@ class TurnTakingExecutor:
                 self._executor.execute(task, environment)
 
     def close(self, logs: Path) -> None:
-        """Release what the job with this folder of logs needed, after the job has ended."""
+        """Release the resources of a job that has ended; `logs` is the job's folder of logs."""
         self._executor.close(logs)

@@ -3,7 +3,7 @@
 An artefact is a folder. Its key names the stage, the version of the algorithm, the options, the content of
 the inputs, and the versions of the libraries. A process writes the folder to a temporary place in the store,
 syncs it, and writes a manifest last. Then it renames the folder to its final name in one step. Every folder
-with the name of a key is therefore complete, even if a process is killed at any moment.
+that has its final name is therefore complete, even if a process was killed.
 """
 
 from __future__ import annotations
@@ -39,34 +39,34 @@ _AWAY = frozenset({
     errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.ECONNRESET, errno.ECONNABORTED,
     errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENETUNREACH, errno.ENODEV, errno.ENXIO,
 })  # fmt: skip
-"""Error numbers of a network disk whose server does not answer, and of a failing disk."""
+"""Error numbers (errno) of a failing disk, and of a network disk with a server that does not answer."""
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}) | _AWAY
-"""Error numbers of failures that the disk causes, not the file."""
+"""Error numbers (errno) of failures that are caused by the disk and not by the file."""
 _VOLATILE_SUFFIXES = (".db",)
-"""Suffixes of files that are not part of the content's digest: the bytes of a database differ from run to
-run, even if its content is equal."""
+"""Suffixes of files that the digest of an artefact's content omits. The bytes of a database differ from run
+to run, even if the rows in the database are equal."""
 _REMEMBER_BYTES = 1 << 20
-"""Maximum size (bytes) of a file that every look-up hashes again. A larger file is hashed again only if its
-inode, size or times have changed, so the look-up of a long job is fast. The inputs of a task are always
-hashed. Evidence: none."""
+"""Maximum size (bytes) of a file that is hashed at every look-up of its artefact. A larger file is hashed
+again only if its inode, size or times have changed. Look-ups of large artefacts are therefore fast. The
+inputs of a task are always hashed before the task runs. Evidence: none."""
 _Found = TypeVar("_Found")
 _LOCK = "lock"
 """Name of the file in a draft's folder that the draft's process keeps locked."""
 _SETTING_ASIDE = "setting-aside"
-"""Name of the lock file for processes that move artefacts away from their final names."""
+"""Name of the lock file that a process locks while it moves a damaged artefact away."""
 _UNLOCKED = "new-"
 """Prefix of a draft's name until the draft is locked."""
 _STALE_S = 60.0
 """Minimum age (seconds) before a draft that was never locked is removed. Creating and locking a draft takes
 only milliseconds. Evidence: none."""
 _KEY_LENGTH = 32
-"""Number of hexadecimal digits in the name of a key. With 128 bits, two keys practically never have the same
-name."""
+"""Number of hexadecimal digits in the name of a key. These 128 bits make equal names of two different keys
+practically impossible."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArtefactKey:
-    """The key of an artefact: everything that it is computed from. Equal keys mean equal results.
+    """Identifies an artefact by everything that it is computed from. Equal keys mean equal results.
 
     Attributes:
         stage: Stage name.
@@ -88,7 +88,7 @@ class ArtefactKey:
 
     @property
     def name(self) -> str:
-        """Hexadecimal name of the key: the first digits of its digest."""
+        """Name of the key: the first hexadecimal digits of the key's digest."""
         return json_digest(self.document())[:_KEY_LENGTH]
 
 
@@ -100,7 +100,7 @@ class Artefact:
         path: Folder of the artefact.
         digest: Digest of the content. Equal contents have equal digests, even if their keys differ.
         made: Cost of computing the artefact (seconds, peak memory, threads); not part of the content.
-        files: SHA-256 of each file, by its path relative to the folder.
+        files: SHA-256 of each file, by the file's path relative to the artefact's folder.
     """
 
     path: Path
@@ -123,7 +123,7 @@ class Draft:
 
 
 class Store:
-    """The artefacts below one folder.
+    """Stores artefacts below one folder, and finds them by their keys.
 
     Args:
         root: Folder of the store; created if it does not exist.
@@ -145,7 +145,7 @@ class Store:
         self.digests = FileDigests(self.root / "digests")
 
     def find(self, key: ArtefactKey) -> Artefact | None:
-        """Return the artefact of a key; None if it is missing or damaged. A damaged artefact is set aside."""
+        """Return the artefact of a key; None if it is missing or damaged. Move a damaged artefact away."""
         path = self._path(key)
         with disk_errors(self.root):
             if not path.is_dir():
@@ -154,7 +154,7 @@ class Store:
             return artefact or self._set_aside(path, lambda: self._verified(path, key))
 
     def verify(self, path: Path) -> None:
-        """Hash all files of an artefact that a task will read; set the artefact aside if it is damaged.
+        """Hash all files of an artefact that a task will read. If the artefact is damaged, move it away.
 
         Args:
             path: The artefact's folder.
@@ -212,7 +212,7 @@ class Store:
             key: The key of the artefact.
             made: Cost of computing the artefact (seconds, peak memory, threads).
             before: Called before the last, atomic step; may raise an error to prevent the commit.
-            replace: True to replace an artefact of this key that is stored already.
+            replace: True to replace the artefact if one with this key is stored already.
 
         Raises:
             StoreError: The disk is full or fails.
@@ -294,9 +294,10 @@ class Store:
     def _set_aside(self, path: Path, look: Callable[[], _Found]) -> _Found:
         """Move a damaged artefact away, and return the result of `look`.
 
-        If `look` finds a sound artefact, nothing is moved: another process has already replaced the damaged
-        artefact. A lock prevents other processes from moving the artefact between `look` and the move. If no
-        artefact existed before `look`, nothing is moved either: a new artefact may have been committed since.
+        The function `look` searches for the artefact again. If `look` finds a sound artefact, nothing is
+        moved, because another process has already replaced the damaged artefact. If no artefact existed
+        before `look`, nothing is moved, because a new artefact may have been committed since. A lock prevents
+        other processes from moving the artefact between `look` and the move.
         """
         with self._setting_aside():
             existed = os.path.lexists(path)
@@ -363,7 +364,7 @@ def _content_digest(files: Mapping[str, str]) -> str:
 
 
 def _sync_files(folder: Path) -> dict[str, str]:
-    """Sync every file below a folder to the disk; return the SHA-256 of each file by its relative path."""
+    """Sync every file below a folder to the disk; return each file's SHA-256 by the file's relative path."""
     digests: dict[str, str] = {}
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         with path.open("rb") as stream:

@@ -15,12 +15,14 @@ from typing import NamedTuple
 
 _PACKAGE = Path(__file__).parent.parent
 _NAMED = re.compile(r"bodycap_batch\.(\w+(?:\.\w+)*)")
-"""Pattern of a string that names a module of this package, or a subpackage whose data files are read."""
+"""Pattern of a string in the code that names a module of this package. The string may also name a subpackage
+that contains data files."""
 _NOT_COMPUTING = frozenset(
     {"core.errors", "core.context", "core.progress", "config", "config.options", "config.models"}
 )
-"""Modules that are not part of an algorithm's version, because they do not affect a result. Options affect
-results, but the key holds the values of the options separately."""
+"""Modules that are not part of an algorithm's version, because they do not affect a result. Modules of
+options are also excluded: options affect results, but an artefact's key holds the values of the options
+separately."""
 _SKIPPED_SUFFIXES = (".pyc", ".pyo")
 _reading = threading.Lock()
 """Lock that is held while sources are read, so that several jobs of one process parse each file only once."""
@@ -45,7 +47,7 @@ class Program:
 
 @cache
 def algorithm_version(module: str) -> str:
-    """Return the version of a stage's algorithm: a digest of a module's code and of all code it imports.
+    """Return the version of a stage's algorithm: a digest of its module's code and of all imported code.
 
     The version is computed from the code and not maintained by hand. A stored result is therefore never
     reused after the code has changed. Comments, docstrings and the layout of the source do not affect the
@@ -65,7 +67,7 @@ def algorithm_version(module: str) -> str:
 
 @cache
 def library_versions(names: tuple[str, ...]) -> dict[str, str]:
-    """Return the installed version of each distribution; of alternatives (``a|b``), the first installed."""
+    """Return the installed version of each distribution. For ``a|b``, use the first that is installed."""
     return {name.split("|")[0]: _installed(name.split("|")) for name in names}
 
 
@@ -89,7 +91,7 @@ def _closure(module: str) -> set[Path]:
 
 
 class _Source(NamedTuple):
-    """The part of a file that the digest includes, and the modules of this package that the file names."""
+    """What the digest of an algorithm needs from one file: the file's code and the modules that it names."""
 
     content: bytes
     mentions: frozenset[str]
@@ -122,9 +124,9 @@ def _mentions(tree: ast.AST) -> Iterator[str]:
 def code_text(tree: ast.AST) -> str:
     """Return a syntax tree as text that is equal on all supported versions of Python.
 
-    The text omits positions, docstrings, other bare strings and empty fields. Python 3.12 added the field
-    ``type_params``, and Python 3.13 prints trees without empty lists. These differences must not change a
-    digest.
+    The text omits positions, docstrings, other bare strings and empty fields. Empty fields differ between
+    versions: Python 3.12 added the field ``type_params``, and Python 3.13 prints trees without empty lists.
+    These differences must not change a digest.
     """
     fields = []
     for name, value in ast.iter_fields(tree):

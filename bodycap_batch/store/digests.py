@@ -1,4 +1,4 @@
-"""Digests of files. The digest of a large file is stored under the file's identity in the file system."""
+"""Digests of files. The digest of a large file is stored, so that the file is not read again."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _BLOCK_BYTES = 1 << 20
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _TEMPORARY = re.compile(r"\.([0-9a-f]{8})\.(\d+)\.\d+\.part$")
 """Pattern of the name of a temporary file. The name ends with a code of the machine, the process id and a
-time, because several machines may share a folder."""
+time. The code of the machine is needed because several machines may share a folder."""
 _MIN_AGE_S = 1.0
-"""Minimum age (seconds) of a file whose digest is stored. A younger file may change again without a change of
-its times, within one tick of the file system's clock. Evidence: none."""
+"""Minimum time (seconds) since a file's last change before the digest of the file is stored. Within one tick
+of the file system's clock, a file may change again and keep the same times. Evidence: none."""
 
 
 def json_digest(value: Any) -> str:
@@ -32,7 +32,7 @@ def json_digest(value: Any) -> str:
 
 
 def set_digest(files: Mapping[str, str]) -> str:
-    """Return the SHA-256 of a set of named files, from the digest of each file by name."""
+    """Return the SHA-256 of a set of files, from the digest of each file by the file's name."""
     return json_digest(dict(sorted(files.items())))
 
 
@@ -88,7 +88,7 @@ def _is_alive(pid: int) -> bool:
 
 
 class FileDigests:
-    """The stored digests of large files. Device, inode, size, mtime and ctime identify the state of a file.
+    """Stores digests of large files. Device, inode, size, mtime and ctime identify the state of a file.
 
     If the bytes of a file change, its ctime changes too, and no program can set the ctime back. A stored
     digest is therefore correct, and a finished job does not read its videos again.
@@ -101,7 +101,7 @@ class FileDigests:
         self._folder = folder
 
     def sha256(self, path: Path, on_bytes: Callable[[int], None] | None = None) -> str:
-        """Return the SHA-256 of a file; if the file has not changed, the stored digest is returned.
+        """Return the SHA-256 of a file. If the file has not changed, return the stored digest.
 
         Args:
             path: Path of the file.

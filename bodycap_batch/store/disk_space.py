@@ -11,13 +11,15 @@ from bodycap_batch.core.errors import StoreError
 _BYTES_PER_FRAME = 70_000
 """Disk space (bytes) per frame for intermediate files and results. Evidence: docs/decisions/pipeline.md."""
 _BYTES_PER_LARGE_FRAME = 150_000
-"""Additional disk space (bytes) per frame of a large video. All frames of such a video are stored at the work
-size, the image size that all stages work at. Evidence: docs/decisions/pipeline.md."""
+"""Additional disk space (bytes) per frame of a video with large images. All frames of such a video are
+stored, reduced to the work size (the image size that all stages work at). Evidence:
+docs/decisions/pipeline.md."""
 _HARD_CAPTURE_FACTOR = 4
-"""Ratio of the disk space of a difficult capture to the space of an easy capture. A difficult capture has
-about four times as many keyframes. Evidence: docs/decisions/pipeline.md."""
+"""Ratio of the disk space that a difficult capture needs to the disk space that an easy capture needs. A
+difficult capture has about four times as many keyframes as an easy capture. Evidence:
+docs/decisions/pipeline.md."""
 _MIN_BYTES = 50_000_000
-"""Disk space (bytes) that a job of any length needs. Evidence: none."""
+"""Disk space (bytes) that every job needs, even a very short job. Evidence: none."""
 
 
 def require_room(folder: Path, frames: int, large: int = 0) -> list[str]:

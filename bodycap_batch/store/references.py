@@ -1,4 +1,4 @@
-"""The artefacts that jobs still refer to, and the removal of all other artefacts."""
+"""Record which artefacts the jobs' results refer to, and remove all other artefacts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from bodycap_batch.store.artefacts import Store, disk_errors
 from bodycap_batch.store.digests import json_digest, write_atomically
 
 _FOLDER = "references"
-"""Subfolder of the store. It holds one file for each folder of results: the list of its artefacts."""
+"""Subfolder of the store. It holds one file for each folder of results. The file lists the artefacts that
+these results refer to."""
 _LOCK = "in-use"
 """Name of the file that is locked while jobs use the store, and while the store is cleaned."""
 
@@ -34,8 +35,8 @@ class References:
     Args:
         store: The store of the artefacts.
         owner: The folder of results.
-        also: Other paths that the folder may have while it is being moved. The artefacts are kept as long as
-            one of the paths exists.
+        also: Other paths that the folder of results may have while it is being moved. The artefacts are kept
+            as long as `owner` or one of these paths exists.
     """
 
     def __init__(self, store: Store, owner: Path, also: Iterable[Path] = ()) -> None:
@@ -64,7 +65,7 @@ class References:
                 self._write()
 
     def take_over(self, artefacts: Iterable[str]) -> None:
-        """Add references to these artefacts, and write them with the folder's paths. Raises `StoreError`."""
+        """Add references to these artefacts, and store the paths of this folder. Raises `StoreError`."""
         with self._lock:
             self.named |= set(artefacts)
             self._write()
@@ -92,7 +93,8 @@ def moving(store: Store, before: Path, *, wait: bool = True) -> Iterator[Callabl
 
     Yields:
         A function to call as ``to(after, *others)`` just before the move. `after` is the folder's new path,
-        or the path where its results will be computed again. `others` are paths that it may have later.
+        or the path of the folder in which the results will be computed again. `others` are further paths that
+        the folder may have later.
 
     Raises:
         StoreError: The disk fails.
@@ -114,12 +116,12 @@ def moving(store: Store, before: Path, *, wait: bool = True) -> Iterator[Callabl
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Garbage:
-    """The artefacts that no job refers to, and what else cleaning the store removes.
+    """Describes what cleaning the store removes, and what it keeps.
 
     Attributes:
         artefacts: Folders of the artefacts that no job refers to, relative to the store.
         corrupt: Folder names of damaged artefacts that were set aside.
-        gone: Paths of folders of results that no longer exist.
+        gone: Paths of folders of results that no longer exist; their references are removed.
         kept: Number of artefacts that jobs refer to.
         freed_bytes: Disk space (bytes) that the removal frees. The removal of a file that also has a hard
             link in a folder of results frees no space.
@@ -136,7 +138,8 @@ class Garbage:
 def in_use(store: Store, *, wait: bool = False) -> Iterator[None]:
     """Prevent the cleaning of the store while it is in use.
 
-    If the store is being cleaned already: wait for the end if `wait` is True, else raise `StoreBusy`.
+    If the store is being cleaned already, wait for the end of the cleaning if `wait` is True; otherwise raise
+    `StoreBusy`.
     """
     kind = fcntl.LOCK_SH if wait else fcntl.LOCK_SH | fcntl.LOCK_NB
     with _locked(store, kind, "the store is being cleaned", "start again when `bodycap gc` has ended"):
@@ -187,7 +190,7 @@ def _locked(store: Store, kind: int, refusal: str, hint: str) -> Iterator[None]:
 
 
 def _read(path: Path) -> tuple[list[str], list[str]]:
-    """Read a list of references: the folder's paths and its artefacts; an unreadable list has none."""
+    """Read the paths and the artefacts of one folder of results; both are empty for an unreadable list."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         places = [content["owner"], *content.get("also", ())]
@@ -210,7 +213,7 @@ def _freed_bytes(folder: Path) -> int:
 
 
 def _remove(folders: Iterable[Path], trash: Path) -> None:
-    """Remove folders. Each is renamed first, in one step: a killed process leaves no incomplete artefact."""
+    """Remove folders. Each folder is first moved to `trash`, so that no incomplete artefact can remain."""
     for folder in folders:
         moved = trash / f"removed-{folder.name}"
         os.replace(folder, moved)

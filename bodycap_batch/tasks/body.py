@@ -25,8 +25,8 @@ def camera_distances(body: BodyInput) -> list[tuple[str, str, float, float]]:
     """
     from bodycap_batch.model.skeleton_presets import camera_reach
 
-    # The map's scale is unknown, so mapping uses only the proportions of these distances. The stature is
-    # removed: a user who adds it to the job later must get the same map.
+    # The map's scale is unknown, so mapping uses only the ratios of these distances. The stature is removed,
+    # so that the map stays the same if the user adds the stature to the job later.
     return camera_reach(*load_body(replace(body, height_m=None)))
 
 
@@ -34,7 +34,7 @@ def mount_prior(mount: MountInput, skeleton: SkeletonModel) -> Mount:
     """Return the prior of a camera's mount.
 
     A pose given in the job replaces the nominal pose of the named place. Standard deviations given in the job
-    replace the defaults; a given pose has other default deviations than a nominal pose.
+    replace the defaults. The defaults for a given pose differ from the defaults for a nominal pose.
     """
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""The task of solving one camera's frames with the help of other cameras: for the stages rig and recover."""
+"""The task of the stages `rig` and `recover`: solve one camera's frames with the help of other cameras."""
 
 from __future__ import annotations
 

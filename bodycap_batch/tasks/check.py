@@ -19,7 +19,8 @@ class CheckTask:
     """Check a job before anything is computed.
 
     Attributes:
-        job: The resolved job. It is not part of the key: the fields below hold all that the check depends on.
+        job: The resolved job. The job is not part of the artefact's key, because the other fields hold
+            everything that the check depends on.
         cameras: For each camera name, the digest of everything that the camera's frames depend on.
         body: The body; None for a job without a skeleton.
         formats: Formats of the files to export.

@@ -20,7 +20,8 @@ class ExportTask:
     """Write the result files.
 
     Attributes:
-        options: The stage's options. `preview` is not part of the key: a separate stage renders the preview.
+        options: The stage's options. The option `preview` is not part of the artefact's key, because a
+            separate stage renders the preview.
         map: The map.
         registrations: The registration of each camera, by camera name.
         keyframes: The selected keyframes of each camera, by camera name.

@@ -21,8 +21,9 @@ def load_capture(
 
     Args:
         capture: The cameras and their videos.
-        keyframes: The keyframes' artefact of each camera, by camera name. An artefact may hold copies of
-            decoded frames; these copies are then read instead of the video.
+        keyframes: The artefact with the keyframes of each camera, by camera name. If an artefact holds copies
+            of decoded frames, the copies are read instead of the video. None to read all frames from the
+            videos.
         threads: Number of threads of each video decoder; 0 lets the decoder choose.
     """
     from bodycap_batch.capture import open_capture

@@ -44,8 +44,8 @@ class MapTask:
         options: The stage's options.
         capture: The videos of all cameras.
         keyframes: The selected keyframes of each camera, by camera name.
-        reach: Distances between cameras that the body permits. The task holds these rounded distances instead
-            of the body, so that a small change of a mount in the job does not change the map.
+        reach: The distances that the body permits between the cameras of each pair, rounded. The task does
+            not hold the body itself. A small change of a mount in the job therefore does not change the map.
     """
 
     options: MapOptions
@@ -56,7 +56,7 @@ class MapTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExtendTask:
-    """Add keyframes to a map where frames were lost.
+    """Extend a map by further keyframes, to localise frames that were lost.
 
     Attributes:
         options: The stage's options.

@@ -96,7 +96,7 @@ def _merge_inputs(task: MergeTask) -> MergeInputs:
 def _with_board(
     inputs: MergeInputs, task: MergeTask, footage: BoardFootage, board: MarkerBoard, context: StageContext
 ) -> MergeInputs:
-    """Return the inputs with the views of the marker board in the keyframes added."""
+    """Search the keyframes for the marker board, and return the inputs completed with its views."""
     import dataclasses
 
     import numpy as np

@@ -13,6 +13,6 @@ cameras of a rig together, and recover lost frames."""
 
 
 def stages_from(stage: StageName) -> frozenset[str]:
-    """Return the names of a stage of `STAGE_ORDER` and of all stages that run after this stage."""
+    """Return the name of a given stage of `STAGE_ORDER`, and the names of all stages that run after it."""
     later = set[str](STAGE_ORDER[STAGE_ORDER.index(stage) :])
     return frozenset(later | (_DURING_REGISTRATION if "registration" in later else set()))

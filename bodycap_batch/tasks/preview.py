@@ -80,7 +80,7 @@ def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInput
 
 
 def _transforms_of(maps: Sequence[Map], merge: MergeResult | None) -> dict[str, Similarity]:
-    """Return the transform of each map to show, by the map's gauge.
+    """Return the transform of each map that the preview shows, by the name of the map's gauge.
 
     With a motion, these are the transforms of all maps that merging placed in the world. Without a motion,
     only the largest map is shown, untransformed.

@@ -14,7 +14,7 @@ from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, r
 
 _MEMORY_MB = 900
 """Memory to reserve (MB) for a recovery task. Recovery holds a limited number of keyframes and frames in
-memory; each needs half a megabyte."""
+memory, about half a megabyte for each image."""
 
 
 def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> None:

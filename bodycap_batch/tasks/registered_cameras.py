@@ -22,13 +22,14 @@ RIG_POSES = "rig"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegisteredCameras:
-    """The registrations of all cameras.
+    """The registrations of all cameras, in the form that later stages use.
 
     Attributes:
         trajectories: The trajectory of each camera.
         clocks: The clock of each camera, by camera name.
-        row_fraction: The result of `mean_row_fraction`, by camera name. It holds only the cameras with a
-            known rolling shutter whose poses are not corrected for it.
+        row_fraction: For each camera name, the (N,) result of `mean_row_fraction` for the camera's frames.
+            Only cameras with a known rolling shutter are included, and only if their poses are not corrected
+            for the rolling shutter.
     """
 
     trajectories: tuple[Trajectory, ...]

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from bodycap_batch.model.scene import Registration
 
 NOT_ROUNDS = omitted_from_key("rounds")
-"""Metadata that omits the option `rounds` from the key. The option decides how many rounds run; it does not
-change the result of a round."""
+"""Metadata of a dataclass field; it omits the option `rounds` from the artefact's key. This option sets the
+number of rounds and does not change the result of a single round."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

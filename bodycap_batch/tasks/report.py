@@ -28,7 +28,8 @@ class ReportTask:
         name: The job's name.
         failure: The error that stopped the job (``BodycapError.to_dict``) and the stage where it occurred;
             None if the job was not stopped.
-        max_gap_s: Maximum time (seconds) between two measurements that merging filled without a mark.
+        max_gap_s: Maximum length (seconds) of a time without measurements that merging fills without marking
+            the filled frames.
         capture: The videos of all cameras.
         keyframes: The selected keyframes of each camera, by camera name; empty if the stage did not finish.
         registrations: The registration of each camera, by camera name; empty if the stage did not finish.

@@ -13,9 +13,9 @@ from bodycap_batch.tasks.typed_json import from_json
 
 SUMMARY = "summary.json"
 CAPTURE_FOLDER = "capture"
-"""Folder of a synth artefact that holds the videos and the ground truth."""
+"""Name of the folder for the videos and the ground truth, in an artefact of the stage `synth`."""
 RESULTS_FOLDER = "results"
-"""Folder of an artefact that holds the result files for the user."""
+"""Name of the folder for the result files for the user, in an artefact."""
 VISION_LIBRARIES = ("numpy", "av", "opencv-python-headless|opencv-python")
 """Python distributions that a stage needs to decode and process images."""
 VISION_MODULES = ("bodycap_batch.capture", "bodycap_batch.config.models", "cv2", "av")
@@ -30,13 +30,15 @@ class Stage(Generic[TaskT]):
     Attributes:
         name: Stage name.
         task: The dataclass that describes one task of the stage.
-        function: Called in the child with the task, the context and the folder that becomes the artefact. The
-            function's module and all modules that it imports from this package are the stage's algorithm. A
-            digest of their code is part of the store's keys.
-        libraries: Python distributions that the result depends on (``a|b``: a or b).
+        function: Function that runs a task in the child process. Its arguments are the task, the context and
+            the folder that becomes the artefact. The stage's algorithm is the code of the function's module
+            and of all modules of this package that this module imports. A digest of this code is part of the
+            artefact's key.
+        libraries: Python distributions that the result depends on. An entry ``a|b`` means that either a or b
+            is installed.
         modules: Modules that take long to load. A child process may load them before it gets a task.
-        memory_mb: Memory (MB) to reserve for one task. Two large tasks therefore do not run at the same time
-            on a small machine.
+        memory_mb: Memory (MB) to reserve for one task. The reservation keeps two large tasks from running at
+            the same time on a small machine.
     """
 
     name: str

@@ -1,8 +1,8 @@
 """Convert task dataclasses to JSON, and select the part of a task that identifies its result in the store.
 
-The pipeline writes a task with `to_json` and keys its artefact with `key_inputs` and `key_options`. The child
-process reads the task back with `from_json`. A field may be a dataclass, a pydantic model, a path or a JSON
-value. It may also be a mapping or tuple of these, or optional (``X | None``).
+The pipeline writes a task with `to_json`. It makes the key of the task's artefact with `key_inputs` and
+`key_options`. The child process reads the task back with `from_json`. A field may be a dataclass, a pydantic
+model, a path or a JSON value. It may also be a mapping or tuple of these, or optional (``X | None``).
 """
 
 from __future__ import annotations
@@ -28,23 +28,25 @@ from pydantic import BaseModel
 
 _Loaded = TypeVar("_Loaded")
 _OPTIONS = "options"
-"""Name of the field that holds a stage's options; the store's key has a separate part for the options."""
+"""Name of the task's field that holds the stage's options. An artefact's key stores the options separately
+from the inputs."""
 _OMITTED = "omitted from the key"
 
 
 @runtime_checkable
 class Reference(Protocol):
-    """A value that names content by its path; the key contains only the digest of the content."""
+    """A value that refers to content by its path. An artefact's key holds the content's digest instead."""
 
     def key_content(self) -> Any:
         """Return the digests that identify the content."""
 
 
 def omitted_from_key(*names: str) -> Mapping[str, Any]:
-    """Return metadata for a dataclass field that is omitted from the key, entirely or in part.
+    """Return metadata for a dataclass field that the artefact's key omits, entirely or in part.
 
     Args:
-        names: Names inside the field's value that are omitted; without names, the whole field is omitted.
+        names: Names of the parts of the field's value that the key omits; without names, the key omits the
+            whole field.
     """
     return {_OMITTED: names}
 
@@ -60,7 +62,7 @@ def from_json(kind: type[_Loaded], data: Any) -> _Loaded:
 
 
 def key_inputs(task: Any) -> dict[str, Any]:
-    """Return the inputs of a task in the form of the artefact's key: with digests instead of paths."""
+    """Return the inputs of a task for the artefact's key: the digest of each input replaces its path."""
     return {
         field.name: _without(_keyed(getattr(task, field.name)), field)
         for field in dataclasses.fields(task)
@@ -69,7 +71,7 @@ def key_inputs(task: Any) -> dict[str, Any]:
 
 
 def key_options(task: Any) -> dict[str, Any]:
-    """Return the options of a task as JSON values of the artefact's key; empty if there are none."""
+    """Return the options of a task for the artefact's key, as JSON values; empty without options."""
     for field in dataclasses.fields(task):
         if field.name == _OPTIONS:
             return dict(_without(to_json(task.options), field))
@@ -86,7 +88,7 @@ def _without(value: Any, field: dataclasses.Field[Any]) -> Any:
 
 
 def _plain(value: Any, describe: Callable[[Any], Any]) -> Any:
-    """Convert a value to JSON values; `describe` returns the JSON values of a `Reference`."""
+    """Convert a value to plain JSON values; `describe` converts each `Reference` inside the value."""
 
     def plain(part: Any) -> Any:
         return _plain(part, describe)
