@@ -15,19 +15,19 @@ _OCTAVES = 5
 """Number of pyramid levels in addition to the full size. Each level has half the size of the previous level.
 """
 _STEPS = 2
-"""Number of degrees of blur per octave. The two degrees are a pyramid level, and the mean of this level and
-the next level."""
+"""Number of degrees of blur per octave (pyramid level). The first degree is the level itself. The second
+degree is the mean of this level and the next level."""
 _BORDER = 2**_OCTAVES
-"""Width (texels of level 0) of the border around an image: one texel of the coarsest level. Image positions
-are multiples of this width, so that a texel of the coarsest level never mixes two images."""
+"""Width (texels of level 0) of the border around each image. It equals the width of one texel of the coarsest
+level. Image positions are multiples of it, so that a texel of the coarsest level never mixes two images."""
 _BATCH_COLUMNS = 1024
-"""Number of columns of the array in which look-ups are passed to cv2.remap. cv2.remap refuses arrays with
+"""Number of columns of the array that passes look-ups to cv2.remap. cv2.remap refuses arrays with
 more than 32,767 rows, so one long column is not possible."""
 _MAX_TAPS = 6
-"""Maximum number of look-ups for a pixel. It limits the rendering time."""
+"""Maximum number of texture look-ups for one pixel. The limit reduces the rendering time."""
 _FOOTPRINT_SCALE = np.float32(1.4)
-"""Ratio of the size of a pixel's footprint to the size of the pixel. It is larger than 1 because lens and
-sensor blur slightly. With a ratio of 1, sharp edges would shift by up to 0.1 px."""
+"""Multiplier of the area on the texture that is averaged for a pixel, in each direction. It is larger than 1
+because lens and sensor blur slightly. With a multiplier of 1, sharp edges would shift by up to 0.1 px."""
 
 Float32 = npt.NDArray[np.float32]
 """An array of float32."""
@@ -37,10 +37,12 @@ Bytes = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filter:
-    """How to average the texture over the footprint of each of N pixels.
+    """How to average the texture over the footprints of N pixels.
+
+    The footprint of a pixel is the area of the texture that the pixel shows.
 
     Attributes:
-        kind: (N,) code of the filter: 16 · degree of blur (half octaves) + number of look-ups.
+        kind: (N,) code of each pixel's filter: 16 · degree of blur (in half octaves) + number of look-ups.
         along: (2,N) longer axis of the footprint as a vector, texels of level 0. The look-ups are distributed
             along this axis.
     """
@@ -50,7 +52,7 @@ class Filter:
 
 
 class Atlas:
-    """An image pyramid that holds all textures.
+    """An image pyramid that holds all textures, so that one look-up can serve pixels on any surface.
 
     Args:
         images: RGB images (H,W,3). Each image is surrounded by copies of its edge pixels, so that filtering
@@ -70,8 +72,8 @@ class Atlas:
                 image, _BORDER, bottom, _BORDER, right, cv2.BORDER_REPLICATE
             )
         self.origins: FloatArray = np.array(origins, dtype=np.float64) + _BORDER
-        # Each level has half the size of the previous level. Other ratios shift sharp edges by a part of a
-        # texel.
+        # Each level has half the size of the previous level. With another ratio, sharp edges would
+        # shift by a part of a texel.
         self._levels = [base]
         for _ in range(_OCTAVES):
             half = self._levels[-1].shape[1] // 2, self._levels[-1].shape[0] // 2
@@ -83,7 +85,7 @@ class Atlas:
         Args:
             at: (2,N) texel coordinates (x, y) of the pixels at level 0. The centre of the first texel is
                 (0.5, 0.5).
-            filters: Filters of single pixels, or of cells of pixels that share a filter.
+            filters: Filters. Each filter is for one pixel, or for a cell of pixels that share this filter.
             cell: (N,) index of each pixel's filter; None if pixel number i uses filter number i.
 
         Returns:
@@ -128,8 +130,8 @@ def select_filter(footprint: Float32) -> Filter:
     Elongated footprints are averaged from several look-ups along their longer axis.
 
     Args:
-        footprint: (4,N) derivatives of the texel coordinates: of x and y with respect to a step of one pixel
-            to the right, then of x and y with respect to a step of one pixel down.
+        footprint: (4,N) changes of the texel coordinates. Rows 0 and 1: change of x and of y for a step of
+            one pixel to the right. Rows 2 and 3: change of x and of y for a step of one pixel down.
 
     Source:
         McCormack et al., "Feline: fast elliptical lines for anisotropic texture mapping", 1999.

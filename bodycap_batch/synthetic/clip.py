@@ -14,7 +14,7 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel, forward_kinemati
 
 
 class Clip:
-    """A recorded motion that is interpolated between its frames.
+    """A recorded motion that gives the pose of the body at any time, by interpolation between its frames.
 
     Rotations are interpolated by slerp, positions linearly. The pose is constant before and after the
     recording.
@@ -22,8 +22,8 @@ class Clip:
     Args:
         motion: The recorded motion.
         start_s: Time (seconds) in the recording at which the capture's common clock is zero.
-        length_s: Duration of the capture, seconds. The motion is moved so that the path of the root in this
-            time is centred in the room, and the lowest joint is on the floor.
+        length_s: Duration of the capture, seconds. The motion is shifted: the path of the root during
+            the capture is then centred in the room, and the lowest joint is on the floor.
     """
 
     def __init__(self, motion: Motion, start_s: float, length_s: float) -> None:

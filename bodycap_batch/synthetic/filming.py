@@ -17,19 +17,19 @@ from bodycap_batch.synthetic.render import SceneRenderer, Triangles, concatenate
 from bodycap_batch.synthetic.wearer import Wearer
 
 _BLUR_STEP_PX = 1.0
-"""Maximum image motion (px) between two sub-frames. A frame with motion blur is the mean of its sub-frames.
-"""
+"""Maximum image motion (px) between two sub-frames of a frame. A frame with motion blur is the mean of
+several sub-frames, which are rendered at different times during the exposure."""
 _MAX_BLUR_STEPS = 24
-"""Maximum number of sub-frames of a blurred frame. It limits the rendering time."""
+"""Maximum number of sub-frames of a blurred frame. The limit reduces the rendering time."""
 _USUAL_DISTANCE_M = 0.5
-"""Assumed distance (metres) of near objects. It converts a shift of the camera into image motion, which
-determines the number of sub-frames."""
+"""Assumed distance (metres) of near objects from the camera. With this distance, a shift of the camera is
+converted into image motion. The image motion determines the number of sub-frames."""
 _NOISE_SURPLUS = 1 << 21
-"""Number of random values in addition to the values of one image. The noise of each frame starts at a random
-position within this surplus."""
+"""Number of additional random values in the noise array that all frames share. The noise of each frame is a
+section of the array that starts at a random index below this number."""
 _SHUTTER_BANDS = 16
-"""Maximum number of bands of rows in a rolling-shutter image. The wearer's body does not move within a band.
-"""
+"""Maximum number of bands of rows in a rolling-shutter image. All rows of a band show the wearer's body in
+the same pose."""
 
 
 class MovingBody(Protocol):
@@ -140,13 +140,13 @@ class Sensor:
         gain = rng.uniform(0.94, 1.06, 3)
         self._mean = (np.arange(256)[:, None] * gain)[None].astype(np.float32)
         self._sigma = (noise * np.sqrt(0.5 + self._mean * (0.5 / 128.0))).astype(np.float32)
-        # Drawing a million numbers for each frame takes as long as rendering. So frames share one array.
+        # Drawing a million numbers for each frame would double the rendering time. So frames share one array.
         self._normal = rng.standard_normal(size + _NOISE_SURPLUS if noise > 0 else 0, dtype=np.float32)
 
     def record(self, image: Bytes, frame: int) -> Bytes:
-        """Return the recorded image (H,W,3) of an ideal image (H,W,3).
+        """Return an ideal image (H,W,3) as the sensor records it.
 
-        The noise depends on the frame number.
+        The frame number determines the noise.
         """
         mean = cv2.LUT(image, self._mean)
         if len(self._normal):

@@ -1,8 +1,8 @@
 """A procedural walk: a path with bends, a gait phase, joint angles, and arms that reach out.
 
-The motion does not follow the priors of the merging stage, because its velocities are no random walk. Joint
-angles are periodic functions of a gait phase plus a few slow sinusoids. The path is a spline through given
-positions.
+The velocities of this motion are not a random walk. So the motion differs from the motion model that the
+merging stage assumes. Joint angles are periodic functions of a gait phase plus a few slow sinusoids. The path
+is a spline through given positions.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ _LAP = np.array(
 )
 """Positions on one lap. Columns: time (seconds); x and y (metres from the room's middle); direction of the
 face (degrees from +x, counter-clockwise). The lap starts with steps to the right while the person faces a
-wall, because sideways movement is a good start for a map."""
+wall, because a map is easy to initialise from sideways movement."""
 _TURN_S, _TURN_DEG, _SWAY_M = 5.0, 75.0, 0.02
 """Motion of a person who rotates on the spot: period (s), maximum rotation to each side (degrees), amplitude
 of the sway (m)."""
 _ARM_PARTS = ("Lift", "Ahead", "Arm", "Out", "Spin", "Elbow", "Twist")
-"""Names of the angles of an arm's posture, explained at `WalkStyle.posture`."""
+"""Names of the angles of an arm's posture, which `WalkStyle.posture` explains."""
 _SAMPLE_HZ = 50.0
-"""Sampling rate (Hz) of the splines of gait phase and root height."""
+"""Sampling rate (Hz) of the two splines that describe the gait phase and the height of the root."""
 _MARGIN_S = 4.0
 """Additional time (seconds) that the motion covers before and after the capture."""
 
@@ -104,7 +104,7 @@ class _ArmReach:
     pronation: float
 
     def weight(self, t_s: FloatArray) -> FloatArray:
-        """Return the weight (T,) of the additional angles at common times (T,). It is 0 … 1 and smooth."""
+        """Return the weight (T,) of the additional angles at common times (T,). It is smooth, 0 … 1."""
         up = np.clip((t_s - self.start_s) / self.ramp_s, 0, 1)
         down = np.clip((t_s - self.start_s - self.ramp_s - self.hold_s) / self.ramp_s, 0, 1)
         return np.asarray(_smooth_step(up) - _smooth_step(down))
@@ -135,12 +135,12 @@ class WalkStyle:
             are in front of the chest.
         presses: Times and angles at which a hand is held against the chest.
         on_the_spot: True: the person does not walk, but rotates to both sides on the spot.
-        posture: Offset (degrees) of each joint angle from the mean of all people, by name; a missing name
-            means 0. Names of the trunk: ``Bend`` (forward) and ``Turn`` (about the vertical). Names of an
-            arm, with the prefix ``Left`` or ``Right``: ``Lift`` (shoulder girdle up), ``Ahead`` (shoulder
-            girdle forward), ``Arm`` (flexion of the shoulder), ``Out`` (abduction of the shoulder), ``Spin``
-            (axial rotation of the upper arm), ``Elbow`` (flexion) and ``Twist`` (pronation). In a T-pose,
-            only the angles of the trunk and of the shoulder girdle are applied.
+        posture: Offset (degrees) of each joint angle from the mean of all people, by name. The offset of a
+            missing name is 0. Names of the trunk: ``Bend`` (forward) and ``Turn`` (about the vertical). Names
+            of an arm, with the prefix ``Left`` or ``Right``: ``Lift`` (shoulder girdle up), ``Ahead``
+            (shoulder girdle forward), ``Arm`` (flexion of the shoulder), ``Out`` (abduction of the shoulder),
+            ``Spin`` (axial rotation of the upper arm), ``Elbow`` (flexion) and ``Twist`` (pronation). In a
+            T-pose, only the angles of the trunk and of the shoulder girdle are applied.
     """
 
     t_pose_s: float = 0.0
@@ -216,7 +216,7 @@ class Walk:
                 end = self.skeleton.end_offsets_m[joint]
                 sole = np.nan_to_num(end) if np.isfinite(end).all() else np.array([0.0, 0.0, -self._ankle_m])
                 soles.append((poses[:, joint, :3, :3] @ sole + poses[:, joint, :3, 3])[:, 2])
-        softness_m = 0.01  # parameter of a soft minimum over the soles
+        softness_m = 0.01  # smoothness of the minimum over the soles
         lowest = -softness_m * np.log(np.exp(-np.array(soles) / softness_m).sum(axis=0))
         return np.asarray(-lowest)
 
@@ -264,7 +264,7 @@ class Walk:
     def _t_pose(self, t_s: FloatArray) -> FloatArray:
         """Return the weight (T,) of the T-pose.
 
-        It is 1 during the T-pose, and decreases to 0 within 1 s after it.
+        The weight is 1 during the T-pose, and decreases to 0 within 1 s after the T-pose.
         """
         return (
             np.asarray(1.0 - _smooth_step(np.clip(t_s - self._t_pose_s, 0, 1)))

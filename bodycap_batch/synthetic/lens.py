@@ -18,12 +18,13 @@ from bodycap_batch.model.camera import Camera
 _NEWTON_STEPS = 30
 """Maximum number of Newton steps of an inversion."""
 _DERIVATIVE_STEP = 1e-6
-"""Step to each side of a point for a numerical derivative, as a length in the image plane at depth 1."""
+"""Step of the central differences that give numerical derivatives, as a length in the image plane at depth 1.
+"""
 _CONVERGED = 1e-9
-"""Maximum error of a converged inversion, as a length in the image plane at depth 1."""
+"""Maximum error of an inversion that is treated as converged, as a length in the image plane at depth 1."""
 _BRANCH_SAMPLES = 8
-"""Number of test points between the centre and a solution. The determinant of the distortion's derivative
-must be positive at all test points."""
+"""Number of test points on the line from the image centre to a solution of the inversion. A solution is valid
+only if the Jacobian of the distortion has a positive determinant at all test points."""
 _BLOCK = 1 << 13
 """Number of points that are inverted together. A block of this size fits into the processor's cache."""
 _SINGLE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -42,7 +43,7 @@ class RayGrid:
         in_cam: (H,W,3) unit directions in the camera frame (x right, y down, z forward).
         per_px_x: (H,W,3) change of the direction for a step of one pixel to the right.
         per_px_y: (H,W,3) change of the direction for a step of one pixel down.
-        valid: (H,W) False for a pixel without a viewing ray, because the distortion has no inverse there.
+        valid: (H,W) True for a pixel with a viewing ray. At the other pixels the distortion has no inverse.
         planes: (9,H,W) components of `in_cam`, `per_px_x` and `per_px_y` as float32, for the renderer.
     """
 
@@ -156,9 +157,9 @@ def undistort(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, B
     """Invert a distortion for points (N,2) by Newton's method.
 
     Returns:
-        The ideal points (N,2), and a mask (N,). The mask is True for a point with an inverse that is
-        connected with the image centre: the distortion keeps its orientation between the centre and the ideal
-        point.
+        The ideal points (N,2), and a mask (N,). The mask is True for a point with a valid inverse:
+        the Jacobian of the distortion has a positive determinant on the line from the image centre to the
+        ideal point.
     """
     found = [
         _undistort_block(distort, distorted[start : start + _BLOCK])
@@ -171,7 +172,7 @@ def undistort(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, B
 
 
 def _undistort_block(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Invert a distortion for a block of points (N,2). The results are the results of `undistort`."""
+    """Invert a distortion for a block of points (N,2). The results are as for `undistort`."""
     plane = distorted.copy()
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):

@@ -16,17 +16,18 @@ from bodycap_batch.synthetic.textures import shade_image
 _CELL_M = 0.08
 """Distance (metres) between the points of a surface at which the light is computed."""
 _AMBIENT = 0.60
-"""Irradiance without lamps. It is a multiplier of the texture's brightness."""
+"""Irradiance (light on a surface) without lamps, as a multiplier of the texture's brightness."""
 _LAMP_SAMPLES = 6
-"""Number of random points on each lamp. Every surface point casts a shadow ray towards each of them."""
+"""Number of random points on each lamp. A shadow ray is cast from every surface point to each of these
+points."""
 _LAMP_SIZE_M = 0.35
 """Size (metres) of a lamp along x and y."""
 _LIFT_M = 0.004
-"""Distance (metres) between a surface and the start of its shadow rays. Without it, the
-surface would shade itself."""
+"""Distance (metres) between a surface and the start of its shadow rays. Without this distance, the surface
+would shade itself."""
 _LAMP_STRENGTH = 10.0
-"""Irradiance of all lamps together at a distance of 0. It is a multiplier of the texture's brightness. It
-decreases with 1 / (1 + d²), where d is the distance in metres."""
+"""Irradiance of all lamps together at a distance of 0, as a multiplier of the texture's brightness. The
+irradiance decreases with 1 / (1 + d²), where d is the distance in metres."""
 _MIN_EMISSION = 0.05
 """Minimum emission of a lamp in any direction, as a fraction of the emission straight down."""
 _RAY_LENGTH = 0.98

@@ -43,15 +43,15 @@ from bodycap_batch.synthetic.truth import (
 from bodycap_batch.synthetic.wearer import Wearer
 
 _TEXELS_PER_PIXEL_M = 0.85
-"""Texture detail: ratio of the texels per metre to the focal length in pixels. At a distance of 1 m, a texel
-covers slightly more than one pixel."""
+"""Ratio of the texture detail (texels per metre) to the focal length (pixels). With this ratio, a texel at a
+distance of 1 m covers slightly more than one pixel."""
 _MAX_TEXELS_PER_M = 500.0
-"""Maximum texture detail (texels per metre). It limits the memory."""
+"""Maximum texture detail (texels per metre). The limit saves memory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Subject:
-    """The person who is filmed.
+    """The person who wears the cameras.
 
     Attributes:
         motion: The moving body, centred in the room.
@@ -118,7 +118,7 @@ def write_synthetic_capture(
 
 
 def _draw_kept_frames(options: SynthOptions, subject: Subject) -> dict[str, BoolArray]:
-    """Draw a mask of the frames that each camera delivers.
+    """Draw at random which frames each camera delivers, as one mask for each camera.
 
     The first and the last frame are always delivered.
     """
@@ -163,7 +163,7 @@ def _write_camera_truth(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _FrameRecorder:
-    """Renderer of the recorded frames of one camera. A frame depends only on its number."""
+    """Function that renders one recorded frame of a camera. The frame depends only on the frame number."""
 
     renderer: CameraRenderer
     sensor: Sensor
@@ -298,7 +298,7 @@ def _atomic_folder(out_dir: Path) -> Iterator[Path]:
     except OSError as error:
         raise store_error_from_os_error(error, out_dir) from error
     except StoreError as error:
-        # Name the requested folder in the error, because the temporary folder is deleted.
+        # Replace the temporary folder in the error by the requested folder: the temporary folder is deleted.
         path = Path(error.path or out_dir)
         named = out_dir / path.relative_to(folder) if path.is_relative_to(folder) else path
         raise StoreError(error.message, path=named, hint=error.hint) from error

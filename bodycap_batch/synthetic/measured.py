@@ -11,7 +11,7 @@ from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.synthetic.options import SynthOptions
 
 _BURST_FRAMES = (2, 7)
-"""Minimum length of a burst of gross errors, and maximum length plus 1, in frames."""
+"""Range of the length (frames) of a burst of gross errors. The end of the range is not included."""
 _GROSS_M = 0.4
 """Standard deviation (metres) of the shift of a gross error along each axis."""
 _GROSS_RAD = 0.5
@@ -50,15 +50,18 @@ def disturb_poses(
     shift = shift + outlier[:, None] * rng.normal(0.0, _GROSS_M, (count, 3))
     poses = make_transform(world_from_cam[:, :3, :3] @ turn, world_from_cam[:, :3, 3] + shift)
     present = np.ones(count, dtype=bool)
-    # Keep the first and the last frame. The last drawn gap is shortened to get the exact number of lost
-    # frames.
+    # Keep the first and the last frame. `_draw_runs` shortens the last gap that it draws, so that
+    # the number of lost frames is exact.
     shortest, longest = options.gap_frames
     present[1:-1] = ~_draw_runs(max(count - 2, 0), round(options.lost * count), (shortest, longest + 1), rng)
     return MeasuredPoses(world_from_cam=poses, present=present, outlier=outlier)
 
 
 def _draw_runs(count: int, wanted: int, lengths: tuple[int, int], rng: np.random.Generator) -> BoolArray:
-    """Draw runs of frames until exactly `wanted` of `count` frames are in a run. Return a mask (count,)."""
+    """Draw runs of consecutive frames until exactly `wanted` of `count` frames are in a run.
+
+    Return a mask (count,) that is True for the frames in a run.
+    """
     out = np.zeros(count, dtype=bool)
     while int(out.sum()) < min(wanted, count):
         start = int(rng.integers(0, count))

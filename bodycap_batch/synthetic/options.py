@@ -13,7 +13,7 @@ from bodycap_batch.config.options import Options
 from bodycap_batch.model.camera import CAMERA_MODELS, Camera, parameter_count
 
 _EARLIEST_S = 3.0
-"""Maximum time (seconds) before the common clock's zero at which a camera may start. The built-in walk starts
+"""Maximum time (seconds) from the start of a camera to time 0 of the common clock. The built-in walk starts
 even earlier."""
 _DEFAULT_FOCAL_PX = 420.0
 """Focal length (px) of the default lens at an image width of 640 px. The horizontal angle of view is 75
@@ -129,9 +129,9 @@ class SynthOptions(Options):
             raise ValueError("gap_frames: shortest first, one frame or more")
 
     def _check_pressed(self) -> None:
-        """Check that only hands of the built-in walker are held against the chest.
+        """Check the option that holds a hand against the chest.
 
-        The body must be rendered in this case.
+        Only the built-in walk supports it, only for hands, and only if the body is rendered.
         """
         for name, (start_s, end_s) in self.pressed_s.items():
             place = mount_of(name)
@@ -146,7 +146,7 @@ class SynthOptions(Options):
 
     @property
     def frame_count(self) -> int:
-        """Number of frames of a camera at the common frame rate, including dropped frames."""
+        """Number of frames of each camera at the common frame rate, including the frames that are dropped."""
         return max(1, round(self.seconds * self.fps))
 
     def rate_fps(self, camera: str) -> float:

@@ -80,11 +80,11 @@ _POSTURE_SIGMA_DEG = {
 """Standard deviation (degrees) between people of each joint angle in relaxed standing. `WalkStyle.posture`
 explains the names.
 
-Sources: The angles of shoulder girdle, shoulder and elbow are interquartile ranges of 158 arms of standing
-people, divided by 1.349, from Y. Yoshida et al., "Three-dimensional alignment of the upper extremity in the
-standing neutral position in healthy subjects", J. Orthop. Surg. Res. 17, 2022. The rotation of the trunk
-(``Turn``) has the standard deviation of the shoulder blades' rotation, 3.18 degrees, from table 1 of
-"Standard reference values of the upper body posture in healthy middle-aged female adults in Germany",
+Sources: The values of shoulder girdle, shoulder and elbow are interquartile ranges divided by 1.349. They
+were measured on 158 arms of standing people: Y. Yoshida et al., "Three-dimensional alignment of the upper
+extremity in the standing neutral position in healthy subjects", J. Orthop. Surg. Res. 17, 2022. The rotation
+of the trunk (``Turn``) has the standard deviation of the shoulder blades' rotation, 3.18 degrees, from table
+1 of "Standard reference values of the upper body posture in healthy middle-aged female adults in Germany",
 Scientific Reports 11, 2021. The forward bend of the trunk (``Bend``) has half of the standard deviation of
 the kyphosis angle, because the bend is the upper half of the kyphosis. The standard deviation of the whole
 angle is 6.4 degrees, from Abrisham et al., as cited in https://www.nature.com/articles/s41598-023-27976-8,
@@ -122,8 +122,8 @@ def draw_mounts(
     Args:
         cameras: Names of the cameras, which are names of mounts.
         skeleton: Skeleton of the body that wears the cameras.
-        sigmas: Standard deviations of the rotation (degrees) and of the shift (metres). Each value is the
-            root of the sum of the three axes' variances, so that each axis gets 1/√3 of the value.
+        sigmas: Total standard deviations of the rotation (degrees) and of the shift (metres). The standard
+            deviation for each of the three axes is 1/√3 of the total.
         rng: Source of randomness.
 
     Raises:

@@ -25,15 +25,16 @@ _CHEST_HEIGHT_RATIO = 0.45
 """Position of the touched point along the bone from Spine1 to the neck, as a fraction of the bone's length.
 """
 _OFF_CHEST_M = 0.045
-"""Distance (metres) of the lens from the chest's surface. It is larger than the renderer's minimum distance,
-and small enough that the chest fills the image."""
+"""Distance (metres) of the lens from the chest's surface. The distance is larger than the renderer's minimum
+distance, and so small that the chest fills the image."""
 _LOW_DEG = np.array([-10.0, -40.0, 0.0, -80.0, -80.0, -80.0, -40.0])
 """Minimum of each angle of `ArmAngles`, degrees. Evidence: none."""
 _HIGH_DEG = np.array([110.0, 100.0, 150.0, 90.0, 80.0, 80.0, 40.0])
 """Maximum of each angle of `ArmAngles`, degrees. Evidence: none."""
 _COMFORT = 0.002
-"""Residual for each degree between a joint angle and the middle of its range. For comparison: a camera
-position error of 1 cm, or a viewing direction error of 6 degrees, has a residual of 1."""
+"""Residual per degree of difference between a joint angle and the middle of its range. It makes the search
+prefer comfortable postures. For comparison: a camera position error of 1 cm, or a viewing direction error of
+6 degrees, has a residual of 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,13 +90,13 @@ def _rotation_about(axis: str, degrees: FloatArray) -> Rotation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Press:
-    """A period in which one hand is held against the chest.
+    """A period in which one hand is held against the chest, so that its camera sees only the wearer.
 
     Attributes:
         side: ``Left`` or ``Right``.
         start_s: Common time (seconds) at which the camera on the hand arrives at the chest.
         end_s: Common time (seconds) at which the camera leaves the chest.
-        degrees: (7,) angles of `ArmAngles` between these times, degrees.
+        degrees: (7,) the angles of `ArmAngles`, in that order, from `start_s` to `end_s`, degrees.
     """
 
     side: str

@@ -9,7 +9,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.formats.open3d_loader import load_open3d
 
 NOTHING = -1
-"""Face index that is used for a ray that meets no triangle."""
+"""Value that replaces the face index if a ray meets no triangle."""
 
 _Float32 = npt.NDArray[np.float32]
 

@@ -32,7 +32,7 @@ different rows and columns."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Triangles:
-    """Triangles with their planes and textures, all in the same coordinate frame.
+    """Triangles that can be rendered: their planes and textures, all in the same coordinate frame.
 
     Attributes:
         vertices: (V,3) positions of the vertices, metres.
@@ -42,8 +42,8 @@ class Triangles:
         texel_at_point: (F,2) atlas coordinates (texels) at `point`.
         texels_per_m: (F,2,3) gradient of the atlas coordinates with respect to the position, texels per
             metre.
-        plane: (F,) number of the textured plane of each triangle. Adjacent triangles in one plane with one
-            texture have equal numbers.
+        plane: (F,) number of the textured plane that holds each triangle. Adjacent triangles have the same
+            number if they lie in one plane and share a texture.
         surface: (F,) number of the surface that holds each triangle.
         gain: (F,) brightness factor of each triangle.
     """
@@ -113,7 +113,7 @@ class _Texels:
     Attributes:
         faces: (N,) indices of the triangles that the rays meet, or `NOTHING`.
         rows: (9,N) homographies from viewing directions to the textures of these triangles, row by row.
-        inverse: (N,) reciprocal of the third homogeneous coordinate that each homography gives for its ray.
+        inverse: (N,) 1/w, where w is the third homogeneous coordinate that the homography gives for the ray.
         at: (2,N) texel coordinates (x, y) of the points.
     """
 
@@ -152,8 +152,8 @@ def _shared_filters(
         lens: Three arrays (3,H·W): the rays, their changes for a step of one pixel to the right, and their
             changes for a step of one pixel down.
         size: Size (H,W) of the image.
-        uniform: (H·W,) True for a pixel between four rays that meet the same plane. Each other pixel gets a
-            separate filter.
+        uniform: (H·W,) True for a pixel between four rays that meet the same plane. Only such pixels share
+            filters.
 
     Returns:
         The filters, and the index (H·W,) of each pixel's filter.
@@ -219,7 +219,7 @@ class SceneRenderer:
     def _homographies(self, poses: FloatArray) -> Float32:
         """Return a homography (9,B·F) for each of B poses and F triangles.
 
-        It maps a direction in the camera frame to homogeneous atlas coordinates (u·w, v·w, w).
+        Each homography maps a direction in the camera frame to homogeneous atlas coordinates (u·w, v·w, w).
         """
         shape, out = self._triangles, np.empty((3, 3, len(poses), len(self._triangles.faces)))
         rotation, centre = poses[:, :3, :3], poses[:, :3, 3]
@@ -267,7 +267,7 @@ class SceneRenderer:
         rotation, centre = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
         origin_and_ray = np.empty((rays.shape[1], 6), np.float32)
         if pose_of is None:
-            # No matrix product here: BLAS would start additional threads in each rendering thread.
+            # Do not use `@` here: BLAS would start additional threads in each rendering thread.
             turned, start = np.einsum("ij,jn->in", rotation[0], rays), centre[0][:, None]
         else:
             turned, start = np.einsum("nij,jn->in", rotation[pose_of], rays), centre[pose_of].T

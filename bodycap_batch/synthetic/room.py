@@ -24,23 +24,25 @@ _EDGE_M = 0.06
 """Minimum width (metres) of a face with its material's texture. A narrower face, such as the edge of a board,
 gets a texture of painted metal."""
 _MAX_TEXELS = 6000
-"""Maximum length (texels) of the longer side of a texture. It limits the memory."""
+"""Maximum length (texels) of the longer side of a texture. The limit saves memory."""
 HEIGHT_M = 2.8
 """Height of the room, metres."""
 MARGIN_M = 1.7
 """Minimum distance (metres) between the walk and the walls. Furniture at the walls is up to 0.7 m deep."""
 _MIN_HALF_M = (3.4, 3.0)
-"""Minimum of half of the room's size along x and y, metres."""
+"""Minimum distances (metres) from the room's middle to the walls along x and y."""
 _CARPETS = ((-0.38, -0.35), (0.42, 0.30), (-0.25, 0.45), (0.4, -0.5))
-"""Centres (x, y) of the carpets, as fractions of half of the room's size."""
+"""Centres (x, y) of the carpets. The value 0 is the room's middle, and the values −1 and 1 are the walls."""
 _PICTURE_BASES_M = (2.05, 1.25, 1.55, 1.10)
-"""Minimum height (metres) of the pictures' lower edges on each wall. It is above the furniture at this wall.
-"""
+"""Minimum height (metres) of the lower edges of pictures, for each of the four walls. The pictures are above
+the furniture at the wall."""
 
 
 @dataclass(slots=True)
 class _Builder:
-    """Collector of surfaces. Each random texture uses the next child of one seed sequence.
+    """Collect the surfaces of a room while the room is built.
+
+    Each random texture uses the next child of one seed sequence.
 
     Attributes:
         seeds: Seed sequence of all random streams.
@@ -89,7 +91,7 @@ class _Builder:
 
 @dataclass(frozen=True, slots=True)
 class _Wall:
-    """One wall of the room.
+    """One wall of the room. It gives world positions for the objects at the wall.
 
     Attributes:
         middle: (3,) world position (m) of the wall's middle at floor height.
@@ -135,7 +137,7 @@ def build_room(
         texels_per_m: Detail of the textures, texels per metre.
         seed: Seed of all textures and positions.
         furnished: False: the room has plain walls, floor and ceiling, and pictures on the walls only.
-        repeated_posters: True: three different pictures hang in many positions.
+        repeated_posters: True: copies of only three different pictures hang at many positions.
 
     Returns:
         The surfaces of the room. Their textures include the light of the lamps.
@@ -195,7 +197,7 @@ def _build_shell(build: _Builder, half: list[float], *, bare: bool) -> list[_Wal
 
 
 def _seen_from_behind(face: Surface) -> Surface:
-    """Return a rectangle at the same position whose image faces the opposite side."""
+    """Return a rectangle at the same position. Its image is on the opposite side."""
     return replace(face, corner=face.corner + face.across, across=-face.across)
 
 

@@ -64,7 +64,7 @@ def surface_facing(
 
 
 def box_faces(centre: npt.ArrayLike, size_m: npt.ArrayLike, yaw_deg: float) -> list[Surface]:
-    """Return the six faces of a box: four sides, top, bottom. Their images are one black texel.
+    """Return the six faces of a box: four sides, top, bottom. Each image is a single black texel.
 
     Args:
         centre: (3,) world position (m) of the middle of the box.

@@ -1,6 +1,6 @@
-"""Write the files of a capture other than videos: calibration and ground truth.
+"""Write all files of a capture except the videos: calibration and ground truth.
 
-The ground truth is the paths of the cameras, joint positions, body proportions, motion and mounts.
+The ground truth consists of camera paths, joint positions, body proportions, motion and mounts.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ JOINT_ROLES = {
     "right_shoulder": "RightArm", "left_knee": "LeftLeg", "right_knee": "RightLeg", "left_hip": "LeftUpLeg",
     "right_hip": "RightUpLeg", "left_ankle": "LeftFoot", "right_ankle": "RightFoot",
 }  # fmt: skip
-"""Names of the joints in ``gt/joints.npz``, with the role of each joint in the skeleton."""
+"""Role of a joint in the skeleton for each name in ``gt/joints.npz``."""
 
 _README = """Ground truth of a synthetic capture. Metres, Z up, floor at z = 0.
 
@@ -42,7 +42,7 @@ synth.json     the options the capture was made with.
 The body's true proportions are those of ../skeleton.bvh and of motion.bvh.
 """
 MARKER = Path("gt", "synth.json")
-"""Path of a file that every complete synthetic capture has, relative to the capture's folder."""
+"""Path of the file that marks a folder as a complete synthetic capture, relative to the folder."""
 
 
 def write_calibration(folder: Path, options: SynthOptions) -> None:
@@ -104,7 +104,7 @@ def seconds_from_ns(times_ns: IntArray) -> FloatArray:
 def common_ticks_ns(options: SynthOptions) -> IntArray:
     """Return regular times (nanoseconds) on the common clock at the common frame rate.
 
-    They cover the capture from the earliest to the latest timestamp of all cameras.
+    The times cover the capture from the earliest to the latest timestamp of all cameras.
     """
     offsets = [options.offsets_s.get(name, 0.0) for name in options.cameras]
     lasts_s = (options.frame_count - 1) / options.fps + max(offsets) - min(offsets)

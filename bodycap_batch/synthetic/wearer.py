@@ -27,8 +27,8 @@ _RADII = {
     "Foot": (0.035, 0.035),
     "ToeBase": (0.03, 0.02),
 }
-"""Radii (metres) of each limb at the start and at the end of its bone, by the name of the joint at which the
-bone starts. Evidence: none."""
+"""Radii (metres) of each limb: at the start and at the end of the limb's bone. The key is the name of the
+joint at which the bone starts. Evidence: none."""
 _SKIN = ("Hand", "Neck", "Head")
 """Body parts without clothes."""
 _TROUSERS = ("Hips", "UpLeg", "Leg")
@@ -40,8 +40,8 @@ _CAP_RINGS = 3
 _TEXELS_PER_M = 300.0
 """Detail (texels per metre) of the body's textures."""
 _CLEARANCE_M = 0.02
-"""Maximum distance (metres) of a camera from a limb's surface. A camera that is outside the limb, but within
-this distance, is treated as inside the limb."""
+"""Threshold of the distance (metres) between a limb's surface and a camera outside the limb. A camera within
+this distance is treated as inside the limb."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +53,7 @@ class _Limb:
 
 
 class Wearer:
-    """The surface of a body: all limbs that a camera may see.
+    """The surface of the wearer's body, which gives the triangles to render in any pose.
 
     Args:
         skeleton: Skeleton with the true proportions.
@@ -91,7 +91,8 @@ class Wearer:
     def visible_from(self, mount: Mount, skeleton: SkeletonModel) -> Wearer:
         """Return the body without the limb on which a camera is mounted, if the camera is inside this limb.
 
-        The limb would hide the view of the camera. The housing of a real camera presses the cloth in.
+        Otherwise the limb would block the view of the camera. A real camera has a free view, because its
+        housing presses the cloth in.
         """
         joint = skeleton.index_of_role(mount.role)
         centre = mount.joint_from_cam[:3, 3]
@@ -142,8 +143,8 @@ def _find_bones(skeleton: SkeletonModel) -> list[_Bone]:
         end = skeleton.end_offsets_m[joint]
         children = np.flatnonzero(skeleton.parents == joint)
         if len(children):
-            # A bone of the trunk ends at the child joint straight above. A bone of a limb ends at the only
-            # child.
+            # A bone of the trunk ends at the child joint straight above. A bone of a limb ends at its only
+            # child joint.
             ahead = rest[children] - rest[joint]
             end = ahead[np.argmin(np.abs(ahead[:, 0]))]
         if np.isfinite(end).all() and np.linalg.norm(end) > 0.01:

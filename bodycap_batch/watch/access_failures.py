@@ -13,8 +13,8 @@ from bodycap_batch.store.artefacts import store_error
 from bodycap_batch.watch.spool import Spool
 
 _FIRST_PAUSE_S = 1.0
-"""Time (seconds) between the first failure and the second attempt. Each failure doubles it. Evidence: none.
-"""
+"""Time (seconds) between the first failure and the second attempt. Each further failure doubles this
+time. Evidence: none."""
 _MAX_PAUSE_S = 60.0
 """Maximum time (seconds) between two attempts. Evidence: none."""
 

@@ -25,8 +25,8 @@ another machine makes."""
 _POLL_MS = 1000
 """Time (milliseconds) between two scans of a folder that is polled. Evidence: none."""
 _STOP_CHECK_MS = 2000
-"""Time (milliseconds) between two checks of the stop event by `watchfiles`. It is also the pause after an
-error. Evidence: none."""
+"""Time (milliseconds) between two checks whether the thread must stop. After an error, the thread waits for
+this time before the next attempt. Evidence: none."""
 
 
 class ChangeNotifier:
@@ -75,7 +75,7 @@ class ChangeNotifier:
                 ):
                     self._woken.set()
             except (OSError, RuntimeError) as error:
-                # The system has no free inotify watches, or the folder is gone. The regular scans continue.
+                # The system has no free inotify watches, or the folder is gone. Poll the folder instead.
                 if not self.polling:
                     sys.stderr.write(f"note: {self._folder} is polled from now on, because: {error}\n")
                 self.polling = True

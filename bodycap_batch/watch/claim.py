@@ -23,7 +23,7 @@ from bodycap_batch.watch.spool import JobDir
 
 
 class Claim:
-    """A watcher's claim on a job.
+    """A watcher's claim on a job. Its heartbeat shows other watchers that the job is being processed.
 
     Args:
         job: The job's folder.
@@ -45,7 +45,10 @@ class Claim:
 
     @property
     def ownership(self) -> Ownership:
-        """The check that this claim still holds. It precedes each step that other processes can see."""
+        """Object that checks whether this claim still holds.
+
+        The check precedes each step that other processes can see.
+        """
         return Ownership(owner=self.job.owner, token=self._token, generation=self.generation)
 
     def set_job_dir(self, job: JobDir) -> None:
@@ -58,7 +61,7 @@ class Claim:
         with self._lock:
             if self._ended or self.lost.is_set():
                 return
-            with contextlib.suppress(OSError):  # the run of the job reports a full or missing disk
+            with contextlib.suppress(OSError):  # the job's run reports a full or missing disk
                 if self.ownership.is_held():
                     self._write()
                 else:
@@ -72,7 +75,7 @@ class Claim:
                 self._write(released=True)
 
     def stop_heartbeat(self) -> None:
-        """Write no more heartbeats, for example because the job has ended and moves to its final folder."""
+        """Stop the heartbeats of this claim, for example before the ended job moves to its final folder."""
         with self._lock:
             self._ended = True
 

@@ -40,14 +40,14 @@ from bodycap_batch.watch.spool import (
 )
 
 _MAX_SNAPSHOT_FILES = 1000
-"""Number of files after which the inspection of a waiting entry ends when jobs are listed. Evidence: none."""
+"""Maximum number of files of a waiting entry that are inspected for the list of jobs. Evidence: none."""
 _POLL_S = 0.1
 """Time (seconds) between two checks of a job that is being cancelled. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobRow:
-    """One job as a row of a table.
+    """One job as a row of the table that `bodycap status` and the live page show.
 
     Attributes:
         name: Name of the job.
@@ -138,11 +138,11 @@ def _keep_artefacts(job: JobDir, hidden: JobDir, spool: Spool) -> Iterator[Calla
     """Keep a job's artefacts in the store until the job runs again.
 
     Yields:
-        A function that must be called with the job's next path.
+        A function. The caller must call it with the path to which the job will be moved.
     """
     store = read_status(job).get("store")
     if not store or not (Path(store) / "artefacts").is_dir():
-        yield lambda _: None  # the job has not started a stage
+        yield lambda _: None  # no stage has started, so the store holds no artefacts
         return
     with moving(Store(Path(store)), job.result) as keep_for:
 
@@ -158,8 +158,9 @@ def cancel_job(spool: Spool, name: str, wait_s: float = 5.0) -> JobDir | None:
     """Cancel a waiting or running job. The results of its finished stages stay in the store.
 
     Returns:
-        The job's folder. The job may have ended before it could be stopped: `read_status` returns its state.
-        None if no watcher has reacted within `wait_s` seconds. The next watcher that runs cancels the job.
+        The job's folder, or None if no watcher has reacted within `wait_s` seconds. In the case of None, the
+        next watcher that runs cancels the job. A returned job may have ended before it could be cancelled:
+        `read_status` returns the final state of the job.
 
     Raises:
         JobError: The job does not exist, or it has ended.
@@ -179,9 +180,10 @@ def cancel_job(spool: Spool, name: str, wait_s: float = 5.0) -> JobDir | None:
 
 
 def _request_cancel(spool: Spool, name: str) -> JobDir | None:
-    """Cancel a waiting job or mark a running one. Return None if the job is being claimed.
+    """Cancel a waiting job, or mark a running job so that its watcher cancels it.
 
-    A job that is being claimed is also marked. If the entry returns to the inbox, the mark is lost.
+    Return None if a watcher is claiming the job. Such a job is also marked. If the claim fails, the job
+    returns to the inbox and the mark is lost.
     """
     waiting = [entry for entry in entries_in(spool.inbox) if _is_same_name(entry.name, name)]
     job = spool.find(name)
@@ -192,7 +194,7 @@ def _request_cancel(spool: Spool, name: str) -> JobDir | None:
         if waiting:
             return _cancel_waiting(spool, waiting[0])
         for job_dir in map(JobDir, spool.running.glob(f"{CLAIM_PREFIX}*")):
-            if name in _dropped_names(job_dir):  # if its watcher is gone, the next watcher continues
+            if name in _dropped_names(job_dir):  # a watcher is claiming this job
                 job_dir.cancel.touch()
                 return None
     except FileNotFoundError:  # another process has claimed the job, or moved it to its final folder
@@ -203,7 +205,7 @@ def _request_cancel(spool: Spool, name: str) -> JobDir | None:
 
 
 def _dropped_names(job_dir: JobDir) -> tuple[str, ...]:
-    """Return the names of a job for users: its former name in the inbox with and without the suffix."""
+    """Return the names by which users know a job: its name in the inbox, with and without the suffix."""
     dropped = str(read_status(job_dir).get("dropped", ""))
     return dropped, Path(dropped).stem
 
@@ -267,7 +269,7 @@ def job_row(job: JobDir) -> JobRow:
     )
     running = state == "running"
     cause = str(error.get("message", ""))
-    if state == "stopped" and cause:  # a missing disk, or a running `bodycap gc`
+    if state == "stopped" and cause:  # it waits for a disk or for `bodycap gc`
         where = error.get("path")
         cause = f"continues later: {f'{where}: ' if where else ''}{cause}"
     if state == "interrupted":

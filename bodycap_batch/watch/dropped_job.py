@@ -1,4 +1,4 @@
-"""Read a dropped job, check that it names only permitted paths, and write it to its folder for the run."""
+"""Read a job from the inbox, check that it names only permitted paths, and write it to the job's folder."""
 
 from __future__ import annotations
 
@@ -82,14 +82,17 @@ def path_policy(path: Path, roots: tuple[Path, ...], *, is_file: bool) -> PathPo
     """Return the policy for the paths that an entry may name.
 
     An entry may always name paths below `roots`. A folder may also name paths inside itself. A link or a
-    single file has no such folder.
+    single job file may name no other paths.
     """
     own = None if is_file or path.is_symlink() else path
     return PathPolicy(folder=own, roots=roots)
 
 
 def unread_job_files(folder: Path) -> list[str]:
-    """Return the names of YAML files in a folder that are not read, because none is named like a job file."""
+    """Return the names of the YAML files in a folder without a job file; otherwise return an empty list.
+
+    These YAML files are not read, because none has the name of a job file.
+    """
     if job_file_in(folder) is not None:
         return []
     return [path.name for path in visible_entries(folder) if path.suffix.lower() in YAML_SUFFIXES]

@@ -60,7 +60,7 @@ def claim_entry(
             return None
         move_to_running(spool, claim)
     except (OSError, StoreError) as failed:
-        with contextlib.suppress(OSError, StoreError):  # on failure, a later takeover follows
+        with contextlib.suppress(OSError, StoreError):  # on failure, a watcher takes the job over later
             return_to_inbox(spool, job_dir)
         raise store_error(failed, entry.path) if isinstance(failed, OSError) else failed from failed
     return claim, error
@@ -142,7 +142,7 @@ def return_to_inbox(
 
 
 def finish_interrupted_retries(spool: Spool) -> None:
-    """Move jobs to the inbox if the `retry` command that was moving them was killed."""
+    """Find jobs whose `retry` command was killed during the move, and move these jobs to the inbox."""
     for path in sorted(spool.failed.glob(f"{RETRY_PREFIX}*")):
         if not is_process_running(path.name.removeprefix(RETRY_PREFIX)):
             with contextlib.suppress(FileNotFoundError):  # another watcher is moving the job
@@ -179,7 +179,7 @@ def _move_entry(
         os.rename(entry.path, target)
     except FileNotFoundError:
         return False
-    if leads_to:  # a relative link would point to another path from the new folder
+    if leads_to:  # a relative link is not valid in the new folder
         absolute_link = job_dir.path / "link"
         absolute_link.symlink_to(leads_to)
         os.replace(absolute_link, target)

@@ -32,7 +32,7 @@ Names that start with ``._`` (resource forks) are treated in the same way."""
 
 @dataclass(frozen=True, slots=True)
 class InboxEntry:
-    """A folder or a job file in the inbox."""
+    """A folder or a job file in the inbox. It becomes a job when a watcher claims it."""
 
     path: Path
 
@@ -50,6 +50,8 @@ class InboxEntry:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EntrySnapshot:
     """The state of an entry's files at one moment.
+
+    Two snapshots show whether a user is still copying or changing the files.
 
     Attributes:
         digest: Digest of the names, sizes and times of all files. It changes if a file is added, removed,
@@ -124,10 +126,11 @@ def take_snapshot(entry: InboxEntry, max_files: int) -> EntrySnapshot:
 
 
 class CompletionTracker:
-    """Observe the entries of the inbox until they are complete.
+    """Find out which entries of the inbox users have copied completely.
 
     Args:
-        unchanged_s: Time (seconds) for which the names, sizes and times of an entry's files must not change.
+        unchanged_s: Time (seconds) for which the names, sizes and times of an entry's files must not change
+            before the entry is treated as complete.
         max_files: Maximum number of files of an entry that are inspected.
         clock: Function that returns the time of this process's own clock, seconds.
 
@@ -179,7 +182,11 @@ class CompletionTracker:
 
 
 def _try_snapshot(entry: InboxEntry, max_files: int) -> tuple[EntrySnapshot | None, str]:
-    """Return a snapshot of an entry and "", or None and the error. The error is "" if the entry is gone."""
+    """Return a snapshot of an entry and an error text.
+
+    If the entry cannot be read, the snapshot is None. The error text is "" if there is no error, and also if
+    the entry no longer exists.
+    """
     try:
         return take_snapshot(entry, max_files), ""
     except FileNotFoundError:

@@ -23,7 +23,7 @@ FINAL = ("done", "failed", "cancelled")
 _WRITE_PERIOD_S = 0.5
 """Minimum time (seconds) between two writes of the progress. Evidence: none."""
 _MAX_NOTES = 100
-"""Maximum number of notes in the file. The limit keeps the file small. Evidence: none."""
+"""Maximum number of notes in `status.json`. The limit keeps the file small. Evidence: none."""
 _FIELD_TYPES: Mapping[str, tuple[type, ...]] = {
     **dict.fromkeys(("kind", "dropped", "state", "stage", "camera"), (str,)),
     "store": (str, NoneType),
@@ -33,9 +33,11 @@ _FIELD_TYPES: Mapping[str, tuple[type, ...]] = {
     "progress": (int, float, NoneType),
     "error": (dict, NoneType),
 }
-"""Permitted types of each field. A value of another type is ignored: a user may have edited the file."""
+"""Permitted types of each field of `status.json`. A value of another type is ignored, because a user may have
+edited the file."""
 _ACTIVITY_WITHOUT_END = "reading videos"
-"""Label of an activity that is not a stage and reports no end. It ends when a stage starts."""
+"""Label of an activity that is not a stage. No event reports the end of this activity. It is treated as ended
+when a stage starts."""
 
 
 class JobStatusFile:
@@ -89,7 +91,7 @@ class JobStatusFile:
         """Record one event of the job."""
         with self._lock:
             _apply_event(self.document, event)
-            if event.kind != "note" and not self._failed:  # keep the failed stage, even if a report follows
+            if event.kind != "note" and not self._failed:  # after a failure, keep the failed stage
                 self.document.update(stage=event.stage, camera=event.camera)
                 self._failed = event.kind == "failed"
             if event.kind != "progress":
@@ -146,7 +148,7 @@ class JobStatusFile:
     def _write(self) -> None:
         self.document["updated_at"] = utc_text()
         self._written = time.monotonic()
-        if not self._job.path.is_dir() or not self._may_write():  # another watcher has claimed or moved it
+        if not self._job.path.is_dir() or not self._may_write():  # another watcher has the job
             return
         temporary = self._job.path / f".status.{os.getpid()}.{threading.get_ident()}.part"
         with disk_errors(self._job.path):

@@ -22,13 +22,13 @@ from bodycap_batch.watch.spool import JobDir, Spool, move_to_free_name
 from bodycap_batch.watch.watch_options import WatchOptions
 
 _MAX_DISK_FAILURES = 5
-"""Maximum number of disk failures after which a job is tried again. A failure is counted only if the disk
-itself answers, so that the file is at fault. Evidence: none."""
+"""Maximum number of disk failures of a job. After one more failure, the job ends as failed. A failure is
+counted only if the disk itself answers, because then a file of the job is at fault. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOutcome:
-    """How the processing of a job ended.
+    """How the processing of a job ended. The watcher reports this to the operator.
 
     Attributes:
         name: Name of the job.
@@ -77,7 +77,7 @@ class JobWorker:
 
     def _process(self, claim: Claim, read_error: BodycapError | None) -> JobOutcome:
         previous = read_status(claim.job, strict=True)
-        if previous.get("state") in FINAL:  # its watcher wrote the final status, but ended before the move
+        if previous.get("state") in FINAL:  # an earlier watcher ended before it moved the job
             return self._file(claim, previous["state"], _error_from_status(previous), None)
         status = JobStatusFile(claim.job, previous, claim.ownership.is_held)
         try:
@@ -156,8 +156,8 @@ class JobWorker:
     def _postpone(self, claim: Claim, status: JobStatusFile, error: DiskAway) -> JobOutcome:
         """Postpone a job after a disk failure, or end it after too many disk failures.
 
-        The heartbeat of a postponed job stops. The job starts again when its claim is stale, that is, after
-        the maximum time without a heartbeat.
+        The heartbeat of a postponed job stops. After `stale_s` seconds without a heartbeat, a watcher takes
+        the job over and starts it again.
         """
         name = claim.job.name
         if any(not stage["reused"] for stage in status.document["finished_stages"]):
@@ -174,15 +174,14 @@ class JobWorker:
     def _stuck(self, claim: Claim, error: Exception) -> JobOutcome:
         """Stop the heartbeat after a disk failure, and report it to the operator.
 
-        The job is processed again when its claim is stale, that is, after the maximum time without a
-        heartbeat.
+        After `stale_s` seconds without a heartbeat, a watcher takes the job over and processes it again.
         """
         claim.stop_heartbeat()
         code, name = StoreError.exit_code, claim.job.name
         return JobOutcome(name=name, state="stuck", exit_code=code, message=f"continues later: {error}")
 
     def _leave(self, claim: Claim, status: JobStatusFile, error: BodycapError) -> JobOutcome:
-        """Leave the job in `running`, so that the next watcher or this watcher can try it again later."""
+        """Leave the job in `running`, so that this or another watcher can run the job again later."""
         cause = None if isinstance(error, Cancelled) else error.to_dict()
         status.update(state="stopped", active={}, error=cause)
         return self._release(claim, error)

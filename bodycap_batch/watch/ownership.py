@@ -28,7 +28,9 @@ _FIELD_TYPES: Mapping[str, type] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ownership:
-    """The ownership of a job by one claim. The claims of a job are numbered.
+    """Check whether one claim still owns its job.
+
+    The claims of a job are numbered. A claim loses the job when a watcher makes a claim with a higher number.
 
     Attributes:
         owner: Path of the job's `owner.json`.
@@ -64,7 +66,7 @@ class Ownership:
 
 
 def generation_marker(folder: Path, generation: int) -> Path:
-    """Return the path of the file that marks the claim of a number. Only one process can create this file."""
+    """Return the path of the file that reserves a claim number. Only one process can create this file."""
     return folder / f"{MARKER_PREFIX}{generation}"
 
 

@@ -17,18 +17,18 @@ from bodycap_batch.store.artefacts import disk_errors
 INBOX, RUNNING, DONE, FAILED = "inbox", "running", "done", "failed"
 _JOB_FOLDERS = (RUNNING, DONE, FAILED)
 CLAIM_PREFIX, RETRY_PREFIX = ".claim-", ".retry-"
-"""Name prefixes of hidden folders that are moving between two states. If the moving process was killed, a
-watcher completes the move."""
+"""Name prefixes of the hidden folders of jobs that are being claimed (``.claim-``) or retried (``.retry-``).
+If the process that moves such a job is killed, a watcher completes the move."""
 _MAX_NAME_BYTES = 200
-"""Maximum length (bytes) of a job's name. File systems usually permit 255 bytes. The rest is for a number and
-the suffixes of temporary files."""
+"""Maximum length (bytes) of a job's name. File systems usually permit 255 bytes. The remaining bytes
+are for a number and the suffixes of temporary files."""
 _NAME_TAKEN_ERRORS = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR, errno.EISDIR)
 """Error numbers that mean that the target name of a rename already exists."""
 
 
 @dataclass(frozen=True, slots=True)
 class JobDir:
-    """The folder of one claimed job."""
+    """The folder of one claimed job, with the paths of the files in this folder."""
 
     path: Path
 
@@ -185,7 +185,7 @@ def move_to_free_name(
 
     Args:
         source: Path of the file or folder to move.
-        folder: Folder that receives it.
+        folder: Folder into which the file or folder is moved.
         name: Preferred new name.
         before_move: Function that is called with the target path just before each attempt. There are several
             attempts if another process takes a name in the meantime.

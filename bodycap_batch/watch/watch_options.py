@@ -30,7 +30,7 @@ class WatchOptions:
         poll: True: poll the inbox for changes (network disks need this). False: do not poll. None: poll only
             if the inbox is on a network disk.
         once: True: stop when nothing is left to do.
-        command: Command line of the child processes.
+        command: Command line that starts the child process of a job.
     """
 
     permissions: JobPermissions = field(default_factory=JobPermissions)

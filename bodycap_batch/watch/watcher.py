@@ -114,7 +114,7 @@ class Watcher:
                     if (pause_s := self._step(pool)) is None:
                         break
                     self._woken.wait(pause_s)
-                    self._woken.clear()  # clear before `_stop` is tested, because `stop` sets `_stop` first
+                    self._woken.clear()  # before the test of `_stop`: `stop` sets `_stop` first
             finally:
                 self._stop.set()
                 heartbeat.join()
@@ -271,7 +271,7 @@ class Watcher:
         for job in self._heartbeat_monitor.find_abandoned([job for job in jobs if job.path not in own_jobs]):
             if len(found) < max_jobs and (claim := self._take_over(job)) is not None:
                 found.append(claim)
-        self._has_left_jobs = bool(found)  # there may be more abandoned jobs than free slots
+        self._has_left_jobs = bool(found)  # more abandoned jobs may be left
         return found
 
     def _take_over(self, job: JobDir) -> Claim | None:

@@ -21,8 +21,8 @@ from bodycap_batch.watch.spool import Spool
 
 _PREFIX, _SUFFIX = ".watcher-", ".json"
 _MAX_SILENCE_S = 86_400.0
-"""Maximum time (seconds) without an update before a watcher of another machine is no longer listed: one day.
-This machine cannot determine whether a silent watcher of another machine was killed."""
+"""Maximum age (seconds) of the status file of a watcher on another machine: one day. A watcher with an older
+file is not listed, because this machine cannot check whether that watcher still runs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,9 +55,9 @@ class WatcherStatus:
 
 
 class WatcherStatusFile:
-    """The status file of this watcher.
+    """Write the status file of this watcher, so that other processes can see that the watcher runs.
 
-    Write errors are ignored, because a failure of this disk may be the trouble that the file should report.
+    Write errors are ignored. Their cause may be the disk failure that the file should report.
 
     Args:
         spool: The folders of the watcher.
@@ -91,7 +91,8 @@ class WatcherStatusFile:
 def active_watchers(spool: Spool) -> list[WatcherStatus]:
     """Return the running watchers of a spool.
 
-    For other machines, these are the watchers that have updated their file within `_MAX_SILENCE_S` seconds.
+    A watcher of another machine is treated as running if its file was updated within the last
+    `_MAX_SILENCE_S` seconds.
     """
     paths = sorted(spool.running.glob(f"{_PREFIX}*{_SUFFIX}"))
     found = (_read_watcher_status(path) for path in paths if not _is_abandoned(path))
@@ -99,7 +100,7 @@ def active_watchers(spool: Spool) -> list[WatcherStatus]:
 
 
 def _is_abandoned(path: Path) -> bool:
-    """Return True if the watcher that wrote a file has ended, or has been silent for too long."""
+    """Return True if the watcher of a status file has ended, or has not updated the file for too long."""
     tag = path.name.removeprefix(_PREFIX)
     if is_from_this_machine(tag):
         return not is_process_running(tag)

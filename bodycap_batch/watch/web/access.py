@@ -21,19 +21,19 @@ from bodycap_batch.core.errors import JobError
 
 COOKIE = "bodycap_token"
 _READING_METHODS = ("GET", "HEAD")
-"""HTTP methods that only read."""
+"""HTTP methods of requests that change nothing on the server."""
 _MIN_TOKEN_LENGTH = 16
 """Minimum number of characters of a token. There are 64 permitted characters, so 16 characters hold up to 96
 bits. A random token of this length cannot be guessed."""
 _PORT = re.compile(r":[0-9]+$")
 """Pattern of the port in a Host header. Browsers omit the default port."""
 _TOKEN = re.compile(rf"[A-Za-z0-9_\-]{{{_MIN_TOKEN_LENGTH},200}}")
-_TOKEN_HINT = "python3 -c 'import secrets; print(secrets.token_urlsafe())' makes one"  # noqa: S105 - a remedy
+_TOKEN_HINT = "python3 -c 'import secrets; print(secrets.token_urlsafe())' makes one"  # noqa: S105 - a hint
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Access:
-    """Address of the live page, and the token that the page requires.
+    """Check whether a request may use the live page.
 
     Attributes:
         host: Name or address to listen on.
@@ -83,7 +83,7 @@ class Access:
             return False
         if is_loopback(self.host):
             return name in ("localhost", "127.0.0.1", "[::1]", _host_in_url(self.host))
-        # An attacker can let a foreign name point to this machine, but not an address or this machine's name.
+        # An attacker can register a domain name that points to this machine, so other names are refused.
         return _is_address(name) or name in (self.host.lower(), *_host_names())
 
     def _shows_token(self, headers: Mapping[str, str], query: str) -> bool:

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 
 _PAGE_FOLDER = Path(__file__).with_name("page")
 _UPDATE_PERIOD_S = 1.0
-"""Time (seconds) between two checks for changes to send. Evidence: none."""
+"""Time (seconds) between two checks whether a job has changed. Changes are sent to the browsers.
+Evidence: none."""
 _KEEP_ALIVE_S = 15.0
 """Maximum time (seconds) without data on an event stream. After this time the server sends a comment, which
 keeps the connection open. Evidence: none."""
@@ -61,7 +62,7 @@ def make_app(job_list: JobList, access: Access, uploads: Uploads, stopped: threa
         job_list: The jobs to show.
         access: Address of the page, and the token that it requires.
         uploads: Receiver of the files that browsers send.
-        stopped: Event that is set when the watcher ends. It ends the event streams.
+        stopped: Event that is set when the watcher ends. The event streams end at the same time.
     """
     page = _Routes(job_list, uploads, stopped)
     routes = [

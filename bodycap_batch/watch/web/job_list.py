@@ -16,12 +16,12 @@ from bodycap_batch.watch.spool import JobDir, Spool, visible_entries
 
 REPORT = "report.html"
 _MAX_AGE_S = 0.8
-"""Maximum age (seconds) of the text before the spool is read again. It is shorter than the page's update
-period of 1 s."""
+"""Maximum age (seconds) of the list of jobs as JSON text. If the text is older, the spool is read again. The
+limit is shorter than the page's update period of 1 s."""
 _MAX_ENDED = 500
 """Maximum number of ended jobs on the page. The page shows the most recent jobs. Evidence: none."""
 _MAX_LOG_BYTES = 64 << 10
-"""Maximum size (bytes) of the part of a log that is shown. The part is the end of the log. Evidence: none."""
+"""Maximum size (bytes) of the end of a log that the page shows. Evidence: none."""
 
 
 class JobList:

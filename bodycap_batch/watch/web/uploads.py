@@ -173,7 +173,7 @@ class Uploads:
     def _require_not_discarded(upload: _Upload) -> None:
         """Raise the error for an unknown upload if the upload was discarded.
 
-        It replaces the error of the file.
+        The user sees this error instead of the error that the removal of the files causes.
         """
         if upload.discarded:
             raise _unknown_upload() from None
@@ -238,7 +238,7 @@ def remove_abandoned_uploads(inbox: Path) -> None:
 def _is_abandoned(folder: Path) -> bool:
     """Return True if the process that receives an upload has ended.
 
-    A process of another machine is treated as ended if its folder has not changed for a day.
+    A process of another machine is treated as ended if the folder has not changed for a day.
     """
     tag = folder.name.removeprefix(_PREFIX)
     if is_from_this_machine(tag):
