@@ -1,4 +1,4 @@
-"""Check a job before it runs: open everything that it needs, and compute nothing."""
+"""Check a job before it runs: open all files that the job needs, without computing any result."""
 
 from bodycap_batch.check.check_report import CameraSummary, CheckReport
 from bodycap_batch.check.preflight import check_job, check_path, require_ready

@@ -1,4 +1,4 @@
-"""Advice on a job that can run: what would improve its result."""
+"""Give advice on a job that can run: what would improve its result."""
 
 from __future__ import annotations
 
@@ -8,26 +8,42 @@ from bodycap_batch.check.check_report import CameraSummary
 from bodycap_batch.config.models import SKELETON_PRESETS, Job
 
 _LOW_FPS = 24.0
-"""Frames a second below which swinging arms are poorly sampled; cinema cameras run at 24. Evidence: none."""
+"""Minimum number of frames per second that needs no advice.
+
+At a lower rate swinging arms are poorly sampled. Cinema cameras run at 24 frames per second. Evidence: none.
+"""
 _MAX_MISSING_S = 3.0
-"""A camera gives no advice if it starts later or ends earlier than the others by fewer seconds. Evidence:
-none."""
+"""Maximum time (seconds) without a camera, at the start or end of the capture, that needs no advice.
+
+Evidence: none.
+"""
 _MAX_MISSING_RATIO = 0.1
-"""The same as a fraction of the capture's duration; the larger of both counts. Evidence: none."""
+"""Maximum time without a camera, at the start or end of the capture, that needs no advice.
+
+It is a fraction of the capture's duration. The longer time of this one and `_MAX_MISSING_S` is used.
+Evidence: none.
+"""
 _SECONDS_PER_VIDEO_SECOND = (1.3, 5.0)
-"""Seconds of computation for a second of one camera's video on two cores, for an easy and a hard capture.
-Evidence: docs/decisions/check.md."""
+"""Computation time (seconds) for one second of one camera's video on two cores.
+
+The first value is for an easy capture, the second value is for a hard capture. Evidence:
+docs/decisions/check.md.
+"""
 _LONG_CAPTURE_S = 60.0
-"""Seconds of video in all cameras together, above which the duration of the computation is estimated.
-Evidence: none."""
+"""Maximum duration (seconds) of the videos of all cameras together that needs no estimate.
+
+For longer videos the advice contains an estimate of the computation time. Evidence: none.
+"""
 
 
 def advise(job: Job, cameras: Sequence[CameraSummary]) -> list[str]:
-    """Return sentences of advice, the most important ones first; each has a reason and a remedy.
+    """Return sentences of advice, the most important sentences first.
+
+    Each sentence gives a reason and a remedy.
 
     Args:
         job: A resolved job without errors.
-        cameras: Summary of each camera.
+        cameras: The summary of each camera.
     """
     if not cameras:
         return []

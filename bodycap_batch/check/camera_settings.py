@@ -1,6 +1,6 @@
-"""Find camera settings that spoil a capture: stabilisation, zoom, a variable rate.
+"""Find camera settings that spoil a capture: stabilisation, digital zoom, a variable frame rate.
 
-Only settings that the video files state can be found.
+Settings are found only if they are stored in the video files or visible in the frame times.
 """
 
 from __future__ import annotations
@@ -19,33 +19,44 @@ from bodycap_batch.core.arrays import IntArray
 _CONTAINER_BOXES = (b"moov", b"udta")
 _GOPRO_BOX = b"GPMF"
 _MAX_BOX_BYTES = 1 << 20
-"""Largest settings box that is read, bytes; a larger one is damaged. Evidence: none."""
+"""Maximum size (bytes) of a box of settings that is read. A larger box is damaged. Evidence: none."""
 _OFF_VALUES = ("", "N", "N/A", "NA", "OFF", "NONE")
-"""Values of a setting that is switched off."""
+"""Values that mean that a setting is switched off."""
 _PHONE_KEYS = {
     "com.apple.quicktime.model": "com.apple.quicktime.make",
     "com.android.model": "com.android.manufacturer",
 }
-"""Metadata key of a phone's model, and the key of its maker."""
+"""Metadata key of a phone's maker, by the metadata key of the phone's model."""
 _MAX_RATE_RATIO = 1.5
-"""The 95th percentile of the frame steps over the 5th; jitter stays below it. Evidence: none."""
+"""Maximum ratio of the 95th to the 5th percentile of the frame steps for a fixed frame rate.
+
+A frame step is the time between successive frames. Jitter alone gives a smaller ratio. Evidence: none.
+"""
 _DROPPED_STEP_RATIO = 1.75
-"""A step longer than this multiple of the median contains a dropped frame. The next note limits this."""
+"""Maximum ratio of a regular frame step to the median frame step.
+
+A longer step contains a dropped frame, if enough steps are regular (`_MIN_REGULAR_RATIO`).
+"""
 _MIN_REGULAR_RATIO = 0.75
-"""If a smaller fraction of the steps is regular, long steps belong to a variable rate and are not dropped
-frames. Evidence: none."""
+"""Minimum fraction of regular frame steps in a video with dropped frames.
+
+If fewer steps are regular, the long steps are treated as a variable frame rate and not as dropped frames.
+Evidence: none.
+"""
 
 
 def setting_notes(camera: CaptureCamera) -> list[str]:
-    """Return notes on the camera's settings, from the first chapter's metadata and the frame times."""
+    """Return notes on a camera's settings, found in the first chapter's metadata and in the frame times."""
     path = camera.chapters[0]
     return [*_gopro_notes(gopro_settings(path)), *_phone_notes(path), *_rate_notes(camera.times_ns)]
 
 
 def gopro_settings(path: Path) -> dict[str, str]:
-    """Return a GoPro's settings by four-letter key; empty for the file of another camera.
+    """Return the settings of a GoPro camera, by four-letter key. They are empty for another camera's file.
 
-    Source: the GPMF key-length-value format, published by GoPro; the box ``moov/udta/GPMF`` of an MP4.
+    The settings are in the box ``moov/udta/GPMF`` of an MP4 file.
+
+    Source: the GPMF key-length-value format, published by GoPro.
     """
     with path.open("rb") as handle:
         handle.seek(0, 2)
@@ -54,7 +65,13 @@ def gopro_settings(path: Path) -> dict[str, str]:
 
 
 def _find_box(handle: BinaryIO, start: int, end: int) -> bytes | None:
-    """Return the content of the first settings box between two offsets of an MP4, or None."""
+    """Return the content of the first GPMF box in a part of an MP4 file, or None if there is no such box.
+
+    Args:
+        handle: The open file.
+        start: Offset of the first byte of the part.
+        end: Offset of the end of the part.
+    """
     while start + 8 <= end:
         handle.seek(start)
         header = handle.read(16)
@@ -79,9 +96,9 @@ def _find_box(handle: BinaryIO, start: int, end: int) -> bytes | None:
 
 
 def _text_items(data: bytes) -> Iterator[tuple[str, str]]:
-    """Yield the texts among the key-length-value items, also the nested ones.
+    """Yield the key and the value of each key-length-value item that contains text, including nested items.
 
-    Each item is padded to four bytes.
+    Each item is padded to a multiple of four bytes.
     """
     offset = 0
     while offset + 8 <= len(data):
@@ -123,7 +140,7 @@ def _phone_notes(path: Path) -> list[str]:
 
 
 def _rate_notes(times_ns: IntArray) -> list[str]:
-    """Return a note if the rate varies; dropped frames do not count."""
+    """Return a note if the frame rate varies; otherwise nothing. Dropped frames are ignored."""
     steps = np.diff(times_ns)
     if len(steps) < 20:
         return []

@@ -12,31 +12,32 @@ from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import BodycapError
 
 _MAX_SHOWN_FILES = 3
-"""Number of a camera's files that are listed."""
+"""Maximum number of a camera's video files that are listed by name."""
 _LINE_WIDTH = 100
-"""Characters of a line of advice."""
+"""Maximum number of characters in a line of advice."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraSummary:
-    """What the files of one camera contain.
+    """Summary of the video files and the calibration of one camera.
 
     Attributes:
         name: Camera name.
-        role: Bone that carries the camera, or None.
-        files: Names of its video files.
-        frames: Number of frames in all.
-        used_frames: Number of frames between start_s and end_s.
-        used_runs: First and last number, in the joined video, of each run of successive used frames.
-        start_s: Common time of the first used frame.
-        end_s: Common time of the last used frame.
-        fps: Nominal rate.
-        variable_rate: True if frames are not evenly spaced.
-        size_px: Width and height as a player shows the video.
-        work_size_px: Width and height at which frames are processed.
-        lens: Intrinsics as text.
+        role: Role of the bone on which the camera is mounted; None if it is unknown.
+        files: Names of the camera's video files.
+        frames: Number of frames in all files.
+        used_frames: Number of used frames: with usable times between start_s and end_s.
+        used_runs: First and last frame number of each run of successive used frames. Frames are numbered over
+            all chapters of the video.
+        start_s: Common time of the first used frame, seconds.
+        end_s: Common time of the last used frame, seconds.
+        fps: Nominal frame rate, frames per second.
+        variable_rate: True if frames are not evenly spaced in time.
+        size_px: Width and height of the video as a player shows it, pixels.
+        work_size_px: Width and height at the work size (the image size that all stages work at), pixels.
+        lens: Description of the intrinsics for the user.
         notes: Notes for the user that are not errors.
-        guessed_lens: True if there is no calibration.
+        guessed_lens: True if the camera has no calibration.
     """
 
     name: str
@@ -57,7 +58,10 @@ class CameraSummary:
 
     @property
     def large_frames(self) -> int:
-        """Number of frames that are also stored at the work size: all of a much larger video, else 0."""
+        """Number of frames that are copied at the work size because the video is large.
+
+        If the video is much larger than the work size, all used frames are copied. Otherwise the number is 0.
+        """
         return self.used_frames if should_keep_all(self.size_px, self.work_size_px) else 0
 
     def lines(self) -> list[str]:
@@ -84,14 +88,14 @@ class CameraSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckReport:
-    """Everything that a check found.
+    """The result of a check.
 
     Attributes:
-        job: The resolved job; None if it could not be resolved.
-        cameras: One summary per camera that could be opened.
-        notes: Notes about the job as a whole.
-        errors: What prevents the job from running.
-        advice: What would improve the result; empty if there are errors.
+        job: The resolved job; None if the job could not be resolved.
+        cameras: The summary of each camera that passed the check.
+        notes: Notes for the user about the job as a whole.
+        errors: Errors that prevent the job from running.
+        advice: Sentences about what would improve the result; empty if there are errors.
     """
 
     job: Job | None = None
@@ -107,7 +111,7 @@ class CheckReport:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the first error; 0 if there is none."""
+        """Exit code of the first error; 0 without errors."""
         return self.errors[0].exit_code if self.errors else 0
 
     def lines(self) -> list[str]:

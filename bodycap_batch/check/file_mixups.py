@@ -1,4 +1,4 @@
-"""Find video files that were mixed up: one video for two cameras, or a missing chapter."""
+"""Find mixed-up video files: the same video for two cameras, or a missing chapter."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _GOPRO_CHAPTER = re.compile(r"G[HXL](?P<chapter>[0-9]{2})(?P<video>[0-9]{4})", r
 
 
 def require_distinct_videos(job: Job) -> None:
-    """Refuse a video that belongs to two cameras, and a list of chapters with a missing one.
+    """Refuse a job in which two cameras have the same video, or in which a chapter of a video is missing.
 
     Raises:
-        CaptureError: Two cameras share a video, or a chapter is missing; the error names the file.
+        CaptureError: Two cameras have the same video, or a chapter is missing. The error names the file.
     """
     for camera in job.capture.cameras:
         _require_all_chapters(camera)
@@ -33,7 +33,10 @@ def require_distinct_videos(job: Job) -> None:
 
 
 def _is_same_content(first: Path, second: Path) -> bool:
-    """Return True if two files hold the same bytes. A missing file is reported by another check."""
+    """Return True if two files have the same content and are not empty.
+
+    The result is False if a file is missing. Another check reports missing files.
+    """
     try:
         size = first.stat().st_size
         return size > 0 and size == second.stat().st_size and filecmp.cmp(first, second, shallow=False)
@@ -42,9 +45,13 @@ def _is_same_content(first: Path, second: Path) -> bool:
 
 
 def _require_all_chapters(camera: CameraConfig) -> None:
-    """Raise `CaptureError` if a GoPro chapter is missing.
+    """Require that no chapter of a GoPro recording is missing between two listed chapters.
 
-    Without it, all later frames would get times that are too early.
+    If a chapter were missing, all later frames would get times that are too early. A camera with a file of
+    timestamps is not checked.
+
+    Raises:
+        CaptureError: A chapter is missing.
     """
     if camera.timestamps:
         return

@@ -1,6 +1,6 @@
 """Write a first job file for a folder of videos.
 
-It lists the cameras that were found, what the user must fill in, and every option with its meaning.
+The file lists the cameras in the folder, marks what the user must fill in, and explains every option.
 """
 
 from __future__ import annotations
@@ -25,23 +25,27 @@ from bodycap_batch.formats.atomic_files import write_text
 
 JOB_FILE = "job.yaml"
 UNKNOWN_MOUNT = "<where on the body?>"
-"""Placeholder for a mount that the camera's file name does not state."""
+"""Placeholder for an unknown mount. The mount is unknown if the camera's file name does not contain it."""
 _STAGES = ("keyframes", "map", "registration", "merge", "export")
 _OPTION_WIDTH = 34
-"""Characters of an option before its meaning."""
+"""Number of characters in the column of options, before the column of their meanings."""
 _MAX_NAME_LENGTH = 60
-"""Characters. A camera's name may have 64, and a number may follow."""
+"""Maximum number of characters in a name that is made from a file name.
+
+A camera name in a job may have 64 characters. A number may be appended to the name.
+"""
 
 
 def write_job_template(folder: Path, *, replace: bool = False) -> Path:
     """Write ``job.yaml`` for the videos of a folder.
 
     Args:
-        folder: Holds videos or folders of chapters, and optionally ``calib.json`` and a skeleton (``*.bvh``).
-        replace: Overwrite an existing job file.
+        folder: Folder with videos or with folders of chapters. It may also contain a calibration
+            (``calib.json``) and a skeleton (``*.bvh``).
+        replace: True to overwrite an existing job file.
 
     Returns:
-        The path of the file.
+        The path of the job file.
 
     Raises:
         JobError: A job file exists already.
@@ -115,7 +119,10 @@ def _calibration_lines(folder: Path) -> list[str]:
 
 
 def _mount_lines() -> list[str]:
-    """Return the possible mounts as comments, for cameras with file names that do not state the mount."""
+    """Return comment lines that list all possible mounts.
+
+    They help the user to fill in mounts that the file names do not contain.
+    """
     listed = textwrap.wrap(", ".join(MOUNT_NAMES), 90)
     return ["  # Places of a camera on the body (`mount:`):", *(f"  #   {line}" for line in listed)]
 
@@ -133,7 +140,7 @@ def _camera_lines(safe: str, name: str, files: Sequence[Path], folder: Path) -> 
 
 
 def _video_summary(files: Sequence[Path]) -> str:
-    """Return one line about the files of a camera."""
+    """Return one line that describes the video files of a camera."""
     if files[0].is_dir():
         return f"chapters in {files[0].name}/"
     videos = [index_video(path) for path in files]
@@ -144,7 +151,7 @@ def _video_summary(files: Sequence[Path]) -> str:
 
 
 def _option_lines() -> Iterable[str]:
-    """Yield all options with their defaults and meanings, as comments."""
+    """Yield comment lines that list all options of all stages, with their defaults and meanings."""
     for stage in _STAGES:
         model = Job.model_fields[stage].annotation
         assert isinstance(model, type)
@@ -171,13 +178,16 @@ def _default_text(field: FieldInfo) -> str:
 
 
 def _yaml_text(text: str) -> str:
-    """Return text as a YAML value, quoted if YAML would read it as another type."""
+    """Return text as a YAML value. It is quoted if YAML could read the text as another type."""
     plain = re.fullmatch(r"[A-Za-z][\w./\-]*", text) and text.lower() not in {"null", "true", "false"}
     return text if plain else json.dumps(text, ensure_ascii=False)
 
 
 def _unique_names(found: Sequence[str]) -> list[str]:
-    """Return a different name for each camera: "cam 1" and "cam_1" would share one folder of results."""
+    """Return a different safe name for each camera.
+
+    A number is appended where necessary. For example, both "cam 1" and "cam_1" have the safe name "cam_1".
+    """
     out: list[str] = []
     used_names: set[str] = set()
     for plain in map(_safe_name, found):
@@ -190,5 +200,5 @@ def _unique_names(found: Sequence[str]) -> list[str]:
 
 
 def _safe_name(text: str) -> str:
-    """Return a name that can be part of the results' file names."""
+    """Return a name that can be part of the file names of results."""
     return re.sub(r"[^A-Za-z0-9_\-]+", "_", text).strip("_-")[:_MAX_NAME_LENGTH] or "walk"

@@ -18,12 +18,14 @@ from typing import Literal
 State = Literal["ok", "note", "problem"]
 
 _PYTHON_VERSIONS = ((3, 11), (3, 14))
-"""Supported versions of Python: from the first, below the second."""
+"""First supported version of Python, and first later version that is not supported."""
 _ENOUGH_MEMORY_MB = 4000
-"""Megabytes for three cameras and ten minutes; their map stage takes 2 to 3 GB. Evidence:
-docs/decisions/check.md."""
+"""Memory (megabytes) that suffices for three cameras and ten minutes.
+
+The map stage needs 2 to 3 GB for such a capture. Evidence: docs/decisions/check.md.
+"""
 _ENOUGH_DISK_MB = 5000
-"""Megabytes of free disk space for a usual job. Evidence: none."""
+"""Free disk space (megabytes) that suffices for a usual job. Evidence: none."""
 _LIBRARIES = {
     "numpy": "numpy",
     "scipy": "scipy.optimize",
@@ -43,18 +45,21 @@ _EXTRAS = {
 }
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "microsoft-edge")
 _CHILD_TIMEOUT_S = 60
-"""Seconds for the import of one library; open3d takes some seconds on a slow disk. Evidence: none."""
+"""Maximum time (seconds) for the import of one library.
+
+The import of open3d takes some seconds on a slow disk. Evidence: none.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MachineFinding:
-    """The result of one check.
+    """The result of one check of the machine.
 
     Attributes:
-        what: What was checked.
-        state: "ok"; "note" if something optional is missing; "problem" if jobs will fail.
-        found: What was found.
-        remedy: What to do; "" if nothing has to be done.
+        what: Name of the checked part of the machine.
+        state: "ok"; "note" if something is missing but jobs can run; "problem" if jobs will fail.
+        found: Description of what was found.
+        remedy: Advice to the user; "" if the user has to do nothing.
     """
 
     what: str
@@ -69,15 +74,15 @@ class MachineFinding:
 
 
 def examine_machine(folder: Path) -> Iterator[MachineFinding]:
-    """Check Python, processors, memory, libraries, disk, extras and programs, one after the other.
+    """Check Python, processors, memory, libraries, disk, extras and programs, and yield each finding.
 
     Args:
-        folder: Folder for the results.
+        folder: Folder in which results will be written. It need not exist.
     """
     yield _python_finding()
     yield _processor_finding()
     yield _memory_finding()
-    # Each import runs in a process of its own, so that a library that crashes does not end this one.
+    # Each import runs in a separate process, so that a library that crashes does not end this process.
     with ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1)) as pool:
         yield from pool.map(_library_finding, _LIBRARIES)
     yield _video_finding()
@@ -142,7 +147,11 @@ def _library_finding(name: str) -> MachineFinding:
 
 
 def _error_of_code(code: str) -> str | None:
-    """Run code in a child process; return the last line of its error output, or None if it succeeds."""
+    """Run Python code in a child process and return its error.
+
+    Returns:
+        The last line of the error output, or None if the code succeeds.
+    """
     try:
         done = subprocess.run(
             [sys.executable, "-c", code],
@@ -192,7 +201,10 @@ def _disk_finding(folder: Path) -> MachineFinding:
 
 
 def _writing_finding(folder: Path) -> MachineFinding:
-    """Check whether the file system has renames and hard links, which results are published with."""
+    """Check whether files can be written, renamed and hard-linked. Publishing results needs these operations.
+
+    Without hard links, results are copied instead.
+    """
     place = _nearest_existing(folder)
     try:
         with tempfile.TemporaryDirectory(dir=place, prefix=".bodycap-doctor-") as scratch:
@@ -222,7 +234,7 @@ def _can_hard_link(source: Path, target: Path) -> bool:
 
 
 def _nearest_existing(folder: Path) -> Path:
-    """Return the folder, or its nearest existing parent."""
+    """Return the folder if it exists, or its nearest existing parent folder."""
     folder = folder.resolve()
     while not folder.exists():
         folder = folder.parent

@@ -1,4 +1,7 @@
-"""Inspect a few frames of a camera: black, dark, static or low-contrast pictures, and too few corners."""
+"""Inspect a few frames of a camera for pictures that are hard to track.
+
+Such pictures are black, dark or static, or they have low contrast or too few corners.
+"""
 
 from __future__ import annotations
 
@@ -11,36 +14,49 @@ from bodycap_batch.core.arrays import IntArray, evenly_spaced
 from bodycap_batch.core.errors import CaptureError
 
 _SAMPLES = 8
-"""Number of frames to inspect. Evidence: none."""
+"""Number of evenly spaced frames to inspect. Evidence: none."""
 _MAX_BLACK_GREY = 20.0
-"""Grey level (of 255). The sensor noise of a covered lens stays below it in 99 of 100 pixels. Evidence:
-none."""
+"""Maximum grey level (of 255) of a black picture, at the 99th percentile of the pixels.
+
+The sensor noise of a camera with a covered lens stays below this level. Evidence: none.
+"""
 _MIN_CONTRAST = 12.0
-"""Grey levels between the 1st and the 99th percentile. A wall out of focus or a fogged lens has fewer.
-Evidence: none."""
+"""Minimum range of grey levels from the 1st to the 99th percentile of the pixels.
+
+A wall out of focus or a fogged lens gives a smaller range. Evidence: none.
+"""
 _MAX_DECODED_FRAMES, _REFERENCE_PIXELS = 250, 640 * 480
-"""Frames of that many pixels that may be decoded to reach the last frame, and as many to reach frames between
-rare key frames. Each takes about a second; for 4K video the limit is 9 frames. Evidence: none."""
+"""Maximum number of frames that may be decoded to reach a frame, and the picture size (pixels) for it.
+
+For larger pictures the maximum is smaller in proportion: 9 frames for 4K video. The maximum applies once to
+the last frame, and once to all sample frames between rare key frames together. Decoding this number of frames
+takes about a second. Evidence: none.
+"""
 _MIN_MEDIAN_GREY = 45.0
-"""Median grey level below which pictures are dark; good captures have 100 and more. Evidence:
-docs/decisions/check.md."""
+"""Minimum median grey level (of 255) of pictures that are not dark.
+
+Good captures have a median grey level of 100 or more. Evidence: docs/decisions/check.md.
+"""
 _FAST_THRESHOLD = 15
-"""Contrast of a FAST corner in grey levels. Evidence: docs/decisions/check.md."""
+"""Minimum contrast (grey levels) of a FAST corner. Evidence: docs/decisions/check.md."""
 _MIN_CORNERS = 60
-"""FAST corners of a picture of 640 x 480 pixels, below which tracking is hard. Evidence:
-docs/decisions/check.md."""
+"""Minimum number of FAST corners in a picture of 640 x 480 pixels.
+
+A picture with fewer corners is hard to track. Evidence: docs/decisions/check.md.
+"""
 _MIN_WIDTH_PX = 160
-"""Pictures narrower than this are too small to judge their texture, pixels. Evidence: none."""
+"""Minimum width (pixels) of a picture whose texture is judged. Evidence: none."""
 
 
 def check_picture_quality(camera: CaptureCamera) -> list[str]:
-    """Decode a few evenly spaced frames and inspect them.
+    """Decode a few evenly spaced frames of a camera and inspect them.
 
     Returns:
         Notes about pictures that are hard to track.
 
     Raises:
-        CaptureError: A frame cannot be decoded, there is only one, or all are black.
+        CaptureError: A frame cannot be decoded, the video has fewer than two frames, or all inspected frames
+            are black.
     """
     if sum(len(video.pts) for video in camera.videos) < 2:
         raise CaptureError(
@@ -85,7 +101,10 @@ def check_picture_quality(camera: CaptureCamera) -> list[str]:
 
 
 def _corner_count(image: Image) -> float:
-    """Return the number of corners, scaled to a picture of 640 x 480 pixels; infinite for a thumbnail."""
+    """Return the number of corners in a picture, scaled to a picture of 640 x 480 pixels.
+
+    The number is infinite for a picture that is too small to judge its texture.
+    """
     if image.shape[1] < _MIN_WIDTH_PX:
         return np.inf
     import cv2
@@ -95,11 +114,11 @@ def _corner_count(image: Image) -> float:
 
 
 def _tracking_notes(grey: list[float], corners: list[float]) -> list[str]:
-    """Return notes on low light and missing texture. Black pictures are reported separately.
+    """Return notes on low light and missing texture. Another note reports black pictures.
 
     Args:
         grey: Median grey level of each picture.
-        corners: Corners of each picture.
+        corners: Number of corners in each picture, scaled to 640 x 480 pixels.
     """
     out = []
     lit = [value for value in grey if value >= _MAX_BLACK_GREY]
@@ -118,14 +137,15 @@ def _tracking_notes(grey: list[float], corners: list[float]) -> list[str]:
 
 
 def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
-    """Return indices of evenly spaced frames, with the first frame and, if it is cheap to decode, the last.
+    """Return the indices of sample frames that are about evenly spaced and cheap to decode.
 
-    Key frames are preferred, because they decode without their neighbours. If they are too rare, frames
-    between them are used, as far as they can be decoded in a second.
+    The first frame is included. The last frame, or a frame as near to it as is cheap to decode, is included
+    as well. Key frames are preferred, because they decode without their neighbours. If key frames are too
+    rare, frames between them are used. Decoding these takes about a second.
 
     Args:
-        camera: The camera.
-        count: Number of frames wanted.
+        camera: The camera with its videos.
+        count: Number of evenly spaced sample frames. The result can contain fewer or more frames.
     """
     last = len(camera.frame_numbers) - 1
     even = evenly_spaced(last + 1, count)
@@ -133,7 +153,8 @@ def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
     if not len(keys):
         return even[:1]
     picked = keys[np.abs(keys[None] - even[:, None]).argmin(axis=1)]
-    # A broken recording shows at its end. Without a key frame near the end, decoding it takes too long.
+    # Damage to a recording is visible at its end. If no key frame is near the end, decoding the last frame
+    # takes too long.
     width, height = camera.videos[-1].stored_size
     max_decoded = round(_MAX_DECODED_FRAMES * min(1.0, _REFERENCE_PIXELS / (width * height)))
     end = min(last, int(keys[-1]) + max_decoded)
@@ -142,13 +163,13 @@ def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
 
 
 def _frames_between_keys(far_indices: IntArray, keys: IntArray, last: int, max_decoded: int) -> IntArray:
-    """Return frames to replace sample frames that are far from a key frame.
+    """Return the indices of frames between key frames that replace sample frames far from a key frame.
 
     Args:
-        far_indices: (N,) indices of the frames to replace.
+        far_indices: (N,) indices of the sample frames to replace.
         keys: (K,) indices of the key frames.
         last: Index of the last frame.
-        max_decoded: Number of frames that may be decoded in all.
+        max_decoded: Maximum number of frames that may be decoded for all replacements together.
     """
     before = np.searchsorted(keys, far_indices, side="right") - 1
     starts, counts = np.unique(before[before >= 0], return_counts=True)

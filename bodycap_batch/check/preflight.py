@@ -1,4 +1,4 @@
-"""Run the checks of a job in order: cameras, files, clocks, skeleton, formats, disk."""
+"""Run the checks of a job in order: cameras, files, clocks, named frames, skeleton, formats, disk."""
 
 from __future__ import annotations
 
@@ -27,17 +27,26 @@ from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.store.disk_space import require_room
 
 _RATE_TOLERANCE = 0.2
-"""A rate is variable if a frame step differs from the median by more than this fraction. Evidence: none."""
+"""Maximum relative difference of a frame step from the median step for a fixed frame rate.
+
+A frame step is the time between successive frames. Evidence: none.
+"""
 _MIN_DURATION_S = 2.0
-"""Seconds of video below which there is hardly enough motion for a map. Evidence: none."""
+"""Minimum duration (seconds) of a video that gives no note.
+
+A shorter video hardly has enough motion for a map. Evidence: none.
+"""
 _MIN_UNIX_TIME_S = 1e8
-"""Seconds. A larger time is a Unix time (this one is in 1973) and not a time since the start of the video."""
+"""Maximum time (seconds) that is treated as the time since the start of a video.
+
+A larger time is treated as a Unix time. This value as a Unix time is in 1973.
+"""
 _TRUNK_ROLES = ("Hips", "Spine", "Spine1", "Neck", "Head")
-"""Bones of the trunk and the head."""
+"""Roles of the bones of the trunk and the head."""
 
 
 def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
-    """Check a job file or a folder of videos. Errors are stored in the report; none is raised."""
+    """Check a job file or a folder of videos. Errors of the job are stored in the report and not raised."""
     try:
         job = load_job(path, overrides)
     except (JobError, CaptureError) as error:
@@ -51,13 +60,19 @@ def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
 
 
 def require_ready(job: Job, threads: int = 1) -> CheckReport:
-    """Check a resolved job before hours of work, and raise its first error, if any.
+    """Check a resolved job before hours of computation, and raise the first error.
 
     Disk space is not checked, because it changes while the job runs.
 
     Args:
-        job: The job.
+        job: The resolved job.
         threads: Number of cameras that are inspected at the same time.
+
+    Returns:
+        The report of the check, without errors.
+
+    Raises:
+        BodycapError: A check found an error.
     """
     report = _run_checks(job, _CHECKS, threads)
     if report.errors:
@@ -66,7 +81,7 @@ def require_ready(job: Job, threads: int = 1) -> CheckReport:
 
 
 def check_job(job: Job) -> CheckReport:
-    """Check a resolved job: inspect every video, and check calibration, clocks, skeleton and disk space."""
+    """Run all checks of a resolved job, including disk space. If there are no errors, add advice."""
     report = _run_checks(job, (*_CHECKS, _check_disk), os.cpu_count() or 1)
     return replace(report, advice=tuple(advise(job, report.cameras))) if report.ready else report
 
@@ -83,7 +98,7 @@ def _run_checks(
                 summaries.append(look.result())
             except CaptureError as error:
                 errors.append(error)
-    finally:  # on an interruption, do not wait for the remaining cameras
+    finally:  # if the user interrupts the check, do not wait for the remaining cameras
         pool.shutdown(cancel_futures=True)
     notes = _body_notes(job)
     for check in checks:
@@ -132,7 +147,7 @@ def _summarise_camera(camera: CaptureCamera, config: CameraConfig, notes: list[s
 
 
 def _frame_runs(numbers: IntArray) -> tuple[tuple[int, int], ...]:
-    """Return the first and last number of each run of successive numbers."""
+    """Return the first and the last frame number of each run of successive frame numbers."""
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
     return tuple((int(run[0]), int(run[-1])) for run in runs)
 
@@ -168,7 +183,14 @@ def _intrinsics_notes(camera: CaptureCamera) -> list[str]:
 
 
 def _dropped_frame_notes(camera: CaptureCamera, usual_ns: float) -> list[str]:
-    """Return a note on dropped frames, found from the frame times and not from the nominal rate."""
+    """Return a note if frames were dropped; otherwise nothing.
+
+    Dropped frames are found from the frame times and not from the nominal rate.
+
+    Args:
+        camera: The camera.
+        usual_ns: Median time between successive frames, nanoseconds.
+    """
     if usual_ns <= 0.0:
         return []
     lost = np.round(np.diff(camera.times_ns) / usual_ns) - 1
@@ -202,7 +224,7 @@ def _body_notes(job: Job) -> list[str]:
 
 
 def _check_clocks(job: Job, summaries: list[CameraSummary]) -> list[str]:
-    """Check that the cameras ran at the same time."""
+    """Check that each camera ran at the same time as at least one other camera."""
     if len(summaries) < 2:
         return []
     for camera in summaries:
@@ -234,7 +256,7 @@ def _no_common_time_error(job: Job, camera: CameraSummary, others: list[CameraSu
 
 
 def _check_skeleton(job: Job, _findings: list[CameraSummary]) -> list[str]:
-    """Check that a skeleton file can be read and has the bones that carry cameras."""
+    """Check that a skeleton file can be read and contains the bones on which cameras are mounted."""
     if job.skeleton is None or job.skeleton in SKELETON_PRESETS:
         return []
     path = Path(job.skeleton)
@@ -252,12 +274,15 @@ def _check_skeleton(job: Job, _findings: list[CameraSummary]) -> list[str]:
 
 
 def _check_formats(job: Job, _findings: list[CameraSummary]) -> list[str]:
-    """Check that the libraries of the formats are installed, and that a user's rig keeps its names."""
+    """Check that the libraries for the export formats are installed.
+
+    Also check that the job does not rename the joints of a user's own skeleton.
+    """
     if job.skeleton == NO_SKELETON:
         return []
     require_libraries(job.export.formats)
     if "fbx" in job.export.formats:
-        from bodycap_batch.formats.fbx import require_blender  # loading it takes as long as everything else
+        from bodycap_batch.formats.fbx import require_blender  # this import takes as long as all other code
 
         require_blender()
     if job.export.names != "hik" and job.skeleton not in SKELETON_PRESETS:
@@ -270,7 +295,7 @@ def _check_formats(job: Job, _findings: list[CameraSummary]) -> list[str]:
 
 
 def _check_named_frames(job: Job, summaries: list[CameraSummary]) -> list[str]:
-    """Check that the frames that the job names exist and are used, before a map is computed."""
+    """Check that the frame numbers given in the job exist and belong to used frames."""
     known = {camera.name: camera for camera in summaries}
     for (block, field, _), camera, number in named_frames(job):
         finding = known.get(camera)
@@ -299,7 +324,7 @@ def _check_files(job: Job, _findings: list[CameraSummary]) -> list[str]:
 
 
 def _check_disk(job: Job, summaries: list[CameraSummary]) -> list[str]:
-    """Check that the disk has space for the results and intermediate files, and can be written."""
+    """Check that the disk has space for results and intermediate files, and that files can be written."""
     frames, large = (
         sum(camera.used_frames for camera in summaries),
         sum(camera.large_frames for camera in summaries),

@@ -1,4 +1,4 @@
-"""Find pictures that do not change: the recording is frozen, or the camera is not on the body."""
+"""Find pictures that do not change because the recording is frozen or the camera is not on the body."""
 
 from __future__ import annotations
 
@@ -11,30 +11,48 @@ from bodycap_batch.capture.images import Image
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 
 _COLUMNS, _ROWS, _BLOCK_PX = 8, 6, 8
-"""Number of blocks in a reduced picture, and the side of a block in its pixels. Evidence: none."""
+"""Number of block columns and block rows in a reduced picture, and side length of a block.
+
+The side length is in pixels of the reduced picture. Evidence: none.
+"""
 _MIN_BLOCK_SIGMA = 3.0
-"""Standard deviation of a block in grey levels. A block with less has no texture that shows motion. Evidence:
-none."""
+"""Minimum standard deviation (grey levels) of a textured block.
+
+A block with a smaller standard deviation has too little texture to show motion. Evidence: none.
+"""
 _MIN_TEXTURED_BLOCKS, _MAX_GREY_DIFFERENCE = 6, 1.0
-"""If fewer blocks have texture, two pictures are the same if they differ by less than this grey level.
-Evidence: none."""
+"""Minimum number of textured blocks for a comparison by blocks, and maximum grey-level difference without it.
+
+With fewer textured blocks, two pictures are treated as equal if no pixel differs by this many grey levels or
+more. Evidence: none.
+"""
 _MIN_CORRELATION = 0.9
-"""Normalised correlation of two equal blocks. Evidence: none."""
+"""Minimum normalised correlation of two blocks that are treated as equal. Evidence: none."""
 _MIN_STATIC_RATIO = 0.7
-"""Fraction of textured blocks that are equal in two views of a static camera. Evidence:
-docs/decisions/check.md."""
+"""Minimum fraction of textured blocks that are equal in two pictures of a static camera.
+
+Evidence: docs/decisions/check.md.
+"""
 _MIN_STEP_S, _MIN_STEP_RATIO = 1.0, 0.125
-"""Least time between compared pictures, in seconds and as a fraction of the recording. Pictures closer in
-time may be equal: a person may pause or turn slowly."""
+"""Length of a time step for judging static pictures, in seconds and as a fraction of the recording.
+
+The longer of the two steps is used. Equal pictures within one step are accepted, because a person may pause
+or turn slowly.
+"""
 _MIN_RUN_PICTURES, _MIN_RUN_STEPS = 3, 2
-"""A part of a recording is static if at least this many successive pictures are equal and span this many
-steps."""
+"""Minimum number of successive equal pictures in a static part of a recording, and of time steps in it.
+
+The equal pictures of a static part span at least this number of time steps (`_MIN_STEP_S`).
+"""
 _MIN_SPAN_RATIO = 0.7
-"""Fraction of a recording that pictures must span to decide about all of it. Evidence: none."""
+"""Minimum fraction of a recording that equal pictures must span to call the whole recording static.
+
+Evidence: none.
+"""
 
 
 def reduced_picture(image: Image) -> FloatArray:
-    """Return a grey picture (H,W) reduced to a grid of blocks, in grey levels."""
+    """Reduce a grey picture (H,W) to the size of the grid of blocks. Pixel values are grey levels."""
     import cv2
 
     size = (_COLUMNS * _BLOCK_PX, _ROWS * _BLOCK_PX)
@@ -42,13 +60,13 @@ def reduced_picture(image: Image) -> FloatArray:
 
 
 def static_notes(pictures: Sequence[FloatArray], times_s: FloatArray, length_s: float) -> list[str]:
-    """Return a note if pictures do not change; empty otherwise.
+    """Return a note if the pictures of a camera do not change; otherwise nothing.
 
-    If all pictures are from a short part of a longer recording, the rest is unknown and there is no note.
+    A recording is called static throughout only if the equal pictures span most of the recording.
 
     Args:
-        pictures: Reduced pictures in the order of time.
-        times_s: (N,) their times on the common clock.
+        pictures: N reduced pictures in the order of time.
+        times_s: (N,) common time of each picture, seconds.
         length_s: Duration of the recording, seconds.
     """
     same = np.eye(len(pictures), dtype=bool)
@@ -73,7 +91,11 @@ def static_notes(pictures: Sequence[FloatArray], times_s: FloatArray, length_s: 
 
 
 def _is_same_view(first: FloatArray, second: FloatArray) -> bool:
-    """Return True if nearly all textured blocks of two pictures are equal, regardless of the light."""
+    """Return True if most textured blocks of two reduced pictures are equal.
+
+    The brightness and the contrast of a block may differ between the two pictures. Pictures with few textured
+    blocks are compared pixel by pixel instead.
+    """
     (one, one_shows), (other, other_shows) = _blocks(first), _blocks(second)
     shows = np.maximum(one_shows, other_shows) > _MIN_BLOCK_SIGMA
     if shows.sum() < _MIN_TEXTURED_BLOCKS:
@@ -84,17 +106,22 @@ def _is_same_view(first: FloatArray, second: FloatArray) -> bool:
 
 
 def _blocks(picture: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the blocks (B,P) without their mean, and the standard deviation (B,) of each."""
+    """Return the B blocks of a reduced picture.
+
+    Returns:
+        (B,P) grey levels of each block's P pixels minus the block's mean, and (B,) standard deviation of each
+        block.
+    """
     blocks = picture.reshape(_ROWS, _BLOCK_PX, _COLUMNS, _BLOCK_PX).swapaxes(1, 2).reshape(-1, _BLOCK_PX**2)
     return blocks - blocks.mean(axis=1, keepdims=True), blocks.std(axis=1)
 
 
 def _longest_static_run(same: BoolArray, times_s: FloatArray) -> tuple[int, int]:
-    """Return the first and last index of the successive equal pictures that span the longest time.
+    """Return the first and the last index of the successive equal pictures that span the longest time.
 
     Args:
-        same: (N,N) which pictures are equal.
-        times_s: (N,) their times.
+        same: (N,N) True for each pair of equal pictures.
+        times_s: (N,) time of each picture, seconds.
     """
     runs = [
         (start, stop)

@@ -1,4 +1,4 @@
-"""Refuse a video beyond the operator's limits before any of it is decoded."""
+"""Refuse a video that exceeds the operator's limits, before any frame is decoded."""
 
 from __future__ import annotations
 
@@ -11,7 +11,13 @@ from bodycap_batch.core.errors import CaptureError
 
 
 def require_within_limits(job: Job, limits: Limits) -> None:
-    """Compare the size and the duration of each video, as its container states them, with the limits.
+    """Require that each video of a job is within the limits of size and duration.
+
+    The size and the duration are read from the video's container.
+
+    Args:
+        job: The job.
+        limits: The operator's limits.
 
     Raises:
         CaptureError: A video is larger or longer than permitted, or cannot be read.

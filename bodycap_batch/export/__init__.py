@@ -1,4 +1,4 @@
-"""The export stage: write the result files of a job and verify the motion files by reading them back."""
+"""The export stage: write the result files of a job, and verify the motion files by reading them back."""
 
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.result_files import export_results

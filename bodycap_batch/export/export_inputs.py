@@ -18,17 +18,20 @@ class ExportInputs:
     """The results of all earlier stages of a job.
 
     Attributes:
-        out_dir: Folder for the files; it is created if it does not exist.
+        out_dir: Folder for the result files. The folder is created if it does not exist.
         maps: The maps, largest first, each in its own gauge.
-        trajectories: One per camera, in the gauge of its map.
-        clocks: The clock of each camera, by name.
-        selections: Keyframe selections, one per camera.
-        merge: The body in the world; None for ``skeleton: none``, or if merging failed.
-        partial_reason: Why there is no body although the job asks for one; None otherwise.
-        row_fraction: By camera, (N,) mean image row of the observations behind each pose, as a fraction of
-            the image height. It corrects times for a rolling shutter. A camera without an entry has 0.5.
-        relative_poses: Relative poses of cameras on one segment, in the unit of the gauge of both cameras.
-        log: Diagnostics of mapping as plain JSON values without times and paths; they are written to
+        trajectories: One trajectory for each camera, in the gauge of the camera's map.
+        clocks: The clock of each camera, by camera name.
+        selections: One keyframe selection for each camera.
+        merge: The result of merging, with the body in the world; None for ``skeleton: none``, or if merging
+            failed.
+        partial_reason: The reason for a missing body, if the job asks for a body; None otherwise.
+        row_fraction: (N,) mean image row of the observations of each pose, as a fraction of the image height,
+            by camera name. It is used to correct times for a rolling shutter. For a camera without an entry
+            the fraction is 0.5.
+        relative_poses: Relative poses of cameras on the same segment, in the unit of the gauge of both
+            cameras.
+        log: Diagnostics of mapping as plain JSON values without run times and file paths. They are written to
             ``metrics.json``.
     """
 

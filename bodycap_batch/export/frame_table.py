@@ -1,4 +1,4 @@
-"""``frames.csv``: the status of every frame of every camera."""
+"""Write ``frames.csv``: the status of every frame of every camera."""
 
 from __future__ import annotations
 
@@ -19,11 +19,15 @@ LOST = "LOST"
 
 
 def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
-    """Write one line per camera and frame, and return the path.
+    """Write one line for each frame of each camera, and return the path of the file.
 
-    Times are in seconds, errors in pixels at the work size. The column `status` is KEYFRAME, REGISTERED, RIG
-    or LOST. RIG means that the pose follows from other cameras of the rig. The column `reason` says why a
-    frame is lost, with the values of `FrameStatus`.
+    Times are in seconds. Errors are in pixels at the work size (the image size that all stages work at). The
+    column `status` is KEYFRAME, REGISTERED, RIG or LOST. RIG means that the pose was derived from other
+    cameras of the rig. For a lost frame, the column `reason` holds the value of `FrameStatus`.
+
+    Args:
+        path: Path of the file to write.
+        inputs: The results of the earlier stages.
 
     Raises:
         StoreError: The file cannot be written.
@@ -51,5 +55,5 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
 
 
 def _status_and_reason(status: FrameStatus) -> tuple[str, str]:
-    """Return the columns `status` and `reason`."""
+    """Return the values of the columns `status` and `reason`."""
     return (status.value, "") if status.localised else (LOST, status.value)

@@ -1,4 +1,4 @@
-"""``joints.csv`` and ``joints.npz``: the pose of every joint at every tick."""
+"""Write ``joints.csv`` and ``joints.npz``: the pose of every joint at every tick of the motion."""
 
 from __future__ import annotations
 
@@ -18,16 +18,22 @@ COLUMNS = "time,joint,x_m,y_m,z_m,qx,qy,qz,qw,local_qx,local_qy,local_qz,local_q
 
 
 def write_joint_table(path: Path, motion: Motion, sigma_m: FloatArray | None = None) -> Path:
-    """Write one line per tick and joint as CSV, and return the path.
+    """Write one CSV line for each joint at each tick, and return the path of the file.
 
-    The columns are: common time in seconds; position and orientation in the world (world_from_joint);
-    rotation in the frame of the parent; whether cameras measured the joint; `sigma_m`, empty if unknown.
+    The columns are:
+
+    - the common time, seconds;
+    - the name of the joint;
+    - the position (metres) and the orientation of the joint in the world (world_from_joint);
+    - the rotation of the joint in the frame of the parent joint;
+    - 1 if cameras measured the joint at this tick, else 0;
+    - `sigma_m`, empty if unknown.
 
     Args:
-        path: The file.
+        path: Path of the file to write.
         motion: The motion in the world.
-        sigma_m: (T,J) standard deviation per axis of each joint's centre relative to the first solved
-            joint's; NaN if unknown.
+        sigma_m: (T,J) standard deviation per axis of each joint's centre, metres; NaN if unknown. It is
+            relative to the centre of the first solved joint.
 
     Raises:
         StoreError: The file cannot be written.
@@ -57,17 +63,25 @@ def _csv_field(name: str) -> str:
 
 
 def write_joint_arrays(path: Path, motion: Motion, sigma_m: FloatArray | None = None) -> Path:
-    """Write the motion of J joints at T ticks as arrays, and return the path.
+    """Write the motion of J joints at T ticks as NumPy arrays, and return the path of the file.
 
-    The arrays are: ``names`` and ``roles`` (J,); ``parents`` (J,), −1 for the root; ``offsets_m`` (J,3) in
-    the frame of the parent; ``t`` (T,), common time in seconds; ``fps``; ``world`` (T,J,3), metres;
-    ``world_quat_xyzw`` and ``local_quat_xyzw`` (T,J,4); ``observed`` (T,J); ``sigma_m`` (T,J), NaN if
-    unknown.
+    The arrays are:
+
+    - ``names`` and ``roles`` (J,): name and role of each joint;
+    - ``parents`` (J,): index of each joint's parent, −1 for the root;
+    - ``offsets_m`` (J,3): offset of each joint in the frame of the parent, metres;
+    - ``t`` (T,): common time of each tick, seconds;
+    - ``fps``: number of ticks per second;
+    - ``world`` (T,J,3): position of each joint in the world, metres;
+    - ``world_quat_xyzw`` (T,J,4): orientation of each joint in the world;
+    - ``local_quat_xyzw`` (T,J,4): rotation of each joint in the frame of the parent;
+    - ``observed`` (T,J): True if cameras measured the joint at this tick;
+    - ``sigma_m`` (T,J): standard deviation per axis of each joint's centre, metres, NaN if unknown.
 
     Args:
-        path: The file.
+        path: Path of the file to write.
         motion: The motion in the world.
-        sigma_m: As in `write_joint_table`.
+        sigma_m: (T,J) standard deviation as described for `write_joint_table`.
 
     Raises:
         StoreError: The file cannot be written.

@@ -1,6 +1,6 @@
-"""``metrics.json``: the figures of a job.
+"""Collect the metrics of a job for ``metrics.json``.
 
-The file has no run times, dates and host names, so equal jobs give equal files.
+The metrics contain no run times, dates and host names, so equal jobs give equal files.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from bodycap_batch.model.skeleton import Motion
 
 
 def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all figures as plain JSON values.
+    """Return all metrics of a job as plain JSON values.
 
     Args:
-        inputs: The results.
-        motion: The exported motion, or None without a body.
-        gap: Difference of the exported motion to the motion graph and to the cameras (`Projection.gap`).
+        inputs: The results of the earlier stages.
+        motion: The exported motion; None without a body.
+        gap: Difference of the exported motion from the motion graph and from the cameras (`Projection.gap`).
     """
     errors = [observation_errors(scene, inputs.trajectories) for scene in inputs.maps]
     trajectories = trajectories_in_target_frames(inputs)
@@ -69,20 +69,21 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
 
 
 def _map_index(maps: Sequence[Map], scene: Map) -> int:
-    """Return the index of a map, by identity."""
+    """Return the index of a map in a sequence. Maps are compared by identity, not by content."""
     return next(index for index, item in enumerate(maps) if item is scene)
 
 
 def observation_errors(scene: Map, trajectories: Sequence[Trajectory]) -> FloatArray:
-    """Return the reprojection error (M,) of every observation of a map, in pixels at the work size.
+    """Return the reprojection error (M,) of every observation of a map, pixels at the work size.
 
-    For a camera with rolling-shutter correction, the observed pixels are first moved to the exposure of the
-    middle row, at which its poses are given.
+    The work size is the image size that all stages work at. The poses of a camera with rolling-shutter
+    correction are given at the exposure of the middle image row. The observed pixels of such a camera are
+    first moved to this exposure.
 
     Args:
         scene: The map.
-        trajectories: The trajectories of the cameras. Those in the map's gauge give the velocity of its
-            keyframes, which the rolling-shutter correction needs.
+        trajectories: The trajectories of the cameras. Only trajectories in the map's gauge are used. The
+            rolling-shutter correction computes the motion of the keyframes from them.
     """
     paths = {path.camera: path for path in trajectories if path.gauge == scene.gauge}
     out = np.full(len(scene.obs_px), np.nan)
@@ -104,7 +105,7 @@ def observation_errors(scene: Map, trajectories: Sequence[Trajectory]) -> FloatA
 
 
 def _map_counts(scene: Map, errors: FloatArray) -> dict[str, Any]:
-    """Return the number of points and observations of one map, and the mean reprojection error."""
+    """Return the number of points, the number of observations and the mean reprojection error of one map."""
     return {
         "points": len(scene.points),
         "measurements": len(scene.obs_px),
@@ -115,12 +116,12 @@ def _map_counts(scene: Map, errors: FloatArray) -> dict[str, Any]:
 def _camera_metrics(
     inputs: ExportInputs, trajectory: Trajectory, errors: Sequence[FloatArray]
 ) -> dict[str, Any]:
-    """Return the figures of one camera.
+    """Return the metrics of one camera.
 
     Args:
-        inputs: The results.
+        inputs: The results of the earlier stages.
         trajectory: The trajectory of the camera.
-        errors: (M,) reprojection error of each observation, for each map.
+        errors: For each map, the (M,) reprojection errors of its observations, pixels at the work size.
     """
     name = trajectory.camera
     localised = trajectory.localised
@@ -150,7 +151,7 @@ def _camera_metrics(
 
 
 def _registration_metrics(trajectory: Trajectory) -> dict[str, Any]:
-    """Return the figures of the observations behind the poses of one camera's frames."""
+    """Return the metrics of the observations from which registration computed one camera's poses."""
     localised = trajectory.localised & np.isfinite(trajectory.error_px)
     inliers = trajectory.inliers[localised]
     total = int(inliers.sum())
@@ -163,9 +164,10 @@ def _registration_metrics(trajectory: Trajectory) -> dict[str, Any]:
 
 
 def _relative_pose_metrics(inputs: ExportInputs, item: RelativePose) -> dict[str, Any]:
-    """Return the figures of the relative pose of two cameras on one segment.
+    """Return the metrics of the relative pose of two cameras on the same segment.
 
-    Lengths are in metres if the map is in the world, else in the unit of the map.
+    Lengths are in metres if the cameras' map has a transform to the world. Otherwise lengths are in the unit
+    of the map's gauge.
     """
     gauge = {path.camera: path.gauge for path in inputs.trajectories}.get(item.cameras[0])
     candidates = (exported for exported in maps_in_target_frames(inputs) if exported.scene.gauge == gauge)
@@ -188,7 +190,7 @@ def _relative_pose_metrics(inputs: ExportInputs, item: RelativePose) -> dict[str
 def _total_metrics(
     inputs: ExportInputs, cameras: Mapping[str, Mapping[str, Any]], errors: Sequence[FloatArray]
 ) -> dict[str, Any]:
-    """Return the figures of all cameras together."""
+    """Return the metrics of all cameras together."""
 
     def total(key: str) -> int:
         return sum(int(camera[key] or 0) for camera in cameras.values())
@@ -209,7 +211,10 @@ def _total_metrics(
 
 
 def _motion_metrics(motion: Motion, gap: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the figures of the exported motion: rate, length, observed joints, and the gap."""
+    """Return the metrics of the exported motion: frame rate, length, observed joints, and the gap.
+
+    The gap is described in `collect_metrics`.
+    """
     ratio = motion.observed.mean(axis=0) if len(motion.observed) else np.zeros(len(motion.skeleton.joints))
     return {
         "fps": motion.fps,
@@ -229,13 +234,13 @@ def _motion_metrics(motion: Motion, gap: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _finite_mean(values: FloatArray) -> float | None:
-    """Return the mean of the finite values, or None if there is none."""
+    """Return the mean of the finite values, or None without finite values."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None
 
 
 def _json_value(value: Any) -> Any:
-    """Return a value as plain JSON values: numpy types are converted, NaN and infinity become null."""
+    """Convert a value to plain JSON values. NumPy types are converted, and NaN and infinity become null."""
     if isinstance(value, Mapping):
         return {str(key): _json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

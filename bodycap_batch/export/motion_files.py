@@ -19,16 +19,22 @@ from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
 POSITION_TOLERANCE_M = 1e-4
-"""Metres. Largest accepted difference of a joint centre. Derivation: above the rounding of all formats,
-below what an animator sees."""
+"""Maximum accepted difference (metres) of a joint centre.
+
+Derivation: it is larger than the rounding of all formats and smaller than an animator can see.
+"""
 
 ANGLE_TOLERANCE_DEG = 0.01
-"""Degrees. Largest accepted difference of an orientation. Derivation: 0.1 mm at the end of a bone of 0.6
-m."""
+"""Maximum accepted difference (degrees) of an orientation.
+
+Derivation: it moves the end of a bone of 0.6 m by 0.1 mm.
+"""
 
 _RATE_TOLERANCE = 1e-6
-"""Ratio. Largest accepted difference of the frame rate. Derivation: above the rounding of a Frame Time of ten
-decimals at 240 Hz."""
+"""Maximum accepted relative difference of the frame rate.
+
+Derivation: it is larger than the rounding of BVH's Frame Time with ten decimals at 240 Hz.
+"""
 
 
 def write_verified_bvh(path: Path, motion: Motion, options: ExportOptions) -> Path:
@@ -46,7 +52,7 @@ def write_verified_glb(path: Path, motion: Motion) -> Path:
     """Write a GLB file, read it back, compare it with the motion, and return the path.
 
     Raises:
-        StoreError: As for `write_verified_bvh`.
+        StoreError: The file cannot be written, or it differs by more than 0.1 mm or 0.01° when read back.
     """
     write_glb(path, motion)
     _verify(path, motion, read_glb)
@@ -57,7 +63,7 @@ def write_verified_usd(path: Path, motion: Motion) -> Path:
     """Write a USD file, read it back, compare it with the motion, and return the path.
 
     Raises:
-        StoreError: As for `write_verified_bvh`.
+        StoreError: The file cannot be written, or it differs by more than 0.1 mm or 0.01° when read back.
     """
     write_usd(path, motion)
     _verify(path, motion, read_usd)
@@ -65,17 +71,19 @@ def write_verified_usd(path: Path, motion: Motion) -> Path:
 
 
 def points_from_motion(motion: Motion) -> LabelledPoints:
-    """Return the joint centres as labelled points in the world."""
+    """Return the joint centres of a motion as labelled points in the world."""
     return LabelledPoints(
         names=motion.skeleton.joints, fps=motion.fps, x_in_world_m=motion.world_from_joint()[..., :3, 3]
     )
 
 
 def _verify(path: Path, motion: Motion, read: Callable[[Path], Motion | None]) -> None:
-    """Read a file back and compare it with the motion; a file that differs is deleted.
+    """Read a file back and compare its motion with the written motion.
+
+    A file that cannot be read, or that differs too much, is deleted.
 
     Raises:
-        StoreError: The file cannot be read, or it differs.
+        StoreError: The file cannot be read, or its motion differs too much.
     """
     try:
         position_m, angle_deg = motion_difference(read(path), motion)
@@ -92,12 +100,13 @@ def _verify(path: Path, motion: Motion, read: Callable[[Path], Motion | None]) -
 
 
 def motion_difference(back: Motion | None, motion: Motion) -> tuple[float, float]:
-    """Return the largest difference of joint centres in metres and of orientations in degrees.
+    """Return the largest difference of joint centres (metres) and the largest difference of orientations (°).
 
-    Both are infinite if joint names, number of ticks or frame rate differ.
+    Both differences are infinite if there is no motion in the file, or if joint names, number of ticks or
+    frame rate differ.
 
     Args:
-        back: The motion that was read back, or None.
+        back: The motion that was read back; None if the file contains no motion.
         motion: The motion that was written.
     """
     same = back is not None and sorted(back.skeleton.joints) == sorted(motion.skeleton.joints)
@@ -113,10 +122,10 @@ def motion_difference(back: Motion | None, motion: Motion) -> tuple[float, float
 
 
 def without_unsolved_branches(motion: Motion, solved: BoolArray) -> Motion:
-    """Return the motion without the joints that are neither solved nor ancestors of a solved joint.
+    """Return the motion of the solved joints and their ancestors only.
 
     Args:
-        motion: The motion of the whole skeleton.
+        motion: The motion of all joints of the skeleton.
         solved: (J,) True for the joints that the motion graph solved.
     """
     skeleton = motion.skeleton
@@ -135,9 +144,13 @@ def without_unsolved_branches(motion: Motion, solved: BoolArray) -> Motion:
 
 
 def _sub_skeleton(skeleton: SkeletonModel, kept: BoolArray) -> SkeletonModel:
-    """Return the skeleton of the kept joints (J,).
+    """Return the skeleton without the removed joints.
 
-    The bone of a joint that has lost all its children ends at the centre of its first child.
+    If all children of a joint are removed, the joint's bone ends where the first child was.
+
+    Args:
+        skeleton: The skeleton with all joints.
+        kept: (J,) True for each joint that is kept.
     """
     chosen = np.flatnonzero(kept)
     new_index = {int(joint): index for index, joint in enumerate(chosen)}

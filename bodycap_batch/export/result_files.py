@@ -1,4 +1,7 @@
-"""Write all result files of a job. The metrics are written last, so they exist only if all other files do."""
+"""Write all result files of a job.
+
+``metrics.json`` is written last. If this file exists, all other files were written.
+"""
 
 from __future__ import annotations
 
@@ -37,15 +40,16 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
 
     The options select among ``map.ply``, ``trajectories/<camera>.tum``, ``colmap/<n>/``, ``frames.csv``,
     ``joints.csv``, ``motion.bvh``, ``motion.glb`` and further formats. ``metrics.json`` is always written.
-    All files are in the world if it exists.
+    With a body, the poses and points in the files are in the world. Maps and cameras that merging did not
+    place in the world are the exception.
 
     Args:
-        inputs: Maps, trajectories and the merged body.
-        options: The formats, and the layout of the motion files.
-        context: Progress and cancelling.
+        inputs: The results of the earlier stages.
+        options: The selected formats, and the layout of the motion files.
+        context: The context of the stage, which receives the progress and can cancel the stage.
 
     Returns:
-        The written files, relative to the folder.
+        The paths of the written files, relative to ``inputs.out_dir``.
 
     Raises:
         JobError: A format needs a library or a program that is not installed.
@@ -78,10 +82,10 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
 def _motion_writers(
     folder: Path, motion: Motion, options: ExportOptions, sigma_m: FloatArray | None
 ) -> dict[str, Callable[[], list[Path]]]:
-    """Return a function that writes each format of the motion.
+    """Return, for each motion format, a function that writes its file.
 
-    The formats for animation have the layout of the options. The formats for measurements have the solved
-    motion.
+    The animation formats (BVH, GLB, FBX, USD) contain the motion in the layout that the options select. The
+    measurement formats (C3D, TRC, NPZ) contain the solved motion.
     """
     animated, centres = apply_layout(motion, options), points_from_motion(motion)
     return {
@@ -96,13 +100,13 @@ def _motion_writers(
 
 
 def _exported_sigma_m(merge: MergeResult, motion: Motion) -> FloatArray:
-    """Return the standard deviation (T,J) of each exported joint's centre; NaN for unsolved joints."""
+    """Return the standard deviation (T,J) of each exported joint's centre, metres; NaN if not solved."""
     kept = [merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
     return merge.joint_sigma_m()[:, kept]
 
 
 def _write_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str, Any]) -> Path:
-    """Write ``metrics.json`` and return its path."""
+    """Write ``metrics.json``, and return the path of the file."""
     path = inputs.out_dir / "metrics.json"
     metrics = collect_metrics(inputs, motion, gap)
     write_text(path, json.dumps(metrics, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
@@ -110,7 +114,10 @@ def _write_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str
 
 
 def _exported_motion(inputs: ExportInputs, options: ExportOptions) -> tuple[Motion | None, dict[str, Any]]:
-    """Return the motion to export and its gap (`Projection.gap`); None and an empty gap without a body."""
+    """Return the motion to export, and its difference from the motion graph and the cameras.
+
+    The difference is `Projection.gap`. Without a body, the motion is None and the difference is empty.
+    """
     if inputs.merge is None:
         return None, {}
     motion = with_file_zero_pose(inputs.merge.motion)

@@ -22,18 +22,25 @@ from bodycap_batch.formats.tum import TimedPoses, write_tum
 from bodycap_batch.model.scene import Trajectory
 
 PATH_SPACING_M = 0.01
-"""Metres. Distance of the points of a camera path in the world. Evidence: none; it looks like a line."""
+"""Distance (metres) between neighbouring points that draw a camera path in the world.
+
+Evidence: none; with this distance the points look like a line.
+"""
 
 _PATH_SPACING_RATIO = 1e-3
-"""Ratio to the extent of the points, for the same in a map's own gauge. Derivation: 1 cm in a room of 10
-m."""
+"""Distance between neighbouring points that draw a camera path in a map's own gauge.
+
+It is a ratio to the extent of the map's points. Derivation: 1 cm in a room of 10 m.
+"""
 
 
 def write_maps(inputs: ExportInputs) -> list[Path]:
-    """Write the maps in the main target frame to ``map.ply``, and those of other gauges to ``map_<n>.ply``.
+    """Write one point cloud for each target frame, with the maps and the camera paths in this frame.
+
+    The file of the main target frame is ``map.ply``. The file of each other target frame is ``map_<n>.ply``.
 
     Returns:
-        The written files.
+        The paths of the written files.
 
     Raises:
         StoreError: A file cannot be written.
@@ -62,12 +69,13 @@ def write_maps(inputs: ExportInputs) -> list[Path]:
 
 
 def write_trajectories(inputs: ExportInputs) -> list[Path]:
-    """Write one TUM file per camera with its localised frames and its own timestamps.
+    """Write one TUM file for each camera, with the camera's localised frames and own timestamps.
 
-    The file of a camera that is not in the main target frame is written to ``trajectories/unplaced/``.
+    The files are in ``trajectories/``. If the poses of a camera are not in the main target frame, the file is
+    in ``trajectories/unplaced/``.
 
     Returns:
-        The written files.
+        The paths of the written files.
 
     Raises:
         StoreError: A file cannot be written.
@@ -96,10 +104,12 @@ def _header_comments(trajectory: Trajectory) -> list[str]:
 
 
 def write_colmap(inputs: ExportInputs) -> list[Path]:
-    """Write one COLMAP model per map: ``colmap/0``, ``colmap/1`` and so on, those in the world first.
+    """Write one COLMAP model for each map: ``colmap/0``, ``colmap/1`` and so on.
+
+    The maps in the world come first.
 
     Returns:
-        The written files.
+        The paths of the written files.
 
     Raises:
         StoreError: A file cannot be written.
@@ -119,14 +129,14 @@ def _points_in_target(exported: ExportedMap) -> FloatArray:
 
 
 def _camera_centres(trajectory: Trajectory) -> FloatArray:
-    """Return the camera centres (N,3); NaN for lost frames."""
+    """Return the camera centres (N,3) of a trajectory, in the trajectory's gauge; NaN for lost frames."""
     return np.asarray(trajectory.gauge_from_cam[:, :3, 3])
 
 
 def _extent(points: FloatArray) -> float:
-    """Return the diagonal of the box between the 5th and the 95th percentile of points (N,3).
+    """Return the extent of points (N,3): the diagonal of the box from the 5th to the 95th percentile.
 
-    The result is 1 for fewer than two different points.
+    The result is 1 if there are fewer than two points, or if the box has no extent.
     """
     if len(points) < 2:
         return 1.0

@@ -1,6 +1,6 @@
-"""The frame of reference in which each map and each trajectory is exported.
+"""Choose the target frame: the frame of reference in which a map or a trajectory is exported.
 
-It is the world if merging has aligned the map with the body, else the map's own gauge.
+The target frame is the world if merging aligned the map with the body. Otherwise it is the map's own gauge.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.scene import Map, Trajectory
 
 WORLD = "world"
-"""Name of the world as a target frame. Other targets have the identifier of a gauge."""
+"""Name of the world as a target frame. The name of any other target frame is the identifier of a gauge."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,7 +22,7 @@ class ExportedMap:
     Attributes:
         scene: The map in its own gauge.
         target: Name of the target frame: "world", or the identifier of the map's gauge.
-        target_from_map: Transform to the target frame; None for the identity.
+        target_from_map: Transform from the map's gauge to the target frame; None for the identity.
     """
 
     scene: Map
@@ -31,9 +31,10 @@ class ExportedMap:
 
 
 def maps_in_target_frames(inputs: ExportInputs) -> tuple[ExportedMap, ...]:
-    """Return all maps with their target frames: first those in the world, then the others.
+    """Return all maps with their target frames.
 
-    Within each group, the largest map comes first.
+    Maps in the world come first, then all other maps. Each of these two groups is sorted by size, with the
+    largest map first.
     """
     world_from_map = {} if inputs.merge is None else inputs.merge.world_from_map
     exported = [
@@ -48,12 +49,20 @@ def maps_in_target_frames(inputs: ExportInputs) -> tuple[ExportedMap, ...]:
 
 
 def trajectories_in_target_frames(inputs: ExportInputs) -> tuple[Trajectory, ...]:
-    """Return each camera's trajectory: in the world if merging has it, else in its map's gauge."""
+    """Return the trajectory of each camera in its target frame.
+
+    The trajectory is in the world if merging placed the camera there. Otherwise it is in the gauge of the
+    camera's map.
+    """
     merged = {} if inputs.merge is None else {path.camera: path for path in inputs.merge.trajectories}
     return tuple(merged.get(path.camera, path) for path in inputs.trajectories)
 
 
 def main_target_name(inputs: ExportInputs) -> str:
-    """Return the name of the main target frame: the world if it exists, else the largest map's gauge."""
+    """Return the name of the main target frame.
+
+    The main target frame is the world if at least one map is in the world, or if there are no maps. Otherwise
+    it is the gauge of the largest map.
+    """
     exported = maps_in_target_frames(inputs)
     return exported[0].target if exported else WORLD

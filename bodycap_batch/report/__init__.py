@@ -1,4 +1,4 @@
-"""The page about a job: verdict, 3D viewer, figures and tables in one file that works offline."""
+"""The report page of a job: verdict, 3D viewer, drawings and tables in one file that works offline."""
 
 from bodycap_batch.report.report_inputs import ReportInputs
 from bodycap_batch.report.report_writer import REPORT_FILE, write_report

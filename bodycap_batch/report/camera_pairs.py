@@ -1,4 +1,4 @@
-"""Criteria about pairs of cameras: their distance on one body, and their relative rotation on one bone."""
+"""Criteria about pairs of cameras: the distance of two cameras, and the relative rotation on one bone."""
 
 from __future__ import annotations
 
@@ -12,22 +12,32 @@ from bodycap_batch.model.skeleton_presets import split_side
 from bodycap_batch.report.grades import Criterion, Grade, grade_value
 
 _TWISTING_SEGMENT = "ForeArm"
-"""Segment that twists along its length: a camera at the wrist turns relative to one near the elbow."""
+"""Name of the segment that twists along its length.
+
+A camera at the wrist therefore rotates relative to a camera near the elbow.
+"""
 _GOOD_REACH_SHARE, _FAIR_REACH_SHARE = 0.98, 0.9
-"""Shares of distances within the body's reach. Evidence: none."""
+"""Minimum fraction of the distances between cameras that are within the body's reach.
+
+The first value is for the grade "good", the second value is for "usable with care". Evidence: none.
+"""
 _GOOD_UNEXPLAINED_DEG, _FAIR_UNEXPLAINED_DEG = 2.0, 6.0
-"""Degrees of relative rotation beyond the poses' noise. Evidence: docs/decisions/report.md."""
+"""Maximum relative rotation (degrees) of two cameras that the poses' noise does not explain.
+
+The first value is for the grade "good", the second value is for "usable with care". Evidence:
+docs/decisions/report.md.
+"""
 
 
 def distance_criteria(reach: Mapping[str, Any] | None, unused: Collection[str]) -> Iterator[Criterion]:
     """Yield the criterion about distances between cameras compared with the body's reach.
 
-    There is none without a body, because its reach is unknown, and none with too few distances. If the share
-    is too small to judge single keyframes by it, that is a finding as well.
+    Nothing is yielded without a body, because its reach is unknown. Nothing is yielded with too few distances
+    either. The finding also says if the fraction is too small to judge single keyframes.
 
     Args:
-        reach: Result of the map's distance check.
-        unused: Cameras that are not part of the body; the share includes their distances.
+        reach: Result of the map's distance check; None if the distances were not checked.
+        unused: Names of the cameras that are not part of the body. The fraction includes their distances.
     """
     if not reach or "within_reach" not in reach:
         return
@@ -56,12 +66,14 @@ def shared_segment_criteria(
     mounts: Mapping[str, Mapping[str, Any]],
     unused: Collection[str],
 ) -> Iterator[Criterion]:
-    """Yield the criterion about cameras on one bone; there is none with too few common frames.
+    """Yield the criterion about cameras on one bone.
+
+    A pair of cameras with too few common frames is ignored. Nothing is yielded if no pair remains.
 
     Args:
-        relative_poses: One entry for each pair, as ``relative_poses`` of ``metrics.json``.
-        mounts: By camera, with the ``role`` of the bone.
-        unused: Cameras that are not part of the body.
+        relative_poses: One entry for each pair of cameras, as in ``relative_poses`` of ``metrics.json``.
+        mounts: Mount of each camera, by camera name; it holds the ``role`` of the bone.
+        unused: Names of the cameras that are not part of the body.
     """
     found = []
     for pair in relative_poses:
@@ -92,7 +104,10 @@ def shared_segment_criteria(
 
 
 def _unexplained_spread_deg(pair: Mapping[str, Any]) -> float:
-    """Return the part of a pair's spread that the poses' noise does not explain; zero for a rig."""
+    """Return the part of a pair's spread (degrees) that the poses' noise does not explain.
+
+    It is zero for two cameras that are mounted rigidly.
+    """
     if pair["rigid"]:
         return 0.0
     return math.sqrt(max(0.0, pair["spread_deg"] ** 2 - (pair["explained_deg"] or 0.0) ** 2))

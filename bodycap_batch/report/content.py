@@ -1,4 +1,4 @@
-"""The content of the page, section by section; the templates only lay it out."""
+"""Collect the content of the page, section by section. The templates only arrange this content."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bodycap_batch.report.report_inputs import ReportInputs
 from bodycap_batch.report.verdict import judge
 
 _SHEET_PICTURES = 24
-"""Most pictures of lost frames on the page: six rows of four on a wide screen."""
+"""Maximum number of pictures of lost frames on the page: six rows of four pictures on a wide screen."""
 _PROGRESS_AT_FAILURE = {
     "check": "no video was read",
     "keyframes": "the videos were opened; the selection of keyframes was not finished",
@@ -42,11 +42,14 @@ def page_content(
     """Return the variables of the templates.
 
     Args:
-        inputs: The results.
+        inputs: The results of the job.
         scene: Maps and camera paths of the 3D viewer.
-        losses: The lost intervals of all cameras.
-        colours: Colour of each camera, ``#rrggbb``.
-        budget: Share of the budgets; it records what was thinned.
+        losses: The lost intervals of all cameras, with their causes.
+        colours: Colour ``#rrggbb`` of each camera, by camera name.
+        budget: The budget of the page. It records which items were thinned.
+
+    Returns:
+        The value of each template variable, by variable name.
     """
     verdict = judge(inputs.metrics, inputs.failure)
     return {
@@ -92,7 +95,7 @@ def _progress_at_failure(inputs: ReportInputs) -> str:
 def _cameras(
     inputs: ReportInputs, losses: Sequence[DiagnosedLoss], colours: dict[str, str], budget: PageBudget
 ) -> list[dict[str, Any]]:
-    """Return the section of each camera."""
+    """Return the content of each camera's section."""
     span = _time_span(inputs)
     causes = count_frames_by_cause(losses)
     used = set() if inputs.merge is None else {path.camera for path in inputs.merge.trajectories}
@@ -119,7 +122,7 @@ def _cameras(
 
 
 def _time_span(inputs: ReportInputs) -> tuple[float, float]:
-    """Return the first and the last common time of all cameras, seconds."""
+    """Return the earliest and the latest common time (seconds) of the frames of all cameras."""
     ends: list[float] = []
     for name in inputs.cameras:
         path = inputs.path(name)
@@ -133,7 +136,12 @@ def _time_span(inputs: ReportInputs) -> tuple[float, float]:
 
 
 def _lost_pictures(losses: Sequence[DiagnosedLoss], most: int) -> list[dict[str, Any]]:
-    """Return the longest losses that have a picture, in the order of time."""
+    """Return the longest lost intervals that have a picture, sorted by start time.
+
+    Args:
+        losses: The lost intervals of all cameras.
+        most: Maximum number of intervals to return.
+    """
     with_picture = sorted(
         (diagnosed for diagnosed in losses if diagnosed.appearance is not None),
         key=lambda diagnosed: -diagnosed.loss.frame_count,
@@ -168,7 +176,11 @@ def _facts(diagnosed: DiagnosedLoss) -> str:
 
 
 def _distances_before_optimisation(inputs: ReportInputs) -> list[dict[str, Any]]:
-    """Return the distance of each joint from the place where one camera alone would put it."""
+    """Return, for each bone with a camera, how far the optimisation moved its joint.
+
+    This is the distance between the solved joint and the position that the camera's poses and the assumed
+    mount alone give: median and 95th percentile, metres.
+    """
     merge = inputs.merge
     if merge is None:
         return []

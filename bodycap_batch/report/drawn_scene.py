@@ -1,4 +1,4 @@
-"""Maps and camera paths in one frame of reference for the 3D viewer."""
+"""Transform maps and camera paths into one frame of reference for the 3D viewer."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class DrawnPath:
 
     Attributes:
         camera: Camera name.
-        poses: (N,4,4) pose of each frame, NaN for a lost frame.
-        times_s: (N,) common time of each frame.
-        keyframe: (N,) True for keyframes.
+        poses: (N,4,4) camera pose (drawn frame of reference from camera) of each frame; NaN for a lost frame.
+        times_s: (N,) common time of each frame, seconds.
+        keyframe: (N,) True for each frame that is a keyframe.
     """
 
     camera: str
@@ -31,14 +31,18 @@ class DrawnPath:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DrawnScene:
-    """Maps and camera paths in one frame of reference: the world, or the largest map turned upright.
+    """Maps and camera paths in the drawn frame of reference.
+
+    The drawn frame of reference is the world. Without a body it is the gauge of the largest map, rotated
+    upright.
 
     Attributes:
-        is_metric: True for the world, in metres, Z up. In a map the unit is arbitrary and "up" is a guess.
-        drawn_from_map: Transform of each map, by its gauge.
-        maps: The maps with a transform.
-        paths: The cameras in these maps.
-        omitted_cameras: Cameras in a map without a transform.
+        is_metric: True if the drawn frame of reference is the world, in metres with Z up. Otherwise the unit
+            of length is arbitrary, and the upward direction is a guess.
+        drawn_from_map: Transform of each map into the drawn frame of reference, by the map's gauge.
+        maps: The maps with a known transform.
+        paths: The paths of the cameras in these maps.
+        omitted_cameras: Names of the cameras in maps without a known transform.
     """
 
     is_metric: bool
@@ -79,9 +83,17 @@ def make_drawn_scene(inputs: ReportInputs) -> DrawnScene:
 
 
 def common_times_s(inputs: ReportInputs, camera: str, times_ns: IntArray) -> FloatArray:
-    """Return the common times (N,) of a camera's own timestamps (N,), seconds.
+    """Convert a camera's timestamps into common times.
 
-    A camera that is not registered has no clock yet. The capture's offset is used for it.
+    A camera that is not registered has no estimated clock. The capture's time offset is used for this camera.
+
+    Args:
+        inputs: The results of the job.
+        camera: Camera name.
+        times_ns: (N,) timestamps of the camera's own clock, nanoseconds.
+
+    Returns:
+        (N,) common times, seconds.
     """
     clock = inputs.clocks.get(camera)
     if clock is not None:
@@ -101,9 +113,10 @@ def _draw_path(inputs: ReportInputs, path: Trajectory, drawn_from_gauge: Similar
 
 
 def _upright_from_map(scene: Map) -> Similarity:
-    """Return the transform that makes the mean upward direction of the keyframes' images the Z axis.
+    """Return the transform that rotates a map upright and centres it.
 
-    The origin is the median position of the keyframes.
+    The Z axis is the mean upward direction of the keyframes' images. The origin is the median position of the
+    keyframes.
     """
     up = -scene.map_from_cam[:, :3, 1].mean(axis=0)
     up = up / max(float(np.linalg.norm(up)), 1e-12)

@@ -1,4 +1,4 @@
-"""Intervals of lost frames, with measurements in them and next to them."""
+"""Find intervals of lost frames, measure sharpness and rotation there, and name the likely cause."""
 
 from __future__ import annotations
 
@@ -18,18 +18,24 @@ from bodycap_batch.report.frame_pictures import FrameAppearance
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _FAST_DEG = 8.0
-"""Degrees from one frame to the next.
+"""Maximum rotation (degrees) between successive frames that is not treated as a fast turn.
 
-Optical flow loses most tracks above 20 degrees, and motion blur starts at much smaller angles.
+Optical flow loses most tracks above 20 degrees. Motion blur starts at much smaller angles.
 """
 _PLAIN_RATIO = 0.3
-"""Corners relative to the camera's registered frames below which surfaces are plain. Evidence: none."""
+"""Minimum ratio of a lost frame's number of corners to the usual number in the camera's registered frames.
+
+A frame with fewer corners shows plain surfaces. Evidence: none.
+"""
 _NEIGHBOURS = 3
-"""Frame pairs before and after a lost interval in which the rotation is measured. Evidence: none."""
+"""Number of frame pairs before a lost interval in which the rotation is measured, and also after it.
+
+Evidence: none.
+"""
 
 
 class LossCause(StrEnum):
-    """The likely cause of a lost interval, as far as it can be measured."""
+    """The likely cause of a lost interval, derived from measurements."""
 
     DARK = "too dark"
     FAST = "fast turn"
@@ -42,18 +48,19 @@ class LossCause(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameLoss:
-    """Successive frames without a pose.
+    """A lost interval: successive frames of one camera without a pose.
 
     Attributes:
         camera: Camera name.
         first: Index of the first frame.
         last: Index of the last frame.
-        start_s: Common time of the first frame.
-        end_s: Common time of the last frame.
+        start_s: Common time of the first frame, seconds.
+        end_s: Common time of the last frame, seconds.
         reason: The most frequent status of the frames.
-        sharpness: Median sharpness relative to the median of the registered frames; NaN if unknown.
-        turn_deg: Largest rotation per frame next to the interval, degrees; NaN if no two successive frames
-            there are registered.
+        sharpness: Ratio of the frames' median sharpness to the median sharpness of the camera's registered
+            frames; NaN if unknown.
+        turn_deg: Largest rotation between two successive registered frames near the interval, degrees; NaN if
+            there are no such frames.
     """
 
     camera: str
@@ -67,17 +74,17 @@ class FrameLoss:
 
     @property
     def frame_count(self) -> int:
-        """Number of frames."""
+        """Number of frames in the interval."""
         return self.last - self.first + 1
 
     @property
     def middle(self) -> int:
-        """Index of the middle frame."""
+        """Index of the frame in the middle of the interval."""
         return (self.first + self.last) // 2
 
 
 def find_frame_losses(inputs: ReportInputs) -> list[FrameLoss]:
-    """Return every interval of lost frames, camera by camera."""
+    """Return the lost intervals of all registered cameras, camera by camera."""
     return [
         loss
         for registration in inputs.registrations
@@ -91,9 +98,9 @@ def likely_cause(
     """Return the likely cause of a lost interval.
 
     Args:
-        loss: The interval.
-        appearance: Its middle frame; None if it was not decoded.
-        usual_corners: Corners in the camera's registered frames; None if there are none to compare with.
+        loss: The lost interval.
+        appearance: Measurements of the interval's middle frame; None if this frame was not decoded.
+        usual_corners: Median number of corners in the camera's registered frames; None if unknown.
     """
     if loss.reason is FrameStatus.NO_MAP:
         return LossCause.NO_MAP
@@ -111,7 +118,10 @@ def likely_cause(
 
 
 def turn_per_frame_deg(trajectory: Trajectory) -> FloatArray:
-    """Return the rotation (N−1,) from each frame to the next, degrees; NaN if one of them has no pose."""
+    """Return the rotation angle (N−1,) between each frame and the next frame, degrees.
+
+    The angle is NaN if one of the two frames has no pose.
+    """
     rotation, localised = trajectory.gauge_from_cam[:, :3, :3], trajectory.localised
     both = localised[:-1] & localised[1:]
     turn_deg = np.full(max(len(localised) - 1, 0), np.nan)

@@ -1,4 +1,4 @@
-"""The overlays of a camera's frames: the inlier points of each pose, and the visible bones."""
+"""Make the overlays of a camera's frames: the inlier points of each pose, and the visible bones."""
 
 from __future__ import annotations
 
@@ -15,16 +15,19 @@ from bodycap_batch.report.packing import pack_scaled
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _MAX_INLIERS = 120
-"""Points drawn over each picture; more would hide it. Evidence: none."""
+"""Maximum number of points that are drawn over one picture. More points would hide it. Evidence: none."""
 _LINE_POINTS = 6
-"""Points of a bone's line that are stored. A lens bends the line, but not much within an image."""
+"""Number of stored points on the line of one bone.
+
+Lens distortion bends the line in the image, but only slightly.
+"""
 
 
 class FrameOverlays:
-    """Status and overlays of every camera's frames.
+    """Describes the frames of all cameras by their status and overlays.
 
     Args:
-        inputs: The results.
+        inputs: The results of the job.
     """
 
     def __init__(self, inputs: ReportInputs) -> None:
@@ -34,9 +37,15 @@ class FrameOverlays:
         self._bone_motion = None if inputs.merge is None else bones_from_merge(inputs.merge)
 
     def describe(self, camera: str, frames: Iterable[int]) -> list[dict[str, Any]]:
-        """Return index, status, number of inliers, error and overlays of frames, as JSON values.
+        """Describe frames of one camera as JSON values.
 
-        Positions are fractions of the image's width and height.
+        Args:
+            camera: Camera name.
+            frames: Indices of the frames to describe.
+
+        Returns:
+            The index, status, number of inliers, reprojection error (pixels) and overlays of each frame.
+            Positions in the overlays are fractions of the image's width and height.
         """
         view, path = self._views.get(camera), self._inputs.path(camera)
         return [
@@ -49,7 +58,15 @@ class FrameOverlays:
         ]
 
     def describe_part(self, camera: str, first: int, count: int) -> list[dict[str, Any]]:
-        """Describe at most `count` frames from `first` on; after the camera's last frame there are none."""
+        """Describe successive frames of one camera as `describe` does.
+
+        The result ends at the camera's last frame, so that it can be shorter than `count` or empty.
+
+        Args:
+            camera: Camera name.
+            first: Index of the first frame.
+            count: Maximum number of frames.
+        """
         path = self._inputs.path(camera)
         if path is None:
             return []
@@ -69,7 +86,7 @@ class FrameOverlays:
 
 
 def _pose_facts(path: Trajectory | None, index: int) -> dict[str, Any]:
-    """Return status, number of inliers and error of a frame."""
+    """Return the index, status, number of inliers and reprojection error (pixels) of a frame."""
     if path is None:
         return {"i": index, "status": "", "inliers": 0, "error": None}
     error = float(path.error_px[index])
@@ -82,7 +99,10 @@ def _pose_facts(path: Trajectory | None, index: int) -> dict[str, Any]:
 
 
 def bones_from_merge(merge: MergeResult) -> BoneMotion:
-    """Return the bones between solved joints, in the motion that all outputs show."""
+    """Return the moving bones between solved joints, from the motion that all outputs show.
+
+    A solved joint at the end of a limb also gives the bone from this joint to its tip.
+    """
     skeleton, poses, solved = merge.skeleton, merge.motion.world_from_joint(), merge.solved
     centres = poses[..., :3, 3]
     ends: list[FloatArray] = []
@@ -106,7 +126,10 @@ def bones_from_merge(merge: MergeResult) -> BoneMotion:
 
 
 def _inlier_positions(view: CameraView | None, index: int) -> FloatArray:
-    """Return the observed positions (N,2) of at most `_MAX_INLIERS` inliers of a frame, evenly selected."""
+    """Return the observed image positions (N,2) of a frame's inliers, as fractions of the image size.
+
+    If there are more than `_MAX_INLIERS` inliers, every second or third (and so on) is selected.
+    """
     if view is None:
         return np.zeros((0, 2))
     observed_px = view.inliers_at(index).observed_px

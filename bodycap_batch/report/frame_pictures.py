@@ -1,4 +1,4 @@
-"""Small pictures of video frames: a series for the time slider, and pictures of lost frames."""
+"""Make small pictures of video frames: a series for the time slider, and pictures of lost frames."""
 
 from __future__ import annotations
 
@@ -15,37 +15,51 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError
 
 SERIES_BUDGET = 6_000_000
-"""Characters of all series together; some tenths of them are for the overlays. Less than half of the page."""
-_OVERLAY_CHARACTERS = 1_300
-"""Characters of one picture's overlays: points and bones. Evidence: none."""
-_SERIES_SIDE_PX = 320
-"""Longer side of a series' pictures, pixels. Evidence: none."""
-MAX_JPEG_CHARACTERS = 50_000
-"""Characters of a picture of 320×240 that contains only noise, the largest possible one.
+"""Maximum number of characters of all picture series together, including their overlays.
 
-If pictures of this size fit into the budget, no frame is decoded to measure the size.
+This is less than half of the page's maximum size.
+"""
+_OVERLAY_CHARACTERS = 1_300
+"""Estimated number of characters of one picture's overlays (points and bones). Evidence: none."""
+_SERIES_SIDE_PX = 320
+"""Maximum length (pixels) of the longer side of a picture in a series. Evidence: none."""
+MAX_JPEG_CHARACTERS = 50_000
+"""Maximum number of base64 characters of one picture in a series.
+
+A picture of 320×240 pixels that contains only noise has this size. If the budget suffices for pictures of
+this size, no frame is decoded to estimate the actual size.
 """
 _LOST_SIDE_PX = 240
-"""Longer side of a lost frame's picture, pixels. Evidence: none."""
+"""Maximum length (pixels) of the longer side of a lost frame's picture. Evidence: none."""
 _JPEG_QUALITY = 60
-"""JPEG quality of 100. Evidence: none."""
+"""JPEG quality on the scale from 0 to 100. Evidence: none."""
 _PROBED_FRAMES = 6
-"""Frames that are encoded to estimate the size of a picture. Evidence: none."""
+"""Number of frames that are encoded to estimate the size of a picture. Evidence: none."""
 _MAX_PICTURES_PER_S = 5.0
-"""Pictures per second. More would only enlarge the page, because the motion itself is drawn at every tick."""
-_MAX_SHIFT_S = 1.0
-"""Largest time from an evenly spaced frame to the kept frame that replaces it, seconds.
+"""Maximum number of pictures per second of video.
 
-Keyframes are at most half a second apart.
+The 3D viewer draws the motion at every tick anyway, so more pictures would only enlarge the page.
+"""
+_MAX_SHIFT_S = 1.0
+"""Maximum time (seconds) between an evenly spaced frame and the kept frame that replaces it.
+
+If pictures are far apart, half the time between two pictures is the maximum instead. Keyframes are at most
+half a second apart.
 """
 _DARK_BRIGHTNESS = 30.0
-"""Mean brightness of 255 below which hardly any light reached the camera. Evidence: none."""
+"""Minimum mean brightness, of 255. Hardly any light reached the camera in a darker frame. Evidence: none."""
 MAX_CORNERS = 300
-"""Corners that are counted at most. Evidence: none."""
+"""Maximum number of corners that are counted in a frame. Evidence: none."""
 _CORNER_QUALITY = 0.02
-"""Strength of a corner relative to the strongest one (`goodFeaturesToTrack`). Evidence: none."""
+"""Minimum ratio of a corner's strength to the strength of the strongest corner (`goodFeaturesToTrack`).
+
+Evidence: none.
+"""
 _MIN_CORNER_CONTRAST = 20
-"""Range of grey levels around a corner, of 255; the range of sensor noise is smaller. Evidence: none."""
+"""Minimum range of grey levels (of 255) in the pixels around a corner.
+
+The range of sensor noise is smaller. Evidence: none.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,10 +67,10 @@ class FramePicture:
     """A video frame as a small JPEG.
 
     Attributes:
-        index: Frame index in its camera.
-        jpeg: The file's content, base64.
-        width: Pixels.
-        height: Pixels.
+        index: Index of the frame in its camera.
+        jpeg: Content of the JPEG file as base64 text.
+        width: Width of the picture, pixels.
+        height: Height of the picture, pixels.
     """
 
     index: int
@@ -67,12 +81,12 @@ class FramePicture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameAppearance:
-    """Measurements of a video frame's image.
+    """A video frame's picture, with measurements of its image.
 
     Attributes:
-        picture: The frame.
-        brightness: Mean brightness, 0 to 255.
-        corners: Number of distinct corners, at most `MAX_CORNERS`.
+        picture: The frame as a small JPEG.
+        brightness: Mean brightness of the frame, 0 to 255.
+        corners: Number of distinct corners in the frame, at most `MAX_CORNERS`.
     """
 
     picture: FramePicture
@@ -92,9 +106,9 @@ def picture_series(
 
     Args:
         camera: The camera with its videos.
-        times_s: (N,) common time of each frame.
-        budget: Characters of base64 and overlays.
-        context: Cancelling.
+        times_s: (N,) common time of each frame, seconds.
+        budget: Maximum number of characters of all pictures (base64) and overlays.
+        context: The context of the stage, through which the stage can be cancelled.
     """
     count = len(camera.frame_numbers)
     if count == 0:
@@ -116,7 +130,16 @@ def picture_series(
 def measure_appearance(
     camera: CaptureCamera, indices: Sequence[int], context: StageContext
 ) -> dict[int, FrameAppearance]:
-    """Return picture, brightness and number of corners of frames, by frame index."""
+    """Measure the picture, the brightness and the number of corners of frames.
+
+    Args:
+        camera: The camera with its videos.
+        indices: Indices of the frames, in any order.
+        context: The context of the stage, through which the stage can be cancelled.
+
+    Returns:
+        The appearance of each frame, by frame index. Frames that cannot be decoded are missing.
+    """
     import cv2
 
     measured = {}
@@ -132,9 +155,10 @@ def measure_appearance(
 
 
 def _corners_above_noise(grey: Any, corners: FloatArray) -> FloatArray:
-    """Return the corners with more contrast than sensor noise.
+    """Return the corners whose surroundings have more contrast than sensor noise.
 
-    The threshold of `goodFeaturesToTrack` is relative to the best corner, so it finds corners in pure noise.
+    The threshold of `goodFeaturesToTrack` is relative to the strongest corner. The function therefore also
+    finds corners in an image of pure noise.
     """
     import cv2
 
@@ -146,11 +170,11 @@ def _corners_above_noise(grey: Any, corners: FloatArray) -> FloatArray:
 
 
 def _prefer_cheap_frames(camera: CaptureCamera, indices: IntArray) -> IntArray:
-    """Replace evenly spaced frames by near frames that are cheaper to read.
+    """Replace evenly spaced frames by nearby frames that are cheaper to read.
 
-    If the capture keeps the keyframes' images, these are preferred: little new comes into view between two
-    keyframes. Otherwise frames that decode without their neighbours are preferred. If no cheap frame is near,
-    the original frame is kept.
+    If the capture stores images of keyframes, the stored frames are preferred. Little new comes into view
+    between two keyframes. Otherwise frames that decode without their neighbours are preferred. A frame
+    without a cheap frame nearby is not replaced.
     """
     cheap = camera.key_indices() if camera.kept is None else camera.kept.frames
     if len(indices) < 3 or len(cheap) == 0:
@@ -166,7 +190,7 @@ def _prefer_cheap_frames(camera: CaptureCamera, indices: IntArray) -> IntArray:
 
 
 def _thin_to_budget(pictures: list[FramePicture], budget: int) -> list[FramePicture]:
-    """Omit every second picture until the rest fits into the budget."""
+    """Remove every second picture, repeatedly, until the remaining pictures fit into the budget."""
     while len(pictures) > 2 and sum(len(each.jpeg) + _OVERLAY_CHARACTERS for each in pictures) > budget:
         pictures = pictures[::2]
     return pictures
@@ -180,9 +204,9 @@ def _read_pictures(camera: CaptureCamera, indices: IntArray, context: StageConte
 
 
 def _decode_frames(camera: CaptureCamera, indices: IntArray, context: StageContext) -> list[tuple[int, Any]]:
-    """Return colour frames up to the first one that cannot be decoded.
+    """Return the colour frames before the first frame that cannot be decoded.
 
-    The frames after it are missing on the page, but the report does not fail.
+    If a frame cannot be decoded, all later frames are missing on the page, but the report does not fail.
     """
     frames = []
     try:

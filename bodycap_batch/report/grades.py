@@ -1,4 +1,4 @@
-"""Grades of results."""
+"""Grades of results, and the criteria behind them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import IntEnum
 
 
 class Grade(IntEnum):
-    """Reliability of a result. The worst grade of its criteria is the grade of the result."""
+    """Reliability of a result. The grade of a result is the worst grade of the result's criteria."""
 
     GOOD = 0
     FAIR = 1
@@ -22,16 +22,16 @@ class Grade(IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Criterion:
-    """One graded figure.
+    """One graded value.
 
     Attributes:
-        subject: ``cameras`` or ``body``: the half of the verdict to which the criterion belongs.
-        name: What is judged.
-        grade: Its grade.
-        finding: The figure in words.
-        rationale: The bounds of the grades and the reason for them.
-        metric: Dotted path of the figure in ``metrics.json``; "" if it is derived from several figures.
-        value: The figure.
+        subject: The half of the verdict that uses the criterion: ``cameras`` or ``body``.
+        name: Name of the graded quantity.
+        grade: Grade of the value.
+        finding: The value in words.
+        rationale: The bounds of the grades, and the reason for these bounds.
+        metric: Dotted path of the value in ``metrics.json``; "" if it is derived from several values.
+        value: The value; None if the criterion is not numerical.
     """
 
     subject: str
@@ -44,7 +44,14 @@ class Criterion:
 
 
 def grade_value(value: float, good: float, fair: float, *, more_is_better: bool = False) -> Grade:
-    """Grade a value by the bounds of the grades "good" and "usable with care"."""
+    """Grade a value by two bounds.
+
+    Args:
+        value: The value to grade.
+        good: Bound of the grade "good": the largest good value, or the smallest one with `more_is_better`.
+        fair: Bound of the grade "usable with care". A value beyond this bound is "poor".
+        more_is_better: True if large values are better than small values.
+    """
     if more_is_better:
         value, good, fair = -value, -good, -fair
     return Grade.GOOD if value <= good else Grade.FAIR if value <= fair else Grade.POOR

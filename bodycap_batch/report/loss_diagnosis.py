@@ -1,4 +1,4 @@
-"""The likely cause of each lost interval, from measurements and from its image."""
+"""Diagnose the likely cause of each lost interval from the measurements and from a frame's image."""
 
 from __future__ import annotations
 
@@ -15,9 +15,15 @@ from bodycap_batch.report.frame_pictures import FrameAppearance, measure_appeara
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _REFERENCE_FRAMES = 5
-"""Registered frames of each camera that are compared with its lost frames. Evidence: none."""
+"""Number of registered frames of each camera that are compared with the camera's lost frames.
+
+Evidence: none.
+"""
 _MAX_PICTURES = 24
-"""Lost intervals of each camera of which a frame is decoded: as many as the page shows at most."""
+"""Maximum number of lost intervals of each camera from which a frame is decoded.
+
+The page shows no more pictures than this.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,9 +31,9 @@ class DiagnosedLoss:
     """A lost interval with its likely cause and the appearance of its middle frame.
 
     Attributes:
-        loss: The interval.
-        cause: The likely cause.
-        appearance: The middle frame; None if it was not decoded.
+        loss: The lost interval.
+        cause: The likely cause of the loss.
+        appearance: Appearance of the interval's middle frame; None if this frame was not decoded.
     """
 
     loss: FrameLoss
@@ -36,7 +42,10 @@ class DiagnosedLoss:
 
 
 def diagnose_losses(inputs: ReportInputs, context: StageContext) -> list[DiagnosedLoss]:
-    """Return every lost interval with its likely cause; a frame of each camera's longest ones is decoded."""
+    """Return every lost interval with its likely cause.
+
+    The middle frame is decoded only for the longest lost intervals of each camera.
+    """
     losses = find_frame_losses(inputs)
     diagnosed = []
     for name in inputs.cameras:
@@ -57,7 +66,11 @@ def diagnose_losses(inputs: ReportInputs, context: StageContext) -> list[Diagnos
 def _measure_frames(
     inputs: ReportInputs, camera: str, losses: Sequence[FrameLoss], context: StageContext
 ) -> tuple[dict[int, FrameAppearance], float | None]:
-    """Return the appearance of lost frames, and the median number of corners in registered frames."""
+    """Return the appearance of lost frames, and the median number of corners in registered frames.
+
+    The appearance is given by frame index. It also contains the registered frames. The median is None if
+    there are no registered frames.
+    """
     path = inputs.path(camera)
     if not losses or path is None or inputs.capture is None:
         return {}, None

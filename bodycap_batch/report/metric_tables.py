@@ -1,4 +1,4 @@
-"""Tables of a job's figures; each cell names its place in ``metrics.json``."""
+"""Make the tables of a job's metrics. Each cell names the path of its value in ``metrics.json``."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from bodycap_batch.report.viewer_data import known_joint_sigma_m
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
-    """One cell.
+    """One cell of a table.
 
     Attributes:
         text: The displayed text.
-        metric: Dotted path in ``metrics.json``, "" if the cell is not one of its figures.
-        value: The figure, not rounded.
-        share: Length of a bar behind the text, 0 to 1; None for no bar.
+        metric: Dotted path of the value in ``metrics.json``; "" if the cell shows no value of this file.
+        value: The value without rounding; None if the cell shows no number.
+        share: Relative length of a bar behind the text, 0 to 1; None for no bar.
     """
 
     text: str
@@ -32,7 +32,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """A table with a caption. The first cell of a row is the row's head."""
+    """A table with a caption. The first cell of each row is the row's heading."""
 
     caption: str
     heads: tuple[str, ...]
@@ -41,7 +41,10 @@ class Table:
 
 
 def metric_at(metrics: Mapping[str, Any], dotted: str) -> Any:
-    """Return the value at a dotted path, or None if there is none. Camera names must not contain a dot."""
+    """Return the value at a dotted path of nested mappings and lists, or None if the path does not exist.
+
+    The names in the path, such as camera names, must not contain a dot.
+    """
     value: Any = metrics
     for part in dotted.split("."):
         if isinstance(value, list):
@@ -52,7 +55,7 @@ def metric_at(metrics: Mapping[str, Any], dotted: str) -> Any:
 
 
 def make_tables(inputs: ReportInputs) -> dict[str, Table]:
-    """Return the tables of the page by name, except those without rows."""
+    """Return the tables of the page, by table name. Tables without rows are omitted."""
     metrics = inputs.metrics
     if metrics is None:
         return {}
@@ -81,13 +84,13 @@ def metric_cell(
     form: str | Callable[[float], str] = "{:,}",
     factor: float = 1.0,
 ) -> Cell:
-    """Return a figure of ``metrics.json`` as a cell; an unknown figure is shown as a dash.
+    """Return a value of ``metrics.json`` as a cell. An unknown value is shown as a dash.
 
     Args:
         metrics: The content of ``metrics.json``.
-        dotted: Path of the figure.
-        form: Format string, or function that returns the text.
-        factor: Factor from the figure to the displayed unit.
+        dotted: Dotted path of the value.
+        form: Format string for the value, or function that converts the value to text.
+        factor: Factor that converts the value to the displayed unit.
     """
     value = metric_at(metrics, dotted)
     if value is None:
@@ -178,7 +181,15 @@ def _residuals_table(merge: Mapping[str, Any]) -> Table:
 
 
 def _joint_distance_table(merge: Mapping[str, Any], key: str, caption: str) -> Table:
-    """Return a table of a distance at each joint: the median, and the 95th percentile with a bar."""
+    """Return a table with the median and the 95th percentile of a distance at each joint.
+
+    A bar shows the 95th percentile relative to the largest 95th percentile in the table.
+
+    Args:
+        merge: The entry ``merge`` of ``metrics.json``.
+        key: Name of the distance in this entry.
+        caption: Caption of the table.
+    """
     metrics, distances = {"merge": merge}, merge.get(key, {})
     largest = max((distance["p95"] for distance in distances.values()), default=0.0)
     rows = []
@@ -282,7 +293,7 @@ def _scale_source_cells(merge: Mapping[str, Any], path: str) -> tuple[Cell, ...]
 
 
 def _chi_square_note(agreement: Mapping[str, Any]) -> str:
-    """Return how far sources disagree, compared with what their uncertainties let expect."""
+    """Return a note that compares the sources' disagreement (χ²) with the expected disagreement."""
     degrees_of_freedom = agreement.get("degrees_of_freedom")
     if not degrees_of_freedom:
         return ""
@@ -338,7 +349,7 @@ def _joint_sigma_table(inputs: ReportInputs) -> Table:
 
 
 def headline_figures(metrics: Mapping[str, Any]) -> Iterable[tuple[str, Cell]]:
-    """Yield name and value of the few figures at the top of the page."""
+    """Yield the name and the cell of each value at the top of the page."""
     yield "frames registered", metric_cell(metrics, "total.frames_registered")
     yield "of all frames", metric_cell(metrics, "total.coverage", _percent)
     yield "map error", metric_cell(metrics, "total.mean_reprojection_error_px", "{:.2f} px")

@@ -1,4 +1,7 @@
-"""Arrays in the page: quantised to at most 16 bits, base64, thinned to a budget; the thinning is recorded."""
+"""Pack arrays for the page: quantise to at most 16 bits, encode as base64, and thin to a size budget.
+
+The budget records what was thinned.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +16,18 @@ import numpy.typing as npt
 from bodycap_batch.core.arrays import FloatArray
 
 MISSING_CODE = 65535
-"""The 16-bit code of a missing value."""
+"""The 16-bit code that stands for a missing value (NaN)."""
 _LEVELS = MISSING_CODE - 1
-"""Steps between the smallest and the largest value of a column."""
+"""Number of steps between the smallest and the largest value of a column."""
 _CHARACTERS_PER_BYTE = 4.0 / 3.0
-"""Characters of base64 for each byte."""
+"""Number of base64 characters for each byte."""
 
 
 def pack_scaled(values: FloatArray) -> dict[str, Any]:
     """Pack numbers (N,C) as 16-bit codes between the smallest and the largest value of each column.
 
-    NaN remains NaN. A step is the range over 65,534: a third of a millimetre in a room of 20 m.
+    NaN and infinite values become `MISSING_CODE`. A step is the column's range divided by 65,534: a third of
+    a millimetre in a room of 20 m.
     """
     values = np.asarray(values, dtype=np.float64)
     finite = np.where(np.isfinite(values), values, np.nan)
@@ -42,43 +46,47 @@ def pack_scaled(values: FloatArray) -> dict[str, Any]:
 
 
 def pack_bytes(values: npt.NDArray[np.uint8]) -> dict[str, Any]:
-    """Pack bytes of any shape."""
+    """Pack an array of bytes of any shape."""
     return {"shape": list(values.shape), "u8": base64_text(values)}
 
 
 def base64_text(values: npt.NDArray[Any]) -> str:
-    """Return the bytes of an array as base64."""
+    """Return the bytes of an array as base64 text."""
     return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")
 
 
 def affordable_count(characters: int, bytes_per_item: float) -> int:
-    """Return how many items fit into a budget of characters; at least two."""
+    """Return the number of items that fit into a number of base64 characters, but at least two."""
     return max(2, int(characters / (bytes_per_item * _CHARACTERS_PER_BYTE)))
 
 
 @dataclass(slots=True)
 class PageBudget:
-    """The share of the page's budgets that may be used, and a record of what was thinned.
+    """The usable fraction of the page's size budgets, and a record of what was thinned.
+
+    Each kind of item on the page (points, pictures, poses) has a budget: a maximum number of items or of
+    characters.
 
     Attributes:
-        share: Factor on every budget; below 1 if the page would be too large otherwise.
-        counts: Numbers of shown and of available items, by the name of the items.
+        share: Factor by which every budget is multiplied. It is below 1 if the page would otherwise be too
+            large.
+        counts: Number of shown items and number of available items, by the name of the items.
     """
 
     share: float = 1.0
     counts: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def scaled(self, budget: float) -> int:
-        """Return the usable part of a budget."""
+        """Return a budget multiplied by the usable fraction."""
         return int(budget * self.share)
 
     def record(self, items: str, shown: int, available: int) -> None:
-        """Add the numbers of shown and of available items."""
+        """Add to the numbers of shown and available items of one kind."""
         earlier = self.counts.get(items, (0, 0))
         self.counts[items] = (earlier[0] + int(shown), earlier[1] + int(available))
 
     def thinned_lines(self) -> list[str]:
-        """Return a phrase for each kind of items that was thinned."""
+        """Return a phrase for each kind of item that was thinned."""
         return [
             f"{shown:,} of {available:,} {items}"
             for items, (shown, available) in self.counts.items()
@@ -86,5 +94,5 @@ class PageBudget:
         ]
 
     def to_dict(self) -> Mapping[str, Any]:
-        """Return the record as JSON values."""
+        """Return the numbers of shown and available items as JSON values."""
         return {items: {"shown": shown, "of": available} for items, (shown, available) in self.counts.items()}

@@ -1,4 +1,4 @@
-"""The page itself: templates, styles, scripts and the 3D library combined into one file."""
+"""Combine templates, styles, scripts and the 3D library into one HTML page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from typing import Any
 from bodycap_batch.core.errors import StoreError
 
 LIBRARY = "k3d"
-"""The package that contains the 3D library: its bundle for browsers includes all of three.js."""
+"""Name of the Python package that contains the 3D library.
+
+The package's bundle for browsers includes all of three.js.
+"""
 _BUNDLE = "k3d/static/standalone.js"
 _SCRIPTS = (
     "packing.js",
@@ -29,11 +32,11 @@ _SCRIPTS = (
 
 
 def render_page(context: Mapping[str, Any], data: Mapping[str, Any]) -> str:
-    """Render the page.
+    """Render the page as one HTML document.
 
     Args:
-        context: Variables of the templates.
-        data: Data of the viewer; JSON values.
+        context: The value of each template variable, by variable name.
+        data: Data of the 3D viewer as JSON values.
 
     Returns:
         A complete HTML document that loads nothing from the network.

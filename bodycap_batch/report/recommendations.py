@@ -1,4 +1,4 @@
-"""What to change in the next capture: each recommendation follows from a measurement of this job."""
+"""Recommend changes for the next capture. Each recommendation follows from a measurement of this job."""
 
 from __future__ import annotations
 
@@ -20,23 +20,32 @@ from bodycap_batch.report.report_inputs import ReportInputs
 from bodycap_batch.report.verdict import FAIR_GAP_S, GOOD_MOUNT_DEG, describe_lens_misfit
 
 _MIN_LOST_SHARE = 0.02
-"""Share of all frames from which a cause of losses is worth a recommendation. Evidence: none."""
+"""Minimum fraction of all frames that a cause of losses must affect to give a recommendation.
+
+Evidence: none.
+"""
 _FORWARD_DEG = 25.0
-"""Angle between motion and optical axis of a camera that moves along its line of sight. Evidence: none."""
+"""Maximum angle (degrees) between a camera's direction of motion and its optical axis.
+
+At a smaller angle the camera is treated as moving along its line of sight. Evidence: none.
+"""
 _MAX_FORWARD_SHARE = 0.6
-"""Share of the motion along the line of sight above which depth is poorly known. Evidence: none."""
+"""Maximum fraction of a camera's path along its line of sight.
+
+If every camera exceeds this fraction, depth is poorly known. Evidence: none.
+"""
 _MIN_SHARED_SHARE = 0.03
-"""Share of a camera's points that another camera should see as well. Evidence: none."""
+"""Minimum fraction of a camera's points that at least one other camera should also see. Evidence: none."""
 _NARROW_DEG = 3.0
-"""Median triangulation angle below which depth is poorly known, degrees. Evidence: none."""
+"""Minimum median triangulation angle, degrees. With a smaller angle depth is poorly known. Evidence: none."""
 _SUFFICIENT_SCALE_SIGMA = 0.02
-"""Relative sigma of the metric scale that needs no recommendation. Evidence: none."""
+"""Maximum relative sigma of the metric scale that needs no recommendation. Evidence: none."""
 _ARM_LENGTH_M = 0.6
-"""Metres; it makes an error of the scale tangible."""
+"""Length of an arm (metres), used to express a relative error of the scale as a length."""
 _T_POSE = re.compile(r",? or stand in a T-pose for two seconds first")
-"""The part of merging's advice about a T-pose."""
+"""Pattern of the phrase about a T-pose in the advice that merging gives."""
 _ADVICE_SEPARATOR = "; to know it better, "
-"""Separates the finding from the advice in merging's sentences."""
+"""Text that separates the finding from the advice in the sentences that merging gives."""
 
 _ACTIONS = {
     LossCause.DARK: "Switch lights on or film by day, and keep sleeves and straps away from the lens.",
@@ -68,9 +77,9 @@ class Recommendation:
     """One change for the next capture.
 
     Attributes:
-        action: What to do.
-        reason: What was measured.
-        priority: Recommendations with a larger value are shown first.
+        action: The change that the user should make.
+        reason: The measurement that justifies the change.
+        priority: Importance of the recommendation. Larger values are shown first.
     """
 
     action: str
@@ -79,11 +88,11 @@ class Recommendation:
 
 
 def recommend_changes(inputs: ReportInputs, lost: Mapping[str, Counter[LossCause]]) -> list[Recommendation]:
-    """Return recommendations, the most helpful one first.
+    """Return recommendations for the next capture, the most helpful recommendation first.
 
     Args:
-        inputs: The results.
-        lost: Number of lost frames by camera and cause.
+        inputs: The results of the job.
+        lost: Number of lost frames, by camera name and cause.
     """
     mirrored = _mirrored_cameras(inputs)
     found = [
@@ -99,9 +108,10 @@ def recommend_changes(inputs: ReportInputs, lost: Mapping[str, Counter[LossCause
 
 
 def _combine_t_poses(found: Sequence[Recommendation]) -> list[Recommendation]:
-    """Recommend a T-pose once if it would improve several constants.
+    """Combine several recommendations of a T-pose into a single recommendation.
 
-    It comes before the other ways to improve each of them.
+    The phrase about the T-pose is removed from the original recommendations. The combined recommendation gets
+    a higher priority than these.
     """
     improved = [recommendation for recommendation in found if _T_POSE.search(recommendation.action)]
     if len(improved) < 2:
@@ -122,17 +132,17 @@ def _combine_t_poses(found: Sequence[Recommendation]) -> list[Recommendation]:
 
 
 def _map_diagnostics(inputs: ReportInputs) -> MapDiagnostics:
-    """Return what mapping reports, from the metrics; empty without metrics."""
+    """Return mapping's diagnostics, read from the metrics. They are empty without metrics."""
     return MapDiagnostics.from_log((inputs.metrics or {}).get("mapping", {}))
 
 
 def _mirrored_cameras(inputs: ReportInputs) -> Sequence[str]:
-    """Return the cameras that the map excludes because their videos are mirrored."""
+    """Return the names of the cameras that the map excludes because their videos are mirrored."""
     return _map_diagnostics(inputs).flipped_cameras
 
 
 def _about_mirrored_cameras(inputs: ReportInputs) -> Iterator[Recommendation]:
-    """Recommend to flip mirrored videos; no other way of filming would help."""
+    """Recommend to mirror the videos of mirrored cameras back. Filming in another way would not help."""
     if names := _mirrored_cameras(inputs):
         yield Recommendation(
             action=f"Flip the video of {', '.join(names)} back (ffmpeg -i in -vf hflip out.mp4), and switch "
@@ -151,7 +161,10 @@ def _about_mirrored_cameras(inputs: ReportInputs) -> Iterator[Recommendation]:
 
 
 def _about_lenses(inputs: ReportInputs) -> Iterator[Recommendation]:
-    """Recommend to correct calibrations that the map contradicts; all other results depend on them."""
+    """Recommend to correct calibrations that the map contradicts.
+
+    The priority is high, because all other results depend on the calibrations.
+    """
     misfits = _map_diagnostics(inputs).misfit_factors
     if misfits:
         fits = "; ".join(
@@ -186,7 +199,15 @@ def _about_losses(inputs: ReportInputs, lost: Mapping[str, Counter[LossCause]]) 
 
 
 def count_shared_points(maps: tuple[Map, ...], cameras: tuple[str, ...]) -> IntArray:
-    """Return how many points two cameras both see (C,C); the diagonal counts each camera's points."""
+    """Count the map points that each pair of cameras sees.
+
+    Args:
+        maps: The maps.
+        cameras: Names of the C cameras.
+
+    Returns:
+        (C,C) number of points that both cameras see. The diagonal holds the number of points of each camera.
+    """
     shared = np.zeros((len(cameras), len(cameras)), dtype=np.int64)
     number = {name: index for index, name in enumerate(cameras)}
     for scene in maps:
@@ -202,7 +223,7 @@ def count_shared_points(maps: tuple[Map, ...], cameras: tuple[str, ...]) -> IntA
 
 
 def _about_overlap(inputs: ReportInputs) -> Iterator[Recommendation]:
-    """Recommend to film common places with cameras that share few points with the others."""
+    """Recommend to film common places with each camera that shares few points with any other camera."""
     if len(inputs.cameras) < 2 or not inputs.maps:
         return
     shared = count_shared_points(inputs.maps, inputs.cameras)
@@ -219,11 +240,11 @@ def _about_overlap(inputs: ReportInputs) -> Iterator[Recommendation]:
 
 
 def _about_parallax(inputs: ReportInputs) -> Iterator[Recommendation]:
-    """Recommend sideways movement if cameras only moved forward or triangulation angles are small."""
+    """Recommend sideways movement if all cameras moved mainly forward or triangulation angles are small."""
     forward_shares = []
     for registration in inputs.registrations:
         poses = registration.trajectory.gauge_from_cam[registration.trajectory.localised]
-        # One of forty steps of the path is long enough for a direction despite the noise of single poses.
+        # A fortieth of the path is long enough to give a direction despite the noise of single poses.
         stride = max(1, len(poses) // 40)
         step = poses[stride::stride, :3, 3] - poses[:-stride:stride, :3, 3][: len(poses[stride::stride])]
         length = np.linalg.norm(step, axis=1)
@@ -252,7 +273,11 @@ def _about_parallax(inputs: ReportInputs) -> Iterator[Recommendation]:
 
 
 def _about_start_and_end(inputs: ReportInputs) -> Iterator[Recommendation]:
-    """Recommend to cut the capture if cameras have no measurement at the motion's start or end."""
+    """Recommend to start all cameras before the movement and to stop them after it.
+
+    The recommendation is given if a camera has no measurement at the motion's start or end. It also names
+    start_s and end_s for shortening this capture, if that helps.
+    """
     merge = inputs.merge
     if merge is None or not merge.trajectories:
         return
@@ -268,7 +293,7 @@ def _about_start_and_end(inputs: ReportInputs) -> Iterator[Recommendation]:
     cuts += [f"end_s: {min(early.values()):.2f}"] if early else []
     missing = [f"{name} has no measurement before {time:.2f} s" for name, time in late.items()]
     missing += [f"{name} has no measurement after {time:.2f} s" for name, time in early.items()]
-    # If one camera ended before another started, no cut helps.
+    # If one camera ended before another camera started, shortening the capture does not help.
     remaining_s = min(early.values(), default=end_s) - max(late.values(), default=start_s)
     cut = f"; this capture can be cut with {' and '.join(cuts)} under `capture`" if remaining_s > 0.0 else ""
     if missing:
@@ -282,7 +307,8 @@ def _about_start_and_end(inputs: ReportInputs) -> Iterator[Recommendation]:
 def _median_triangulation_deg(scene: Map) -> float | None:
     """Return the median triangulation angle of the points, degrees; None without observations.
 
-    A point's angle is the largest one between the ray of its first and that of any other observation.
+    The triangulation angle of a point is the largest angle between the ray of the point's first observation
+    and the ray of any other observation.
     """
     if len(scene.obs_point) == 0:
         return None
@@ -298,7 +324,7 @@ def _median_triangulation_deg(scene: Map) -> float | None:
 
 
 def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
-    """Yield merging's advice on constants of the body that are not well known."""
+    """Yield recommendations about the body: exchanged sides, wrong clocks, and constants not well known."""
     if inputs.merge is None:
         return
     report = inputs.merge.report

@@ -1,4 +1,4 @@
-"""A job's results as a recording for the Rerun viewer (``.rrd``)."""
+"""Write a job's results as a recording for the Rerun viewer (``.rrd``)."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ _AXIS_LENGTH_M = 0.1
 def write_recording(inputs: ReportInputs, target: Path) -> None:
     """Write points, camera paths and the solved skeleton of a job as one recording.
 
-    The frame of reference is the world, or the largest map turned upright if there is no body. Times are
-    common times. The motion is the solved one; the export's options about root, rate and names do not apply.
+    The frame of reference is the world. Without a body it is the gauge of the largest map, rotated upright.
+    Times are common times. The motion is the solved motion: the export options about root, rate and names are
+    not applied.
 
     Args:
-        inputs: The results.
-        target: The ``.rrd`` file.
+        inputs: The results of the job.
+        target: Path of the ``.rrd`` file.
 
     Raises:
         JobError: rerun-sdk is not installed, or there is nothing to show.
@@ -75,7 +76,7 @@ def _log_maps(stream: rr.RecordingStream, scene: DrawnScene) -> None:
 
 
 def _log_path(stream: rr.RecordingStream, path: DrawnPath, colour: Colour) -> None:
-    """Log the line of a path, interrupted at its gaps, and the camera that moves along it."""
+    """Log a camera path as a line that is interrupted at lost frames, and the camera moving along it."""
     import rerun as rr
 
     localised = np.asarray(np.isfinite(path.poses).all(axis=(1, 2)))

@@ -1,4 +1,4 @@
-"""The results that a report shows, of a finished job or of one that stopped."""
+"""The results that a report shows. The job may have finished, or an error may have stopped it."""
 
 from __future__ import annotations
 
@@ -14,21 +14,23 @@ from bodycap_batch.model.skeleton import Mount
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportInputs:
-    """The results of a job. If the job stopped, the results of later stages are empty.
+    """The results of a job. If an error stopped the job, the results of later stages are empty.
 
     Attributes:
-        name: The job's name.
-        cameras: Names of the job's cameras, in its order.
+        name: Name of the job.
+        cameras: Names of the job's cameras, in the order of the job.
         maps: The maps, largest first, each in its own gauge.
-        registrations: One for each camera, in the gauge of its map.
+        registrations: One registration for each registered camera, in the gauge of the camera's map.
         clocks: Clock of each registered camera, by camera name.
-        selections: Keyframe selections.
-        merge: The body in the world.
+        selections: The keyframe selection of each camera.
+        merge: The result of merging: the body in the world; None if there is no body.
         mounts: The mounts that were assumed before the body was solved.
-        metrics: The content of ``metrics.json``.
-        capture: The videos; None if they cannot be opened.
-        failure: The error that stopped the job: ``type``, ``message``, ``hint`` and its other fields.
-        max_gap_s: Longest time between two measurements that the body's motion bridges (``merge.max_gap_s``).
+        metrics: The content of ``metrics.json``; None if there are no metrics.
+        capture: The opened videos; None if they cannot be opened.
+        failure: The error that stopped the job: ``type``, ``message``, ``hint`` and the error's other fields;
+            None if no error stopped the job.
+        max_gap_s: Maximum time (seconds) between two measurements that the body's motion bridges
+            (``merge.max_gap_s``).
     """
 
     name: str
@@ -45,15 +47,19 @@ class ReportInputs:
     max_gap_s: float = 1.0
 
     def registration(self, camera: str) -> Registration | None:
-        """Return a camera's registration, or None if it was not registered."""
+        """Return the registration of a camera, or None if the camera was not registered."""
         return next((found for found in self.registrations if found.trajectory.camera == camera), None)
 
     def selection(self, camera: str) -> KeyframeSelection | None:
-        """Return a camera's keyframe selection, or None if there is none."""
+        """Return the keyframe selection of a camera, or None if the camera has no selection."""
         return next((found for found in self.selections if found.camera == camera), None)
 
     def path(self, camera: str) -> Trajectory | None:
-        """Return a camera's poses: in the world if merging placed the camera, else in its map's gauge."""
+        """Return the trajectory of a camera, or None if the camera was not registered.
+
+        The trajectory is in the world if merging placed the camera there. Otherwise it is in the gauge of the
+        camera's map.
+        """
         merged = () if self.merge is None else self.merge.trajectories
         registration = self.registration(camera)
         in_world = next((path for path in merged if path.camera == camera), None)

@@ -1,4 +1,4 @@
-"""The stage that writes ``report.html``."""
+"""Write ``report.html``, the report page of a job."""
 
 from __future__ import annotations
 
@@ -22,21 +22,24 @@ from bodycap_batch.report.viewer_data import make_viewer_data
 
 REPORT_FILE = "report.html"
 MAX_BYTES = 15_000_000
-"""Largest size of the page, bytes: it can still be sent by e-mail."""
+"""Maximum size of the page, bytes. A page of this size can still be sent by e-mail."""
 _BUDGET_SHARES = (1.0, *(0.6**step for step in range(1, 16)))
-"""Shares of all budgets, tried in turn. With the last one little more than text and tables remains."""
+"""Factors by which all size budgets are multiplied, tried one after the other until the page is small enough.
+
+With the last factor, little more than text and tables remains.
+"""
 
 
 def write_report(inputs: ReportInputs, path: Path, context: StageContext) -> None:
-    """Write the page: everything in one file of at most 15 MB, whatever the length of the capture.
+    """Write the report page as one file of at most 15 MB, however long the capture is.
 
-    If the page is too large, it is rendered again with smaller budgets until it fits. The page then states
-    what was thinned.
+    If the page is too large, it is rendered again with smaller budgets until it is small enough. The page
+    then lists what was thinned.
 
     Args:
-        inputs: The results.
-        path: The file to write.
-        context: Progress and cancelling.
+        inputs: The results of the job.
+        path: Path of the file to write.
+        context: The context of the stage, which receives the progress and can cancel the stage.
 
     Raises:
         StoreError: The file cannot be written.
@@ -66,7 +69,7 @@ def write_report(inputs: ReportInputs, path: Path, context: StageContext) -> Non
 
 
 def _thin_series(series: Mapping[str, Any], budget: PageBudget) -> dict[str, Any]:
-    """Return a camera's series thinned to its budget, and record how many pictures are shown."""
+    """Return a camera's picture series thinned to the budget, and record how many pictures are shown."""
     frames = series["frames"]
     most = budget.scaled(len(frames))
     kept = evenly_spaced(len(frames), max(most, 2))[:most]
@@ -75,7 +78,10 @@ def _thin_series(series: Mapping[str, Any], budget: PageBudget) -> dict[str, Any
 
 
 def make_picture_series(inputs: ReportInputs, context: StageContext) -> list[dict[str, Any]]:
-    """Return each camera's pictures with the overlays of each, as JSON values; none without videos."""
+    """Return the picture series of each camera as JSON values. The list is empty without videos.
+
+    Each picture has the overlays of its frame.
+    """
     if inputs.capture is None:
         return []
     overlays, all_series = FrameOverlays(inputs), []

@@ -1,4 +1,4 @@
-"""A local server for the report with the job's real videos."""
+"""Serve the report on this computer, together with the job's original videos."""
 
 from __future__ import annotations
 
@@ -22,26 +22,37 @@ LOOPBACK = "127.0.0.1"
 _CONTENT_TYPES = {".mp4": "video/mp4", ".m4v": "video/mp4", ".mov": "video/mp4", ".mkv": "video/x-matroska"}
 _CONTENT_TYPES |= {".webm": "video/webm", ".avi": "video/x-msvideo", ".html": "text/html; charset=utf-8"}
 FRAMES_PER_PART = 60
-"""Frames in each ``/marks/<camera>/<part>.json``: one or two seconds, loaded before they are shown."""
+"""Number of frames in each part ``/marks/<camera>/<part>.json``.
+
+This is one or two seconds of video. The page loads each part before it shows the part's frames.
+"""
 OverlaySource = Callable[[str, int], list[dict[str, Any]]]
-"""Returns the overlays of a part of a camera's frames, from a frame index on."""
+"""Function that returns the overlays of successive frames of a camera.
+
+The arguments are the camera name and the index of the first frame.
+"""
 _RANGE = re.compile(r"bytes=(\d+)-(\d*)")
-"""A request for a range of bytes; other forms of the header are answered with the whole file."""
+"""Pattern of a Range header that requests one range of bytes.
+
+A request with any other form of this header is answered with the whole file.
+"""
 _OVERLAY_ADDRESS = re.compile(r"/marks/(\d{1,4})/(\d{1,7})\.json", re.ASCII)
 _CHUNK_BYTES = 1 << 18
-"""Bytes of a file that are read at once. Evidence: none."""
+"""Maximum number of bytes of a file that are read at once. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServedContent:
-    """Everything that the server answers to.
+    """The content that the server provides.
 
     Attributes:
-        files: Files by address, including ``/report.html``.
-        videos: The answer to ``/videos.json``: the chapters of each camera. A chapter has its address, the
-            index of its first frame in the camera and half a frame's duration. For each frame it has the
-            common time and the time in the file, at the middle of the frame's duration.
-        overlays: Returns status and overlays of `FRAMES_PER_PART` frames; None if they are not available.
+        files: Path of each file, by address. The addresses include ``/report.html``.
+        videos: The answer to ``/videos.json``: the chapters of each camera, by camera name. A chapter has an
+            address, the index of its first frame in the camera, and half a frame's duration (seconds). Each
+            frame of a chapter has a common time and a time in the video file (seconds). The time in the file
+            is the middle of the frame's duration.
+        overlays: Function that returns the status and the overlays of up to `FRAMES_PER_PART` frames; None if
+            overlays are not available.
     """
 
     files: dict[str, Path]
@@ -52,12 +63,12 @@ class ServedContent:
 def make_served_content(
     report: Path, capture: Capture, overlays: OverlaySource | None = None
 ) -> ServedContent:
-    """Give the report and each video of a capture an address.
+    """Assign an address to the report and to each video of a capture.
 
     Args:
-        report: The page.
-        capture: The videos.
-        overlays: As `ServedContent.overlays`.
+        report: Path of the report page.
+        capture: The capture with the videos.
+        overlays: Function that returns overlays, as described in `ServedContent.overlays`.
     """
     files, videos = {"/report.html": report}, {}
     for number, camera in enumerate(capture.cameras):
@@ -70,7 +81,7 @@ def make_served_content(
 
 
 def make_server(content: ServedContent, port: int = 0) -> ThreadingHTTPServer:
-    """Return a server on the loopback address; with port 0 it takes a free port.
+    """Return a server on the loopback address. With port 0 the server uses a free port.
 
     Raises:
         StoreError: The port is in use.
@@ -88,14 +99,17 @@ def make_server(content: ServedContent, port: int = 0) -> ThreadingHTTPServer:
 
 
 def _chapters(camera: CaptureCamera) -> list[dict[str, Any]]:
-    """Return common time and time in the file of each used frame, seconds, for each chapter."""
+    """Return, for each chapter, the common time and the time in the file of each used frame, seconds.
+
+    See `ServedContent.videos`.
+    """
     common = camera.common_times_ns() * 1e-9
     chapters, chapter_start = [], 0
     for video in camera.videos:
         numbers = camera.frame_numbers - chapter_start
         in_chapter = (numbers >= 0) & (numbers < len(video.pts))
         seconds = (video.pts[numbers[in_chapter]] - video.pts[0]) * float(video.time_base)
-        # At the very start of a frame a player may still show the frame before it, so its middle is used.
+        # At the start of a frame's duration a player may still show the previous frame. The middle is safe.
         half = 0.5 / video.fps if video.fps else 0.0
         chapters.append(
             {
@@ -110,31 +124,35 @@ def _chapters(camera: CaptureCamera) -> list[dict[str, Any]]:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers GET and HEAD for known addresses, with byte ranges, which players need to seek."""
+    """Answers GET and HEAD requests for known addresses.
+
+    Byte ranges are supported, because video players need them to seek.
+    """
 
     served: ServedContent
     protocol_version = "HTTP/1.1"
 
     def do_GET(self) -> None:
-        """Answer with the content."""
+        """Answer with headers and content."""
         self._answer_until_closed(with_body=True)
 
     def do_HEAD(self) -> None:
-        """Answer without the content."""
+        """Answer with headers only."""
         self._answer_until_closed(with_body=False)
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the base class's name
         """Log nothing."""
 
     def _answer_until_closed(self, *, with_body: bool) -> None:
-        # Players close the connection whenever they seek, so a broken connection is not an error.
+        # Video players close the connection whenever they seek, so a closed connection is not an error.
         try:
             self._answer(with_body=with_body)
         except ConnectionError:
             self.close_connection = True
 
     def _answer(self, *, with_body: bool) -> None:
-        # A foreign web page can give this computer another host name (DNS rebinding), so that is refused.
+        # A foreign web page can reach this server through its own host name (DNS rebinding). Therefore all
+        # requests with another host name are refused.
         host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
         if host not in (LOOPBACK, "localhost"):
             self.send_error(HTTPStatus.FORBIDDEN)

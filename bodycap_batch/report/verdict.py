@@ -1,4 +1,4 @@
-"""The verdict on a job: each criterion is graded by bounds, and the page states the reason for the bounds."""
+"""Judge the result of a job: grade each criterion by bounds. The page gives the reason for the bounds."""
 
 from __future__ import annotations
 
@@ -12,35 +12,62 @@ from bodycap_batch.report.camera_pairs import distance_criteria, shared_segment_
 from bodycap_batch.report.grades import Criterion, Grade, grade_value
 
 _GOOD_ERROR_PX, _FAIR_ERROR_PX = 1.0, 2.0
-"""Mean reprojection error, pixels: with sharp corners and correct intrinsics it is less than one."""
+"""Maximum mean reprojection error (pixels) for the grades "good" and "usable with care".
+
+With sharp corners and correct intrinsics the error is less than one pixel.
+"""
 _GOOD_COVERAGE, _FAIR_COVERAGE = 0.98, 0.85
-"""Share of registered frames of all cameras; the criterion's text states the reason."""
+"""Minimum fraction of registered frames of all cameras for the grades "good" and "usable with care".
+
+The criterion's text gives the reason.
+"""
 _GOOD_CAMERA_COVERAGE, _FAIR_CAMERA_COVERAGE = 0.95, 0.75
-"""Share of registered frames of the worst camera. Evidence: none."""
+"""Minimum fraction of registered frames of the worst camera for the grades "good" and "usable with care".
+
+Evidence: none.
+"""
 _FAIR_FOCAL_ERROR = 0.1
-"""Relative error of a focal length. Evidence: docs/decisions/report.md."""
+"""Maximum relative error of a focal length for the grade "usable with care".
+
+Evidence: docs/decisions/report.md.
+"""
 _GOOD_SCALE_SIGMA, _FAIR_SCALE_SIGMA = 0.025, 0.10
-"""Relative sigma of the metric scale; the criterion's text states the reason."""
+"""Maximum relative sigma of the metric scale for the grades "good" and "usable with care".
+
+The criterion's text gives the reason.
+"""
 _GOOD_RESIDUAL_M, _FAIR_RESIDUAL_M = 0.01, 0.03
-"""Metres, of residuals and of distances at joints; the criteria's texts state the reason."""
+"""Maximum residuals and maximum distances at joints (metres) for the grades "good" and "usable with care".
+
+The criteria's texts give the reason.
+"""
 _GOOD_GAP_S, FAIR_GAP_S = 0.2, 0.6
-"""Seconds without a measurement; the criterion's text states the reason."""
+"""Maximum time (seconds) without a measurement for the grades "good" and "usable with care".
+
+The criterion's text gives the reason.
+"""
 GOOD_MOUNT_DEG, _FAIR_MOUNT_DEG = 4.0, 12.0
-"""Sigma of a mount's rotation, degrees; the criterion's text states the reason."""
+"""Maximum sigma (degrees) of a mount's rotation for the grades "good" and "usable with care".
+
+The criterion's text gives the reason.
+"""
 _GOOD_OBSERVED_SHARE, _FAIR_OBSERVED_SHARE = 0.95, 0.8
-"""Share of the time in which a joint is measured. Evidence: none."""
+"""Minimum fraction of the time in which a joint is measured for the grades "good" and "usable with care".
+
+Evidence: none.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """The result in a few words, at the top of the page.
+    """The judgement of a job's result, shown at the top of the page.
 
     Attributes:
-        headline: One sentence.
-        grade: The worse grade of the two halves.
-        cameras: Grade of cameras and room.
-        body: Grade of the motion; None if the job asks for none.
-        criteria: All graded figures.
+        headline: The judgement in one sentence.
+        grade: The worse of the two grades `cameras` and `body`.
+        cameras: Grade of the camera paths and the map.
+        body: Grade of the body's motion; None if the job asks for no body.
+        criteria: All graded criteria.
     """
 
     headline: str
@@ -51,11 +78,11 @@ class Verdict:
 
 
 def judge(metrics: Mapping[str, Any] | None, failure: Mapping[str, Any] | None) -> Verdict:
-    """Grade a job by its own figures.
+    """Grade the result of a job by the job's own metrics.
 
     Args:
-        metrics: The content of ``metrics.json``; None if the job has none.
-        failure: The error that stopped the job; None if it finished.
+        metrics: The content of ``metrics.json``; None if the job has no metrics.
+        failure: The error that stopped the job; None if the job finished.
     """
     criteria = () if metrics is None else tuple(_criteria(metrics))
     cameras = _worst_grade(criteria, "cameras") if metrics is not None else Grade.NONE
@@ -163,8 +190,8 @@ def _map_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
     yield from distance_criteria(mapping.reach, unused)
     yield from shared_segment_criteria(metrics.get("relative_poses", ()), merge.get("mounts", {}), unused)
     misfits, freed = mapping.misfit_factors or {}, mapping.recalibrated
-    # A wrong camera model, such as a pinhole for a wide lens, leaves a larger error than sharp corners have.
-    # Then the lenses that were estimated together with the map do not count as corrected.
+    # A wrong camera model, such as a pinhole model for a wide lens, leaves a larger error than sharp corners
+    # have. With such an error, lenses that were estimated together with the map are not treated as corrected.
     yield from _lens_criteria(misfits, freed if error is not None and float(error) <= _GOOD_ERROR_PX else ())
 
 
@@ -195,14 +222,14 @@ def _lens_criteria(misfits: Mapping[str, float], freed: Collection[str]) -> Iter
     """Yield the criterion about calibrations that the map contradicts.
 
     Args:
-        misfits: Fitting over given focal length, by camera.
-        freed: Cameras for which the intrinsics were estimated together with the map, and fit.
+        misfits: Ratio of the focal length that fits the pictures to the given focal length, by camera name.
+        freed: Names of the cameras whose intrinsics were estimated together with the map and now fit.
     """
     not_corrected = {name: factor for name, factor in misfits.items() if name not in freed}
     misfits = not_corrected or misfits
     name, worst = max(misfits.items(), key=lambda item: abs(item[1] - 1.0), default=("", None))
     if worst is not None:
-        # The map can contradict a lens although its focal length fits, so the grade is never "good".
+        # The map can contradict a lens with a correct focal length. Therefore the grade is never "good".
         grade = (
             max(Grade.FAIR, grade_value(abs(worst - 1.0), 0.0, _FAIR_FOCAL_ERROR))
             if not_corrected
@@ -223,10 +250,11 @@ def _lens_criteria(misfits: Mapping[str, float], freed: Collection[str]) -> Iter
 
 
 def describe_lens_misfit(factor: float) -> str:
-    """Describe the fitting lens relative to the given one.
+    """Describe the lens that fits the pictures, compared with the given lens.
 
     Args:
-        factor: Fitting over given focal length. If only the principal point is wrong, it can be one.
+        factor: Ratio of the focal length that fits the pictures to the given focal length. The ratio can be
+            1 if only the principal point is wrong.
     """
     rounded_percent = round(100 * abs(factor - 1.0))
     if not rounded_percent:

@@ -1,4 +1,4 @@
-"""The data of the 3D viewer: points, camera paths and the moving skeleton."""
+"""Make the data of the 3D viewer: points, camera paths and the moving skeleton."""
 
 from __future__ import annotations
 
@@ -15,24 +15,31 @@ from bodycap_batch.report.packing import PageBudget, affordable_count, pack_byte
 from bodycap_batch.report.report_inputs import ReportInputs
 
 MAX_POINTS = 50_000
-"""Points of the map. A software renderer cannot turn more smoothly, and they could not be distinguished."""
+"""Maximum number of drawn map points.
+
+With more points, a software renderer could not rotate the view smoothly. A user could not distinguish more
+points either.
+"""
 _PATH_BUDGET = 1_300_000
-"""Characters of all camera paths together. Evidence: none."""
+"""Maximum number of base64 characters of all camera paths together. Evidence: none."""
 _MOTION_BUDGET = 2_000_000
-"""Characters of the motion. Evidence: none."""
+"""Maximum number of base64 characters of the body's motion. Evidence: none."""
 _POSE_BYTES = 16
-"""Bytes of one pose of a path: position, quaternion and time in 16 bits each."""
+"""Number of bytes of one pose of a path: 16 bits for each number of position, quaternion and time."""
 _MAX_DISTANCE = 4.0
-"""Distance of a drawn point from the cameras, relative to the scene's half width. Evidence: none."""
+"""Maximum distance of a drawn point from the scene's centre, as a ratio to the scene's half width.
+
+Evidence: none.
+"""
 
 
 def make_viewer_data(inputs: ReportInputs, scene: DrawnScene, budget: PageBudget) -> dict[str, Any]:
     """Return everything that the viewer draws, as JSON values.
 
     Args:
-        inputs: The results.
-        scene: Maps and paths in the drawn frame of reference.
-        budget: Share of the budgets; it records what was thinned.
+        inputs: The results of the job.
+        scene: Maps and camera paths in the drawn frame of reference.
+        budget: The budget of the page. It records which items were thinned.
     """
     points, colours = _select_points(scene, budget)
     path_budget = budget.scaled(_PATH_BUDGET) // max(1, len(scene.paths))
@@ -47,7 +54,11 @@ def make_viewer_data(inputs: ReportInputs, scene: DrawnScene, budget: PageBudget
 
 
 def _select_points(scene: DrawnScene, budget: PageBudget) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
-    """Return positions and RGB colours of the drawn points, in random order."""
+    """Select the map points to draw, in random order.
+
+    Returns:
+        The positions (P,3) in the drawn frame of reference, and the RGB colours (P,3).
+    """
     clouds = [scene.drawn_from_map[one_map.gauge].apply(one_map.points) for one_map in scene.maps]
     points = np.concatenate([np.zeros((0, 3)), *clouds])
     colours = np.concatenate([np.zeros((0, 3), np.uint8), *(one_map.colors for one_map in scene.maps)])
@@ -55,15 +66,19 @@ def _select_points(scene: DrawnScene, budget: PageBudget) -> tuple[FloatArray, n
     if len(points):
         centre, radius = _extent(scene, points)
         selected = np.flatnonzero(np.abs(points - centre).max(axis=1) < _MAX_DISTANCE * radius)
-    # On a slow computer the viewer draws only the first points while it moves; in random order they are a
-    # thinner cloud of the same shape.
+    # On a slow computer the viewer draws only the first points while the view moves. Because of the random
+    # order, the first points form a thinner cloud of the same shape.
     selected = np.random.default_rng(0).permutation(selected)[: budget.scaled(MAX_POINTS)]
     budget.record("points of the map", len(selected), len(points))
     return points[selected], np.asarray(colours[selected], dtype=np.uint8)
 
 
 def _extent(scene: DrawnScene, points: FloatArray) -> tuple[FloatArray, float]:
-    """Return the median camera position, and the distance to it of all cameras and 90 % of the points."""
+    """Return the scene's centre (3,) and the scene's half width.
+
+    The centre is the median camera position, or the median point without cameras. A cube around the centre
+    with this half width contains all cameras and 90 % of the points.
+    """
     centres = _camera_centres(scene)
     middle = np.median(centres if len(centres) else points, axis=0)
     point_distance = np.percentile(np.abs(points - middle).max(axis=1), 90)
@@ -72,7 +87,7 @@ def _extent(scene: DrawnScene, points: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _camera_centres(scene: DrawnScene) -> FloatArray:
-    """Return the centres (N,3) of all registered frames."""
+    """Return the camera centres (N,3) of all registered frames, in the drawn frame of reference."""
     centres = np.concatenate([np.zeros((0, 3)), *(path.poses[:, :3, 3] for path in scene.paths)])
     return np.asarray(centres[np.isfinite(centres).all(axis=1)])
 
@@ -93,7 +108,7 @@ def _pack_path(path: DrawnPath, characters: int, budget: PageBudget) -> dict[str
 
 
 def _pack_body(merge: MergeResult, budget: PageBudget) -> dict[str, Any]:
-    """Return joint centres and the tips of end joints over time, with the skeleton's structure."""
+    """Return the centres of joints and the tips of end joints over time, with the skeleton's structure."""
     skeleton = merge.skeleton
     times = merge.times_ns() * 1e-9
     end_joints = np.flatnonzero(np.isfinite(skeleton.end_offsets_m).all(axis=1))
@@ -119,13 +134,16 @@ def _pack_body(merge: MergeResult, budget: PageBudget) -> dict[str, Any]:
 
 
 def known_joint_sigma_m(merge: MergeResult) -> FloatArray | None:
-    """Return the sigma (T,J) per axis of each joint, metres, NaN where unknown; None if all are unknown."""
+    """Return the sigma (T,J) of each joint's position per axis, metres.
+
+    An unknown sigma is NaN. The result is None if every sigma is unknown.
+    """
     sigma = merge.joint_sigma_m()
     return sigma if np.isfinite(sigma).any() else None
 
 
 def _initial_view(scene: DrawnScene, merge: MergeResult | None, points: FloatArray) -> dict[str, Any]:
-    """Return centre and radius of what the viewer shows at first."""
+    """Return the centre and the radius of the region that the viewer shows when the page opens."""
     centres = _camera_centres(scene)
     if merge is not None:
         centres = np.concatenate([centres, merge.motion.root_in_world_m])

@@ -1,4 +1,4 @@
-"""The layout of a motion for animation software: frame rate, joint names, spine joints, T-pose and root."""
+"""Adapt a motion to animation software: frame rate, joint names, spine joints, T-pose and root."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ __all__ = ["apply_layout"]
 def apply_layout(motion: Motion, options: ExportOptions) -> Motion:
     """Return the motion with the layout of the files for animation (BVH, GLB, FBX, USD).
 
-    Other joint names and numbers of spine joints do not move any joint in the world. A user's own skeleton
-    keeps its names and joints.
+    New joint names and additional spine joints do not move the existing joints in the world. The joint names
+    and the number of joints of a user's own skeleton do not change.
 
     Args:
         motion: The solved motion in the world.

@@ -1,4 +1,4 @@
-"""Joint names and numbers of spine joints of common animation skeletons."""
+"""Change joint names and the number of spine joints to match a common animation skeleton."""
 
 from __future__ import annotations
 
@@ -18,16 +18,21 @@ from bodycap_batch.model.skeleton_presets import split_side
 
 @cache
 def naming_preset(preset: str) -> dict[str, Any]:
-    """Return the entry of a naming preset in ``names.yaml``."""
+    """Return the settings of a naming preset from ``names.yaml``."""
     text = resources.files("bodycap_batch.presets").joinpath("names.yaml").read_text(encoding="utf-8")
     return dict(yaml.safe_load(text)[preset])
 
 
 def rename_joints(motion: Motion, preset: str) -> Motion:
-    """Return the motion with the joint names and the numbers of spine and neck joints of a preset.
+    """Return the motion with the joint names, spine joints and neck joints of a naming preset.
 
-    Added joints lie on the bone that they divide. They rotate about this bone only, each by an equal part of
-    the twist of the joint at the bone's end. Therefore no other joint moves or rotates in the world.
+    Added joints divide a bone into equal parts. They rotate only about this bone. The twist of the joint at
+    the bone's end is divided equally among the added joints and this joint. Therefore no existing joint moves
+    or rotates in the world.
+
+    Args:
+        motion: The motion.
+        preset: Name of the naming preset.
     """
     chosen = naming_preset(preset)
     prefix, spine, neck = chosen.get("prefix", ""), chosen["spine"], chosen["neck"]
@@ -43,22 +48,27 @@ def rename_joints(motion: Motion, preset: str) -> Motion:
 
 
 def _joint_name(role: str, chosen: dict[str, Any]) -> str:
-    """Return the name of the joint with a role in a preset."""
+    """Return the joint name that a preset gives to a role.
+
+    Args:
+        role: The role of the joint.
+        chosen: The settings of the naming preset.
+    """
     side, part = split_side(role)
     name = chosen.get("names", {}).get(part, part)
     return f"{name}{chosen['sides'][side]}" if side and "sides" in chosen else f"{side}{name}"
 
 
 def _insert_joints(motion: Motion, lower: str, upper: str, names: list[str]) -> Motion:
-    """Return the motion with new joints between two joints.
+    """Return the motion with new joints on the bone between a parent joint and a child joint.
 
-    It is returned unchanged if the joints do not exist or are not parent and child.
+    The motion is returned unchanged if one of the joints does not exist, or if they are not parent and child.
 
     Args:
         motion: The motion.
-        lower: Role of the parent.
-        upper: Role of the child.
-        names: Names of the new joints, from the parent to the child.
+        lower: Role of the parent joint.
+        upper: Role of the child joint.
+        names: Names of the new joints, in the order from the parent to the child.
     """
     skeleton = motion.skeleton
     start, end = skeleton.index_of_role(lower), skeleton.index_of_role(upper)
@@ -83,7 +93,13 @@ def _insert_joints(motion: Motion, lower: str, upper: str, names: list[str]) -> 
 
 
 def _skeleton_with_joints(skeleton: SkeletonModel, end: int, names: list[str]) -> SkeletonModel:
-    """Return the skeleton with new joints evenly spaced along the bone from its parent to the joint `end`."""
+    """Return the skeleton with new, evenly spaced joints on the bone that ends at the joint `end`.
+
+    Args:
+        skeleton: The skeleton without the new joints.
+        end: Index of the joint at the bone's end.
+        names: Names of the new joints, in the order from the parent to the joint `end`.
+    """
     count = len(names)
     shifted = np.where(skeleton.parents >= end, skeleton.parents + count, skeleton.parents)
     chain = [int(skeleton.parents[end]), *range(end, end + count)]
@@ -115,5 +131,5 @@ def _twist_rad(rotation: FloatArray, axis: FloatArray) -> FloatArray:
 
 
 def _unit_vector(vector: FloatArray) -> FloatArray:
-    """Return the unit vector of a vector (3,); zero for a vector without length."""
+    """Return the unit vector of a vector (3,); the zero vector is returned unchanged."""
     return np.asarray(vector / (np.linalg.norm(vector) or 1.0))

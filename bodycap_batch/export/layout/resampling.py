@@ -16,26 +16,36 @@ from bodycap_batch.model.geometry import (
 from bodycap_batch.model.skeleton import Motion
 
 _TICK_TOLERANCE = 1e-9
-"""Ratio to the distance of two old ticks. A new tick nearer than this to an old one coincides with it.
-Derivation: above the rounding of tick times."""
+"""Maximum time between a new tick and an old tick that coincide, as a ratio to the old tick interval.
+
+Derivation: it is larger than the rounding of tick times.
+"""
 
 _LAST_TICK_TOLERANCE = 1e-6
-"""New ticks. The last old tick is included if it misses the new timeline by less than this. Derivation: above
-the rounding of tick times."""
+"""Maximum time by which the last new tick may exceed the last old tick, as a ratio to the new tick interval.
+
+Derivation: it is larger than the rounding of tick times.
+"""
 
 _TWO_PASS_CUTOFF_RATIO = float((2**0.5 - 1) ** 0.25)
-"""Ratio of the cut-off frequency after two passes of the filter to that of one pass. Source: D. A. Winter,
-Biomechanics and Motor Control of Human Movement, 4th ed., section 3.4.4."""
+"""Ratio of the filter's cut-off frequency after two passes to its cut-off frequency after one pass.
+
+Source: D. A. Winter, Biomechanics and Motor Control of Human Movement, 4th ed., section 3.4.4.
+"""
 
 _MIN_TICKS = 4
-"""A shorter motion is not smoothed. Evidence: none."""
+"""Minimum number of ticks of a motion that is smoothed. Evidence: none."""
 
 
 def resample(motion: Motion, fps: float) -> Motion:
-    """Return the motion at another rate, from its first to its last tick.
+    """Return the motion at another frame rate, from the first to the last tick of the old motion.
 
-    Rotations are interpolated by slerp, positions linearly. A tick between two old ticks counts as observed
-    if both old ticks were observed.
+    Rotations are interpolated by slerp, and positions linearly. A joint is observed at a new tick between two
+    old ticks if the joint was observed at both old ticks.
+
+    Args:
+        motion: The old motion.
+        fps: The new frame rate, ticks per second.
     """
     if fps == motion.fps:
         return motion
@@ -61,17 +71,19 @@ def resample(motion: Motion, fps: float) -> Motion:
 
 
 def smooth(motion: Motion, cutoff_hz: float) -> Motion:
-    """Return the motion with root path and rotations low-pass filtered, without delay.
+    """Return the motion with a low-pass filter applied to the root path and the rotations, without delay.
 
-    The motion is returned unchanged if the cut-off frequency is not below half the frame rate.
+    The motion is returned unchanged if it is too short. It is also returned unchanged if the filter's cut-off
+    frequency for one pass is at least half the frame rate.
 
     Args:
         motion: The motion.
-        cutoff_hz: Cut-off frequency of the filter.
+        cutoff_hz: Cut-off frequency after both passes of the filter, Hz.
 
-    Source: D. A. Winter, Biomechanics and Motor Control of Human Movement, 4th ed., section 3.4.4: a
-        second-order Butterworth low-pass, forwards and backwards, with its cut-off corrected for the two
-        passes. It is applied to positions and to the components of quaternions with continuous signs.
+    Source: D. A. Winter, Biomechanics and Motor Control of Human Movement, 4th ed., section 3.4.4. The filter
+        is a second-order Butterworth low-pass, applied forwards and backwards. The cut-off frequency is
+        corrected for the two passes. The filter is applied to positions and to the components of quaternions
+        with continuous signs.
     """
     if 2.0 * cutoff_hz / _TWO_PASS_CUTOFF_RATIO >= motion.fps or len(motion.root_in_world_m) < _MIN_TICKS:
         return motion
@@ -84,11 +96,11 @@ def smooth(motion: Motion, cutoff_hz: float) -> Motion:
 
 
 def _low_pass(values: FloatArray, cutoff_hz: float, fps: float) -> FloatArray:
-    """Low-pass filter values (T,...) along time."""
+    """Return values (T,...) after low-pass filtering along the time axis."""
     from scipy.signal import butter, sosfiltfilt
 
     sections = butter(2, cutoff_hz / _TWO_PASS_CUTOFF_RATIO, fs=fps, output="sos")
     padding = min(
         len(values) - 1, round(3.0 * fps / cutoff_hz)
-    )  # three periods: the filter's start has decayed
+    )  # three periods: long enough for the filter's transient to decay
     return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=padding))

@@ -1,4 +1,4 @@
-"""The T-pose frame and the root motion: on the hips, on a root joint on the floor, or removed."""
+"""Add the T-pose frame. Assign the root motion to the hips or to a root joint on the floor, or remove it."""
 
 from __future__ import annotations
 
@@ -13,23 +13,37 @@ from bodycap_batch.model.geometry import quat_xyzw_from_rotation, so3_exp
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
 _MIN_HEADING_NORM = 0.1
-"""Norm of the heading part (w, z) of a unit quaternion. Below this the hips are nearly upside down and have
-no heading. Evidence: none."""
+"""Minimum norm of the heading part (w, z) of a unit quaternion.
+
+With a smaller norm the hips are nearly upside down, and their heading is undefined. Evidence: none.
+"""
 
 _HIPS_OFFSET_M = 1e-3
-"""Metres. In the rest pose the hips are this far in front of the root on the floor. Derivation: directly
-above it they would be at the tip of its bone. Blender's FBX importer would then connect them to it and ignore
-their motion."""
+"""Distance (metres) of the hips in front of the floor root, in the rest pose.
+
+Derivation: the hips must not be directly above the floor root, at the tip of the floor root's bone. Blender's
+FBX importer would then connect the hips to this bone and ignore the hips' motion.
+"""
 
 
 def floor_root_name(names: str, mode: RootMode) -> str | None:
-    """Return the name of the root on the floor if the naming preset or the mode needs one, else None."""
+    """Return the name of the root joint on the floor; None if the motion gets no such joint.
+
+    The mode ``ground`` and some naming presets require this joint.
+
+    Args:
+        names: Name of the naming preset.
+        mode: The mode of the root motion.
+    """
     chosen = naming_preset(names)
     return str(chosen["floor"]) if mode == "ground" or chosen.get("always") else None
 
 
 def prepend_tpose(motion: Motion) -> Motion:
-    """Return the motion with one frame more at the start: the T-pose at the first position, facing −Y."""
+    """Return the motion with a T-pose added as the first frame.
+
+    The T-pose stands at the horizontal position of the first frame of the motion and faces −Y.
+    """
     skeleton = motion.skeleton
     tpose = skeleton.tpose_rotation
     local = np.tile(np.eye(3), (len(skeleton.joints), 1, 1)) if tpose is None else tpose
@@ -44,16 +58,17 @@ def prepend_tpose(motion: Motion) -> Motion:
 
 
 def apply_root_mode(motion: Motion, mode: RootMode, floor: str | None) -> Motion:
-    """Return the motion with the root motion that a mode describes.
+    """Return the motion with the root motion that a mode selects.
 
-    ``hips``: The hips carry the whole motion. ``ground``: The root on the floor below the hips carries their
-    horizontal path and their heading. The hips keep their height and the rest of their rotation, and no joint
-    moves in the world. ``in_place``: The hips stay on the vertical through the origin.
+    ``hips``: the hips hold the whole root motion. ``ground``: a root joint on the floor below the hips holds
+    the horizontal path and the heading of the hips. The hips hold their height and the remaining rotation. No
+    existing joint moves in the world. ``in_place``: the horizontal path is removed, so that the hips stay
+    above the origin.
 
     Args:
         motion: The motion, with the hips as its root.
         mode: The mode of the root motion.
-        floor: Name of the root on the floor, or None for none.
+        floor: Name of the root joint on the floor; None for no such joint.
     """
     if mode == "in_place":
         motion = replace(motion, root_in_world_m=motion.root_in_world_m * [0.0, 0.0, 1.0])
@@ -79,9 +94,13 @@ def apply_root_mode(motion: Motion, mode: RootMode, floor: str | None) -> Motion
 
 
 def heading_rad(world_from_hips: FloatArray) -> FloatArray:
-    """Return the heading (T,) of rotations (T,3,3): their twist about Z, in radians and continuous over time.
+    """Return the heading (T,) of the hips over time: the twist of their rotation about Z, radians.
 
-    At a tick without a defined heading, the last defined one is returned.
+    The heading is continuous over time. At a tick with an undefined heading, the latest defined heading is
+    returned; before the first defined heading, the first one is returned.
+
+    Args:
+        world_from_hips: (T,3,3) rotation of the hips in the world.
     """
     quat = quat_xyzw_from_rotation(world_from_hips)
     defined = np.hypot(quat[:, 2], quat[:, 3]) > _MIN_HEADING_NORM
@@ -93,7 +112,12 @@ def heading_rad(world_from_hips: FloatArray) -> FloatArray:
 
 
 def _skeleton_with_floor_root(skeleton: SkeletonModel, name: str) -> SkeletonModel:
-    """Return the skeleton with an additional root on the floor, the parent of its first root."""
+    """Return the skeleton with a root joint on the floor, which becomes the parent of the old root.
+
+    Args:
+        skeleton: The skeleton, with the hips as its root.
+        name: Name of the new root joint. A number is appended if a joint already has this name.
+    """
     unique_name, number = name, 2
     while unique_name in skeleton.joints:
         unique_name, number = f"{name}{number}", number + 1

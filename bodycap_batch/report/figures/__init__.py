@@ -1,1 +1,1 @@
-"""Drawings as SVG and PNG; the page's style sheet colours them for its light and dark schemes."""
+"""Drawings as SVG and PNG. The page's style sheet colours the SVG for light and dark colour schemes."""

@@ -1,4 +1,4 @@
-"""The skeleton before and after its optimisation, from the front.
+"""Draw the skeleton before and after its optimisation, viewed from the front.
 
 Source: M. Vo, Kim, Choudhary, "Motion Capture using Body Mounted Cameras in an Unknown Environment",
     figure 8.
@@ -17,24 +17,30 @@ from bodycap_batch.report.figures.svg import element, path_through, svg_image, t
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _COLUMNS = 4
-"""Times that are drawn next to each other."""
+"""Number of times at which the skeleton is drawn, side by side."""
 _MAX_INTERVAL_S = 0.1
-"""Longest time between two poses that are interpolated, seconds: three frames of a camera with 30 fps."""
+"""Maximum time (seconds) between two measured poses for interpolation between them.
+
+This is the duration of three frames of a camera with 30 fps.
+"""
 _CELL_WIDTH, _CELL_HEIGHT, _UNITS_PER_M = 236.0, 250.0, 112.0
-"""Size of one drawing, SVG units, and SVG units per metre: a person of 2 m fits."""
+"""Width and height of one drawing (SVG units), and number of SVG units per metre.
+
+A person of 2 m fits into the drawing.
+"""
 _TOP_HEIGHT_M = 1.95
-"""Height above the floor at the upper edge, metres."""
+"""Height above the floor (metres) that is drawn at the upper edge of a drawing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UnoptimisedBone:
-    """A bone as one camera alone places it: from its measured poses and the assumed mount.
+    """A bone before the optimisation, placed only by the measured poses and the assumed mount of one camera.
 
     Attributes:
-        camera: Camera name.
+        camera: Name of the camera on the bone.
         joint: Index of the bone's joint.
-        ticks: (N,) ticks of the motion at a measured pose or between two successive ones.
-        world_from_joint: (N,4,4) pose of the bone.
+        ticks: (N,) indices of the motion's ticks at which the camera has a measured or interpolated pose.
+        world_from_joint: (N,4,4) pose of the bone's joint at these ticks.
     """
 
     camera: str
@@ -43,13 +49,20 @@ class UnoptimisedBone:
     world_from_joint: FloatArray
 
     def distance_m(self, world_from_joint: FloatArray) -> FloatArray:
-        """Return the distance (N,) of its joint from the motion's, whose poses are (T,J,4,4), metres."""
+        """Return how far the bone's joint is from the same joint of the solved motion.
+
+        Args:
+            world_from_joint: (T,J,4,4) joint poses of the solved motion.
+
+        Returns:
+            (N,) distance at each tick of `ticks`, metres.
+        """
         solved = world_from_joint[self.ticks, self.joint, :3, 3]
         return np.asarray(np.linalg.norm(self.world_from_joint[:, :3, 3] - solved, axis=1))
 
 
 def find_unoptimised_bones(inputs: ReportInputs) -> list[UnoptimisedBone]:
-    """Return the bone of each camera as its assumed mount alone places it."""
+    """Return, for each camera on the body, the bone as the camera's poses and assumed mount place it."""
     merge = inputs.merge
     if merge is None:
         return []
@@ -85,7 +98,17 @@ def find_unoptimised_bones(inputs: ReportInputs) -> list[UnoptimisedBone]:
 
 
 def draw_before_and_after(inputs: ReportInputs, colours: dict[str, str]) -> str:
-    """Draw the body at a few times from its own front: before in the cameras' colours, after in ink."""
+    """Draw the body at a few times, viewed from the body's front.
+
+    Bones before the optimisation have the colours of their cameras. Bones after it have the text colour.
+
+    Args:
+        inputs: The results of the job.
+        colours: Colour ``#rrggbb`` of each camera, by camera name.
+
+    Returns:
+        The drawing as SVG; "" without a body.
+    """
     merge = inputs.merge
     bones = find_unoptimised_bones(inputs)
     if merge is None or not bones:
@@ -119,7 +142,7 @@ def _draw_tick(
     across = left / max(float(np.linalg.norm(left)), 1e-9)
 
     def to_drawing(points: FloatArray) -> list[tuple[float, float]]:
-        # From the front the body's left side is on the right.
+        # Viewed from the front, the body's left side appears on the right.
         x = (points - root[:3, 3]) @ across * _UNITS_PER_M + (column + 0.5) * _CELL_WIDTH
         y = 18.0 + (_TOP_HEIGHT_M - points[:, 2]) * _UNITS_PER_M
         return list(zip(x.tolist(), y.tolist(), strict=True))
@@ -158,12 +181,20 @@ def _draw_tick(
 
 
 def _bone_ends(pose: FloatArray, offset: FloatArray) -> FloatArray:
-    """Return near and far end (2,3) of a bone with a pose and the offset of its far end."""
+    """Return the two ends (2,3) of a bone, first the end at the joint.
+
+    Args:
+        pose: (4,4) pose of the joint.
+        offset: (3,) offset of the far end in the frame of the joint.
+    """
     return np.stack([pose[:3, 3], pose[:3, :3] @ offset + pose[:3, 3]])
 
 
 def _far_end_offsets(merge: MergeResult, joint: int) -> list[FloatArray]:
-    """Return the offsets of a bone's far ends in the frame of its joint."""
+    """Return the offsets (3,) of a joint's children, in the frame of the joint.
+
+    For a joint without children, return the offset of the tip of its bone.
+    """
     skeleton = merge.skeleton
     children = np.flatnonzero(skeleton.parents == joint)
     if len(children):

@@ -1,7 +1,9 @@
-"""The camera-landmark matrix: rows are frames, columns are landmarks, a dot is an observation.
+"""Draw the camera-landmark matrix: rows are frames, columns are landmarks, dots are observations.
+
+Landmarks are sorted by their first observation, so new landmarks appear on the diagonal.
 
 Source: M. Vo, Kim, Choudhary, "Motion Capture using Body Mounted Cameras in an Unknown Environment",
-    figures 3 and 5. Landmarks are in the order of first observation, so new ones appear on the diagonal.
+    figures 3 and 5.
 """
 
 from __future__ import annotations
@@ -16,24 +18,30 @@ from bodycap_batch.report.figures.svg import element, number, svg_image, text
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _WIDTH, _LEFT, _TOP, _RIGHT = 960.0, 92.0, 20.0, 12.0
-"""Width of the figure and its margins, SVG units."""
+"""Width of the drawing, and its left, top and right margins, SVG units."""
 _MAX_ROWS, _MAX_COLUMNS = 720, 856
-"""Pixels of all bands together: about one for each SVG unit."""
+"""Number of pixel rows of all bands together, and number of pixel columns: one pixel for each SVG unit.
+
+The bands have more rows if some of them have the minimum height.
+"""
 _MIN_BAND_HEIGHT = 60.0
-"""Height of a camera's band, SVG units: two lines of text."""
+"""Minimum height of a camera's band, SVG units. Two lines of text fit into this height."""
 _BAND_MARGIN = 8.0
-"""Space between two bands, SVG units."""
+"""Height of the space between two bands, SVG units."""
 _NO_POINT = -1
-"""Index of a feature without a point in the map."""
+"""Point index of a feature that has no point in the map."""
 
 
 def draw_camera_landmark_matrix(inputs: ReportInputs, colours: dict[str, str], detail: float = 1.0) -> str:
-    """Draw the matrix of all cameras that are registered in the largest map.
+    """Draw the matrix of all cameras that are registered in the largest map, with one band for each camera.
 
     Args:
-        inputs: The results.
-        colours: Colour of each camera, ``#rrggbb``.
-        detail: Share of the pixels that may be used.
+        inputs: The results of the job.
+        colours: Colour ``#rrggbb`` of each camera, by camera name.
+        detail: Fraction of the pixels that may be used, 0 to 1.
+
+    Returns:
+        The drawing as SVG; "" if no camera is registered in the largest map.
     """
     if not inputs.maps or not inputs.registrations:
         return ""
@@ -73,7 +81,10 @@ def draw_camera_landmark_matrix(inputs: ReportInputs, colours: dict[str, str], d
 
 
 def _observations(registration: Registration, scene: Map) -> tuple[IntArray, IntArray]:
-    """Return frame and point index of a camera's observations: tracked ones and those of its keyframes."""
+    """Return the frame indices (N,) and the point indices (N,) of a camera's observations.
+
+    These are the observations of tracked features in all frames, and the map's observations in keyframes.
+    """
     camera = registration.trajectory.camera
     tracked = scene.points_of(camera, registration.obs_keyframe, registration.obs_feature)
     of_keyframes = np.isin(scene.obs_keyframe, scene.keyframes_of(camera))
@@ -84,7 +95,15 @@ def _observations(registration: Registration, scene: Map) -> tuple[IntArray, Int
 
 
 def _order_by_first_observation(observations: list[tuple[IntArray, IntArray]], count: int) -> IntArray:
-    """Return the column (P,) of each point: by the first camera that sees it, then by its first frame."""
+    """Return the matrix column (P,) of each point.
+
+    Points are sorted by the first camera that observes the point, then by the first frame of this camera that
+    observes the point.
+
+    Args:
+        observations: Frame indices and point indices of the observations of each camera.
+        count: Number of points P.
+    """
     key = np.full(count, np.iinfo(np.int64).max)
     for index, (frames, points) in reversed(list(enumerate(observations))):
         first = np.full(count, np.iinfo(np.int64).max)
@@ -98,14 +117,17 @@ def _order_by_first_observation(observations: list[tuple[IntArray, IntArray]], c
 def _encode_matrix(
     frames: IntArray, columns: IntArray, size: tuple[int, int], pixels: tuple[int, int], colour: str
 ) -> str:
-    """Return a PNG, base64; the opacity of a pixel shows how many observations it has.
+    """Return the matrix of one camera as a PNG image in base64.
+
+    A pixel can represent several entries of the matrix. The pixel's opacity shows the fraction of these
+    entries that are observations.
 
     Args:
-        frames: (N,) frame of each observation.
-        columns: (N,) column of each observation.
-        size: Numbers of frames and landmarks.
-        pixels: Height and width of the image.
-        colour: ``#rrggbb``.
+        frames: (N,) frame index of each observation.
+        columns: (N,) matrix column of each observation.
+        size: Number of frames and number of landmarks.
+        pixels: Maximum height and maximum width of the image, pixels.
+        colour: Colour of the camera, ``#rrggbb``.
     """
     import cv2
 
@@ -145,7 +167,7 @@ def _draw_band(name: str, image: str, top: float, height: float, colour: str) ->
 
 
 def _draw_keyframe_rows(scene: Map, name: str, frame_count: int, top: float, height: float) -> str:
-    """Draw a faint line across the band at each keyframe."""
+    """Draw a faint horizontal line across a camera's band at each keyframe."""
     keyframes = scene.keyframe_frame[scene.keyframes_of(name)]
     rows = top + (keyframes + 0.5) / max(frame_count, 1) * height
     right = number(_WIDTH - _RIGHT)

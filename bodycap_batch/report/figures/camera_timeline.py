@@ -1,4 +1,7 @@
-"""One camera over time: status, inliers, error, sharpness and speed, on the time axis of all cameras."""
+"""Draw one camera over time: status, inliers, error, sharpness, speed and rotation.
+
+All cameras have the same time axis.
+"""
 
 from __future__ import annotations
 
@@ -16,28 +19,36 @@ from bodycap_batch.report.frame_losses import FrameLoss
 from bodycap_batch.report.report_inputs import ReportInputs
 
 WIDTH, LEFT, RIGHT = 960.0, 92.0, 12.0
-"""Width of the figure and its margins, SVG units."""
+"""Width of the drawing, and its left and right margins, SVG units."""
 _STATUS_HEIGHT, _CURVE_HEIGHT, _MARGIN = 18.0, 44.0, 10.0
-"""Heights of the status bar, of a curve and of the space between them, SVG units."""
+"""Height of the status bar, of a curve, and of the space between them, SVG units."""
 MAX_COLUMNS = 480
-"""Points of each curve: two of them are two pixels apart on a wide screen."""
+"""Maximum number of points on a curve. Neighbouring points are two pixels apart on a wide screen."""
 _MIN_COLUMNS = 12
-"""Points of each curve on the smallest page. Evidence: none."""
+"""Minimum number of points on a curve, for a page with little detail. Evidence: none."""
 _MIN_BAR_WIDTH = 0.8
-"""Width of a bar, SVG units: a single lost frame must remain visible."""
+"""Minimum width of a bar, SVG units. A single lost frame must remain visible."""
 _MIN_RANGE_HEIGHT = 0.6
-"""Height of a range, SVG units, from which it is visible behind its curve."""
+"""Height (SVG units) that a range of values must exceed to be drawn.
+
+A smaller range would be hidden behind its curve.
+"""
 _TICK_INTERVALS_S = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60, 120, 300, 600, 1800)
 """Possible intervals between the labels of the time axis, seconds."""
 _MAX_TICKS = 12
-"""Labels of the time axis; more would overlap."""
+"""Maximum number of intervals between the labels of the time axis. More labels would overlap."""
 _DEFAULT_INTERVAL_S = 0.03
-"""Assumed frame interval of a video with one frame, seconds: 30 fps."""
+"""Assumed frame interval (seconds) of a video with a single frame, as for about 30 fps."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Curve:
-    """One curve: its name with the unit, and a value for each frame."""
+    """One curve of the drawing.
+
+    Attributes:
+        name: Name of the quantity, with its unit.
+        values: (N,) value of each frame; NaN if unknown.
+    """
 
     name: str
     values: FloatArray
@@ -45,7 +56,15 @@ class _Curve:
 
 @dataclass(frozen=True, slots=True)
 class _StatusBar:
-    """An interval of one kind ("reg", "bridged" or "lost"), or several that a screen cannot separate."""
+    """A bar that represents an interval of frames, or several intervals that a screen cannot separate.
+
+    Attributes:
+        kind: Kind of the interval: "reg" (registered), "bridged" or "lost".
+        start_s: Common time of the bar's start, seconds.
+        end_s: Common time of the bar's end, seconds.
+        frames: Number of lost frames.
+        reasons: Reasons for the loss, as values of `FrameStatus`.
+    """
 
     kind: str
     start_s: float
@@ -62,15 +81,19 @@ def draw_camera_timeline(
     bridged_s: float,
     detail: float = 1.0,
 ) -> str:
-    """Draw one camera.
+    """Draw the timeline of one camera.
 
     Args:
-        inputs: The results.
+        inputs: The results of the job.
         camera: Camera name.
-        span_s: First and last common time of the axis.
-        losses: The camera's lost intervals.
-        bridged_s: Longest time between two measurements that the body bridges; 0 if it bridges none.
-        detail: Share of the columns that are drawn.
+        span_s: First and last common time of the time axis, seconds.
+        losses: The lost intervals of the camera.
+        bridged_s: Maximum time (seconds) between two measurements that the body's motion bridges; 0 if the
+            motion bridges no gap of this camera.
+        detail: Fraction of the columns that are drawn, 0 to 1.
+
+    Returns:
+        The drawing as SVG; "" if the camera has neither frames with poses nor a keyframe selection.
     """
     columns = column_count(detail)
     selection, path = inputs.selection(camera), inputs.path(camera)
@@ -107,12 +130,17 @@ def draw_camera_timeline(
 
 
 def column_count(detail: float) -> int:
-    """Return the number of points of each curve at a share of the detail."""
+    """Return the number of points on a curve for a fraction of the full detail, 0 to 1."""
     return max(_MIN_COLUMNS, int(MAX_COLUMNS * detail))
 
 
 def x_from_time(time_s: float | FloatArray, span_s: tuple[float, float]) -> FloatArray:
-    """Return the horizontal position of common times, SVG units."""
+    """Return the horizontal positions (SVG units) of common times (seconds).
+
+    Args:
+        time_s: One or more common times, seconds.
+        span_s: First and last common time of the time axis, seconds.
+    """
     share = (np.asarray(time_s) - span_s[0]) / max(span_s[1] - span_s[0], 1e-9)
     return np.asarray(LEFT + share * (WIDTH - LEFT - RIGHT))
 
@@ -151,9 +179,9 @@ def _draw_status(
     lost_bars: list[_StatusBar],
     columns: int,
 ) -> str:
-    """Draw bars of registered and lost intervals, and a line for each keyframe.
+    """Draw bars for registered and lost intervals, and a line for each keyframe.
 
-    A lost bar has a title with the reason and whether the body bridges the interval.
+    The title of a lost bar gives the reasons for the loss. It also says if the body's motion bridges the gap.
     """
     interval = _frame_interval_s(times)
     resolution_s = (span_s[1] - span_s[0]) / (2 * columns)
@@ -182,7 +210,8 @@ def _frame_interval_s(times: FloatArray) -> float:
 
 
 def _lost_bar(loss: FrameLoss, times: FloatArray, bridged_s: float) -> _StatusBar:
-    # Smoothness bridges a gap between two measurements, but not the time before the first or after the last.
+    # Smoothness bridges a gap between two measurements. It does not bridge the time before the first
+    # measurement or after the last measurement.
     is_between = loss.first > 0 and loss.last < len(times) - 1
     gap_s = float(times[loss.last + 1] - times[loss.first - 1]) if is_between else np.inf
     kind = "bridged" if gap_s <= bridged_s else "lost"
@@ -191,7 +220,14 @@ def _lost_bar(loss: FrameLoss, times: FloatArray, bridged_s: float) -> _StatusBa
 
 
 def _merge_close_bars(bars: list[_StatusBar], resolution_s: float) -> list[_StatusBar]:
-    """Merge neighbouring bars of one kind that a screen cannot separate, so that long videos stay small."""
+    """Merge neighbouring bars of the same kind that a screen cannot separate.
+
+    This limits the size of the drawing for a long video.
+
+    Args:
+        bars: The bars in the order of time.
+        resolution_s: Smallest distance of two bars that a screen can separate, seconds.
+    """
     merged: list[_StatusBar] = []
     for bar in bars:
         last = merged[-1] if merged else None
@@ -219,9 +255,9 @@ def _draw_bar(bar: _StatusBar, span_s: tuple[float, float], title: str) -> str:
 def _draw_curve(
     curve: _Curve, times: FloatArray, span_s: tuple[float, float], top: float, max_columns: int
 ) -> str:
-    """Draw the median of each column as a line over the range of its values.
+    """Draw a curve as a line through the median of each column, over the range of the column's values.
 
-    In a short video a column is one frame.
+    A column represents several successive frames, or a single frame in a short video.
     """
     columns = bin_statistics(curve.values, min(max_columns, len(curve.values)))
     column_times = np.interp(
@@ -247,7 +283,10 @@ def _draw_curve(
 
 
 def _range_path(x: FloatArray, y: FloatArray) -> str:
-    """Return vertical lines from the smallest to the largest value, where they differ visibly."""
+    """Return a vertical line from the smallest to the largest value of each column, as SVG path data.
+
+    Columns whose smallest and largest values hardly differ are omitted.
+    """
     visible = np.isfinite(y[:, 0]) & (np.abs(y[:, 0] - y[:, 2]) > _MIN_RANGE_HEIGHT)
     return "".join(f"M{number(x[i])} {number(y[i, 0])}V{number(y[i, 2])}" for i in np.flatnonzero(visible))
 

@@ -1,4 +1,4 @@
-"""The number of landmarks that each pair of cameras shares."""
+"""Draw the number of landmarks that each pair of cameras shares, as a matrix."""
 
 from __future__ import annotations
 
@@ -10,17 +10,23 @@ from bodycap_batch.report.recommendations import count_shared_points
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _CELL, _LEFT, _TOP = 74.0, 130.0, 26.0
-"""Width of a cell, and space for the names at the left and at the top, SVG units."""
+"""Width of a cell, and width and height of the margins for the names at the left and the top, SVG units."""
 _ASPECT = 0.6
-"""Height over width of a cell."""
+"""Ratio of a cell's height to its width."""
 _MAX_CAMERAS = 24
-"""Cameras in the figure. With more it would be unreadable, and its size grows with their square."""
+"""Maximum number of cameras in the drawing.
+
+With more cameras the drawing would be unreadable. Its size grows with the square of the number of cameras.
+"""
 _FULL_SHADE_SHARE, _STRONG_TEXT_SHARE = 0.5, 0.3
-"""Shares of common points from which a cell has the darkest shade, and light text."""
+"""Minimum fraction of common points for a cell with the darkest shade, and for a cell with light text."""
 
 
 def draw_shared_landmarks(inputs: ReportInputs) -> str:
-    """Draw a matrix of cameras; the shade is the share of the points that the camera of the row sees."""
+    """Draw a matrix with one row and one column for each camera.
+
+    A cell's shade shows which fraction of the row's camera's points the column's camera also sees.
+    """
     names = inputs.cameras[:_MAX_CAMERAS]
     if len(names) < 2 or not inputs.maps:
         return ""

@@ -1,4 +1,4 @@
-"""SVG elements as text: escaped, with short numbers."""
+"""Write SVG elements as text, escaped and with short numbers."""
 
 from __future__ import annotations
 
@@ -11,15 +11,20 @@ from bodycap_batch.core.arrays import FloatArray
 
 
 def number(value: float) -> str:
-    """Return a coordinate with one decimal, which is as exact as a screen."""
+    """Return a coordinate as text with one decimal. A screen cannot show more."""
     return f"{value:.1f}".removesuffix(".0")
 
 
 def element(tag: str, content: str = "", /, **attributes: object) -> str:
-    """Return an element.
+    """Return an SVG element as text.
 
-    Underscores in attribute names become hyphens, and a trailing underscore is removed. An attribute with the
-    value None is omitted.
+    In the names of attributes, a trailing underscore is removed and other underscores become hyphens. An
+    attribute with the value None is omitted.
+
+    Args:
+        tag: Name of the element.
+        content: Content of the element as SVG text, already escaped.
+        **attributes: Value of each attribute, by attribute name.
     """
     pairs = [
         f' {name.rstrip("_").replace("_", "-")}="{html.escape(_attribute_text(value), quote=True)}"'
@@ -30,12 +35,12 @@ def element(tag: str, content: str = "", /, **attributes: object) -> str:
 
 
 def text(x: float, y: float, words: str, **attributes: object) -> str:
-    """Return a line of text."""
+    """Return an SVG element with one line of text at a position in SVG units."""
     return element("text", html.escape(words), x=x, y=y, **attributes)
 
 
 def svg_image(width: float, height: float, content: str, title: str, **attributes: object) -> str:
-    """Return a complete drawing with a title for screen readers."""
+    """Return a complete SVG drawing with a title for screen readers."""
     named = element("title", html.escape(title)) + content
     return element(
         "svg",
@@ -49,7 +54,7 @@ def svg_image(width: float, height: float, content: str, title: str, **attribute
 
 
 def path_through(points: Iterable[tuple[float, float]]) -> str:
-    """Return path data of a line through points; the line is interrupted at a point that is not finite."""
+    """Return SVG path data of a line through points. A point that is not finite interrupts the line."""
     out, pen_up = [], True
     for x, y in points:
         if not (np.isfinite(x) and np.isfinite(y)):
@@ -61,7 +66,15 @@ def path_through(points: Iterable[tuple[float, float]]) -> str:
 
 
 def bin_statistics(values: FloatArray, count: int) -> FloatArray:
-    """Return minimum, median and maximum (count,3) of equal parts of values (N,), NaN for empty parts."""
+    """Split values into parts of equal length and summarise each part.
+
+    Args:
+        values: (N,) values.
+        count: Number of parts.
+
+    Returns:
+        (count,3) minimum, median and maximum of the finite values of each part; NaN without finite values.
+    """
     edges = np.linspace(0, len(values), count + 1).round().astype(int)
     statistics = np.full((count, 3), np.nan)
     for index in range(count):
