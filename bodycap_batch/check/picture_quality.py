@@ -26,11 +26,12 @@ _MIN_CONTRAST = 12.0
 A wall out of focus or a fogged lens gives a smaller range. Evidence: none.
 """
 _MAX_DECODED_FRAMES, _REFERENCE_PIXELS = 250, 640 * 480
-"""Maximum number of frames that may be decoded to reach a frame, and the picture size (pixels) for it.
+"""Maximum number of frames that may be decoded to reach a frame, for pictures of this size (pixels).
 
-For larger pictures the maximum is smaller in proportion: 9 frames for 4K video. The maximum applies once to
-the last frame, and once to all sample frames between rare key frames together. Decoding this number of frames
-takes about a second. Evidence: none.
+For larger pictures the maximum is smaller in proportion: 9 frames for 4K video. It limits the frames
+decoded to reach the last frame. A second limit of the same size is the total for all sample frames, if
+the video's intra-coded frames are rare. Decoding this number of frames takes about a second. Evidence:
+none.
 """
 _MIN_MEDIAN_GREY = 45.0
 """Minimum median grey level (of 255) of pictures that are not dark.

@@ -1,4 +1,4 @@
-"""The types of the merging stage's report: sources, values, residuals and doubts.
+"""The types of the merging stage's report: sources, values, residuals and warnings.
 
 The names of the fields are the keys in the stored result, and the keys of ``merge`` in ``metrics.json``.
 """

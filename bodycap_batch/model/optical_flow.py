@@ -62,7 +62,7 @@ _MIN_INLIERS = 7
 """Minimum number of inliers of a homography. Origin: three more than the four points that determine a
 homography."""
 _RELIABLE_RATIO = 0.5
-"""Minimum fraction of the points that are inliers of a reliable motion. Origin: the majority."""
+"""An estimated motion is reliable if at least this fraction of the points are inliers: half of them."""
 _PIECE_SIDE_RATIO = 0.35
 """Ratio of the side of an image piece to the long side of the image. Evidence: none."""
 _PIECE_ROWS, _PIECE_COLUMNS = 2, 3

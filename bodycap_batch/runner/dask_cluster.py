@@ -122,9 +122,9 @@ class Cluster:
     def _resources(self, task: Task, environment: TaskEnvironment) -> dict[str, float] | None:
         """Return the resources that a task reserves; None if no worker declares its memory.
 
-        A task that needs more memory than any worker has reserves all memory of the largest worker. This
-        method waits for the first worker, because the largest memory is unknown without a worker. A task
-        without a reservation could run at the same time as other large tasks.
+        A task that needs more memory than any worker has reserves all memory of the largest worker. Without
+        this reservation, it could run at the same time as other large tasks. The largest memory is known
+        only after a worker has connected, so this method waits for the first worker.
         """
         while (largest := self._largest_worker(task)) is None:
             if environment.cancelled():

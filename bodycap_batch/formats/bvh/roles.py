@@ -32,8 +32,8 @@ _ARM_WORDS = {
     (2,): "forearm lowerarm lowarm loarm elbow radius",
     (3,): "hand wrist palm",
 }
-"""Words that occur in the names of arm joints, separated by spaces. The key of each entry lists the slots
-(indices of `_ARM`) that these words may mean, with the most likely slot first."""
+"""Words that occur in the names of arm joints. The value of an entry is a string of words, separated by
+spaces. Its key lists the slots (indices of `_ARM`) that these words may mean, the most likely slot first."""
 
 _LEG_WORDS = {
     (0,): "upleg upperleg thigh femur hip",

@@ -35,10 +35,10 @@ Evidence: docs/decisions/body_calibration.md.
 T_POSE_SAMPLES = 8
 """Maximum number of additional sampled times in a T-pose. Evidence: none."""
 MIN_SAMPLES = 10
-"""Desired number of samples of each camera together with another camera. Evidence: none.
+"""Desired number of samples at which a camera and at least one other camera were measured, for each camera.
+Evidence: none.
 
-At such a sample, this camera and at least one other camera were measured. If there are too few such frames,
-the camera gets fewer samples.
+If the capture has fewer such instants, the camera gets fewer samples.
 """
 MIN_COMMON_FRAMES = 15
 """Minimum number of common frames of a camera and the reference camera. Evidence: none.

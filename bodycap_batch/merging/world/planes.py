@@ -41,9 +41,9 @@ _AGREEMENT_DEG = 1.0
 """Maximum misalignment (degrees) of a plane that agrees with a vertical. The misalignment is the angle by
 which the plane deviates from horizontal or from vertical, whichever is smaller."""
 _MIN_INFORMATION_SHARE = 0.12
-"""Minimum information about the tilt of the vertical about each of two horizontal axes. Each point of a plane
-counts as one unit of information. The points of a floor count for both tilts, the points of a wall for one
-tilt. The constant is a fraction of the number of points of all planes. Evidence: none."""
+"""Minimum information about the vertical, as a fraction of the number of points of all planes. The vertical
+can tilt about two horizontal axes, and each tilt must reach this minimum. A point of a floor adds one
+unit for both tilts; a point of a wall adds one unit for one tilt. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)

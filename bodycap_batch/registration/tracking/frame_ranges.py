@@ -145,10 +145,10 @@ def _merge_ranges(intervals: list[tuple[int | None, int | None]], count: int) ->
 
 
 def _reusable(tracks: Tracks, intervals: list[tuple[int | None, int | None]], count: int) -> Tracks:
-    """Select the tracks inside the given intervals that start from a keyframe at an end of their interval.
+    """Select the tracks that can be reused: they lie in a given interval and start at a keyframe at its end.
 
-    A keyframe belongs to two intervals. Its tracks into an interval that is tracked again are removed.
-    Otherwise these tracks would be used twice.
+    A keyframe bounds two intervals, one before it and one after it. If one of them is tracked again, the old
+    tracks from the keyframe into that interval are removed, so that they are not used twice.
     """
     kept_frames = np.zeros(
         (count, 2), dtype=np.int64
