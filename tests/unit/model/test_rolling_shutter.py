@@ -141,7 +141,7 @@ def rolling_model(film: Film, *, known: bool = False, stated_s: float = 0.0, pos
 
 
 def readouts_of(film: Film, camera: Any) -> tuple[Any, Any]:
-    """The model as `estimate_readouts` leaves it, and what it tells of its camera."""
+    """Return the model that `estimate_readouts` leaves, and the readout that it estimates for the camera."""
     model = RollingShutterModel(
         the_map(film, range(1, FRAMES, 5)), {"head": film.trajectory()}, {"head": camera}
     )
