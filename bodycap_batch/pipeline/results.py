@@ -36,7 +36,7 @@ def publish(files: Mapping[str, Path], folder: Path) -> None:
             target = folder / name
             target.parent.mkdir(parents=True, exist_ok=True)
             folders.add(target.parent)
-            if not (target.exists() and target.samefile(source)):
+            if not _is_link_to(source, target):
                 _link_or_copy(source, target)
                 changed.add(target.parent)
         for parent in changed:
@@ -67,6 +67,14 @@ def clear_partial(folder: Path) -> None:
     shutil.rmtree(folder / PARTIAL, ignore_errors=True)
 
 
+def _is_link_to(source: Path, target: Path) -> bool:
+    """Return True if `target` exists and is a hard link to `source`."""
+    try:
+        return target.samefile(source)
+    except FileNotFoundError:  # also if another run of the same job removes the target at this moment
+        return False
+
+
 def _link_or_copy(source: Path, target: Path) -> None:
     temporary = temporary_beside(target)
     try:
@@ -90,6 +98,10 @@ def _files_of_last_run(folder: Path) -> list[str]:
 
 
 def _remove_empty(folder: Path, top: Path) -> None:
-    while folder != top and not any(folder.iterdir()):
-        folder.rmdir()
+    """Remove a folder and those above it, up to `top`, as long as they are empty."""
+    while folder != top:
+        try:
+            folder.rmdir()
+        except OSError:  # not empty, or another run of the same job has just removed it
+            return
         folder = folder.parent

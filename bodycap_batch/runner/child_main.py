@@ -44,14 +44,14 @@ RELEASE_PERIOD_S = 0.5
 """Minimum time (seconds) between two releases of freed memory. In a process with much memory, one release
 takes about 50 ms. Evidence: docs/decisions/pipeline.md."""
 FULL_DISK_BYTES = 8 << 20
-"""Minimum free space (bytes) of a disk that is not full. If less space is free after an unexpected failure,
-the full disk is reported as the cause, because libraries hide the error ENOSPC. Evidence: none."""
+"""A disk with less free space (bytes) is treated as full. After an unexpected failure, a full disk is
+reported as the cause of the failure, because libraries hide the error ENOSPC. Evidence: none."""
 
 
 def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
     """Run the task file given in `arguments`; without a file, follow orders until standard input closes.
 
-    An order is one JSON line. ``{"task": file, "log": file}`` runs a task and writes the task's printed
+    An order is one JSON line. ``{"task": task, "log": file}`` runs a task and writes the task's printed
     output to the log. ``{"import": [modules]}`` loads modules while the child has no task. If a task is
     ordered while modules are loading, the task waits until the modules are loaded.
 
@@ -60,19 +60,20 @@ def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
         stages: For each stage name, the function that runs the stage's tasks.
 
     Returns:
-        The exit code: 0 without an error, the exit code of a typed error, or 70 for a bug.
+        The exit code: 0 without an error, the exit code of a `BodycapError`, or 70 for a bug.
     """
     writer = _MessageWriter()
     orders = _OrderReader()
     if arguments:
-        return _run_task_file(Path(arguments[0]), stages, _Parent(writer, orders, asks=False))
+        document = json.loads(Path(arguments[0]).read_text(encoding="utf-8"))
+        return _run_task(document, stages, _Parent(writer, orders, asks=False))
     for order in iter(orders.next, None):
         if "import" in order:
             import_ahead(order["import"])
             continue
         _redirect_prints(Path(order["log"]))
         writer.send("started")
-        if _run_task_file(Path(order["task"]), stages, _Parent(writer, orders, asks=True)) == EXIT_BUG:
+        if _run_task(order["task"], stages, _Parent(writer, orders, asks=True)) == EXIT_BUG:
             return EXIT_BUG
     return 0
 
@@ -101,9 +102,9 @@ class _Parent:
             raise Cancelled("not committed: the job was stopped or taken over", hint="run it again to go on")
 
 
-def _run_task_file(file: Path, stages: Mapping[str, TaskFunction], parent: _Parent) -> int:
-    """Run the task in a task file, report its end to the parent, and return the exit code."""
-    task, root = task_from_json(json.loads(file.read_text(encoding="utf-8")))
+def _run_task(document: Mapping[str, Any], stages: Mapping[str, TaskFunction], parent: _Parent) -> int:
+    """Run a task given as JSON values, report its end to the parent, and return the exit code."""
+    task, root = task_from_json(document)
     try:
         store = Store(root)
         _run(task, store, stages[task.key.stage], parent)
@@ -174,8 +175,8 @@ class DiskFailures:
             raise store_error(error, self._store.root) from error
         if isinstance(error, CaptureError | JobError) and (away := _disk_away(error)) is not None:
             raise away from error
-        # If a writer finds the disk full, its error names the file that it wrote. The new error names the
-        # store's folder.
+        # If the disk is full, replace the error. The error of a writer names the file that could not be
+        # written; the new error names the store's folder.
         other = isinstance(error, Exception) and not isinstance(error, BodycapError)
         if (other or isinstance(error, StoreError)) and self._store.free_bytes() < FULL_DISK_BYTES:
             raise disk_full(self._store.root) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -15,6 +16,7 @@ from bodycap_batch.runner.child_main import FULL_DISK_BYTES, disk_full
 from bodycap_batch.runner.child_process import CHILD_COMMAND, Child, crash_hint, describe_end
 from bodycap_batch.runner.task import Task
 from bodycap_batch.store.artefacts import Store, disk_errors
+from bodycap_batch.store.digests import write_atomically
 
 CHILDREN_LOG = "children.log"
 """Name of the log file for the output that children print while they have no task."""
@@ -46,7 +48,7 @@ class Executor(Protocol):
     """Runs tasks on this machine or on other machines. Several threads may use it at the same time."""
 
     def execute(self, task: Task, environment: TaskEnvironment) -> None:
-        """Compute and commit the task's artefact. Raises `BodycapError`, and `Cancelled` if it is stopped."""
+        """Compute and commit the task's artefact. Raises `BodycapError`; `Cancelled` if the task stops."""
 
     def close(self, logs: Path) -> None:
         """Release the resources of a job that has ended; `logs` is the job's folder of logs."""
@@ -68,14 +70,15 @@ class Children:
         self._lock = threading.Lock()
 
     def close(self, logs: Path) -> None:
-        """End the idle children; remove their log from the folder `logs` if it is empty."""
+        """End the idle children; remove their log from the folder `logs` if the log is empty."""
         with self._lock:
             waiting, self._idle = self._idle, []
         for child in waiting:
             child.kill()
         log = logs / CHILDREN_LOG
-        if log.exists() and log.stat().st_size == 0:
-            log.unlink()
+        with contextlib.suppress(FileNotFoundError):  # another run of the same job may have removed it
+            if log.stat().st_size == 0:
+                log.unlink()
 
     def prepare(self, logs: Path, work: Sequence[Sequence[str]]) -> None:
         """Let idle children load modules: one child per list. If too few children are idle, start new ones.
@@ -103,12 +106,13 @@ class Children:
                 stopped.
         """
         log = environment.logs / f"{task.file_stem}.log"
+        document = task.to_json(environment.store.root)
         with disk_errors(environment.logs):
             environment.logs.mkdir(parents=True, exist_ok=True)
-            order = log.with_suffix(".task.json")
-            order.write_text(json.dumps(task.to_json(environment.store.root), indent=1), encoding="utf-8")
+            # The child does not read this file: another run of the same job may write it at any moment.
+            write_atomically(log.with_suffix(".task.json"), json.dumps(document, indent=1).encode())
             log.write_bytes(b"")
-        child, last = self._run_in_child(task, environment, {"task": str(order), "log": str(log)})
+        child, last = self._run_in_child(task, environment, {"task": document, "log": str(log)})
         stopped = environment.cancelled()
         if last is not None and "ends" not in last and not stopped:
             with self._lock:
@@ -121,7 +125,7 @@ class Children:
             raise _task_error(task, last, child.returncode, log, environment.store)
 
     def _run_in_child(
-        self, task: Task, environment: TaskEnvironment, order: Mapping[str, str]
+        self, task: Task, environment: TaskEnvironment, order: Mapping[str, Any]
     ) -> tuple[Child, dict[str, Any] | None]:
         """Run a task in a child, and return the child and its last message.
 
@@ -137,7 +141,8 @@ class Children:
                 events.append(message["event"])
                 _answer(child, message, environment)
 
-            # The listener of the progress may raise an error, for example if its pipe is closed.
+            # End the child if the listener of the progress raises an error, for example because its pipe is
+            # closed.
             with ExitStack() as on_error:
                 on_error.callback(child.end, at_once=True)
                 self.prepare(environment.logs, preload)

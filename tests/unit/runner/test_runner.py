@@ -11,6 +11,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from bodycap_batch.core.errors import (
 from bodycap_batch.core.progress import Event
 from bodycap_batch.runner import Children, NotStored, Rules, Runner, Task
 from bodycap_batch.runner.child_main import DiskFailures
+from bodycap_batch.runner.children import CHILDREN_LOG
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 
 ROOT = Path(__file__).parents[3]
@@ -84,6 +86,27 @@ def alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def test_the_task_file_of_another_run_does_no_harm(bench: Bench) -> None:
+    task = a_task("work")
+    bench.logs.mkdir()
+    # What is written to this file is lost, as if another run had overwritten it at once.
+    (bench.logs / f"{task.file_stem}.task.json").symlink_to(os.devnull)
+    assert bench.runner.run(task)[1]
+
+
+def test_two_runs_of_a_job_remove_their_empty_log(tmp_path: Path) -> None:
+    children = Children(FAKE)
+
+    def run() -> None:
+        for _ in range(2000):
+            (tmp_path / CHILDREN_LOG).touch()
+            children.close(tmp_path)
+
+    with ThreadPoolExecutor(2) as pool:
+        runs = [pool.submit(run) for _ in range(2)]
+    assert [error for each in runs if (error := each.exception())] == []
 
 
 def test_a_task_makes_its_artefact_once(bench: Bench) -> None:
