@@ -1,4 +1,4 @@
-"""Stage 1: select keyframes by rotation-free parallax, track survival and sharpness."""
+"""Stage 1: select keyframes. The criteria are parallax, the fraction of surviving tracks, and sharpness."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ _MIN_TRACKS = 12
 _ROTATION_ROUNDS = 3
 """Number of rounds of the robust rotation fit. Evidence: none."""
 _NOVELTY_PER_MAX_GAP = 0.05
-"""Novelty that a keyframe gets for a time of `max_gap_s` since the previous keyframe. For a shorter time, the
-keyframe gets proportionally less. So of two keyframes with equally little new content, the keyframe after the
-longer time is kept. Evidence: none."""
+"""Novelty that is added to a keyframe's novelty if the time since the previous keyframe is `max_gap_s`. The
+added novelty is proportional to this time. So if two keyframes have equally little new content, the keyframe
+after the longer time is kept. Unit: 1. Evidence: none."""
 _MIN_RELATIVE_SURVIVAL = 0.5
 """Minimum ratio of a candidate's track survival to the oldest candidate's track survival. A candidate with a
 smaller ratio is not selected as keyframe. Evidence: none."""
@@ -52,7 +52,7 @@ _RAYLEIGH_MEDIAN = 1.177
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """A recent frame: when a keyframe is due, one of the recent frames is selected.
+    """A recent frame that may be selected as the next keyframe.
 
     Attributes:
         index: Frame index.
@@ -79,7 +79,8 @@ class _KeyframeTracker:
 
     Attributes:
         camera: Intrinsics of the full image.
-        mask: (H,W) True where the reduced image shows the room; None: it shows the room everywhere.
+        mask: (H,W) True for each pixel of the reduced image that shows the room; None: every pixel shows the
+            room.
         start_rays: (N,3) unit directions of the tracked corners in the last keyframe.
         px: (N,2) positions of the tracked corners in the newest frame, px of the reduced image.
         image: The reduced image of the newest frame.
@@ -150,7 +151,8 @@ class _KeyframeTracker:
     def noise_px(self) -> float:
         """Return the tracking noise: the standard deviation along an image axis, px of the full image.
 
-        It is the noise of tracking a corner once, from one frame to the next.
+        The noise is the error of a corner's position after one tracking step, from one frame to the next. The
+        result is 0 if no corner was tracked.
         """
         if not self.kept_samples:
             return 0.0
@@ -167,15 +169,17 @@ def select_keyframes(
 ) -> KeyframeSelection:
     """Select the keyframes of one camera: the frames from which the map is built.
 
-    A keyframe is due after `max_gap_s`, if too few tracks survive, or if the parallax exceeds `parallax_px`.
-    The parallax is the image motion that no rotation of the camera explains. If a keyframe is due, the
-    sharpest of the last frames is selected.
+    The parallax is the image motion that no rotation of the camera explains. A keyframe is due if the time
+    since the last keyframe reaches `max_gap_s`, or if too few tracks survive, or if the parallax exceeds
+    `parallax_px` after at least `min_gap_s`. If a keyframe is due, the sharpest of the last frames is
+    selected.
 
     Args:
         camera: The camera with its video.
         options: Thresholds. Thresholds in pixels are for an image with a long side of 640 px.
         context: Progress and cancellation.
-        keeper: Object to which every frame and every keyframe are passed; None: no such object.
+        keeper: Writes copies of frames. Every frame and every keyframe are passed to the keeper. None: no
+            copies are written.
 
     Returns:
         The frame indices of the keyframes, the sharpness of every frame and the tracking noise.
@@ -239,7 +243,8 @@ def _is_due(tracker: _KeyframeTracker, gap_s: float, limit_px: float, options: K
     Args:
         tracker: Tracks from the last keyframe to the newest frame.
         gap_s: Time since the last keyframe, seconds.
-        limit_px: Threshold of the parallax, px of the full image. With a larger parallax, a keyframe is due.
+        limit_px: Threshold of the parallax, px of the full image. With a larger parallax, a keyframe is due
+            after `min_gap_s`.
         options: Thresholds of the times and of the track survival.
     """
     return (
@@ -252,9 +257,9 @@ def _is_due(tracker: _KeyframeTracker, gap_s: float, limit_px: float, options: K
 def _limit_keyframes(selected: list[int], novelty: list[float], limit: int) -> list[int]:
     """Remove the least novel keyframes until `limit` keyframes are left.
 
-    The first and the last keyframe are always kept. In each step, the novelty of each keyframe and the
-    novelty of the next keyframe are added. The keyframe with the smallest sum is removed, and its novelty is
-    added to the novelty of the next keyframe.
+    The first and the last keyframe are always kept. For every other keyframe, a sum is computed: its novelty
+    plus the novelty of the next keyframe. In each step, the keyframe with the smallest sum is removed, and
+    the novelty of the removed keyframe is added to the novelty of the next keyframe.
 
     Args:
         selected: Frame indices of the keyframes.

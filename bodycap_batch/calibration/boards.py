@@ -16,13 +16,14 @@ from bodycap_batch.core.errors import JobError
 
 GreyImage = npt.NDArray[np.uint8]
 MIN_CORNERS = 8
-"""Minimum number of corners in a view. Eight corners give 16 coordinates. Six of them are needed for the
-board's pose, and the rest informs about the intrinsics. Evidence: none."""
+"""Minimum number of corners of a ChArUco board in a view. A view with fewer corners is not used. Eight
+corners give 16 coordinates. The board's pose needs six of these coordinates, and the other ten coordinates
+help to determine the intrinsics. Evidence: none."""
 _WINDOW_RATIO = 0.3
 """Half the side of the window for sub-pixel refinement, as a fraction of the smallest distance between
 corners. With this fraction, the window does not contain a second corner."""
 _MAX_WINDOW_PX = 15
-"""Maximum size (px) of the window for sub-pixel refinement, given as half its side. Evidence: none."""
+"""Maximum of half the side of the window for sub-pixel refinement. Unit: px. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +73,9 @@ class CalibrationBoard:
             )
         if self.kind == "charuco" and not 0.1 < self.marker < 1.0:
             raise JobError(
-                f"a marker cannot be {self.marker:g} of a square", field="--marker", hint="for example 0.75"
+                f"a marker cannot be {self.marker:g} times as wide as a square",
+                field="--marker",
+                hint="for example 0.75",
             )
 
     def __str__(self) -> str:

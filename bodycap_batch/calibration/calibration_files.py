@@ -21,10 +21,10 @@ def write_calibration(result: CalibrationResult, path: Path, camera: str | None)
         result: The calibration.
         path: Path of the file. If `camera` is given and the file exists, the entry of this camera is added
             or replaced. If `camera` is None, an existing file is replaced.
-        camera: Name of the camera to which the calibration applies; None: it applies to all cameras.
+        camera: Name of the camera to which the calibration applies; None if it applies to all cameras.
 
     Raises:
-        JobError: The existing file has other content.
+        JobError: The existing file cannot be read, or does not hold one entry for each camera.
         StoreError: The file cannot be written.
     """
     entry = _calibration_entry(result)
@@ -78,7 +78,8 @@ def _read_camera_entries(path: Path) -> dict[str, Any]:
 def write_preview(result: CalibrationResult, path: Path) -> None:
     """Write a preview: a picture of the clip (left) and the same picture without distortion (right).
 
-    Straight lines of the room must be straight in the right picture.
+    A line that is straight in the room must also be straight in the picture without distortion. Otherwise the
+    calibration is wrong.
 
     Raises:
         StoreError: The file cannot be written.
@@ -86,8 +87,8 @@ def write_preview(result: CalibrationResult, path: Path) -> None:
     fit, (width, height) = result.fit, result.size
     matrix, undistorted_matrix = fit.matrix, fit.matrix.copy()
     if fit.model == "OPENCV_FISHEYE":
-        # An undistorted picture of a fisheye lens's full view would be infinitely large. Only its middle is
-        # shown.
+        # An undistorted picture of a fisheye lens's full view would be infinitely large. Only the middle of
+        # the view is shown.
         undistorted_matrix[:2, :2] *= 0.6
         maps = cv2.fisheye.initUndistortRectifyMap(
             matrix, fit.distortion, np.eye(3), undistorted_matrix, (width, height), cv2.CV_32FC1

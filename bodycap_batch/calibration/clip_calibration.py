@@ -164,7 +164,7 @@ def _sharpest_pictures(
 ) -> Iterator[tuple[int, GreyImage]]:
     """Yield the frame index and the grey picture of the sharpest frame in each block.
 
-    Many pictures are blurred, because a board that is held in the hand is still only for moments.
+    Many pictures are blurred, because a person who holds the board in the hand moves it most of the time.
     """
     ends = iter(stretches)
     end = next(ends)[1]
@@ -205,9 +205,9 @@ def _best_fit(
 def select_diverse_views(views: Sequence[BoardCorners], size: ImageSize, count: int) -> list[int]:
     """Select views in which the board has different positions, sizes and tilts.
 
-    The first selected view is the view with the most corners. Then, in each step, the view with the largest
-    distance from all selected views is added. The distance compares the position, size and tilt of the board
-    in the picture.
+    The first selected view is the view with the most corners. Each further step adds one view: the view that
+    is farthest from its nearest selected view. The distance between two views compares the position, size and
+    tilt of the board in the pictures.
 
     Args:
         views: Views of the board.
@@ -263,8 +263,8 @@ def _notes(fit: IntrinsicsFit, size: ImageSize, coverage: float) -> list[str]:
     notes = []
     if coverage < _MIN_COVERAGE:
         notes.append(
-            f"corners were found in {100 * coverage:.0f} % of the picture: the lens is a guess elsewhere; "
-            "film the board in all corners of the picture, too"
+            f"corners of the board were found in {100 * coverage:.0f} % of the picture, and in the rest the "
+            "distortion is uncertain: film the board in all parts of the picture, also at the edges"
         )
     sigma = max(fit.focal_sigma_px) / fit.matrix[0, 0]
     if sigma > _MAX_FOCAL_SIGMA_RATIO:

@@ -13,15 +13,14 @@ _LOW_FPS = 24.0
 At a lower rate swinging arms are poorly sampled. Cinema cameras run at 24 frames per second. Evidence: none.
 """
 _MAX_MISSING_S = 3.0
-"""Maximum time (seconds) without a camera, at the start or end of the capture, that needs no advice.
+"""Maximum time (seconds) without frames of a camera that needs no advice.
 
-Evidence: none.
+The time is measured at the start or at the end of the capture. Evidence: none.
 """
 _MAX_MISSING_RATIO = 0.1
-"""Maximum time without a camera, at the start or end of the capture, that needs no advice.
+"""Maximum time without frames of a camera, as a fraction of the capture's duration.
 
-It is a fraction of the capture's duration. The longer time of this one and `_MAX_MISSING_S` is used.
-Evidence: none.
+This fraction and `_MAX_MISSING_S` limit the same time. The larger of the two limits is used. Evidence: none.
 """
 _SECONDS_PER_VIDEO_SECOND = (1.3, 5.0)
 """Computation time (seconds) for one second of one camera's video on two cores.

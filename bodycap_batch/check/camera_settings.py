@@ -35,7 +35,7 @@ A frame step is the time between successive frames. Jitter alone gives a smaller
 _DROPPED_STEP_RATIO = 1.75
 """Maximum ratio of a regular frame step to the median frame step.
 
-A longer step contains a dropped frame, if enough steps are regular (`_MIN_REGULAR_RATIO`).
+If enough steps are regular (`_MIN_REGULAR_RATIO`), a longer step is treated as a dropped frame.
 """
 _MIN_REGULAR_RATIO = 0.75
 """Minimum fraction of regular frame steps in a video with dropped frames.
@@ -52,7 +52,9 @@ def setting_notes(camera: CaptureCamera) -> list[str]:
 
 
 def gopro_settings(path: Path) -> dict[str, str]:
-    """Return the settings of a GoPro camera, by four-letter key. They are empty for another camera's file.
+    """Return the settings of a GoPro camera, by four-letter key.
+
+    The result is empty if the file is not from a GoPro camera.
 
     The settings are in the box ``moov/udta/GPMF`` of an MP4 file.
 
@@ -133,14 +135,18 @@ def _phone_notes(path: Path) -> list[str]:
         if metadata.get(model):
             name = " ".join(part for part in (metadata.get(maker, ""), metadata[model]) if part)
             return [
-                f"filmed with a phone ({name}): its own app stabilises and refocuses; film with an app that "
-                "can switch stabilisation off and lock focus and zoom"
+                f"filmed with a phone ({name}): the phone's own camera app stabilises and refocuses; film "
+                "with an app that can switch stabilisation off and lock focus and zoom"
             ]
     return []
 
 
 def _rate_notes(times_ns: IntArray) -> list[str]:
-    """Return a note if the frame rate varies; otherwise nothing. Dropped frames are ignored."""
+    """Return a note if the frame rate varies; otherwise an empty list. Dropped frames are ignored.
+
+    Args:
+        times_ns: (N,) times of the frames, nanoseconds.
+    """
     steps = np.diff(times_ns)
     if len(steps) < 20:
         return []
@@ -152,6 +158,6 @@ def _rate_notes(times_ns: IntArray) -> list[str]:
     if slow < _MAX_RATE_RATIO * fast:
         return []
     return [
-        f"the frame rate varies between {1e9 / slow:.0f} and {1e9 / fast:.0f} per second, exposure "
-        "with it; set a fixed rate (in phones: automatic frame rate off)"
+        f"the frame rate varies between {1e9 / slow:.0f} and {1e9 / fast:.0f} per second, and the "
+        "exposure time varies with it; set a fixed rate (in phones: switch the automatic frame rate off)"
     ]

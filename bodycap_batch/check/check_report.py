@@ -26,7 +26,8 @@ class CameraSummary:
         role: Role of the bone on which the camera is mounted; None if it is unknown.
         files: Names of the camera's video files.
         frames: Number of frames in all files.
-        used_frames: Number of used frames: with usable times between start_s and end_s.
+        used_frames: Number of used frames. A frame is used if the frame's time is usable and lies between
+            start_s and end_s.
         used_runs: First and last frame number of each run of successive used frames. Frames are numbered over
             all chapters of the video.
         start_s: Common time of the first used frame, seconds.

@@ -49,7 +49,7 @@ def write_job_template(folder: Path, *, replace: bool = False) -> Path:
 
     Raises:
         JobError: A job file exists already.
-        CaptureError: There are no videos, or one cannot be opened.
+        CaptureError: There are no videos, or a video cannot be opened.
         StoreError: The file cannot be written.
     """
     path = folder / JOB_FILE
@@ -63,7 +63,7 @@ def job_template(folder: Path) -> str:
     """Return the text of a job file for the videos of a folder.
 
     Raises:
-        CaptureError: There are no videos, or one cannot be opened.
+        CaptureError: There are no videos, or a video cannot be opened.
     """
     recordings = recordings_in(folder)
     lines = [
@@ -77,7 +77,7 @@ def job_template(folder: Path) -> str:
         "",
         "capture:",
         *_calibration_lines(folder),
-        "  # The part to use, in seconds on the common clock: it excludes putting on the cameras.",
+        "  # The part to use (seconds on the common clock); leave out the time of putting on the cameras.",
         "  # start_s: 12.0",
         "  # end_s: 95.5",
         *(_mount_lines() if any(mount_of(name) is None for name, _ in recordings) else ()),
@@ -121,7 +121,7 @@ def _calibration_lines(folder: Path) -> list[str]:
 def _mount_lines() -> list[str]:
     """Return comment lines that list all possible mounts.
 
-    They help the user to fill in mounts that the file names do not contain.
+    The list helps the user to fill in a mount that the file name of a camera does not contain.
     """
     listed = textwrap.wrap(", ".join(MOUNT_NAMES), 90)
     return ["  # Places of a camera on the body (`mount:`):", *(f"  #   {line}" for line in listed)]

@@ -82,7 +82,7 @@ def examine_machine(folder: Path) -> Iterator[MachineFinding]:
     yield _python_finding()
     yield _processor_finding()
     yield _memory_finding()
-    # Each import runs in a separate process, so that a library that crashes does not end this process.
+    # Each import runs in a separate process. If a library crashes, this process continues.
     with ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1)) as pool:
         yield from pool.map(_library_finding, _LIBRARIES)
     yield _video_finding()
@@ -201,9 +201,9 @@ def _disk_finding(folder: Path) -> MachineFinding:
 
 
 def _writing_finding(folder: Path) -> MachineFinding:
-    """Check whether files can be written, renamed and hard-linked. Publishing results needs these operations.
+    """Check whether files can be written, renamed and hard-linked in a folder.
 
-    Without hard links, results are copied instead.
+    These operations are used to publish results. If hard links are impossible, results are copied.
     """
     place = _nearest_existing(folder)
     try:

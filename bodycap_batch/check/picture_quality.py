@@ -21,17 +21,16 @@ _MAX_BLACK_GREY = 20.0
 The sensor noise of a camera with a covered lens stays below this level. Evidence: none.
 """
 _MIN_CONTRAST = 12.0
-"""Minimum range of grey levels from the 1st to the 99th percentile of the pixels.
+"""Minimum difference (grey levels) between the 99th and the 1st percentile of the pixels.
 
-A wall out of focus or a fogged lens gives a smaller range. Evidence: none.
+The difference is smaller if the camera shows a wall out of focus, or if the lens is fogged. Evidence: none.
 """
 _MAX_DECODED_FRAMES, _REFERENCE_PIXELS = 250, 640 * 480
-"""Maximum number of frames that may be decoded to reach a frame, for pictures of this size (pixels).
+"""Maximum number of frames that are decoded after a key frame, for pictures of this size (pixels).
 
-For larger pictures the maximum is smaller in proportion: 9 frames for 4K video. It limits the frames
-decoded to reach the last frame. A second limit of the same size is the total for all sample frames, if
-the video's intra-coded frames are rare. Decoding this number of frames takes about a second. Evidence:
-none.
+For larger pictures the maximum is smaller in proportion: 9 frames for 4K video. The maximum applies to the
+frames that are decoded to reach the end of the video. It applies a second time, as a total, to the frames
+that are decoded between rare key frames. Decoding this number of frames takes about a second. Evidence: none.
 """
 _MIN_MEDIAN_GREY = 45.0
 """Minimum median grey level (of 255) of pictures that are not dark.
@@ -81,12 +80,14 @@ def check_picture_quality(camera: CaptureCamera) -> list[str]:
         raise CaptureError(
             f"camera {camera.name} shows only black pictures ({black} of {black} inspected)",
             path=camera.chapters[0],
-            hint="was the lens covered? Leave the camera out; if a player shows it, convert it to H.264",
+            hint="was the lens covered? Then leave the camera out. If a player shows other pictures, "
+            "convert the video to H.264",
         )
     notes = []
     if any(video.is_interlaced for video in camera.videos):
         notes.append(
-            "interlaced: convert it to full frames first (ffmpeg -i in -vf bwdif=send_frame out.mp4)"
+            "the video is interlaced: convert it to full frames first "
+            "(ffmpeg -i in -vf bwdif=send_frame out.mp4)"
         )
     times_s = camera.common_times_ns() / 1e9
     notes += static_notes(reduced_pictures, times_s[indices], float(times_s[-1] - times_s[0]))
@@ -115,7 +116,7 @@ def _corner_count(image: Image) -> float:
 
 
 def _tracking_notes(grey: list[float], corners: list[float]) -> list[str]:
-    """Return notes on low light and missing texture. Another note reports black pictures.
+    """Return notes on low light and missing texture. Another function reports black pictures.
 
     Args:
         grey: Median grey level of each picture.
@@ -140,13 +141,17 @@ def _tracking_notes(grey: list[float], corners: list[float]) -> list[str]:
 def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
     """Return the indices of sample frames that are about evenly spaced and cheap to decode.
 
-    The first frame is included. The last frame, or a frame as near to it as is cheap to decode, is included
-    as well. Key frames are preferred, because they decode without their neighbours. If key frames are too
-    rare, frames between them are used. Decoding these takes about a second.
+    The first frame is included. The last frame is included if it is cheap to decode. Otherwise the last frame
+    that is cheap to decode is included. Key frames of the codec are preferred, because they decode without
+    their neighbours. If key frames are too rare, frames between key frames are used. Decoding the frames
+    between key frames takes about a second.
 
     Args:
         camera: The camera with its videos.
         count: Number of evenly spaced sample frames. The result can contain fewer or more frames.
+
+    Returns:
+        (M,) indices of the sample frames, increasing.
     """
     last = len(camera.frame_numbers) - 1
     even = evenly_spaced(last + 1, count)
@@ -155,7 +160,7 @@ def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
         return even[:1]
     picked = keys[np.abs(keys[None] - even[:, None]).argmin(axis=1)]
     # Damage to a recording is visible at its end. If no key frame is near the end, decoding the last frame
-    # takes too long.
+    # takes too long, so an earlier frame is used.
     width, height = camera.videos[-1].stored_size
     max_decoded = round(_MAX_DECODED_FRAMES * min(1.0, _REFERENCE_PIXELS / (width * height)))
     end = min(last, int(keys[-1]) + max_decoded)
@@ -164,7 +169,7 @@ def sample_indices(camera: CaptureCamera, count: int) -> IntArray:
 
 
 def _frames_between_keys(far_indices: IntArray, keys: IntArray, last: int, max_decoded: int) -> IntArray:
-    """Return the indices of frames between key frames that replace sample frames far from a key frame.
+    """Return the indices of frames between key frames. They replace sample frames far from a key frame.
 
     Args:
         far_indices: (N,) indices of the sample frames to replace.

@@ -56,7 +56,7 @@ def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
         return CheckReport(errors=(error,))
     report = check_job(job)
     job_file = job_file_in(path) if path.is_dir() else None
-    return report if job_file is None else replace(report, notes=(f"as {job_file} says", *report.notes))
+    return report if job_file is None else replace(report, notes=(f"settings from {job_file}", *report.notes))
 
 
 def require_ready(job: Job, threads: int = 1) -> CheckReport:
@@ -157,7 +157,7 @@ def _intrinsics_text(camera: CaptureCamera) -> str:
     view = 2.0 * np.degrees(np.arctan(0.5 * width / focal))
     if camera.calibrated:
         return f"calibrated: {camera.camera.model}, focal length {focal:.0f} px at the work size"
-    return f"not calibrated: starts at a guess of {view:.0f}° along the long side, refined with the map"
+    return f"not calibrated: estimated with the map, starting at {view:.0f}° field of view (long side)"
 
 
 def _intrinsics_notes(camera: CaptureCamera) -> list[str]:
@@ -166,7 +166,8 @@ def _intrinsics_notes(camera: CaptureCamera) -> list[str]:
     notes = []
     if any(video.is_interlaced for video in camera.videos):
         notes.append(
-            "interlaced: convert it to full frames first (ffmpeg -i in -vf bwdif=send_frame out.mp4)"
+            "the video is interlaced: convert it to full frames first "
+            "(ffmpeg -i in -vf bwdif=send_frame out.mp4)"
         )
     if not 0.2 < lens.focal_px / long_side < 3.0:
         notes.append(
@@ -318,7 +319,7 @@ def _check_named_frames(job: Job, summaries: list[CameraSummary]) -> list[str]:
 
 
 def _check_files(job: Job, _findings: list[CameraSummary]) -> list[str]:
-    """Check that no video is used twice and no chapter is missing."""
+    """Check that no two cameras have the same video and that no chapter of a video is missing."""
     require_distinct_videos(job)
     return []
 

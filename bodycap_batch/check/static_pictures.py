@@ -21,10 +21,10 @@ _MIN_BLOCK_SIGMA = 3.0
 A block with a smaller standard deviation has too little texture to show motion. Evidence: none.
 """
 _MIN_TEXTURED_BLOCKS, _MAX_GREY_DIFFERENCE = 6, 1.0
-"""Minimum number of textured blocks for a comparison by blocks, and maximum grey-level difference without it.
+"""Minimum number of textured blocks for a comparison by blocks, and bound of the difference of grey levels.
 
-With fewer textured blocks, two pictures are treated as equal if no pixel differs by this many grey levels or
-more. Evidence: none.
+With fewer textured blocks, two pictures are compared pixel by pixel. The two pictures are treated as equal if
+the difference of every pixel is below the bound. Evidence: none.
 """
 _MIN_CORRELATION = 0.9
 """Minimum normalised correlation of two blocks that are treated as equal. Evidence: none."""
@@ -36,13 +36,13 @@ Evidence: docs/decisions/check.md.
 _MIN_STEP_S, _MIN_STEP_RATIO = 1.0, 0.125
 """Length of a time step for judging static pictures, in seconds and as a fraction of the recording.
 
-The longer of the two steps is used. Equal pictures within one step are accepted, because a person may pause
-or turn slowly.
+The longer of the two steps is used. Equal pictures that span less than one step are not reported, because a
+person may pause or turn slowly.
 """
 _MIN_RUN_PICTURES, _MIN_RUN_STEPS = 3, 2
-"""Minimum number of successive equal pictures in a static part of a recording, and of time steps in it.
+"""Minimum number of successive equal pictures in a static part of a video, and minimum duration of the part.
 
-The equal pictures of a static part span at least this number of time steps (`_MIN_STEP_S`).
+The duration is given as a number of time steps (`_MIN_STEP_S`, `_MIN_STEP_RATIO`).
 """
 _MIN_SPAN_RATIO = 0.7
 """Minimum fraction of a recording that equal pictures must span to call the whole recording static.
@@ -60,9 +60,9 @@ def reduced_picture(image: Image) -> FloatArray:
 
 
 def static_notes(pictures: Sequence[FloatArray], times_s: FloatArray, length_s: float) -> list[str]:
-    """Return a note if the pictures of a camera do not change; otherwise nothing.
+    """Return a note if the pictures of a camera do not change; otherwise an empty list.
 
-    A recording is called static throughout only if the equal pictures span most of the recording.
+    The note says that the whole recording is static if all pictures are equal and span most of the recording.
 
     Args:
         pictures: N reduced pictures in the order of time.
@@ -85,8 +85,8 @@ def static_notes(pictures: Sequence[FloatArray], times_s: FloatArray, length_s: 
         return []
     return [
         f"the picture stands still from about {first:.1f} to {last:.1f} s ({count} pictures "
-        "are equal): does the person stand still, is the recording frozen, or the camera off the body? "
-        "start_s and end_s cut it off"
+        "are equal): does the person stand still, is the recording frozen, or is the camera off the body? "
+        "start_s and end_s can exclude this part"
     ]
 
 
@@ -94,7 +94,7 @@ def _is_same_view(first: FloatArray, second: FloatArray) -> bool:
     """Return True if most textured blocks of two reduced pictures are equal.
 
     The brightness and the contrast of a block may differ between the two pictures. Pictures with few textured
-    blocks are compared pixel by pixel instead.
+    blocks are compared pixel by pixel. In this case a picture with too little contrast is not called equal.
     """
     (one, one_shows), (other, other_shows) = _blocks(first), _blocks(second)
     shows = np.maximum(one_shows, other_shows) > _MIN_BLOCK_SIGMA

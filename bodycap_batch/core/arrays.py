@@ -28,12 +28,12 @@ def frozen_array(
     Args:
         value: Any value that numpy can convert to an array.
         name: Name of the field, for the error message.
-        shape: Expected shape. None in place of a length accepts any length of this axis.
+        shape: Expected length of each axis. If the expected length is None, any length is accepted.
         dtype: Type of the elements of the returned array.
         finite: True to refuse NaN and infinity.
 
     Raises:
-        ValueError: The shape differs, or a value is not finite.
+        ValueError: The array does not have the expected shape, or a value is not finite.
     """
     array = value if _is_frozen(value, dtype) else np.array(value, dtype=dtype, copy=True)
     matches = array.ndim == len(shape) and all(

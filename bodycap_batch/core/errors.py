@@ -65,7 +65,7 @@ class BodycapError(Exception):
 
 
 class JobError(BodycapError):
-    """There is an error in the job file, in the command line, or in a file that one of them names."""
+    """The job file or the command line contains an error, or a file that they name contains an error."""
 
     exit_code = 2
 

@@ -8,7 +8,7 @@ import gc
 
 
 def release_memory() -> None:
-    """Return to the operating system the memory that this process has freed.
+    """Return the freed memory of this process to the operating system.
 
     The C library glibc keeps freed memory for later use, which increases the peak memory of the next step.
     Other C libraries have no function ``malloc_trim``. With another library, this function only runs Python's

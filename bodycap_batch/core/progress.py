@@ -20,7 +20,7 @@ class Event:
         camera: Camera name; "" if the stage concerns all cameras.
         done: Number of finished units.
         total: Number of all units; 0 if the number is unknown.
-        what: Name of the unit (``frames``, ``pairs`` …), or the text of a note.
+        what: Name of the unit, for example ``frames``; or the text of a note.
         seconds: Duration of a finished task, seconds.
         round: Number of the round, counted from 0. In each round after the first, keyframes are added to the
             map.

@@ -13,8 +13,9 @@ from bodycap_batch.model.geometry import poses_at
 Association = Literal["interpolate", "nearest"]
 
 _SNAP_NS = 1_000_000
-"""Maximum time difference (nanoseconds) between a given time and a true pose that is used without
-interpolation. Derivation: timestamps in some files have only four decimals."""
+"""Maximum time difference (nanoseconds) at which a true pose is used without interpolation.
+
+Derivation: timestamps in some files have only four decimals."""
 
 
 def interpolate_truth(
@@ -48,7 +49,7 @@ def nearest_truth(truth: TimedPoses, times_ns: IntArray, max_diff_s: float) -> t
         max_diff_s: Maximum time difference (seconds) between an estimate and its true pose.
 
     Returns:
-        (N,4,4) nearest true poses; (N,) mask, True where the time difference is small enough.
+        (N,4,4) nearest true poses; (N,) mask, True if the time difference is at most `max_diff_s`.
     """
     if len(truth.times_ns) == 0:
         return np.tile(np.eye(4), (len(times_ns), 1, 1)), np.zeros(len(times_ns), dtype=bool)

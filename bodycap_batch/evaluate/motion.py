@@ -157,7 +157,11 @@ def _read_truth(path: Path) -> _JointPoses:
         with np.load(path, allow_pickle=False) as content:
             names, seconds, world = (np.asarray(content[key]) for key in ("names", "t", "world"))
     except (OSError, KeyError, ValueError) as error:
-        raise JobError(f"not a joints file: {error}", path=path, hint="needs names, t, world") from error
+        raise JobError(
+            f"not a joints file: {error}",
+            path=path,
+            hint="the file must contain the arrays names, t and world",
+        ) from error
     kept = [index for index, name in enumerate(names.tolist()) if name in _ROLE_BY_TRUTH_NAME]
     return _JointPoses(
         times_ns=np.round(seconds * 1e9).astype(np.int64),
@@ -187,7 +191,10 @@ def _compare_joints(estimate: _JointPoses, truth: _JointPoses, options: MotionOp
     selected = {*options.roles, options.root} if options.roles else set(truth.roles)
     roles = tuple(role for role in estimate.roles if role in truth.roles and role in selected)
     if options.root not in roles or len(roles) < 3:
-        message = f"the two share {len(roles)} joints ({', '.join(roles)}); needs {options.root} and two more"
+        message = (
+            f"the two motions share {len(roles)} joints ({', '.join(roles)}); "
+            f"{options.root} and two more are needed"
+        )
         raise JobError(message, hint="joints are matched by name: HumanIK, Mixamo, Biped, CMU ... names")
     positions, true_positions, rotations, true_rotations = _match_joints(estimate, truth, roles, options)
     if len(positions) == 0:
@@ -269,9 +276,9 @@ def _angles_without_offset(rotation: FloatArray, true_rotation: FloatArray) -> F
 
 
 def _procrustes_distances(positions: FloatArray, true_positions: FloatArray) -> FloatArray:
-    """Return the distances (T,J) between estimated and true positions (T,J,3).
+    """Return the distances (T,J) between estimated and true positions (T,J,3) after alignment.
 
-    Before this, the estimate of each frame is aligned with the truth by a separate similarity alignment.
+    The estimated positions of each frame have a separate similarity alignment with the true positions.
     """
     out = np.empty(positions.shape[:2])
     for frame, (source, target) in enumerate(zip(positions, true_positions, strict=True)):

@@ -72,7 +72,7 @@ def relative_camera_error(
     found = np.logical_and.reduce([mask for _, mask in columns])
     if found.sum() < 3:
         hint = "check that all files use the same clock"
-        raise JobError(f"{found.sum()} frames have both cameras and their truth", hint=hint)
+        raise JobError(f"{found.sum()} frames have estimated and true poses of both cameras", hint=hint)
     limb, trunk, true_limb, true_trunk = (poses[found] for poses, _ in columns)
     centres = np.concatenate([limb[:, :3, 3], trunk[:, :3, 3]])
     alignment = align_points(
@@ -93,7 +93,7 @@ def normalised_errors(
 ) -> FloatArray:
     """Return the normalised squared errors (N,) of N poses: squared Mahalanobis distances from the truth.
 
-    The errors show whether the covariances are correct: their mean is then 6.
+    If the covariances are correct, the mean of the normalised squared errors is 6.
 
     Args:
         gauge_from_cam: (N,4,4) estimated poses.

@@ -188,7 +188,7 @@ def score_trajectories(
     if empty:
         raise JobError(
             f"the truth of camera {', '.join(empty)} has no poses",
-            hint="a TUM file: time tx ty tz qx qy qz qw",
+            hint="a line of a TUM file holds: time tx ty tz qx qy qz qw",
         )
     pairs = {name: _match_poses(estimates[name], truths[name], options) for name in sorted(estimates)}
     alignment = _truth_from_estimate(pairs, options.align)
@@ -244,7 +244,7 @@ def _truth_from_estimate(pairs: Mapping[str, _MatchedPoses], align: Alignment) -
         return align_points(estimate, truth, with_scale=align == "sim3")
     except ValueError as error:
         raise JobError(
-            f"{len(estimate)} poses have a truth at their time: cannot align ({error})",
+            f"{len(estimate)} poses have a true pose at their time: cannot align ({error})",
             hint="check that both files use the same clock",
         ) from error
 

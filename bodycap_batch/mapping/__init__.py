@@ -1,4 +1,4 @@
-"""Stage 2: one sparse map from the keyframes of all cameras."""
+"""Stage 2: build one sparse map from the keyframes of all cameras."""
 
 from bodycap_batch.mapping.build import build_map
 from bodycap_batch.mapping.extend import extend_map

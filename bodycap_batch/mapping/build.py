@@ -100,8 +100,9 @@ def build_map_once(
     The arguments are the same as in `build_map`.
 
     Returns:
-        The map; the reason why the map is unusable (too few keyframes, or contradicted matches), or None if
-        the map is usable. The error is returned, not raised, because other intrinsics may give a usable map.
+        The map; an error with the reason why the map is unusable (too few keyframes, or matches that
+        contradict the map), or None if the map is usable. The error is returned, not raised, because other
+        intrinsics may give a usable map.
 
     Raises:
         EstimationError: No model was reconstructed.

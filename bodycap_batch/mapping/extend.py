@@ -47,7 +47,8 @@ def extend_map(
     """Add keyframes to a map.
 
     First, the new keyframes are registered, and the existing poses do not change. Then misregistered
-    keyframes are removed. Last, all poses are adjusted; in a large map, only the poses of the new keyframes.
+    keyframes are removed. Last, all poses are adjusted. In a large map, only the poses of the keyframes in
+    `extra_frames` are adjusted.
 
     Args:
         capture: All cameras.

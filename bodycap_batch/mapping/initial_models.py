@@ -19,8 +19,9 @@ from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
 
 _INITIAL_PAIRS = 3
 """Maximum number of ranked pairs that are tried before COLMAP's own search for an initial pair. COLMAP's
-search is slow if few pairs have its minimum angle between rays (16 degrees): it then verifies hundreds of
-pairs. Maps from ranked pairs have the same accuracy. Evidence: docs/decisions/mapping.md."""
+search requires an angle of at least 16 degrees between rays. If few pairs have such an angle, the search is
+slow, because it verifies hundreds of pairs. Maps from ranked pairs have the same accuracy.
+Evidence: docs/decisions/mapping.md."""
 
 _LOGGED_CANDIDATES = 5
 """Maximum number of ranked pairs in the log if the first attempt failed. The log also holds the most likely

@@ -15,7 +15,7 @@ from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MappingContext:
-    """The data that all steps of one mapping run share; it is passed to each step.
+    """The data that all steps of one mapping run share. Each step gets this object as an argument.
 
     Attributes:
         workspace: Folder of the database.

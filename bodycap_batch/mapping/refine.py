@@ -36,10 +36,11 @@ def refine_map(
 ) -> MapResult:
     """Correct a map for rolling shutters, with the camera motion that registration estimated.
 
-    Readout times that are not given in the job are estimated from the keyframes. Each keypoint is moved to
-    its position at the instant of the image's middle row, with a velocity from the poses of neighbouring
-    frames. Then each model is adjusted. The observations in the result are at their detected positions again;
-    to repeat the correction, use the readout times in `Map.readout_s`.
+    Readout times that are not given in the job are estimated from the keyframes. The velocity of each
+    keypoint in the image is computed from the poses of neighbouring frames. With this velocity, the keypoint
+    is moved to its position at the instant of the image's middle row. Then each model is adjusted. In the
+    result, the observations are at their detected positions again. `Map.readout_s` holds the readout times
+    with which the correction can be repeated.
 
     Args:
         capture: All cameras.
@@ -51,7 +52,8 @@ def refine_map(
             is adjusted in two steps (`adjust_in_two_steps`).
 
     Returns:
-        The corrected models, each in a new gauge. Models without a rolling shutter are unchanged.
+        The models. Each corrected model has a new gauge. Models in which no camera has a rolling shutter are
+        unchanged.
 
     Raises:
         EstimationError: The adjustment failed.

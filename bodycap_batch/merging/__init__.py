@@ -18,8 +18,8 @@ def merge_trajectories(inputs: MergeInputs, options: MergeOptions, context: Stag
     Args:
         inputs: Trajectories in the gauges of their maps, clocks, skeleton and mount priors.
         options: Options of the stage, among them the number of ticks per second.
-        context: Receiver of the progress and source of cancellation. Both are used between the optimiser's
-            iterations.
+        context: Receives the progress, and reports whether the stage should stop. The stage uses it after
+            each iteration of the optimiser.
 
     Returns:
         The motion of the body, the mounts, the trajectories in the world, and the report.
@@ -33,7 +33,7 @@ def merge_trajectories(inputs: MergeInputs, options: MergeOptions, context: Stag
         T. D. Barfoot, C. H. Tong, S. Särkkä, "Batch continuous-time trajectory estimation as exactly
         sparse Gaussian process regression", RSS 2014).
     """
-    # gtsam takes a second to import.
+    # This import is inside the function because the import of gtsam takes a second.
     from bodycap_batch.merging.stage import merge
 
     return merge(inputs, options, context)

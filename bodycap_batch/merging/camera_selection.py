@@ -28,10 +28,9 @@ REFERENCE_ROLES = ("Spine1", "Spine", "Hips", "Neck", "Head")
 Cameras on limbs are considered after the cameras on these bones, because limbs move relative to the trunk.
 """
 _MIN_TIME_RATIO = 0.25
-"""Minimum localised time of a good reference camera, as a fraction of the longest localised time of a camera.
+"""Minimum localised time of a good reference camera, as a fraction of the longest time of any camera.
 
-A camera with a smaller fraction becomes the reference camera only if no other camera is suitable. Evidence:
-none.
+A camera with a smaller fraction is considered after all cameras with a larger fraction. Evidence: none.
 """
 
 
@@ -73,7 +72,7 @@ def select_cameras(inputs: MergeInputs, step: Callable[[], None], options: Merge
         The selected cameras.
 
     Raises:
-        EstimationError: In no map does the body determine the distance between two cameras.
+        EstimationError: No map contains two cameras whose distance is limited by the skeleton.
     """
     excluded = excluded_cameras(inputs)
     correlated = correlate_mount_priors(inputs, excluded)
@@ -100,7 +99,7 @@ def align_usable_cameras(
         The usable cameras, with trajectories in the gauge of the main map.
 
     Raises:
-        EstimationError: In no map does the body determine the distance between two cameras.
+        EstimationError: No map contains two cameras whose distance is limited by the skeleton.
     """
     excluded = excluded_cameras(inputs) if excluded is None else excluded
     unused: dict[str, str] = {}
@@ -168,7 +167,7 @@ def excluded_cameras(inputs: MergeInputs) -> dict[str, str]:
     """
     rare = rarely_localised(inputs.trajectories)
     still = stationary_cameras(inputs, [each for each in inputs.trajectories if each.camera not in rare])
-    reason = "it stands still while the others move: nobody wears it, or it is frozen"
+    reason = "it stands still while the other cameras move: nobody wears it, or its video is frozen"
     return {**rare, **dict.fromkeys(still, reason)}
 
 

@@ -131,8 +131,8 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         window_ticks=max_window_ticks(len(bones), tracks, tick_times),
         error_modes=calibration.error_modes,
     )
-    # The first mount of the calibration always belongs to the reference camera. The solution of a long
-    # capture may begin with a window that does not contain the reference camera.
+    # The first mount of the calibration always belongs to the reference camera. In a long capture,
+    # the first window of the solution may not contain the reference camera.
     points = map_points_of(inputs, calibration.mounts[0].camera)
     placed = _place_in_world(inputs.skeleton, bones, solution, calibration, scale * points, fps)
     to_world = placed.world_from_solved

@@ -40,7 +40,7 @@ class ObservedPoints:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraView:
-    """The results of one camera that overlays and the preview show, in one frame of reference.
+    """The results of one camera for overlays and the preview. Poses and points have one frame of reference.
 
     Attributes:
         camera: Camera name.
@@ -82,10 +82,10 @@ class CameraView:
         return invert(pose) if np.isfinite(pose).all() else None
 
     def inliers_at(self, index: int) -> ObservedPoints:
-        """Return the observed map points of a frame that are inliers; no points for a lost frame.
+        """Return the inliers among the map points that a frame observed; no points for a lost frame.
 
         With a rolling shutter, the pose refers to the exposure of the middle row. Points in other rows
-        therefore have an error that grows with the delay of their row.
+        therefore have an error. The error grows with the distance of the point's row from the middle row.
         """
         cam_from_frame = self.cam_from_frame(index)
         first, stop = self.observation_start[index : index + 2].tolist()

@@ -43,10 +43,15 @@ def _max_angle_rad(model: str, width_px: int, height_px: int, params: tuple[floa
 
 
 def field_margin(x_in_cam: FloatArray, max_angle_rad: float, near: float) -> FloatArray:
-    """Return a measure (N,) of how far points (N,3) are inside the field of view.
+    """Return a measure (N,) that is positive for points (N,3) inside the field of view.
 
-    The measure is negative if the depth is less than `near`, or if the angle off the optical axis exceeds
-    `max_angle_rad`.
+    The measure is the smaller of two numbers: the depth minus `near`, and `max_angle_rad` minus the angle off
+    the optical axis. Only its sign is meaningful.
+
+    Args:
+        x_in_cam: (N,3) points in the camera frame.
+        max_angle_rad: Maximum angle off the optical axis, radians.
+        near: Minimum depth, in the unit of the points.
     """
     angle = np.arctan2(np.linalg.norm(x_in_cam[:, :2], axis=1), x_in_cam[:, 2])
     return np.asarray(np.minimum(x_in_cam[:, 2] - near, max_angle_rad - angle))

@@ -125,7 +125,7 @@ class Batch:
             other = self._owners.setdefault(out_dir.resolve(), path)
         if other != path:
             raise JobError(
-                f"its results would go to {out_dir}, where those of {other} go",
+                f"its results and the results of {other} would go to the same folder, {out_dir}",
                 path=path,
                 field="name",
                 hint="give the jobs different names (`name:`) or folders (`out:`)",

@@ -290,7 +290,7 @@ class Flow:
             self._job.capture, self._settings.store.digests, self._settings.listener, self._settings.cancelled
         )
         if has_body(self._job):
-            # Each run checks this again, even if the stored check is reused: installed libraries can change.
+            # Each run checks the installed libraries: they can change after the check stage is stored.
             require_libraries(self._job.export.formats)
         task = CheckTask(
             job=self._job,
@@ -342,7 +342,7 @@ class Flow:
         registrations: ByCamera,
         keyframes: ByCamera,
     ) -> CameraGroupTask:
-        """Return the task that solves camera `own` with the help of `cameras`; it lists `own` first."""
+        """Return the task that solves the poses of camera `own` from all `cameras`, with `own` first."""
         ordered = [own, *(camera for camera in cameras if camera.name != own.name)]
         names = [camera.name for camera in ordered]
         return CameraGroupTask(

@@ -38,8 +38,8 @@ def stored_for_report(job: Job, *, out_dir: Path, settings: Settings) -> ReportT
 def _find_stored(job: Job, out_dir: Path, settings: Settings) -> tuple[StageResults, BodycapError | None]:
     """Return the stored results of all stages up to the export.
 
-    If the results of a stage are not stored, the returned results end before this stage. In this case, the
-    error that names the stage is returned too; otherwise None.
+    If the results of a stage are not stored, the returned results end before this stage, and the second value
+    is the error that names the stage. Otherwise the second value is None.
     """
     results = StageResults()
     with Flow(job, replace(settings, compute=False, redo=frozenset()), logs=out_dir / "logs") as flow:
@@ -57,7 +57,7 @@ def _find_stored(job: Job, out_dir: Path, settings: Settings) -> tuple[StageResu
 def remake_report(job: Job, *, out_dir: Path, settings: Settings) -> Path:
     """Write a job's report again from stored results.
 
-    Only the report, and the check of the job if it is not stored, are computed.
+    The report is computed. The check of the job is also computed if its result is not stored.
 
     Args:
         job: A resolved job.

@@ -131,8 +131,8 @@ def _run_until(
 ) -> BodycapError | None:
     """Run the stages up to the last stage that the user wants.
 
-    If the report is finished before the video of the results, the results are published without the video
-    first.
+    If the report is finished before the video of the results, the results are first published without the
+    video.
 
     Returns:
         The error that stopped the stages; None if no error occurred. The error is returned only if a report
@@ -184,9 +184,9 @@ def _publish_failure_report(
         settings.require_owner()
         publish(dict(files_of(results.reported)), out_dir / PARTIAL)
     except BodycapError as another:
-        error.add_note(f"and its report could not be written: {another.message}")
+        error.add_note(f"the report of the job could not be written: {another.message}")
         return
-    _add_hint(error, f"how far it came: {out_dir / PARTIAL / REPORT_FILE}")
+    _add_hint(error, f"the report of the finished stages is {out_dir / PARTIAL / REPORT_FILE}")
 
 
 def _add_hint(error: BodycapError, text: str) -> None:

@@ -77,7 +77,7 @@ def _motion_ref(path: Path | None, digests: FileDigests) -> FileRef | None:
         return None if path is None else FileRef(path=path, digest=digests.sha256(path))
     except OSError as error:
         field = "capture.synthetic.motion"
-        hint = "the path of a BVH file, relative to the job"
+        hint = "give the path of a BVH file, relative to the job file"
         raise JobError(f"cannot be read: {error.strerror}", path=path, field=field, hint=hint) from error
 
 

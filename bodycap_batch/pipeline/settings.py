@@ -46,7 +46,8 @@ class Settings:
         results_ready: Called with the folder of the results if the results are published before their video
             is ready.
         limits: Maximum sizes of the videos; None (no limits) for a job that the user runs directly.
-        turns: The artefacts that jobs of this process are computing; None if the process runs only this job.
+        turns: Object that lets only one job of this process compute an artefact at a time; None if the
+            process runs only this job.
     """
 
     store: Store

@@ -29,15 +29,16 @@ class StageResults:
 
     Attributes:
         stage: Name of the running stage, or of the last stage that ran.
-        keyframes: The keyframes' artefact of each camera, by camera name.
+        keyframes: The artefact of each camera's keyframes, by camera name.
         map: The artefact of the map.
         registrations: The registration of each camera, by camera name.
         merged: The artefact of the skeleton's motion.
         exported: The artefact of the result files.
         reported: The artefact of the report.
-        preview: The future of the video of the results, which is rendered while later stages run.
+        preview: The future of the artefact with the results' video. The video is rendered while later stages
+            run.
         previewed: The artefact of the finished video of the results.
-        failure: The reason why the skeleton that the job asks for is missing.
+        failure: The reason why the skeleton that the job asks for is missing; None if no skeleton is missing.
     """
 
     stage: str = "check"
@@ -52,7 +53,7 @@ class StageResults:
     failure: EstimationError | None = None
 
     def describe_failure(self, error: BodycapError | None) -> dict[str, Any] | None:
-        """Return an error and the stage it stopped, as JSON values for the report; None without an error."""
+        """Return an error and the stage that it stopped, as JSON values; None if there is no error."""
         return None if error is None else {"stage": self.stage, **error.to_dict()}
 
 

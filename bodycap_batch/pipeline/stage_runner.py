@@ -24,7 +24,7 @@ class StageRunner:
 
     Attributes:
         records: The record of every task that has contributed to the results so far.
-        libraries: Version of each library that computed these tasks, by library name.
+        libraries: Version of each library that these tasks used, by library name.
 
     Args:
         settings: Settings of the run: store, threads, listener, cancellation.

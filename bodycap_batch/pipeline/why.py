@@ -25,7 +25,7 @@ _INPUTS = {
     "keyframes": "the keyframes of {}",
     "registrations": "the poses of {}",
     "body": "the body: {}",
-    "extra": "the frames wanted of {}",
+    "extra": "the extra keyframes of {}",
 }
 """Description of a changed input of a task, by the name of the input's field in the task's dataclass. ``{}``
 is replaced by the names of the changed parts."""
@@ -82,7 +82,10 @@ def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
 
 
 def _missing_preview(results: StageResults) -> Sequence[Task]:
-    """Return the preview's task if it would run, else nothing. A thread has looked it up in the store."""
+    """Return the preview's task if its result is not stored; otherwise return an empty sequence.
+
+    A thread has looked up the result in the store.
+    """
     if results.preview is None:
         return ()
     failure = results.preview.exception()
@@ -97,12 +100,18 @@ def _depends_on(stage: str, first: str, job: Job) -> bool:
 
 
 def _position(stage: str) -> int:
-    """Return a stage's position in `STAGE_ORDER`; a stage during registration has registration's position."""
+    """Return the position of a stage in `STAGE_ORDER`.
+
+    A stage that is not in `STAGE_ORDER` follows the registration and has the position of the registration.
+    """
     return STAGE_ORDER.index(stage if stage in STAGE_ORDER else "registration")
 
 
 def _reason(task: Task, store: Store) -> str:
-    """Describe how a task's key differs from the most similar key of a stored artefact of the same stage."""
+    """Describe why a task's result is not stored.
+
+    The task's key is compared with the most similar key among the stored artefacts of the same stage.
+    """
     wanted = dict(_leaves(task.key.document()))
     if any((store.root / "corrupt").glob(f"{task.key.stage}-{task.key.name}-*")):
         return "its stored result was damaged"
@@ -118,7 +127,7 @@ def _reason(task: Task, store: Store) -> str:
 
 
 def _changed_names(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Return the names of the key's values that differ.
+    """Return the names of the values that differ between a stored key (`before`) and a task's key (`now`).
 
     An artefact of another program version may name its inputs differently. In this case, only the names that
     occur in both keys are compared.

@@ -56,7 +56,8 @@ def lay_out_videos(aspects: Sequence[float]) -> list[tuple[Box, Box]]:
 def _partitions(count: int) -> list[tuple[int, ...]]:
     """Return partitions of the videos into rows.
 
-    A partition lists, for each row, the number of videos up to the end of this row.
+    A partition lists, for each row, the number of videos up to the end of this row. For example, (2, 5) means
+    two videos in the first row and three videos in the second row.
 
     For many videos, only partitions into rows of equal length are returned. Their last row may be shorter.
     """
@@ -77,7 +78,7 @@ def _place_rows(aspects: Sequence[float], ends: tuple[int, ...]) -> list[tuple[B
 
     Args:
         aspects: Ratio of width to height of each video.
-        ends: For each row, the number of videos up to its end.
+        ends: For each row, the number of videos up to the end of this row.
 
     Returns:
         For each video, a box for the video and a box for the line of text below it.

@@ -44,7 +44,7 @@ _MAX_CLOCK_S = 1e8
 """Seconds: maximum common time that the caption shows unchanged. A larger time comes from a clock that counts
 from 1970. The caption shows such a time relative to the start."""
 _STROKE_LEGEND = "solid: measured · dashed: inferred"
-_DOT_LEGEND = "dots: map points, green where they fit, red where not"
+_DOT_LEGEND = "dots: map points, green if they fit, red if not"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,8 +75,8 @@ class PreviewInputs:
 def render_preview(inputs: PreviewInputs, context: StageContext) -> Path:
     """Write the preview, 1280×720, and return its path.
 
-    The preview has at most `MAX_FRAMES` frames. A long capture is shown with evenly spaced frames, and faster
-    if necessary.
+    The preview has at most `MAX_FRAMES` frames. A long capture is shown with evenly spaced frames. If
+    necessary, the preview is played faster than the capture was filmed.
 
     Raises:
         CaptureError: A frame cannot be decoded.

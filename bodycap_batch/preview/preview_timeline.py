@@ -10,16 +10,17 @@ import numpy as np
 from bodycap_batch.core.arrays import IntArray, set_array
 
 MAX_FRAMES = 720
-"""Maximum number of frames in the preview: 48 seconds at 15 frames per second, or 60 seconds at 12 frames per
-second.
+"""Maximum number of frames in the preview.
 
-A viewer watches a film of this length to its end. Rendering it takes little time compared with mapping."""
+With this number of frames, the preview lasts 48 seconds at 15 frames per second, or 60 seconds at 12 frames
+per second. A user watches a film of this length to its end. Rendering such a film takes little time compared
+with mapping."""
 MIN_FPS = 12
 """Minimum frame rate at which the preview is played, frames per second. If the motion or the videos have a
 lower rate, the preview is played at their rate. Evidence: none."""
 _TARGET_FPS = 15.0
-"""Preferred frame rate of the preview, frames per second. It is sufficient to follow a body. Evidence:
-docs/decisions/report.md."""
+"""Preferred frame rate of the preview, frames per second. At this rate a user can follow the motion of the
+body. Evidence: docs/decisions/report.md."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,8 +47,8 @@ def make_timeline(start_ns: int, stop_ns: int, fps: float) -> PreviewTimeline:
     Args:
         start_ns: Start of the interval in common time, nanoseconds.
         stop_ns: End of the interval in common time, nanoseconds.
-        fps: Frame rate of the motion or of the videos. At 22.5 or more, or in a long interval, only every
-            second, third ... frame is shown.
+        fps: Frame rate of the motion or of the videos, frames per second. If the rate is at least 22.5 or the
+            interval is long, only every k-th frame is shown, with k of 2 or more.
     """
     rate = Fraction(fps).limit_denominator(1001)
     # The rate may be computed from rounded times. A hundredth of a frame is added, so that rounding never

@@ -56,7 +56,7 @@ class ColouredPoints:
 
 
 def blank_image(size: tuple[int, int]) -> RgbImage:
-    """Return an image of the background. The argument `size` is its width and height."""
+    """Return an image (H,W,3) of the background. The argument `size` is its width and its height, pixels."""
     return np.full((size[1], size[0], 3), BACKGROUND, dtype=np.uint8)
 
 

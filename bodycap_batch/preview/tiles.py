@@ -62,9 +62,9 @@ class VideoTile:
         return np.zeros((0, 4, 4)) if self.view is None else self.view.frame_from_cam
 
     def images(self) -> Generator[RgbImage | None, None, None]:
-        """Yield an image for each frame of the preview.
+        """Yield the video's image for each frame of the preview.
 
-        It is the video's image (H,W,3) at the size of the tile, or None if there is no video frame.
+        The image (H,W,3) has the size of the tile. None is yielded if there is no video frame at this time.
         """
         size = (self.video_box.width, self.video_box.height)
         shown = np.unique(self.frames[self.frames >= 0])
@@ -81,8 +81,8 @@ def resize_image(image: RgbImage, size: tuple[int, int]) -> RgbImage:
     """Return an image (H,W,3) resized to the width and height in `size`.
 
     The image is halved while it is at least twice as large as `size`. It is then interpolated to its final
-    size. Averaging directly to the final size has hardly less aliasing, and takes five times as long: 3 ms
-    for 640×480.
+    size. Averaging the image directly to the final size reduces aliasing only slightly more, and takes five
+    times as long: 3 ms for 640×480.
     """
     import cv2
 
@@ -96,7 +96,7 @@ def resize_image(image: RgbImage, size: tuple[int, int]) -> RgbImage:
 def nearest_frames(camera: CaptureCamera, times_ns: IntArray) -> IntArray:
     """Return the index (F,) of the frame nearest to each common time.
 
-    It is −1 before the video starts and after it ends.
+    The index is −1 for a time before the start or after the end of the video.
     """
     frame_times = camera.common_times_ns()
     if not len(frame_times):

@@ -20,7 +20,7 @@ _AZIMUTHS_RAD = tuple(float(np.deg2rad(side)) for side in (35, -35, 75, -75, 110
 At azimuth zero the camera is in front of a body that faces -Y. A body starts to walk towards -Y."""
 _MIN_SHARE_OF_BEST = 0.6
 """Minimum number of visible points of the selected azimuth, as a fraction of the maximum over all azimuths.
-The first candidate with this number is selected. Evidence: none."""
+The first candidate with at least this number of points is selected. Evidence: none."""
 _SWAY_RAD = float(np.deg2rad(22.0))
 """Radians: amplitude of the camera's slow rotation about the body. The rotation makes depth visible.
 Evidence: none."""
@@ -28,7 +28,7 @@ _SWAY_PERIOD_S = 24.0
 """Seconds of the preview: period of the camera's slow rotation. Evidence: none."""
 _SMOOTHING_SIGMA_S = 1.0
 """Seconds: sigma of the Gaussian that smooths the target's path. A step of a walking body takes less time
-than this, so steps do not shake the camera."""
+than this sigma, so steps do not shake the camera."""
 _SAMPLED_TARGETS = 8
 """Approximate number of target positions at which an azimuth's visible points are counted. Evidence: none."""
 _MARGIN = 1.1
@@ -42,7 +42,7 @@ class Viewpoint:
     Attributes:
         size: Width and height of the image, pixels.
         focal_px: Focal length, pixels.
-        cam_from_room: (4,4) pose with x right, y down, z forward.
+        cam_from_room: (4,4) transform from the room to the camera (x right, y down, z forward).
         distance: Distance between the camera and the target, in the room's unit.
     """
 
@@ -68,8 +68,8 @@ def follow_target(
 ) -> list[Viewpoint]:
     """Return a smoothly moving viewpoint for each frame of the preview.
 
-    The distance between camera and target is constant, and the whole target is visible. The camera rotates
-    slowly about the target to show depth.
+    The camera follows the smoothed path of the target at a constant distance. At this distance the
+    whole body is visible. The camera rotates slowly about the target to show depth.
 
     Args:
         target: (F,3) position to look at in each frame, Z up.

@@ -60,7 +60,8 @@ def register_frames(
             neighbouring keyframes are used again. Every pose is estimated again.
 
     Returns:
-        The registration: a pose or a reason for every frame, and the frames that should become keyframes.
+        The registration: for every frame a pose or the reason why the frame is lost, and the frames that
+        should become keyframes.
     """
     offered = _offered_keyframes(selection, previous)
     scene_map = _map_of_camera(maps, camera.name)
@@ -97,8 +98,9 @@ def register_in_rig(
 ) -> tuple[Registration, list[RelativePose]]:
     """Estimate the pose of every frame of one camera with the observations of all cameras of its rig.
 
-    The relative pose of two cameras is the robust mean over all frames that both cameras localised
-    separately. A camera is excluded if its relative pose has too few samples or scatters too much.
+    The relative pose of two cameras is the robust mean over all instants at which both cameras have a pose.
+    A camera is excluded if the number of these instants is too small, or if the relative pose scatters too
+    much between these instants.
 
     Args:
         own: The camera with its registration.

@@ -1,4 +1,4 @@
-"""Criteria about pairs of cameras: the distance of two cameras, and the relative rotation on one bone."""
+"""Criteria about two cameras: the distance between the cameras, and their relative rotation on one bone."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ docs/decisions/report.md.
 def distance_criteria(reach: Mapping[str, Any] | None, unused: Collection[str]) -> Iterator[Criterion]:
     """Yield the criterion about distances between cameras compared with the body's reach.
 
-    Nothing is yielded without a body, because its reach is unknown. Nothing is yielded with too few distances
-    either. The finding also says if the fraction is too small to judge single keyframes.
+    Nothing is yielded if there is no body, because the reach is then unknown. Nothing is yielded if there are
+    too few distances. If the fraction is too small to judge single keyframes, the finding says so.
 
     Args:
         reach: Result of the map's distance check; None if the distances were not checked.
@@ -43,19 +43,19 @@ def distance_criteria(reach: Mapping[str, Any] | None, unused: Collection[str]) 
         return
     share = float(reach["within_reach"])
     grade = grade_value(share, _GOOD_REACH_SHARE, _FAIR_REACH_SHARE, more_is_better=True)
-    doubt = "" if reach["judged"] else " at most, whatever the scale is"
+    doubt = "" if reach["judged"] else ", even with the best scale"
     if unused and grade is not Grade.GOOD:
         grade = Grade.FAIR
-        doubt += f", including those of {' and '.join(sorted(unused))}, which the body does not carry"
+        doubt += f", including cameras that are not part of the body ({' and '.join(sorted(unused))})"
     elif not reach["judged"]:
-        doubt += ": body, clocks or map do not suit each other"
+        doubt += "; body, clocks or map do not suit each other"
     yield Criterion(
         subject="cameras",
         name="Cameras within the body's reach",
         grade=grade,
         finding=f"{format_percent(share, 1)} of {reach['distances']:,} distances between cameras{doubt}",
-        rationale="Cameras on one body cannot be farther apart than the body reaches. This shows a map that "
-        "merges two similar places, although its error in pixels is small.",
+        rationale="Cameras on one body cannot be farther apart than the body reaches. A small fraction shows "
+        "that the map merges two similar places, even if the map's error in pixels is small.",
         metric="mapping.reach.within_reach",
         value=share,
     )
@@ -106,7 +106,7 @@ def shared_segment_criteria(
 def _unexplained_spread_deg(pair: Mapping[str, Any]) -> float:
     """Return the part of a pair's spread (degrees) that the poses' noise does not explain.
 
-    It is zero for two cameras that are mounted rigidly.
+    For two cameras that are mounted rigidly, this part is zero.
     """
     if pair["rigid"]:
         return 0.0

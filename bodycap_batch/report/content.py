@@ -46,7 +46,7 @@ def page_content(
         scene: Maps and camera paths of the 3D viewer.
         losses: The lost intervals of all cameras, with their causes.
         colours: Colour ``#rrggbb`` of each camera, by camera name.
-        budget: The budget of the page. It records which items were thinned.
+        budget: The budget of the page. It records how many items of each kind are shown.
 
     Returns:
         The value of each template variable, by variable name.
@@ -79,7 +79,7 @@ def page_content(
 _CAUSE_CRITERIA = {
     LossCause.DARK: "the mean brightness of the lost frame is below 30 of 255",
     LossCause.FAST: "the camera turned more than 8° per frame next to the gap",
-    LossCause.BLUR: "the sharpness is below 60 % of that of the registered frames",
+    LossCause.BLUR: "the sharpness is below 60 % of the sharpness of the registered frames",
     LossCause.PLAIN: "the frame has under 30 % of the corners of the camera's registered frames",
     LossCause.SHALLOW: "the visible points did not determine the position",
     LossCause.UNKNOWN_PLACE: "the frame is sharp and textured, but it does not match the map",
@@ -176,10 +176,13 @@ def _facts(diagnosed: DiagnosedLoss) -> str:
 
 
 def _distances_before_optimisation(inputs: ReportInputs) -> list[dict[str, Any]]:
-    """Return, for each bone with a camera, how far the optimisation moved its joint.
+    """Return how far the optimisation moved the joint of each bone with a camera.
 
-    This is the distance between the solved joint and the position that the camera's poses and the assumed
-    mount alone give: median and 95th percentile, metres.
+    Before the optimisation, only the poses and the assumed mount of the bone's camera determine the joint's
+    position. The distance from this position to the solved position is computed for each tick.
+
+    Returns:
+        An entry for each bone, with the median and the 95th percentile of the distance, metres.
     """
     merge = inputs.merge
     if merge is None:

@@ -41,7 +41,7 @@ class DrawnScene:
             of length is arbitrary, and the upward direction is a guess.
         drawn_from_map: Transform of each map into the drawn frame of reference, by the map's gauge.
         maps: The maps with a known transform.
-        paths: The paths of the cameras in these maps.
+        paths: The paths of the cameras in the maps with a known transform.
         omitted_cameras: Names of the cameras in maps without a known transform.
     """
 

@@ -1,4 +1,4 @@
-"""Find intervals of lost frames, measure sharpness and rotation there, and name the likely cause."""
+"""Find the intervals of lost frames, measure sharpness and rotation near them, and name the likely cause."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _PLAIN_RATIO = 0.3
 A frame with fewer corners shows plain surfaces. Evidence: none.
 """
 _NEIGHBOURS = 3
-"""Number of frame pairs before a lost interval in which the rotation is measured, and also after it.
+"""Number of frame pairs on each side of a lost interval in which the rotation is measured.
 
 Evidence: none.
 """

@@ -15,7 +15,10 @@ from bodycap_batch.report.packing import pack_scaled
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _MAX_INLIERS = 120
-"""Maximum number of points that are drawn over one picture. More points would hide it. Evidence: none."""
+"""Maximum number of points that are drawn over one picture.
+
+More points would hide the picture. Evidence: none.
+"""
 _LINE_POINTS = 6
 """Number of stored points on the line of one bone.
 
@@ -60,7 +63,8 @@ class FrameOverlays:
     def describe_part(self, camera: str, first: int, count: int) -> list[dict[str, Any]]:
         """Describe successive frames of one camera as `describe` does.
 
-        The result ends at the camera's last frame, so that it can be shorter than `count` or empty.
+        No frames exist after the camera's last frame. Therefore the result can have fewer than `count`
+        entries or be empty.
 
         Args:
             camera: Camera name.
@@ -99,9 +103,9 @@ def _pose_facts(path: Trajectory | None, index: int) -> dict[str, Any]:
 
 
 def bones_from_merge(merge: MergeResult) -> BoneMotion:
-    """Return the moving bones between solved joints, from the motion that all outputs show.
+    """Return the moving bones between solved joints, from the solved motion `merge.motion`.
 
-    A solved joint at the end of a limb also gives the bone from this joint to its tip.
+    A solved joint at the end of a limb also gives the bone from the joint to the tip of the limb.
     """
     skeleton, poses, solved = merge.skeleton, merge.motion.world_from_joint(), merge.solved
     centres = poses[..., :3, 3]
@@ -128,7 +132,8 @@ def bones_from_merge(merge: MergeResult) -> BoneMotion:
 def _inlier_positions(view: CameraView | None, index: int) -> FloatArray:
     """Return the observed image positions (N,2) of a frame's inliers, as fractions of the image size.
 
-    If there are more than `_MAX_INLIERS` inliers, every second or third (and so on) is selected.
+    If there are more than `_MAX_INLIERS` inliers, only every k-th inlier is selected. The number k is the
+    smallest number with which at most `_MAX_INLIERS` inliers remain.
     """
     if view is None:
         return np.zeros((0, 2))

@@ -41,13 +41,16 @@ _MAX_PICTURES_PER_S = 5.0
 The 3D viewer draws the motion at every tick anyway, so more pictures would only enlarge the page.
 """
 _MAX_SHIFT_S = 1.0
-"""Maximum time (seconds) between an evenly spaced frame and the kept frame that replaces it.
+"""Maximum time (seconds) between an evenly spaced frame and the stored frame that replaces it.
 
-If pictures are far apart, half the time between two pictures is the maximum instead. Keyframes are at most
-half a second apart.
+If half the time between two pictures is longer than this value, half the time between two pictures is the
+maximum. Keyframes are at most half a second apart.
 """
 _DARK_BRIGHTNESS = 30.0
-"""Minimum mean brightness, of 255. Hardly any light reached the camera in a darker frame. Evidence: none."""
+"""Minimum mean brightness (grey levels, 0 to 255) of a frame that is not dark.
+
+If a frame is darker, hardly any light reached the camera. Evidence: none.
+"""
 MAX_CORNERS = 300
 """Maximum number of corners that are counted in a frame. Evidence: none."""
 _CORNER_QUALITY = 0.02
@@ -172,9 +175,16 @@ def _corners_above_noise(grey: Any, corners: FloatArray) -> FloatArray:
 def _prefer_cheap_frames(camera: CaptureCamera, indices: IntArray) -> IntArray:
     """Replace evenly spaced frames by nearby frames that are cheaper to read.
 
-    If the capture stores images of keyframes, the stored frames are preferred. Little new comes into view
-    between two keyframes. Otherwise frames that decode without their neighbours are preferred. A frame
-    without a cheap frame nearby is not replaced.
+    If copies of frames are stored, frames with a stored copy are preferred. The keyframes have a stored copy,
+    and little new comes into view between two keyframes. If no copies are stored, frames that decode without
+    their neighbours are preferred. A frame without a cheap frame nearby is not replaced.
+
+    Args:
+        camera: The camera with its videos.
+        indices: (N,) indices of the evenly spaced frames.
+
+    Returns:
+        (M,) indices of the frames to read, increasing. M is at most N.
     """
     cheap = camera.key_indices() if camera.kept is None else camera.kept.frames
     if len(indices) < 3 or len(cheap) == 0:
@@ -204,7 +214,7 @@ def _read_pictures(camera: CaptureCamera, indices: IntArray, context: StageConte
 
 
 def _decode_frames(camera: CaptureCamera, indices: IntArray, context: StageContext) -> list[tuple[int, Any]]:
-    """Return the colour frames before the first frame that cannot be decoded.
+    """Return the index and the colour image of each frame before the first frame that cannot be decoded.
 
     If a frame cannot be decoded, all later frames are missing on the page, but the report does not fail.
     """

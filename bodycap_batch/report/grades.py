@@ -25,7 +25,7 @@ class Criterion:
     """One graded value.
 
     Attributes:
-        subject: The half of the verdict that uses the criterion: ``cameras`` or ``body``.
+        subject: The part of the verdict that uses the criterion: ``cameras`` or ``body``.
         name: Name of the graded quantity.
         grade: Grade of the value.
         finding: The value in words.
@@ -48,7 +48,8 @@ def grade_value(value: float, good: float, fair: float, *, more_is_better: bool 
 
     Args:
         value: The value to grade.
-        good: Bound of the grade "good": the largest good value, or the smallest one with `more_is_better`.
+        good: Bound of the grade "good": the largest good value, or the smallest good value if
+            `more_is_better` is True.
         fair: Bound of the grade "usable with care". A value beyond this bound is "poor".
         more_is_better: True if large values are better than small values.
     """

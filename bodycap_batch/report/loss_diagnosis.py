@@ -22,7 +22,7 @@ Evidence: none.
 _MAX_PICTURES = 24
 """Maximum number of lost intervals of each camera from which a frame is decoded.
 
-The page shows no more pictures than this.
+The page shows at most this number of pictures of lost frames, for all cameras together.
 """
 
 
@@ -66,10 +66,11 @@ def diagnose_losses(inputs: ReportInputs, context: StageContext) -> list[Diagnos
 def _measure_frames(
     inputs: ReportInputs, camera: str, losses: Sequence[FrameLoss], context: StageContext
 ) -> tuple[dict[int, FrameAppearance], float | None]:
-    """Return the appearance of lost frames, and the median number of corners in registered frames.
+    """Measure the middle frames of lost intervals, and a few registered frames of the same camera.
 
-    The appearance is given by frame index. It also contains the registered frames. The median is None if
-    there are no registered frames.
+    Returns:
+        The appearance of each measured frame, by frame index; and the median number of corners in the
+        registered frames, None if no registered frame was measured.
     """
     path = inputs.path(camera)
     if not losses or path is None or inputs.capture is None:

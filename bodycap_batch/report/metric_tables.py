@@ -143,7 +143,7 @@ def _map_table(metrics: Mapping[str, Any]) -> Table:
         caption="Table 2. The map",
         heads=("Seen by", "Points", "Measurements", "Mean reprojection error"),
         rows=tuple(rows),
-        note="Pixels are those of the frames at their work size.",
+        note="Pixels refer to the frames at their work size.",
     )
 
 
@@ -248,7 +248,7 @@ def _joined_cameras_table(merge: Mapping[str, Any]) -> Table:
         caption="Cameras placed by the body alone",
         heads=("Camera", "Rotation uncertainty", "Position uncertainty"),
         rows=rows,
-        note="Their map shares no view with the main map.",
+        note="The map of these cameras shares no view with the main map.",
     )
 
 
@@ -293,11 +293,18 @@ def _scale_source_cells(merge: Mapping[str, Any], path: str) -> tuple[Cell, ...]
 
 
 def _chi_square_note(agreement: Mapping[str, Any]) -> str:
-    """Return a note that compares the sources' disagreement (χ²) with the expected disagreement."""
+    """Return a note that compares the disagreement of the estimates (χ²) with the expected disagreement.
+
+    Args:
+        agreement: An entry of ``metrics.json`` with ``chi2`` and ``degrees_of_freedom``.
+
+    Returns:
+        The note; "" if the degrees of freedom are missing or 0.
+    """
     degrees_of_freedom = agreement.get("degrees_of_freedom")
     if not degrees_of_freedom:
         return ""
-    return f"χ² {agreement['chi2']:.1f}; about {degrees_of_freedom} is expected if all of them are right."
+    return f"χ² {agreement['chi2']:.1f}; about {degrees_of_freedom} is expected if all estimates are right."
 
 
 def _soft_limits_table(merge: Mapping[str, Any]) -> Table:
@@ -316,7 +323,7 @@ def _soft_limits_table(merge: Mapping[str, Any]) -> Table:
             )
         )
     return Table(
-        caption="Soft limits: how often each one was active, and by how much it was exceeded then",
+        caption="Soft limits: share of the time in which each limit was exceeded, and size of the excess",
         heads=("Limit", "Share of the time", "Median", "95 %"),
         rows=tuple(rows),
         note="A limit that is active all the time contradicts the measurements: check the mount and the "

@@ -1,6 +1,6 @@
 """Pack arrays for the page: quantise to at most 16 bits, encode as base64, and thin to a size budget.
 
-The budget records what was thinned.
+To thin means to keep only some of the items, evenly spaced or randomly selected.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def affordable_count(characters: int, bytes_per_item: float) -> int:
 
 @dataclass(slots=True)
 class PageBudget:
-    """The usable fraction of the page's size budgets, and a record of what was thinned.
+    """The usable fraction of the page's size budgets, and the number of shown items of each kind.
 
     Each kind of item on the page (points, pictures, poses) has a budget: a maximum number of items or of
     characters.

@@ -30,12 +30,15 @@ _FORWARD_DEG = 25.0
 At a smaller angle the camera is treated as moving along its line of sight. Evidence: none.
 """
 _MAX_FORWARD_SHARE = 0.6
-"""Maximum fraction of a camera's path along its line of sight.
+"""Maximum fraction of a camera's path on which the camera may move along its line of sight.
 
 If every camera exceeds this fraction, depth is poorly known. Evidence: none.
 """
 _MIN_SHARED_SHARE = 0.03
-"""Minimum fraction of a camera's points that at least one other camera should also see. Evidence: none."""
+"""Minimum fraction of a camera's points that one other camera should also see.
+
+If every other camera sees a smaller fraction, a recommendation is given. Evidence: none.
+"""
 _NARROW_DEG = 3.0
 """Minimum median triangulation angle, degrees. With a smaller angle depth is poorly known. Evidence: none."""
 _SUFFICIENT_SCALE_SIGMA = 0.02
@@ -111,7 +114,7 @@ def _combine_t_poses(found: Sequence[Recommendation]) -> list[Recommendation]:
     """Combine several recommendations of a T-pose into a single recommendation.
 
     The phrase about the T-pose is removed from the original recommendations. The combined recommendation gets
-    a higher priority than these.
+    a higher priority than the original recommendations.
     """
     improved = [recommendation for recommendation in found if _T_POSE.search(recommendation.action)]
     if len(improved) < 2:
@@ -142,20 +145,24 @@ def _mirrored_cameras(inputs: ReportInputs) -> Sequence[str]:
 
 
 def _about_mirrored_cameras(inputs: ReportInputs) -> Iterator[Recommendation]:
-    """Recommend to mirror the videos of mirrored cameras back. Filming in another way would not help."""
+    """Recommend to mirror the videos of mirrored cameras back.
+
+    If it is unknown which of two groups of cameras is mirrored, recommend to look for text in their videos.
+    """
     if names := _mirrored_cameras(inputs):
         yield Recommendation(
             action=f"Flip the video of {', '.join(names)} back (ffmpeg -i in -vf hflip out.mp4), and switch "
             "off the mirroring in the front camera or the app.",
-            reason="it shows what the other cameras see with left and right exchanged, and was excluded",
+            reason="compared with the other cameras, left and right are exchanged, and the map excludes "
+            "mirrored videos",
             priority=3.0,
         )
     for one, other in _map_diagnostics(inputs).undecided_groups:
         yield Recommendation(
             action=f"See whether text reads backwards in the video of {', '.join(one)} or "
-            f"{', '.join(other)}: flip that one back (ffmpeg -i in -vf hflip out.mp4). "
-            "If it does in neither, cover wall mirrors.",
-            reason="they see mirror images of each other, and it is unknown which one is right",
+            f"{', '.join(other)}. If it does, flip that video back (ffmpeg -i in -vf hflip out.mp4). "
+            "If text reads correctly in all of these videos, cover wall mirrors.",
+            reason="these cameras see mirror images of each other; it is unknown which video is mirrored",
             priority=3.0,
         )
 
@@ -273,10 +280,10 @@ def _about_parallax(inputs: ReportInputs) -> Iterator[Recommendation]:
 
 
 def _about_start_and_end(inputs: ReportInputs) -> Iterator[Recommendation]:
-    """Recommend to start all cameras before the movement and to stop them after it.
+    """Recommend to start all cameras before the movement and to stop them after the movement.
 
-    The recommendation is given if a camera has no measurement at the motion's start or end. It also names
-    start_s and end_s for shortening this capture, if that helps.
+    The recommendation is given if a camera has no measurement at the motion's start or end. If shortening
+    this capture helps, the recommendation also gives values for start_s and end_s.
     """
     merge = inputs.merge
     if merge is None or not merge.trajectories:
@@ -340,8 +347,9 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
             f"about {clock.offset_s:.1f} for {name}" for name, clock in sorted(clocks.items())
         )
         yield Recommendation(
-            action="Clap once in view of all cameras and state each one's `offset_s` (the time of the clap "
-            f"in the first video minus its time in this video), or try {offsets}.",
+            action="Clap once in view of all cameras, and state the `offset_s` of each camera (the time of "
+            "the clap in the first video minus the time of the clap in the camera's own video). Or try "
+            f"{offsets}.",
             reason="; ".join(clock.says for _, clock in sorted(clocks.items())),
             priority=2.5,
         )
@@ -355,7 +363,7 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
             measure = f"measure how {name} is mounted and state it (joint_from_cam)"
             yield Recommendation(
                 action=_as_sentence(f"{advice}; or {measure}" if advice else measure),
-                reason=finding if advice else f"the mount of {name} is known to {mount.sigma_deg:.0f}° only",
+                reason=finding if advice else f"the mount of {name} is known only to {mount.sigma_deg:.0f}°",
                 priority=1.0 + mount.sigma_deg / 1000.0,
             )
 

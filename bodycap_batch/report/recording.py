@@ -76,7 +76,7 @@ def _log_maps(stream: rr.RecordingStream, scene: DrawnScene) -> None:
 
 
 def _log_path(stream: rr.RecordingStream, path: DrawnPath, colour: Colour) -> None:
-    """Log a camera path as a line that is interrupted at lost frames, and the camera moving along it."""
+    """Log the path and the moving pose of a camera. The path is a line that is interrupted at lost frames."""
     import rerun as rr
 
     localised = np.asarray(np.isfinite(path.poses).all(axis=(1, 2)))

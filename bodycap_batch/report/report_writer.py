@@ -34,7 +34,7 @@ def write_report(inputs: ReportInputs, path: Path, context: StageContext) -> Non
     """Write the report page as one file of at most 15 MB, however long the capture is.
 
     If the page is too large, it is rendered again with smaller budgets until it is small enough. The page
-    then lists what was thinned.
+    then states how many items of each thinned kind are shown, for example pictures or points.
 
     Args:
         inputs: The results of the job.
@@ -80,7 +80,7 @@ def _thin_series(series: Mapping[str, Any], budget: PageBudget) -> dict[str, Any
 def make_picture_series(inputs: ReportInputs, context: StageContext) -> list[dict[str, Any]]:
     """Return the picture series of each camera as JSON values. The list is empty without videos.
 
-    Each picture has the overlays of its frame.
+    Each picture is stored together with the overlays of its frame.
     """
     if inputs.capture is None:
         return []

@@ -94,7 +94,7 @@ def make_server(content: ServedContent, port: int = 0) -> ThreadingHTTPServer:
         return ThreadingHTTPServer((LOOPBACK, port), Handler)
     except OSError as error:
         raise StoreError(
-            f"port {port} cannot be used: {error.strerror}", hint="name another one with --port"
+            f"port {port} cannot be used: {error.strerror}", hint="name another port with --port"
         ) from error
 
 
@@ -109,7 +109,8 @@ def _chapters(camera: CaptureCamera) -> list[dict[str, Any]]:
         numbers = camera.frame_numbers - chapter_start
         in_chapter = (numbers >= 0) & (numbers < len(video.pts))
         seconds = (video.pts[numbers[in_chapter]] - video.pts[0]) * float(video.time_base)
-        # At the start of a frame's duration a player may still show the previous frame. The middle is safe.
+        # At the start of a frame's duration a player may still show the previous frame. In the middle of the
+        # duration it shows the right frame.
         half = 0.5 / video.fps if video.fps else 0.0
         chapters.append(
             {
@@ -151,8 +152,8 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
     def _answer(self, *, with_body: bool) -> None:
-        # A foreign web page can reach this server through its own host name (DNS rebinding). Therefore all
-        # requests with another host name are refused.
+        # A web page from the internet can send requests to this server if the page's own host name is
+        # resolved to this computer (DNS rebinding). Therefore only requests to local host names are allowed.
         host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
         if host not in (LOOPBACK, "localhost"):
             self.send_error(HTTPStatus.FORBIDDEN)

@@ -19,7 +19,7 @@ With sharp corners and correct intrinsics the error is less than one pixel.
 _GOOD_COVERAGE, _FAIR_COVERAGE = 0.98, 0.85
 """Minimum fraction of registered frames of all cameras for the grades "good" and "usable with care".
 
-The criterion's text gives the reason.
+The `rationale` of the criterion gives the reason.
 """
 _GOOD_CAMERA_COVERAGE, _FAIR_CAMERA_COVERAGE = 0.95, 0.75
 """Minimum fraction of registered frames of the worst camera for the grades "good" and "usable with care".
@@ -34,22 +34,23 @@ Evidence: docs/decisions/report.md.
 _GOOD_SCALE_SIGMA, _FAIR_SCALE_SIGMA = 0.025, 0.10
 """Maximum relative sigma of the metric scale for the grades "good" and "usable with care".
 
-The criterion's text gives the reason.
+The `rationale` of the criterion gives the reason.
 """
 _GOOD_RESIDUAL_M, _FAIR_RESIDUAL_M = 0.01, 0.03
-"""Maximum residuals and maximum distances at joints (metres) for the grades "good" and "usable with care".
+"""Maximum 95th percentile (metres) of two distances for the grades "good" and "usable with care".
 
-The criteria's texts give the reason.
+The first distance is the residual of a camera. The second distance is the distance between bones at a joint.
+The `rationale` of each criterion gives the reason.
 """
 _GOOD_GAP_S, FAIR_GAP_S = 0.2, 0.6
 """Maximum time (seconds) without a measurement for the grades "good" and "usable with care".
 
-The criterion's text gives the reason.
+The `rationale` of the criterion gives the reason.
 """
 GOOD_MOUNT_DEG, _FAIR_MOUNT_DEG = 4.0, 12.0
 """Maximum sigma (degrees) of a mount's rotation for the grades "good" and "usable with care".
 
-The criterion's text gives the reason.
+The `rationale` of the criterion gives the reason.
 """
 _GOOD_OBSERVED_SHARE, _FAIR_OBSERVED_SHARE = 0.95, 0.8
 """Minimum fraction of the time in which a joint is measured for the grades "good" and "usable with care".
@@ -149,8 +150,8 @@ def _frame_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
         if share > 0.0
         else Grade.NONE,
         finding=f"{total['frames_registered']:,} of {total['frames']:,} frames ({format_percent(share, 1)})",
-        rationale="From 98 % on only short moments are missing, and the body's smoothness bridges them. "
-        "Below 85 % more than one frame in seven has no measurement.",
+        rationale="At 98 % or more, only short moments are missing, and the body's smoothness bridges them. "
+        "Below 85 %, more than one frame in seven has no measurement.",
         metric="total.coverage",
         value=share,
     )
@@ -163,7 +164,8 @@ def _frame_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
             grade=grade_value(share, _GOOD_CAMERA_COVERAGE, _FAIR_CAMERA_COVERAGE, more_is_better=True),
             finding=f"{name}: {worst['frames_registered']:,} of {worst['frames']:,} frames "
             f"({format_percent(share, 1)})",
-            rationale="An average hides one bad camera, and a limb is only as good as the camera on it.",
+            rationale="An average over all cameras hides one bad camera. The motion of the limb with this "
+            "camera is then bad as well.",
             metric=f"cameras.{name}.coverage",
             value=share,
         )
@@ -213,8 +215,9 @@ def _one_map_criterion(metrics: Mapping[str, Any]) -> Criterion:
         name="One room",
         grade=grade,
         finding=finding,
-        rationale="A camera outside the main map has no known position in the room. The body gets nothing "
-        "from it, unless the body itself determines its position; that is less accurate.",
+        rationale="A camera outside the main map has no known position in the room. The body's motion does "
+        "not use this camera, unless the body itself determines the camera's position. Such a position is "
+        "less accurate.",
     )
 
 
@@ -240,7 +243,7 @@ def _lens_criteria(misfits: Mapping[str, float], freed: Collection[str]) -> Iter
             name="Lenses fit the pictures",
             grade=grade,
             finding=f"{name}: the pictures fit {describe_lens_misfit(worst)} than the calibration says"
-            f"{'' if not_corrected else '; what fits was used instead'}",
+            f"{'' if not_corrected else '; the lens that fits was used instead'}",
             rationale="A wrong lens bends the whole map although its error in pixels is small. On a walk of "
             "2 m, an error of 25 % in the focal length moved every camera by 9 cm; an image centre that was "
             "wrong by 9 % moved them by 16 cm.",
@@ -322,9 +325,9 @@ def _gap_criteria(cameras: Mapping[str, Any]) -> Iterator[Criterion]:
         name="Longest gap",
         grade=grade_value(gap_s, _GOOD_GAP_S, FAIR_GAP_S),
         finding=f"{gap_s:.2f} s without a measurement ({name})",
-        rationale="An arm swings forward and back in about a second. Smoothness bridges a fifth of that time "
-        "well; in more than half of it a whole swing can be missing. The time before a camera's first "
-        "measurement and after its last one also counts.",
+        rationale="An arm swings forward and back in about a second. The smoothness of the motion bridges a "
+        "fifth of a second well. In more than half a second a whole swing can be missing. The time before a "
+        "camera's first measurement and after its last measurement also counts as a gap.",
         metric=f"merge.cameras.{name}.longest_gap_s",
         value=gap_s,
     )
@@ -337,9 +340,9 @@ def _clock_criteria(doubted: Mapping[str, Any]) -> Iterator[Criterion]:
             name="One clock",
             grade=Grade.POOR,
             finding="; ".join(str(doubt["says"]) for _, doubt in sorted(doubted.items())),
-            rationale="Half a second is half a step. If a clock is wrong by that much, limbs are where they "
-            "were half a step earlier, and the metric scale is wrong too: by 28 % on a walk with two clocks "
-            "that were wrong by 0.5 and 0.2 s.",
+            rationale="Half a second is half a step. If a clock is wrong by half a second, the limb of its "
+            "camera has the position of half a step earlier or later. The metric scale is wrong too: by "
+            "28 % on a walk with two clocks that were wrong by 0.5 and 0.2 s.",
         )
 
 
@@ -367,7 +370,7 @@ def _unused_camera_criteria(unused: Mapping[str, Any]) -> Iterator[Criterion]:
             name="Unused cameras",
             grade=Grade.POOR,
             finding="; ".join(f"{name}: {reason}" for name, reason in sorted(unused.items())),
-            rationale="Their limbs are inferred, not measured.",
+            rationale="The limbs with these cameras are inferred, not measured.",
         )
 
 
@@ -381,7 +384,7 @@ def _observed_time_criteria(joints: Mapping[str, Any]) -> Iterator[Criterion]:
             grade=grade_value(share, _GOOD_OBSERVED_SHARE, _FAIR_OBSERVED_SHARE, more_is_better=True),
             finding=f"{format_percent(share, 1)} of the motion at the joint that was measured least ({name})",
             rationale="If a camera starts late, ends early or is lost for a long time, its limb is inferred. "
-            "An average over all joints would hide that.",
+            "An average over all joints would hide such a limb.",
             metric="" if "." in name else f"motion.joints.{name}.observed_share",
             value=share,
         )

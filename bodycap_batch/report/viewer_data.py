@@ -27,9 +27,9 @@ _MOTION_BUDGET = 2_000_000
 _POSE_BYTES = 16
 """Number of bytes of one pose of a path: 16 bits for each number of position, quaternion and time."""
 _MAX_DISTANCE = 4.0
-"""Maximum distance of a drawn point from the scene's centre, as a ratio to the scene's half width.
+"""Maximum distance of a drawn point from the scene's centre, as a multiple of the scene's half width.
 
-Evidence: none.
+The distance is measured along each axis. Evidence: none.
 """
 
 
@@ -39,7 +39,7 @@ def make_viewer_data(inputs: ReportInputs, scene: DrawnScene, budget: PageBudget
     Args:
         inputs: The results of the job.
         scene: Maps and camera paths in the drawn frame of reference.
-        budget: The budget of the page. It records which items were thinned.
+        budget: The budget of the page. It records how many items of each kind are shown.
     """
     points, colours = _select_points(scene, budget)
     path_budget = budget.scaled(_PATH_BUDGET) // max(1, len(scene.paths))

@@ -21,7 +21,7 @@ higher layer. The package `runner` must not import the package `tasks`."""
 KILL_AFTER_S = 3.0
 """Time (seconds) that a child has to end by itself before it is killed. Evidence: none."""
 _POLL_S = 0.2
-"""Time (seconds) between two checks in which the parent asks whether the job was stopped. Evidence: none."""
+"""Time (seconds) between two checks by the parent whether the job was stopped. Evidence: none."""
 _THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -131,7 +131,7 @@ def _environment() -> dict[str, str]:
 
 
 def describe_end(returncode: int) -> str:
-    """Describe, from the exit code, how a child ended that sent no last message."""
+    """Return a text that says how a child without a last message ended, from the child's exit code."""
     if returncode >= 0:
         return f"the stage's process ended with code {returncode} and no message"
     try:
@@ -147,4 +147,4 @@ def crash_hint(returncode: int) -> str:
         return (
             "probably out of memory: close other programs, or lower work_px in the job; run it again to go on"
         )
-    return "a native library crashed; run it again, and if it stays, please report it with this log"
+    return "a native library crashed; run the job again; if it crashes again, please report it with this log"

@@ -32,13 +32,13 @@ MEMORY = "memory"
 """Name of the Dask resource with which a worker declares its memory (MB). Tasks reserve parts of this memory
 while they run on the worker."""
 _POLL_S = 0.2
-"""Time (seconds) between two checks in which a waiting job asks whether it was stopped. Evidence: none."""
+"""Time (seconds) between two checks whether a waiting job was stopped. Evidence: none."""
 _PROGRESS_PERIOD_S = 1.0
 """Minimum time (seconds) between two reports of a task's progress. Each report takes a few milliseconds on
 the worker, on the scheduler and on the client. Evidence: none."""
 _WORKERS_PERIOD_S = 2.0
 """Minimum time (seconds) between two requests for the scheduler's list of workers. The list must be renewed,
-because workers come and go. A request for each task would take longer than the submission of the task.
+because workers start and end. A request for each task would take longer than the submission of the task.
 Evidence: none."""
 _CLIENT_LEFT = ("closing", "closed")
 _WORKER_ENDS = ("closing", "closed", "failed")
@@ -122,9 +122,9 @@ class Cluster:
     def _resources(self, task: Task, environment: TaskEnvironment) -> dict[str, float] | None:
         """Return the resources that a task reserves; None if no worker declares its memory.
 
-        A task that needs more memory than any worker has reserves all memory of the largest worker. Without
-        this reservation, it could run at the same time as other large tasks. The largest memory is known
-        only after a worker has connected, so this method waits for the first worker.
+        If a task needs more memory than any worker has, the task reserves all memory of the largest worker.
+        Without this reservation, the task could run at the same time as other large tasks. The largest memory
+        is known only after a worker has connected, so this method waits for the first worker.
         """
         while (largest := self._largest_worker(task)) is None:
             if environment.cancelled():
@@ -164,7 +164,7 @@ class Cluster:
         if future.status == "finished":
             try:
                 return dict(future.result())
-            except OSError as error:  # an error of the connection: the answer holds errors of the task
+            except OSError as error:  # the connection failed: errors of the task are in the answer
                 raise _lost(task) from error
         if future.status == "error":
             raise _dask_error(future.exception(), task, environment)
@@ -295,7 +295,7 @@ def _dask_error(failure: BaseException, task: Task, environment: TaskEnvironment
         return BodycapError(
             f"{task.label}: {_ALLOWED_FAILURES + 1} workers died while they ran it",
             path=log,
-            hint="probably out of memory: give workers more, or lower work_px in the job",
+            hint="probably out of memory: give the workers more memory, or lower work_px in the job",
         )
     hint = "install the same bodycap_batch on the scheduler and all workers"
     return BodycapError(f"{task.label}: {type(failure).__name__}: {failure}", path=log, hint=hint)
@@ -305,5 +305,5 @@ def _lost(task: Task) -> BodycapError:
     """Return the error of a task for the case that the scheduler can no longer be reached."""
     return BodycapError(
         f"{task.label}: the scheduler was lost",
-        hint="start it again, and the same batch: finished stages are kept",
+        hint="start the scheduler and the same batch again; finished stages are kept",
     )

@@ -17,7 +17,7 @@ _HINT = "run the job first (`bodycap run`); if it was run before, `bodycap why` 
 
 
 class NotStored(StoreError):
-    """Error: an artefact is not stored, and the runner's rules do not allow to compute it.
+    """Error: an artefact is not stored, and the runner's rules do not permit its computation.
 
     Attributes:
         tasks: The tasks that would compute the missing artefacts.
@@ -44,7 +44,7 @@ class Rules:
 
     Attributes:
         cancelled: Called several times a second; True stops the running tasks.
-        may_commit: Called before an artefact is committed; False stops its task.
+        may_commit: Called before an artefact is committed; False stops the task that computed the artefact.
         before: Called before a task runs; may raise an error to forbid the task.
         compute: If False, only stored artefacts are returned; `NotStored` is raised for a missing artefact.
         redo: Names of the stages that are computed again even if their artefacts are stored.

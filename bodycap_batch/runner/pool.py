@@ -21,13 +21,13 @@ from bodycap_batch.runner.task import Task
 from bodycap_batch.runner.turns import Turns
 
 _POLL_S = 0.1
-"""Time (seconds) between two checks in which a waiting task asks whether it was stopped. Evidence: none."""
+"""Time (seconds) between two checks whether a waiting task was stopped. Evidence: none."""
 
 
 class Slots:
     """Cores and memory of one machine. Tasks reserve both in the order of their priority.
 
-    A task that needs more than the machine has reserves everything, so it runs alone.
+    If a task needs more than the machine has, the task reserves everything and therefore runs alone.
 
     Args:
         cores: Maximum number of threads of all running tasks.
@@ -44,7 +44,7 @@ class Slots:
 
     @contextmanager
     def taken(self, task: Task, cancelled: Callable[[], bool]) -> Iterator[None]:
-        """Wait until a task's cores and memory are free, and reserve them. Raises `Cancelled` if stopped."""
+        """Reserve a task's cores and memory when they are free. Raises `Cancelled` if the task is stopped."""
         need = (min(max(1, task.threads), self.cores), min(task.memory_mb, self.memory_mb))
         self._take(need, task.priority, cancelled)
         try:

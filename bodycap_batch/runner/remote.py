@@ -18,7 +18,7 @@ _lock = threading.Lock()
 
 
 def remote_order(task: Task, environment: TaskEnvironment, command: tuple[str, ...]) -> dict[str, Any]:
-    """Return all that another machine needs to run a task, as JSON values; paths refer to the shared disk."""
+    """Return what another machine needs to run a task, as JSON values; paths refer to the shared disk."""
     return {
         "task": task.to_json(environment.store.root),
         "logs": str(environment.logs),
@@ -69,7 +69,7 @@ def _children_of(command: tuple[str, ...]) -> Children:
 def _require_shared(root: Path) -> None:
     if not (root / "artefacts").is_dir():
         raise StoreError(
-            f"worker {platform.node()} does not see the store",
+            f"worker {platform.node()} cannot find the store",
             path=root,
             hint="put the store and the videos on a disk that all machines mount at the same path",
         )

@@ -12,7 +12,7 @@ from bodycap_batch.runner.children import STOPPED, Executor, TaskEnvironment
 from bodycap_batch.runner.task import Task
 
 _POLL_S = 0.1
-"""Time (seconds) between two checks in which a waiting job asks whether it was stopped. Evidence: none."""
+"""Time (seconds) between two checks whether a waiting job was stopped. Evidence: none."""
 
 
 class Turns:

@@ -1,9 +1,10 @@
 """The artefact store: it holds the results of tasks and finds a result by its key.
 
 An artefact is a folder. Its key names the stage, the version of the algorithm, the options, the content of
-the inputs, and the versions of the libraries. A process writes the folder to a temporary place in the store,
-syncs it, and writes a manifest last. Then it renames the folder to its final name in one step. Every folder
-that has its final name is therefore complete, even if a process was killed.
+the inputs, and the versions of the libraries. A process writes the files into a temporary folder in the
+store, syncs the files to the disk, and writes a manifest last. Then the process renames the folder to its
+final name in one step. Every folder that has its final name is therefore complete, even if a process was
+killed.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ again only if its inode, size or times have changed. Look-ups of large artefacts
 inputs of a task are always hashed before the task runs. Evidence: none."""
 _Found = TypeVar("_Found")
 _LOCK = "lock"
-"""Name of the file in a draft's folder that the draft's process keeps locked."""
+"""Name of the lock file in a draft's folder. The process that writes the draft keeps this file locked."""
 _SETTING_ASIDE = "setting-aside"
 """Name of the lock file that a process locks while it moves a damaged artefact away."""
 _UNLOCKED = "new-"
@@ -98,7 +99,8 @@ class Artefact:
 
     Attributes:
         path: Folder of the artefact.
-        digest: Digest of the content. Equal contents have equal digests, even if their keys differ.
+        digest: Digest of the content. Artefacts with equal contents have equal digests, even if the keys of
+            the artefacts differ.
         made: Cost of computing the artefact (seconds, peak memory, threads); not part of the content.
         files: SHA-256 of each file, by the file's path relative to the artefact's folder.
     """
@@ -168,7 +170,7 @@ class Store:
                 raise StoreError("a stored artefact is damaged", path=path, hint=hint)
 
     def artefacts_in(self, value: Any) -> Iterator[Path]:
-        """Yield the folder of each artefact that the arguments of a task name."""
+        """Yield the folder of each artefact to which the arguments of a task (`value`) refer."""
         if isinstance(value, Mapping):
             value = list(value.values())
         if isinstance(value, list | tuple):
@@ -266,9 +268,9 @@ class Store:
                 return artefact
             if not files.is_dir():
                 raise StoreError(
-                    "an artefact does not read back as it was written",
+                    "an artefact differs from what was written",
                     path=path,
-                    hint="check the disk; another store can be named with --store",
+                    hint="check the disk, or choose another store with --store",
                 )
 
     def _verified(self, path: Path, key: ArtefactKey) -> Artefact | None:
@@ -333,15 +335,15 @@ def store_error(error: OSError, path: Path) -> StoreError:
         errno.ENOSPC: "free some space, or name another disk with --store; finished stages are kept",
         errno.EDQUOT: "your disk quota is used up; name a folder on another disk with --store",
         errno.EROFS: "the file system is read-only; name another folder with --store or --out",
-        errno.EACCES: "no permission; name a folder you may write to with --store or --out",
-        errno.EPERM: "no permission; name a folder you may write to with --store or --out",
+        errno.EACCES: "no permission; choose a folder that you may write to, with --store or --out",
+        errno.EPERM: "no permission; choose a folder that you may write to, with --store or --out",
         errno.ENOTDIR: "a file stands where a folder is needed; name another folder",
     }
     where = error.filename if isinstance(error.filename, str) else path
     reason = os.strerror(error.errno) if error.errno else str(error)
     hint = hints.get(error.errno or 0, "check the disk; another folder can be named with --store")
     if error.errno in _AWAY:
-        hint = "is the disk mounted, its server reachable? Another folder can be named with --store or --out"
+        hint = "is the disk mounted and its server reachable? Choose another folder with --store or --out"
         return DiskAway(reason, path=where, hint=hint)
     return StoreError(reason, path=where, hint=hint)
 

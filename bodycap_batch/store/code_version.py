@@ -67,7 +67,11 @@ def algorithm_version(module: str) -> str:
 
 @cache
 def library_versions(names: tuple[str, ...]) -> dict[str, str]:
-    """Return the installed version of each distribution. For ``a|b``, use the first that is installed."""
+    """Return the installed version of each distribution.
+
+    A name ``a|b`` lists alternatives. The version of the first installed alternative is returned for ``a``.
+    The version is ``none`` if nothing is installed.
+    """
     return {name.split("|")[0]: _installed(name.split("|")) for name in names}
 
 

@@ -21,8 +21,9 @@ _TEMPORARY = re.compile(r"\.([0-9a-f]{8})\.(\d+)\.\d+\.part$")
 """Pattern of the name of a temporary file. The name ends with a code of the machine, the process id and a
 time. The code of the machine is needed because several machines may share a folder."""
 _MIN_AGE_S = 1.0
-"""Minimum time (seconds) since a file's last change before the digest of the file is stored. Within one tick
-of the file system's clock, a file may change again and keep the same times. Evidence: none."""
+"""Minimum time (seconds) since a file's last change before the digest of the file is stored. If a file
+changes twice within the resolution of the file system's clock, its times may stay the same. Evidence: none.
+"""
 
 
 def json_digest(value: Any) -> str:
@@ -32,7 +33,7 @@ def json_digest(value: Any) -> str:
 
 
 def set_digest(files: Mapping[str, str]) -> str:
-    """Return the SHA-256 of a set of files, from the digest of each file by the file's name."""
+    """Return the SHA-256 of a set of files. The argument holds the digest of each file, by file name."""
     return json_digest(dict(sorted(files.items())))
 
 

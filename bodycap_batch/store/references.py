@@ -65,7 +65,7 @@ class References:
                 self._write()
 
     def take_over(self, artefacts: Iterable[str]) -> None:
-        """Add references to these artefacts, and store the paths of this folder. Raises `StoreError`."""
+        """Add references to these artefacts, and store all paths of the folder. Raises `StoreError`."""
         with self._lock:
             self.named |= set(artefacts)
             self._write()
@@ -190,7 +190,10 @@ def _locked(store: Store, kind: int, refusal: str, hint: str) -> Iterator[None]:
 
 
 def _read(path: Path) -> tuple[list[str], list[str]]:
-    """Read the paths and the artefacts of one folder of results; both are empty for an unreadable list."""
+    """Read the paths and the artefacts of one folder of results.
+
+    If the list is missing or damaged, return one empty path and no artefacts.
+    """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         places = [content["owner"], *content.get("also", ())]
@@ -202,7 +205,7 @@ def _read(path: Path) -> tuple[list[str], list[str]]:
 def _exists(place: str) -> bool:
     """Return True if a path exists.
 
-    A disk that does not answer raises `OSError`, so that no artefact is removed by mistake.
+    If the disk fails, this function raises `OSError`, and no artefact is removed by mistake.
     """
     return bool(place) and Path(place).exists()
 

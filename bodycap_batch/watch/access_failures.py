@@ -28,7 +28,7 @@ class AccessFailures:
     Args:
         spool: The spool that the watcher cannot access.
         write_line: Function that is called with each line for the operator.
-        clock: Function that returns the time of this process's own clock, seconds.
+        clock: Function that returns the time (seconds) of this process's monotonic clock.
 
     Attributes:
         current: The latest failure; None while the folders are accessible.
@@ -71,6 +71,6 @@ class AccessFailures:
         """Record that the folders are accessible again."""
         if self.current is not None:
             self._write_line(
-                f"{self._spool.root} answers again after {self.duration_s:.0f} s; the watcher continues"
+                f"{self._spool.root} is accessible again after {self.duration_s:.0f} s; the watcher continues"
             )
         self.current, self._pause_s = None, 0.0

@@ -100,5 +100,8 @@ def is_on_network_disk(folder: Path, mounts: Path = Path("/proc/self/mounts")) -
 
 
 def _without_octal_escapes(text: str) -> str:
-    """Return a mount point with spaces in place of the octal codes that the kernel writes for them."""
+    """Return a mount point with each octal code replaced by its character.
+
+    In its table of mounts, the kernel writes octal codes in place of spaces and some other characters.
+    """
     return text.encode("latin-1", "backslashreplace").decode("unicode_escape") if "\\" in text else text

@@ -145,13 +145,13 @@ def remove_claim_files(job: JobDir) -> None:
 class HeartbeatMonitor:
     """Watch the heartbeats of other watchers.
 
-    A job is treated as abandoned if its `owner.json` has not changed for `stale_s` by this process's own
-    clock. Clocks of different machines are never compared. A job is treated as abandoned at once in two
+    A job is treated as abandoned if its `owner.json` has not changed for `stale_s` seconds on this process's
+    own clock. Clocks of different machines are never compared. A job is treated as abandoned at once in two
     cases: the owner released it, or the owner was a process of this machine that has ended.
 
     Args:
         stale_s: Minimum time (seconds) without a heartbeat before a job may be taken over.
-        clock: Function that returns the time of this process's own clock, seconds.
+        clock: Function that returns the time (seconds) of this process's monotonic clock.
     """
 
     def __init__(self, stale_s: float, clock: Callable[[], float] = time.monotonic) -> None:

@@ -158,9 +158,9 @@ def cancel_job(spool: Spool, name: str, wait_s: float = 5.0) -> JobDir | None:
     """Cancel a waiting or running job. The results of its finished stages stay in the store.
 
     Returns:
-        The job's folder, or None if no watcher has reacted within `wait_s` seconds. In the case of None, the
-        next watcher that runs cancels the job. A returned job may have ended before it could be cancelled:
-        `read_status` returns the final state of the job.
+        The job's folder, or None if no watcher has reacted within `wait_s` seconds. If the result is None,
+        the next watcher that runs cancels the job. If the result is a folder, the job may have ended before
+        it could be cancelled. `read_status` returns the final state of the job.
 
     Raises:
         JobError: The job does not exist, or it has ended.
@@ -269,7 +269,7 @@ def job_row(job: JobDir) -> JobRow:
     )
     running = state == "running"
     cause = str(error.get("message", ""))
-    if state == "stopped" and cause:  # it waits for a disk or for `bodycap gc`
+    if state == "stopped" and cause:  # the job waits for a disk or for `bodycap gc`
         where = error.get("path")
         cause = f"continues later: {f'{where}: ' if where else ''}{cause}"
     if state == "interrupted":

@@ -58,7 +58,7 @@ def read_dropped_job(entry: InboxEntry, snapshot: EntrySnapshot, permissions: Jo
         if entry.path.is_symlink():
             policy.require(entry.path)
     elif snapshot.files > permissions.limits.files:
-        hint = "one folder per recording; the operator can raise --limit files"
+        hint = "put each recording into its own folder, or ask the operator to raise --limit files"
         raise CaptureError(f"more than {permissions.limits.files:g} files", path=entry.path, hint=hint)
     if snapshot.special:
         raise JobError(
@@ -71,8 +71,8 @@ def read_dropped_job(entry: InboxEntry, snapshot: EntrySnapshot, permissions: Jo
         policy.require(decides)
     job = load_job(entry.path, policy=policy, limits=permissions.limits)
     if decides is not None and job.name == safe_name(entry.path.resolve().name):
-        # The name was derived from the folder. Use the name in the inbox: the entry may be a link to a
-        # folder.
+        # The name of the job comes from the real folder. The entry may be a link with another name, so use
+        # the name of the entry.
         job = job.model_copy(update={"name": safe_name(entry.name)})
     _require_video_sizes(job, permissions.limits)
     return job.model_copy(update={"capture": job.capture.model_copy(update={"synthetic": None})})

@@ -60,7 +60,7 @@ def claim_entry(
             return None
         move_to_running(spool, claim)
     except (OSError, StoreError) as failed:
-        with contextlib.suppress(OSError, StoreError):  # on failure, a watcher takes the job over later
+        with contextlib.suppress(OSError, StoreError):  # else a watcher takes the job over later
             return_to_inbox(spool, job_dir)
         raise store_error(failed, entry.path) if isinstance(failed, OSError) else failed from failed
     return claim, error
@@ -100,7 +100,7 @@ def remove_empty_claim(job_dir: JobDir) -> bool:
 
 
 def path_exists(path: Path) -> bool:
-    """Return True if a path is a file, folder or link. Raise `OSError` if the disk does not answer."""
+    """Return True if a path is a file, folder or link. Raise `OSError` if the disk cannot be read."""
     try:
         path.lstat()
     except (FileNotFoundError, NotADirectoryError):

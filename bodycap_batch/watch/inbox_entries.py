@@ -132,11 +132,12 @@ class CompletionTracker:
         unchanged_s: Time (seconds) for which the names, sizes and times of an entry's files must not change
             before the entry is treated as complete.
         max_files: Maximum number of files of an entry that are inspected.
-        clock: Function that returns the time of this process's own clock, seconds.
+        clock: Function that returns the time (seconds) of this process's monotonic clock.
 
     Attributes:
-        incomplete: Reason for each path that has not changed for `unchanged_s`, but is not complete. Examples
-            are an interrupted copy, an empty folder and an unreadable entry.
+        incomplete: Reason why a path is not complete, for each path that has not changed for `unchanged_s`
+            seconds but is not complete. Examples are an interrupted copy, an empty folder and an unreadable
+            entry.
         unreadable: Error text for each path in `incomplete` that cannot be read.
     """
 

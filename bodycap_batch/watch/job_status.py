@@ -177,8 +177,8 @@ def read_status(job: JobDir, *, strict: bool = False) -> dict[str, Any]:
 
     Args:
         job: The job's folder.
-        strict: True: raise `OSError` if the disk cannot read the file. False: return an empty result in this
-            case.
+        strict: True: raise `OSError` if the file exists but cannot be read. False: return an empty result in
+            this case.
     """
     try:
         found = json.loads(job.status.read_text(encoding="utf-8"))

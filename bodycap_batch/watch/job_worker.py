@@ -22,13 +22,14 @@ from bodycap_batch.watch.spool import JobDir, Spool, move_to_free_name
 from bodycap_batch.watch.watch_options import WatchOptions
 
 _MAX_DISK_FAILURES = 5
-"""Maximum number of disk failures of a job. After one more failure, the job ends as failed. A failure is
-counted only if the disk itself answers, because then a file of the job is at fault. Evidence: none."""
+"""Maximum number of counted disk failures of a job. After one more failure, the job ends as failed. A failure
+is counted only if the disk can still be read. In this case the cause is a file of the job and not a missing
+disk. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOutcome:
-    """How the processing of a job ended. The watcher reports this to the operator.
+    """How the processing of a job ended. The watcher reports the outcome to the operator.
 
     Attributes:
         name: Name of the job.
@@ -93,7 +94,7 @@ class JobWorker:
             return self._postpone(claim, status, error)
         except BodycapError as error:
             return self._end(claim, status, "failed", error)
-        except Exception as error:  # noqa: BLE001 - the one place where a job's bugs are caught
+        except Exception as error:  # noqa: BLE001 - the only place that catches program bugs
             away = store_error(error, claim.job.path) if isinstance(error, OSError) else None
             if isinstance(away, DiskAway):
                 return self._postpone(claim, status, away)
@@ -115,7 +116,7 @@ class JobWorker:
             store=str(self._store.root),
         )
         if not job_dir.job.is_file():  # an earlier watcher ended before it wrote the job
-            raise JobError("the job was never read", path=job_dir.input, hint="retry it, so that it is read")
+            raise JobError("the job was never read", path=job_dir.input, hint="retry it: it is then read")
         job = read_job(job_dir, self._options.permissions)
         settings = Settings(
             store=self._store,
@@ -172,7 +173,7 @@ class JobWorker:
         return self._stuck(claim, error)
 
     def _stuck(self, claim: Claim, error: Exception) -> JobOutcome:
-        """Stop the heartbeat after a disk failure, and report it to the operator.
+        """Stop the heartbeat after a disk failure, and return an outcome that reports the failure.
 
         After `stale_s` seconds without a heartbeat, a watcher takes the job over and processes it again.
         """
@@ -249,10 +250,10 @@ class JobWorker:
 
 
 def _is_disk_readable(path: Path) -> bool:
-    """Return True if the disk of an unreadable file answers. In this case the file is at fault.
+    """Return True if the disk of an unreadable file can be read. In this case the cause is the file itself.
 
-    If the disk does not answer, the disk is missing. The watcher waits for a missing disk without a time
-    limit.
+    If the disk cannot be read either, the disk is missing. The watcher waits for a missing disk without a
+    time limit.
     """
     try:
         os.statvfs(path.parent)
@@ -263,7 +264,7 @@ def _is_disk_readable(path: Path) -> bool:
 
 
 def _error_from_status(document: dict[str, object]) -> BodycapError | None:
-    """Return the error of a status file, or None. The error has at least its exit code and its message."""
+    """Return the error that is stored in the content of a status file, or None if there is no error."""
     error = document.get("error")
     if not isinstance(error, dict):
         return None

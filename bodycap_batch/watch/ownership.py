@@ -1,7 +1,7 @@
 """Check whether this process may still write files of a job that several machines can see.
 
-A watcher that was suspended does not know that another watcher has taken its job over. Therefore the
-ownership is checked before each visible step: a commit to the store, a result, a move.
+While a watcher is suspended, another watcher may take its job over. Therefore a watcher checks its ownership
+of a job before each step that other processes can see: a commit to the store, a result, a move.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ class Ownership:
         ):
             return False
         found = read_owner(self.owner)
-        # An earlier owner that was suspended may write its last heartbeat after it has lost the job.
+        # A suspended earlier owner may write `owner.json` once more after it has lost the job. Such a file
+        # has a lower number and is ignored.
         outdated = int(found.get("generation", 0)) < self.generation
         return outdated or (found.get("token"), found.get("generation")) == (self.token, self.generation)
 
@@ -61,7 +62,7 @@ class Ownership:
             raise Cancelled(
                 "another watcher has taken this job over",
                 path=self.owner,
-                hint="nothing to do: the job continues there, after the finished stages",
+                hint="nothing to do: the other watcher continues the job after its finished stages",
             )
 
 

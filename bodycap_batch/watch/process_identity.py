@@ -26,7 +26,7 @@ def machine_id() -> str:
 
 
 def process_start(pid: int) -> str:
-    """Return the start time of a process of this machine in kernel ticks; "" if no such process runs."""
+    """Return the start time of a process of this machine in kernel clock ticks; "" if it does not run."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2]
     except OSError:
@@ -55,7 +55,7 @@ def is_process_running(tag: str) -> bool:
 
 
 def is_from_this_machine(tag: str) -> bool:
-    """Return True if a tag is from a process of this machine that started after the machine's last start."""
+    """Return True if a tag identifies a process that this machine has started since its last boot."""
     return bool(machine_id()) and tag.split("-", maxsplit=1)[0] == _machine_tag()
 
 

@@ -124,7 +124,7 @@ class Spool:
     def free_name(self, name: str) -> str:
         """Return the name if no job has it.
 
-        Otherwise return the first free name of name-2, name-3 and so on.
+        Otherwise return the name with the lowest free number, for example name-2.
         """
         folders = (self.running, self.done, self.failed)
         for number in itertools.count(1):
@@ -158,20 +158,20 @@ def spool_from_path(path: Path) -> Spool:
     """Return the spool of a path. The path is either the inbox or the parent folder of the inbox.
 
     A folder that is not named `inbox` is treated as an inbox only if `running`, `done` and `failed` exist
-    beside it. Any other folder is treated as the parent of the inbox. Its content is therefore never treated
-    as jobs.
+    beside it. Any other folder is treated as the parent of the inbox, and the files in that folder are never
+    treated as jobs.
 
     Raises:
         StoreError: The path is a file, or it is `running`, `done` or `failed`.
     """
     full = Path(os.path.abspath(path))
     if os.path.lexists(full) and not full.is_dir():
-        raise StoreError("not a folder", path=full, hint="name the folder to watch, for example jobs/inbox")
+        raise StoreError("not a folder", path=full, hint="give the folder to watch, for example jobs/inbox")
     if full.name == INBOX:
         return Spool(inbox=full, root=full.parent)
     if not (full / INBOX).is_dir():
         if full.name in _JOB_FOLDERS and (full.parent / INBOX).is_dir():
-            hint = f"name {full.parent / INBOX}, or {full.parent}"
+            hint = f"give {full.parent / INBOX} or {full.parent} instead"
             raise StoreError("finished or running jobs are moved to this folder", path=full, hint=hint)
         if all((full.parent / name).is_dir() for name in _JOB_FOLDERS):
             return Spool(inbox=full, root=full.parent)
@@ -181,7 +181,7 @@ def spool_from_path(path: Path) -> Spool:
 def move_to_free_name(
     source: Path, folder: Path, name: str, before_move: Callable[[Path], None] | None = None, suffix: str = ""
 ) -> Path:
-    """Move a file or folder into another folder, with the first free name (name, name-2, name-3 ...).
+    """Move a file or folder into another folder. If the name is taken, add a number, for example name-2.
 
     Args:
         source: Path of the file or folder to move.
@@ -224,7 +224,7 @@ def visible_entries(folder: Path) -> list[Path]:
 def folder_name_from_text(text: str) -> str:
     """Return a valid name for a job's folder that is close to a text.
 
-    The name is short enough, and has no control characters and no leading dash or dot.
+    The name has at most `_MAX_NAME_BYTES` bytes, no control characters, and no leading dash or dot.
     """
     clean = "".join("_" if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") else c for c in text).strip()
     clean = unicodedata.normalize("NFC", clean)

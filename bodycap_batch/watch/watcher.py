@@ -96,8 +96,8 @@ class Watcher:
     def run(self) -> int:
         """Watch until `stop` is called. With the option `once`, also end when nothing is left to do.
 
-        The watcher waits for a missing disk with growing pauses. With `once` it waits for at most `stale_s`
-        seconds, which is also the time after which it takes over the job of another watcher.
+        The watcher waits for a missing disk, with growing pauses between its attempts. With `once`, it waits
+        for at most `stale_s` seconds. A job without a heartbeat is taken over after the same time.
 
         Returns:
             The highest exit code of the jobs that ended and of the watcher's own disk failures.
@@ -114,7 +114,7 @@ class Watcher:
                     if (pause_s := self._step(pool)) is None:
                         break
                     self._woken.wait(pause_s)
-                    self._woken.clear()  # before the test of `_stop`: `stop` sets `_stop` first
+                    self._woken.clear()  # no stop is lost: `stop` sets `_stop` before `_woken`
             finally:
                 self._stop.set()
                 heartbeat.join()
@@ -147,7 +147,7 @@ class Watcher:
             finish_interrupted_retries(self.spool)
         except (OSError, StoreError) as error:
             if not self._retry_failure_reported:
-                self._write_line(f"an interrupted retry is still in {self.spool.failed}: {error}")
+                self._write_line(f"an interrupted retry in {self.spool.failed} cannot be completed: {error}")
             self._retry_failure_reported = True
 
     def _report_left_entries(self) -> None:

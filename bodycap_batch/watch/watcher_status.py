@@ -1,4 +1,4 @@
-"""Show that a watcher runs, and why it cannot access its folders.
+"""Show which watchers run, and which of them cannot access their folders.
 
 Each watcher writes a small file in `running`. `bodycap status` reads these files.
 """

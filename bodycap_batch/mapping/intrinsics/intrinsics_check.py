@@ -54,7 +54,8 @@ separate focal length for each axis, for pixels that are not square."""
 _MIN_ASPECT_CHANGE = 0.02
 """Minimum relative difference between the two focal lengths of a camera. With a smaller difference, the
 pixels are treated as square. A lower cost is not sufficient evidence for pixels that are not square: the
-model with two focal lengths also has tangential distortion, which may be the cause of the lower cost.
+model with two focal lengths also has further distortion parameters (for example tangential distortion), which
+may be the cause of the lower cost.
 Evidence: docs/decisions/mapping.md."""
 _OBSERVATIONS_PER_PARAMETER = 10
 """Minimum ratio of a camera's number of observations to the number of parameters of its camera model. With
@@ -84,8 +85,8 @@ def find_misfit_intrinsics(
         calibrated: Names of the calibrated cameras by database id.
 
     Returns:
-        The cameras with a large change of the focal length or of the principal point: for each of them, by
-        camera name, the ratio of the focal length that fits the map to the given focal length.
+        By camera name, the ratio of the focal length that fits the map to the given focal length. The result
+        holds only the cameras with a large change of the focal length or of the principal point.
 
     Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999.
     """
@@ -121,7 +122,7 @@ def _principal_point_distance(one: Any, other: Any) -> float:
 def select_camera_models(
     model: Any, settings: pycolmap.IncrementalPipelineOptions, uncalibrated: Collection[int]
 ) -> tuple[dict[int, pycolmap.Camera], frozenset[int]]:
-    """Select camera models that explain the images of uncalibrated cameras much better.
+    """Select camera models that fit the images of uncalibrated cameras much better than the current model.
 
     The current camera model has one radial term and a centred principal point. A part of the map is adjusted
     with each candidate, for all uncalibrated cameras at once. The candidates are first other distortion
@@ -273,8 +274,8 @@ def _change_model(camera: Any, name: str) -> None:
         return
     cubic = radial[0] if radial else 0.0
     if camera.model_name.endswith("FISHEYE") != name.endswith("FISHEYE"):
-        # tan θ = θ + θ³/3 + …: a pinhole model without distortion corresponds to a fisheye model with a
-        # cubic term of 1/3.
+        # For small θ, tan θ is approximately θ + θ³/3. So a pinhole model without distortion corresponds to a
+        # fisheye model with a cubic term of 1/3.
         cubic += _TANGENT_CUBIC if name.endswith("FISHEYE") else -_TANGENT_CUBIC
     extra = [cubic, 0.0] if name.startswith("RADIAL") else [cubic]
     camera.model = getattr(pycolmap.CameraModelId, name)
@@ -289,17 +290,21 @@ def misfit_note(camera: str, factor: float, *, freed: bool = False) -> str:
         factor: Ratio of the focal length that fits the map to the given focal length.
         freed: True if refined intrinsics were used instead of the given intrinsics.
     """
-    instead = "; what fits was used instead" if freed else ""
+    instead = "; the refined values were used instead" if freed else ""
     if abs(factor - 1.0) > _MAX_FOCAL_CHANGE:
         longer = "longer" if factor > 1.0 else "shorter"
         fits = f"a focal length {round(100 * abs(factor - 1.0))} % {longer} than"
         cause = (
-            "stabilisation or digital zoom on, or another lens mode or size calibrated? Film with these off"
+            "stabilisation or digital zoom on, or was the calibration made with another lens mode or picture "
+            "size? Film without stabilisation and digital zoom"
         )
     else:
         # Refined intrinsics may also have another distortion. The check does not refine the distortion.
-        fits = "another centre or distortion than" if freed else "a centre that lies elsewhere than where"
-        cause = "the picture cropped, or another lens mode or size calibrated? Film the whole picture"
+        fits = "another centre or distortion than" if freed else "another centre than"
+        cause = (
+            "the picture cropped, or was the calibration made with another lens mode or picture size? "
+            "Film the whole picture"
+        )
     return (
         f"{camera}: the pictures fit {fits} the calibration says{instead}: was {cause}, calibrate in the "
         "same mode, or use calibration: auto"

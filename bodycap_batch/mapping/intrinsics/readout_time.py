@@ -127,7 +127,9 @@ class RollingShutterModel:
         ]
 
     def corrected(self, readout_s: Mapping[str, float]) -> pycolmap.Reconstruction:
-        """Return a copy of the model with all keypoints at their positions at the middle row's instant.
+        """Return a copy of the model in which all keypoints are at their corrected positions.
+
+        The corrected position of a keypoint is its position at the instant of the image's middle row.
 
         Args:
             readout_s: Readout time (seconds) of each camera, by camera name.
@@ -137,12 +139,12 @@ class RollingShutterModel:
         return out
 
     def move_keypoints(self, model: pycolmap.Reconstruction, readout_s: Mapping[str, float]) -> None:
-        """Move the keypoints in a copy of the model to their positions at the middle row's instant.
+        """Move the keypoints in a copy of the model to their positions at the instant of the middle row.
 
         Args:
             model: The copy of the model, changed in place.
-            readout_s: Readout time (seconds) of each camera, by camera name. If a camera has a readout time
-                of 0 or none, its keypoints are at their detected positions.
+            readout_s: Readout time (seconds) of each camera, by camera name. The keypoints of a camera that
+                is missing here, or that has a readout time of 0, are moved to their detected positions.
         """
         for item in self._keypoints:
             px = px_at_mid_row(
@@ -236,12 +238,13 @@ class RollingShutterModel:
         return out
 
     def undetermined(self, reason: str) -> dict[str, Readout]:
-        """Return the readout times if no readout time can be estimated, by camera name.
+        """Return readout times without an estimation, by camera name.
 
-        A camera has the readout time that is given in the job, else a readout time of 0.
+        A readout time that is given in the job is used. All other cameras get a readout time of 0.
 
         Args:
-            reason: The reason why no readout time could be estimated; it is stored with readout times of 0.
+            reason: The reason why no readout time could be estimated. The reason is stored in
+                `Readout.source` of each camera without a given readout time.
         """
         out = {}
         for name in self._intrinsics:
@@ -272,7 +275,7 @@ class RollingShutterModel:
         return _Keypoints(image_id, ref.camera, feature, px, velocity)
 
     def _points(self, image: Any, feature: IntArray) -> FloatArray:
-        """Return the map points (N,3), in map units, that features of an image observe."""
+        """Return the positions (N,3), in map units, of the points that some features of an image observe."""
         points = image.points2D
         return np.array(
             [self._model.point3D(points[index].point3D_id).xyz for index in feature.tolist()]
@@ -297,8 +300,8 @@ class _ResidualSlope:
     The readout time with the smallest residuals is computed from this model.
 
     Attributes:
-        correlation: Weighted sum, over all residuals, of the residual times its derivative with respect to
-            the readout time, px²/s.
+        correlation: Weighted sum of the products of each residual and its derivative, px²/s. The derivative
+            is taken with respect to the readout time.
         information: Weighted sum of the squared derivatives, px²/s².
         variance: Weighted variance of the residuals at the readout time with the smallest residuals, px².
     """
@@ -317,8 +320,8 @@ class _ResidualSlope:
             step_s: Difference (seconds) of the readout times: second adjustment minus first adjustment.
         """
         change = (after - before) / (step_s if step_s else np.inf)
-        # If an adjustment moves a point far away, the residuals of the point are large. They do not depend on
-        # the readout time and are not used.
+        # If an adjustment moves a point far away, the residuals of the point are large. Such residuals do
+        # not depend on the readout time and are not used.
         small = np.maximum(np.abs(after), np.abs(before)) < _MAX_RESIDUAL_PX
         weight = np.where(small, 1.0 / (1.0 + (after / _LOSS_PX) ** 2), 0.0)
         information = float((weight * change * change).sum())

@@ -15,8 +15,9 @@ from bodycap_batch.model.map_diagnostics import RefinedIntrinsics
 from bodycap_batch.model.scene import Map, MapResult
 
 _MIN_KEYFRAME_RATIO = 0.95
-"""Minimum number of keyframes in a better map, as a ratio to the number of keyframes in the first map. The
-minimum applies to all keyframes together and to the keyframes of each camera. Evidence: none."""
+"""Minimum ratio of the number of keyframes in a new map to the number of keyframes in the first map. A new
+map with a smaller ratio is not better. The ratio is computed for all cameras together and for each camera.
+Evidence: none."""
 
 
 def recalibrate_if_misfit(
@@ -59,8 +60,9 @@ def _recalibrate(
         result: The given map.
         capture: All cameras.
         build: Function that builds a map of a capture with changed intrinsics.
-        usable: Whether the given map is usable. If it is not, a new map is better if it contains all cameras
-            whose given intrinsics contradict the given map.
+        usable: Whether the given map is usable. A better map always contains all cameras whose given
+            intrinsics contradict the given map. If the given map is usable, a better map also passes
+            `_is_better_map`.
     """
     misfits = result.diagnostics.misfit_factors or {}
     if not misfits:

@@ -1,6 +1,6 @@
 """Read and write COLMAP's database of a workspace: cameras, keyframes and the keyframes' SIFT features.
 
-The ids of cameras and images follow a fixed order.
+Cameras and images are written in a fixed order, so the same input always gives the same ids.
 """
 
 from __future__ import annotations
@@ -184,8 +184,8 @@ def rewrite_without_cameras(workspace: Path, cameras: Collection[str]) -> None:
             image_id = write_image(database, ref, new_ids[camera_of[number]])
             database.write_keypoints(image_id, source.read_keypoints(number))
             database.write_descriptors(image_id, source.read_descriptors(number))
-            # A new id is never larger than the old id of the same image. So the file of the image that had
-            # this id was already renamed or removed.
+            # A new id is never larger than the old id of the same image. So this rename never overwrites the
+            # file of another image: the files with smaller old ids were already renamed or removed.
             colour_file.rename(colours / f"{image_id}.npy")
     before.unlink()
 

@@ -47,7 +47,7 @@ _HINT = (
 
 _UNDECIDED_HINT = (
     "that is right if one of them films a wall mirror, or if the room's halves are mirror images of each "
-    "other; else the picture in which text reads backwards is flipped, and the result is wrong"
+    "other; otherwise the result is wrong: the camera in whose video text reads backwards flips the picture"
 )
 
 
@@ -103,7 +103,7 @@ def flip_notes(diagnostics: MapDiagnostics) -> list[str]:
     return [
         *map(excluded_camera_note, diagnostics.flipped_cameras),
         *(
-            f"map.init_frames names camera {name}, which is left out: it is not used"
+            f"map.init_frames is not used, because it names camera {name}, which is left out"
             for name in diagnostics.excluded_from_pair
         ),
         *(
@@ -158,7 +158,10 @@ def _pair_evidence(workspace: Path, selections: Sequence[KeyframeSelection]) -> 
 
 
 def _count_similar_features(one: CameraDescriptors, other: CameraDescriptors) -> int:
-    """Return the number of matches of two cameras, over all image pairs with at least `_MIN_MATCHES`."""
+    """Return the number of matches of two cameras.
+
+    Only image pairs with at least `_MIN_MATCHES` matches are counted.
+    """
     counts = [count_ratio_test_matches(image, other) for image in one]
     return int(sum(count[count >= _MIN_MATCHES].sum() for count in counts))
 
@@ -174,7 +177,8 @@ def _sample_descriptors(
     """Return descriptors of some keyframes of each camera: unchanged and mirrored.
 
     Returns:
-        The `largest_descriptors` of the keyframes, by camera name; the same for the mirrored keyframes.
+        The `largest_descriptors` of the keyframes, by camera name; the `largest_descriptors` of the mirrored
+        keyframes, by camera name.
     """
     import pycolmap
 
@@ -205,8 +209,8 @@ def label_cameras(
 
     The two cameras of a pair may already be in one component, and the pair's evidence may contradict their
     groups. This contradiction is ignored if the evidence that joined the two cameras is at least `_MIN_RATIO`
-    times as strong. Otherwise the component is undecided. A component with two groups of the same size is
-    undecided too.
+    times as strong as the evidence of the pair. Otherwise the component is undecided. A component with two
+    groups of the same size is undecided too.
 
     Args:
         cameras: Camera names.
@@ -214,8 +218,9 @@ def label_cameras(
             opposite orientation.
 
     Returns:
-        The cameras in the smaller groups of all decided components; the two groups with opposite orientation
-        of each undecided component.
+        The cameras in the smaller groups of all decided components; two groups with opposite orientation for
+        each undecided component. If an undecided component has a contradiction, each of its two groups is one
+        camera: the pair with the strongest evidence for opposite orientation.
     """
     components = {name: {name: 1} for name in cameras}
     strength: dict[tuple[str, str], int] = {}

@@ -174,7 +174,8 @@ def find_mutual_matches(first: FloatDescriptors, second: FloatDescriptors) -> In
     products[near, nearest[near]] = -1.0
     second_best = products[near].max(axis=1, initial=-1.0)
     near = near[_angle_rad(best[near]) < MAX_RATIO * _angle_rad(second_best)]
-    # Two features of `first` can be equally near to one feature of `second`. Then only the first one is kept.
+    # Two features of `first` can be equally near to one feature of `second`. Then only the match of the
+    # feature with the smaller index is kept.
     _, once = np.unique(nearest[near], return_index=True)
     near = near[np.sort(once)]
     return np.column_stack([near, nearest[near]])
@@ -220,7 +221,11 @@ def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> 
 
 
 def _error_px(features: KeyframeFeatures) -> float:
-    """Return the maximum epipolar error (px) of an inlier of a keyframe."""
+    """Return the maximum epipolar error (px) of an inlier of a keyframe.
+
+    The unit for an uncalibrated camera is a pixel of the keyframe. The unit for a calibrated camera is a
+    pixel of an image with a long side of 640 px.
+    """
     return _MAX_ERROR_PX if features.calibrated else features.error
 
 

@@ -31,14 +31,14 @@ from bodycap_batch.mapping.matching.skeletal_set import select_skeletal_keyframe
 
 _NEIGHBOUR_STEPS = (1, 2, 3, 4, 6, 9, 14)
 """Steps from a keyframe to other keyframes of the same camera, counted in keyframes. A keyframe is matched
-with the next keyframe, the second, third, fourth, sixth and so on, in both directions of time.
-Evidence: none."""
+with the keyframes at these steps before it and after it. Evidence: none."""
 _SIMULTANEOUS = 2
 """Number of simultaneous partners. A keyframe is matched with this number of keyframes of each other camera:
 the keyframes that are nearest in time. Evidence: none."""
 _RETRIEVED = 64
-"""Maximum number of retrieved partners of a keyframe. This maximum does not apply to the partners that are
-taken first from each camera (`_RETRIEVED_PER_CAMERA`). Evidence: docs/decisions/mapping.md."""
+"""Maximum number of retrieved partners of a keyframe. A retrieved partner is a similar keyframe with which
+the keyframe is matched. The maximum does not apply to the partners that are taken first from each camera
+(`_RETRIEVED_PER_CAMERA`). Evidence: docs/decisions/mapping.md."""
 _RETRIEVED_PER_CAMERA = 8
 """Maximum number of retrieved partners of a keyframe that are taken first from each camera. After these, the
 most similar keyframes of all cameras are taken. Evidence: none."""
@@ -59,8 +59,9 @@ camera. Matching this number of pairs takes some minutes."""
 _EXHAUSTIVE_UP_TO = 120
 """Maximum number of keyframes of a capture in which every pair of keyframes is matched. Evidence: none."""
 _RESECTION_RETRIEVALS = 8
-"""Number of retrieved partners for a resection. Before a keyframe is resected, it is matched with this number
-of keyframes of the map: the most similar ones. Evidence: docs/decisions/mapping.md."""
+"""Maximum number of retrieved partners for a resection. Before a keyframe is resected, the keyframe is
+matched with its most similar keyframes in the map, at most this number.
+Evidence: docs/decisions/mapping.md."""
 
 
 class PairGenerator:
@@ -136,8 +137,8 @@ class PairGenerator:
     def resection_pairs(self, registered: Collection[ImageRef], missing: Collection[ImageRef]) -> list[Pair]:
         """Return the pairs that the resection of keyframes needs.
 
-        Each keyframe is paired with keyframes of the map that are near in time or most similar to it. It is
-        also paired with its neighbours in the same camera.
+        Each missing keyframe is paired with three kinds of keyframes: the keyframes of the map that are
+        nearest in time, the most similar keyframes of the map, and its two neighbours in the same camera.
 
         Args:
             registered: Keyframes of the map.
@@ -160,10 +161,11 @@ class PairGenerator:
         return self._sorted(pairs)
 
     def initial_pairs(self) -> list[Pair]:
-        """Return the pairs of each new keyframe that are matched first.
+        """Return the pairs that are matched first.
 
-        Its partners are its neighbours in time, the simultaneous keyframes of other cameras, and the
-        retrieved keyframes. In exhaustive mode its partners are all keyframes.
+        Each new keyframe is paired with its neighbours in time, with the simultaneous keyframes of other
+        cameras, and with similar keyframes. In exhaustive mode, each new keyframe is paired with all
+        keyframes.
         """
         if self.exhaustive:
             return self._sorted({(row, other) for row in self._new for other in range(len(self._images))})
@@ -173,9 +175,9 @@ class PairGenerator:
         """Return untried pairs near verified pairs, for keyframes with fewer than `_MIN_LINKS` links.
 
         In a returned pair, one keyframe of a verified pair is replaced by its neighbour in time. Such a pair
-        often has matches: if two cameras see a common place, they usually also do so shortly before and
-        after. Links are important: without enough links, a block of keyframes can be metres away from its
-        correct position in the map.
+        often has matches: if two cameras see a common place, they usually also see a common place shortly
+        before and after. Links are important: without enough links, a block of keyframes can be metres away
+        from its correct position in the map.
 
         Args:
             verified: Number of matches of every verified pair.

@@ -17,10 +17,11 @@ SKELETAL_ABOVE = 1000
 skeletal keyframes, and the other keyframes are resected: repeated adjustments of all keyframes would take
 hours. Evidence: docs/decisions/mapping.md."""
 _MIN_MATCHES = 16
-"""Minimum number of matches of two keyframes that surely show the same part of the room: four times
-`MIN_RETRIEVAL_MATCHES`. Evidence: docs/decisions/mapping.md."""
+"""Minimum number of matches of two overlapping keyframes. Two keyframes with fewer matches are not treated as
+overlapping. The number is four times `MIN_RETRIEVAL_MATCHES`. Evidence: docs/decisions/mapping.md."""
 _MIN_SUPPORT = 6
-"""Minimum number of selected keyframes that each keyframe that is not selected must match.
+"""A keyframe is selected if it overlaps with fewer selected keyframes than this number. So every keyframe
+that is not selected overlaps with at least this number of selected keyframes.
 Evidence: docs/decisions/mapping.md."""
 
 
@@ -33,18 +34,20 @@ def select_skeletal_keyframes(
 ) -> IntArray:
     """Select skeletal keyframes, against which all other keyframes can be resected.
 
-    Keyframes are processed in time order. A keyframe is selected if it matches fewer than `min_support`
-    selected keyframes.
+    Keyframes are processed in time order. A keyframe is selected if it overlaps with fewer than
+    `min_support` selected keyframes.
 
-    The selected keyframes form components. A keyframe is also selected if it matches keyframes of several
-    components. If `min_support` keyframes link two components, these become one component.
+    A component is a set of selected keyframes that are connected by overlaps. A keyframe that overlaps with
+    several components links these components and is also selected. The linked components become one
+    component in two cases: `min_support` keyframes linked them, or a keyframe that overlaps with fewer than
+    `min_support` selected keyframes links them.
 
     Args:
         matches: (N,N) number of matches of all pairs of keyframes, symmetric.
         times: (N,) time of each keyframe, in any unit.
-        min_matches: Minimum number of matches of two keyframes that surely show the same part of the room.
-        min_support: Minimum number of selected keyframes that each keyframe that is not selected must match.
-            This is also the number of keyframes that must link two components to join them.
+        min_matches: Minimum number of matches of two overlapping keyframes.
+        min_support: A keyframe is selected if it overlaps with fewer selected keyframes than this number.
+            The number also decides when linked components become one component.
 
     Returns:
         Indices of the selected keyframes, increasing.

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 _INITIAL_PAIR_RELAXATIONS = 2
-"""Number of times that the thresholds for an initial pair are relaxed before the pair is rejected. COLMAP's
-number."""
+"""Number of times that each of two thresholds for an initial pair is halved before the pair is rejected.
+COLMAP uses the same number."""
 
 
 def progress_counter(
@@ -51,8 +51,8 @@ def register_images(
     """Register images of the database in a model, until no further image fits the model.
 
     The model may be empty. If no further image fits, the whole model is adjusted and the function tries once
-    more, like COLMAP's pipeline. If no image was added then, COLMAP adjusts the whole model a second time.
-    This function omits the second adjustment. Evidence: docs/decisions/mapping.md.
+    more, like COLMAP's pipeline. If the last try adds no image, COLMAP adjusts the whole model once more.
+    This function omits that adjustment. Evidence: docs/decisions/mapping.md.
 
     Args:
         workspace: Folder of the database.
@@ -119,7 +119,7 @@ def resect_images(
 ) -> set[int]:
     """Register images in a model without any adjustment.
 
-    An image can only be registered if the model already contains the part of the room in the image.
+    An image can only be registered if the model already contains the part of the room that the image shows.
 
     Args:
         workspace: Folder of the database.

@@ -80,7 +80,7 @@ class InitialPair:
             return f"the cameras hardly moved apart ({np.degrees(self.parallax_rad):.1f} degrees of parallax)"
         if self.coverage < _MIN_COVERAGE:
             return f"the matches fill {self.coverage:.0%} of the images"
-        return f"{self.matches} matches were too few or their geometry too weak"
+        return f"there were too few matches ({self.matches}), or their geometry was too weak"
 
     def to_log(self) -> dict[str, object]:
         """Return the entries for the log."""
@@ -140,7 +140,7 @@ def find_user_pair(
         image_ids = read_image_ids(database)
         ids = sorted(image_ids[_nearest_keyframe(name, image_ids, frame_numbers)] for name in names)
         if ids[0] == ids[1]:
-            raise JobError(f"{' and '.join(names)} are one keyframe", field="map.init_frames")
+            raise JobError(f"{' and '.join(names)} have the same nearest keyframe", field="map.init_frames")
         if not database.exists_two_view_geometry(*ids):
             return None
         return _measure_pair(database, (ids[0], ids[1]), intrinsics)

@@ -74,7 +74,7 @@ def reconstruct(
             if models and models[0].num_reg_images() >= _MIN_REGISTERED_RATIO * total:
                 return models, attempts
             if pair:
-                attempts[-1]["failed"] = pair.rejection_reason if not models else "few keyframes followed"
+                attempts[-1]["failed"] = pair.rejection_reason if not models else "few keyframes were added"
             elif models:
                 return models, attempts
     return [], attempts
@@ -98,9 +98,11 @@ def _reconstruct_from_pair(
 ) -> list[Any]:
     """Return the model that starts from a given pair, and models of the remaining keyframes, largest first.
 
-    A keyframe can be in two models: all keyframes of the first model that fit the largest further model are
-    also registered in the further model. COLMAP does this too, because a part of the room may be connected to
-    the rest on one side only.
+    The first model starts from the given pair. Further models are built from the keyframes that are not in
+    the first model. Then all keyframes that fit are registered in the largest further model. So a keyframe
+    can be in two models. COLMAP does this too, because a part of the room may be connected to the rest on one
+    side only. If the largest further model contains all keyframes of the first model, the first model is
+    removed.
     """
     import pycolmap
 

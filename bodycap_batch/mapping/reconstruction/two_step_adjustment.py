@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MIN_SHARED_POINTS = 60
-"""Minimum number of common points of two keyframes that surely show the same part of the room.
-Evidence: none."""
+"""Minimum number of common points of two overlapping keyframes. Two keyframes with fewer common points are
+not treated as overlapping. Evidence: none."""
 
 
 def adjust_in_two_steps(

@@ -18,8 +18,9 @@ Reach = Mapping[tuple[str, str], tuple[float, float]]
 """Minimum and maximum distance (metres) between two cameras, by their names in alphabetical order."""
 
 MIN_WITHIN_REACH = 0.8
-"""Minimum fraction of the distances that must be within reach at the provisional scale. With a smaller
-fraction, the check is inconclusive. Evidence: none."""
+"""Minimum fraction of the distances that must be within reach. The distances are converted to metres with the
+provisional scale: the scale at which most distances are within reach. With a smaller fraction, the check is
+inconclusive. Evidence: none."""
 _MIN_DISTANCES = 20
 """Minimum number of distances that the check needs. Evidence: none."""
 _MAX_GAP_NS = 1_000_000_000
@@ -32,8 +33,8 @@ _MIN_RUN = 3
 """Minimum length of a violation: number of successive keyframes of a camera that are out of reach. Shorter
 runs are treated as noise of the keyframes' poses."""
 _SMALLEST_UNIT = 1e-300
-"""Small length (map units) that is added to the minimum lower end of a distance's confidence interval. So the
-lower end is positive even for a distance of 0, and its logarithm is defined."""
+"""Minimum lower end (map units) of a distance's confidence interval. Because of this minimum, the lower end
+is positive even for a distance of 0, and the logarithm of the lower end is defined."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,7 +123,8 @@ def find_best_scale(low: FloatArray, high: FloatArray) -> tuple[float, float]:
     If a range of values lies in the same intervals, the middle of the range is returned.
 
     Args:
-        low: (N,) lower ends of the intervals.
+        low: (N,) lower ends of the intervals. The unit is arbitrary; `check_distances` uses the logarithm of
+            a scale.
         high: (N,) upper ends of the intervals.
 
     Returns:
@@ -201,7 +203,7 @@ def _distances_at_keyframes(
 def _keep_long_runs(scene: Map, mask: BoolArray) -> BoolArray:
     """Return a copy of a mask (K,) of keyframes, without short runs.
 
-    If a camera has fewer than `_MIN_RUN` successive keyframes that are True, they become False.
+    Each run of fewer than `_MIN_RUN` successive True keyframes of one camera becomes False.
     """
     out = np.zeros(len(mask), dtype=bool)
     for camera in sorted(scene.cameras):

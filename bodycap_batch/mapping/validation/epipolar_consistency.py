@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MAX_ERROR_PX = 8.0
-"""Maximum epipolar error (px) of a match that the map's poses explain. It is twice the maximum error that
-the verification of pairs permits, because a map is slightly deformed."""
+"""Maximum epipolar error (px of the keyframe) of a match that the map's poses explain. For an image with a
+long side of 640 px, this is twice the maximum error in the verification of pairs. The error may be larger
+than in verification because a map is slightly deformed."""
 _MIN_PAIR_MATCHES = 30
 """Minimum number of matches of an evaluated pair. Some verified pairs with fewer matches are wrong.
 Evidence: none."""
@@ -142,12 +143,12 @@ def check_consistency(ratio: float, reach: Mapping[str, object] | None) -> Estim
         return None
     body = ""
     if reach is not None:
-        found = reach.get("reason", f"{reach.get('keyframes_out_of_reach')} keyframes out of it")
+        found = reach.get("reason", f"{reach.get('keyframes_out_of_reach')} keyframes are out of reach")
         body = f"; the body's reach: {found}"
     return EstimationError(
         f"{ratio:.0%} of the matches between keyframes contradict the map: places that look the same "
-        f"(repeated pictures, tiles, windows) were taken for one{body}",
-        hint="film what tells the places apart, or cover repeated pictures; check the calibration",
+        f"(repeated pictures, tiles, windows) were taken for one place{body}",
+        hint="film objects that distinguish the places, or cover repeated pictures; check the calibration",
     )
 
 
@@ -172,5 +173,5 @@ def check_coverage(
     return EstimationError(
         f"the map holds {registered} of {keyframes} keyframes, "
         f"fewer than {options.min_coverage:.0%}; initial pairs: {attempts}",
-        hint="film sideways movement over textured, well lit surfaces; check the calibration",
+        hint="move the cameras sideways past textured, well lit surfaces; check the calibration",
     )

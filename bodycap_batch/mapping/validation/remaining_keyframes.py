@@ -1,4 +1,4 @@
-"""Resect the keyframes of a long capture that are not skeletal keyframes.
+"""In a long capture, resect the keyframes that are not skeletal keyframes.
 
 Skeletal keyframes are the reduced set of keyframes, Snavely's skeletal set.
 """
@@ -24,8 +24,8 @@ def resect_remaining(
     """Adjust models robustly, then resect the keyframes that no model contains.
 
     An adjustment of all keyframes together would need hundreds of passes over millions of observations. So
-    after resection only the resected keyframes are adjusted. The poses of the other keyframes stay constant,
-    and so do the points that the other keyframes observe. Misregistered keyframes are removed.
+    after resection only the resected keyframes are adjusted. The poses of the other keyframes stay constant.
+    The points that the other keyframes observe stay constant too. Misregistered keyframes are removed.
 
     Args:
         models: Reconstructions from some of the keyframes. They are changed in place, and the list is sorted,

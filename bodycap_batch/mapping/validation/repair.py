@@ -1,4 +1,4 @@
-"""Repair a model: match misregistered and missing keyframes in further pairs, and register them again.
+"""Repair a model: match further pairs of misregistered and missing keyframes, and register them again.
 
 Keyframes that are still misregistered are removed.
 """
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 _ROUNDS = 2
 """Maximum number of rounds of a repair. Evidence: none."""
 _MIN_PAIR_BUDGET = 2000
-"""Number of untried pairs that a round of a repair may always match. A round may match more pairs only if at
-least as many pairs were matched before. Otherwise only the pairs of misregistered keyframes are matched.
-Evidence: none."""
+"""Number of untried pairs that a round of a repair may match in any case. The round may match a larger number
+of untried pairs only if at least that number of pairs was matched before. Otherwise the round matches only
+the pairs of misregistered keyframes. Evidence: none."""
 
 
 def repair_model(
@@ -37,7 +37,7 @@ def repair_model(
     context: MappingContext,
     keyframes: Collection[ImageRef] | None = None,
 ) -> tuple[Any, dict[str, object]]:
-    """Match misregistered and missing keyframes in untried pairs, and register these keyframes again.
+    """Match untried pairs of misregistered and missing keyframes, and register these keyframes again.
 
     A round is accepted if it increases the number of correctly registered keyframes. If this number stays the
     same, the round is accepted if it decreases the number of misregistered keyframes. At the end, all

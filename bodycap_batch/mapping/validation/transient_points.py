@@ -24,8 +24,8 @@ def remove_transient_points(model: pycolmap.Reconstruction, times_ns: Mapping[st
     """Remove points that only one camera observed for a short time, and return the number of removed points.
 
     An object that moves with a camera looks static to this camera for a moment. Points on such an object
-    deform the map. A point is kept if one of its keyframes observes fewer than `_MIN_STATIC_POINTS` static
-    points. Evidence: docs/decisions/mapping.md.
+    deform the map. Such a point is kept if one of its keyframes observes fewer than `_MIN_STATIC_POINTS`
+    static points. Evidence: docs/decisions/mapping.md.
 
     Args:
         model: A reconstruction, changed in place. The caller adjusts it afterwards.

@@ -14,12 +14,13 @@ from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions, segment_axes, split_side
 
 JOINT_SLACK_M = 0.005
-"""Slack of a joint: sigma per axis (metres) of the gap between a bone's joint and its place on the parent
-bone. It allows for soft tissue, and gives the optimiser room. Evidence: none."""
+"""Slack of a joint, metres per axis. The slack is the sigma of the gap between a bone's joint and the place
+of this joint on the parent bone. The slack allows for soft tissue, and lets the optimiser move the bones more
+freely. Evidence: none."""
 
 HINGE_ARM_M = 0.3
-"""Distance (metres) of each of a hinge's two anchors from the joint, along the hinge's axis. Evidence:
-none."""
+"""Distance (metres) between a hinge's joint and each of its two anchors. The anchors are on the hinge's axis.
+Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +28,9 @@ class _JointPrior:
     """Prior of a joint's rotation and of its bone's acceleration.
 
     Attributes:
-        relaxed_flexion_deg: Flexion (degrees) of a person who stands relaxed.
-        sigma_deg: Sigmas (degrees) of the rotation about the along, forward and flexion axes.
+        relaxed_flexion_deg: Flexion (degrees) of the joint while the person stands relaxed.
+        sigma_deg: Sigmas (degrees) of the rotation about the along, forward and flexion axes, see
+            `anatomical_axes`.
         psd_rotation: Power spectral density of the rotational acceleration, rad²/s³.
         psd_translation: Power spectral density of the translational acceleration, m²/s³.
     """
@@ -54,9 +56,9 @@ _PRIORS = {
     "Foot": _JointPrior(0.0, (10.0, 10.0, 20.0), 18.0, 24.0),
     "ToeBase": _JointPrior(0.0, (5.0, 5.0, 20.0), 18.0, 24.0),
 }
-"""Prior of each joint, by part of the body. Sigmas: everyday range of each joint; two sigmas are about half
-of the range of motion in D. A. Neumann, "Kinesiology of the Musculoskeletal System". Power spectral
-densities: measured on walking with reaching."""
+"""Prior of each joint, by part of the body. The sigmas describe the everyday range of each joint: two sigmas
+are about half of the range of motion in D. A. Neumann, "Kinesiology of the Musculoskeletal System". The power
+spectral densities were measured on people who walked and reached for things."""
 _BONE_AFTER_HINGE = {"ForeArm": "Hand", "Leg": "Foot"}
 """Next bone of the limb, for each bone that starts at a hinge."""
 
@@ -97,8 +99,8 @@ class Hinge:
         following: Index of the bone that starts at the lower bone's far end.
         anchors_m: (2,3) positions of the two points in the upper bone's frame.
         range_m: Distance (metres) of each point from the following bone's joint.
-        sigma_m: Sigma (metres) of this distance in addition to the slack of a joint. It is the `off_hinge_m`
-            of the lower bone.
+        sigma_m: Sigma (metres) of this distance due to violations of the hinge. The slack of a joint is not
+            included. The value comes from `off_hinge_m` of the lower bone.
     """
 
     upper: int
@@ -120,9 +122,10 @@ class Bone:
         offset_m: (3,) centre of the bone's joint in the parent bone's frame.
         mean_rotation: (3,3) parent_from_bone in the rest pose.
         rotation_covariance: (3,3) covariance, rad², of the joint's rotation in the bone's own axes.
-        psd: (6,) power spectral density of the bone's acceleration, rotation first.
-        off_hinge_m: Sigma (metres) of the distance of the bone's far end from the hinge's plane, in addition
-            to the slack of a joint.
+        psd: (6,) power spectral density of the bone's acceleration: three rotations (rad²/s³), then three
+            translations (m²/s³).
+        off_hinge_m: Sigma (metres) of the distance between the bone's far end and the plane of its hinge. The
+            slack of a joint is not included. The value is 0 if the motion obeys the hinge.
     """
 
     joint: int
@@ -187,7 +190,7 @@ def anatomical_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
 
 
 def _rest_rotation(skeleton: SkeletonModel, role: str, prior: _JointPrior) -> FloatArray:
-    """Return parent_from_bone (3,3) of a person who stands relaxed with the arms hanging."""
+    """Return the bone's rotation parent_from_bone (3,3) while the person stands relaxed with hanging arms."""
     side, part = split_side(role)
     flexion = so3_exp([0.0, 0.0, np.radians(prior.relaxed_flexion_deg)])
     axes = anatomical_axes(skeleton, role)

@@ -1,4 +1,4 @@
-"""The poses of all joints from the solved bones: an upright pelvis, and zero rotations below solved bones."""
+"""Compute the poses of all joints from the solved bones, and find the joints that the cameras measured."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ def complete_skeleton(
 ) -> tuple[FloatArray, BoolArray]:
     """Return the poses of all joints.
 
-    From the first solved bone towards the root, the trunk straightens joint by joint to an upright pelvis
-    with the heading of the first solved bone. Legs without cameras are therefore in a standing pose. Below
-    the solved bones, joints keep their zero rotation.
+    A pelvis that was not solved is upright, with the heading of the first solved bone. The orientations of
+    the joints between this pelvis and the first solved bone are interpolated. All joints that are neither
+    solved nor above the first solved bone have zero rotation relative to their parent. Legs without cameras
+    are therefore in a standing pose.
 
     Args:
         skeleton: The body.
@@ -28,7 +29,7 @@ def complete_skeleton(
         world_from_bone: (T,B,4,4) poses of the solved bones, z up.
 
     Returns:
-        Poses world_from_joint (T,J,4,4), and (J,) whether each joint was solved.
+        The poses world_from_joint (T,J,4,4), and a mask (J,) that is True for solved joints.
     """
     ticks, count = len(world_from_bone), len(skeleton.joints)
     out = np.tile(np.eye(4), (ticks, count, 1, 1))
@@ -46,7 +47,10 @@ def complete_skeleton(
 
 
 def _straighten_trunk_above(skeleton: SkeletonModel, first: Bone, out: FloatArray, posed: BoolArray) -> None:
-    """Write the poses of the first bone's ancestors into `out` (T,J,4,4), and mark them in `posed` (J,)."""
+    """Write the poses of the joints above the first bone into `out` (T,J,4,4).
+
+    The function also sets these joints to True in `posed` (J,).
+    """
     chain = joints_to_root(skeleton, first.joint)
     trunk = out[:, first.joint].copy()
     trunk[:, :3, :3] = trunk[:, :3, :3] @ first.mean_rotation.T
@@ -88,11 +92,13 @@ def observed_joints(
     tick_times_ns: IntArray,
     max_gap_s: float,
 ) -> BoolArray:
-    """Return whether the cameras measured each joint at each tick (T,J).
+    """Return a mask (T,J) that is True if the cameras measured the joint at the tick.
 
-    A bone with a camera is measured at a tick if the camera has a frame within half a tick interval. It is
-    also measured if the tick lies between two frames that are at most `max_gap_s` apart. A bone without a
-    camera is measured if bones on both sides of it are measured.
+    A bone with a camera is measured at a tick in two cases: the camera has a frame within half a tick
+    interval, or the tick is between two frames that are at most `max_gap_s` seconds apart.
+
+    A bone without a camera is measured if at least one bone below it and at least one other bone outside its
+    subtree are measured.
     """
     measured: dict[int, BoolArray] = {}
     for track in tracks:

@@ -17,8 +17,10 @@ def fill_gaps(poses: FloatArray, valid: BoolArray) -> FloatArray:
     """Interpolate poses (T,4,4) at the ticks where `valid` (T,) is False.
 
     Before the first valid tick and after the last valid tick, the nearest valid pose is repeated. In contrast
-    to `bodycap_batch.model.geometry.poses_at`, this function keeps valid poses and the ends unchanged to the
-    last bit.
+    to `bodycap_batch.model.geometry.poses_at`, this function does not change valid poses by rounding errors.
+
+    Returns:
+        The poses (T,4,4), without gaps.
     """
     known = np.flatnonzero(valid)
     ticks = np.arange(len(poses))
@@ -39,9 +41,9 @@ def pose_bones(
         measured: By bone index, poses world_from_bone (T,4,4) from the bone's camera, at every tick.
 
     Returns:
-        Poses world_from_bone (T,B,4,4). Inverse kinematics solves limb bones without a measurement: elbows
-        point outward and backward, knees forward. All other bones without a measurement are in the rest pose
-        on their parent.
+        Poses world_from_bone (T,B,4,4). Inverse kinematics gives the poses of limb bones without a
+        measurement. In these poses, elbows point outward and backward, and knees point forward. Other bones
+        without a measurement have the rest pose relative to their parent bone.
     """
     ticks = len(next(iter(measured.values())))
     out = np.tile(np.eye(4), (ticks, len(bones), 1, 1))
@@ -133,7 +135,7 @@ def _two_bone_ik(
     side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
     cosine = np.clip((upper**2 + reach**2 - lower**2) / (2.0 * upper * reach), -1.0, 1.0)
     along = cosine * towards + np.sqrt(1.0 - cosine**2) * side
-    # The lower bone is rotated from the upper bone's direction towards the goal: about upper × goal.
+    # Relative to the upper bone, the lower bone is rotated towards the goal, about the axis upper × goal.
     return along, np.cross(side, towards)
 
 

@@ -16,13 +16,14 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import split_side
 
 _REACH_QUANTILE = 0.9
-"""Quantile of the distances that is used as their maximum. A single wrong pose cannot change it much."""
+"""This quantile of the distances is used instead of the maximum of the distances. A single wrong pose hardly
+changes the quantile."""
 _MAX_EXTENSION = 0.96
-"""Ratio of the extension of a nearly straight limb to its length. The elbows of a walker keep 15 to 30° of
-flexion."""
+"""Distance between the ends of a stretched limb, divided by the limb's length. The ratio is below 1, because
+the elbows of a walking person keep 15 to 30° of flexion."""
 _MIN_COMMON_FRAMES = 10
-"""Minimum number of frames in which two cameras are localised at the same time, for their distance to be
-used. Evidence: none."""
+"""Minimum number of frames in which two cameras are localised at the same time. With fewer such frames, the
+distance between the two cameras is not used. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +47,9 @@ class DistanceConstraint:
 
     Attributes:
         camera_offsets: (N,3) differences of the two cameras' centres, map units.
-        mount_offsets_m: (N,3) difference between the two vectors from a camera to its point, according to the
-            mounts.
-        reach_m: Maximum length (metres) of the vector; 0 if both points are one point of the body.
+        mount_offsets_m: (N,3) vector from the first camera to the first point, minus the vector from the
+            second camera to the second point, metres. Both vectors follow from the mounts.
+        reach_m: Maximum length (metres) of the vector; 0 if both points are the same point of the body.
     """
 
     camera_offsets: FloatArray
@@ -64,8 +65,8 @@ class DistanceConstraint:
     def cost(self, scale: float) -> float:
         """Return the misfit (metres) of a scale.
 
-        The cost is the difference of the largest distance from the length of a stretched limb. If both points
-        are one point of the body, the cost is their median distance.
+        The cost is the absolute difference between the largest distance and the length of a stretched limb.
+        If both points are the same point of the body, the cost is the median distance between them.
         """
         distance = np.linalg.norm(scale * self.camera_offsets + self.mount_offsets_m, axis=1)
         if self.reach_m > 0.0:

@@ -16,13 +16,14 @@ from bodycap_batch.model.skeleton_presets import split_side
 _MIN_ARM_ANGLE_RAD = float(np.radians(140.0))
 """Minimum angle (radians) between the directions from the trunk's camera to the two hands. Evidence: none."""
 _MIN_SPAN_RATIO = 0.93
-"""Minimum distance between the hands, as a ratio to the largest distance in the capture. Evidence: none."""
+"""Minimum distance between the hands in a T-pose, as a ratio to the largest distance between the hands in the
+capture. Evidence: none."""
 _MIN_ARM_SPAN_RATIO = 0.75
-"""Minimum distance between the hands, as a ratio to the expected distance. The expected distance is
-inaccurate, because the scale is provisional. Evidence: none."""
+"""Minimum distance between the hands in a T-pose, as a ratio to the expected distance. The expected distance
+is inaccurate, because the scale is provisional. Evidence: none."""
 _MAX_SPEED = 0.15
-"""Maximum speed of the trunk, and of the hands relative to the trunk. Its unit is the largest distance
-between the hands per second. Evidence: none."""
+"""Maximum speed of the trunk, and of the hands relative to the trunk, in a T-pose. Unit: largest distance
+between the hands in the capture, per second. Evidence: none."""
 _MIN_DURATION_S = 0.5
 """Minimum duration (seconds) of a T-pose. Arms that are stretched only in passing are no T-pose. Evidence:
 none."""
@@ -37,12 +38,12 @@ _SIGMA_DEG = {
     "Hand": (8.0, 8.0, 8.0), "Neck": (6.0, 6.0, 6.0), "Head": (8.0, 8.0, 8.0), "UpLeg": (8.0, 5.0, 5.0),
     "Leg": (6.0, 5.0, 6.0), "Foot": (8.0, 8.0, 8.0), "ToeBase": (5.0, 5.0, 8.0),
 }  # fmt: skip
-"""Sigmas (degrees) of the joints in a person's T-pose, by part of the body, about the along, forward and
-flexion axes. The twist of the arms has the largest sigma, because palms may face down or forward. Evidence:
-none."""
+"""Sigmas (degrees) of joint rotations in a T-pose, by part of the body. The three sigmas are for rotations
+about the along, forward and flexion axes, see `anatomical_axes`. The rotation of the arms about the along
+axis has the largest sigma, because palms may face down or forward. Evidence: none."""
 _TRUNK_SIGMA_DEG = (4.0, 4.0, 4.0)
-"""Sigmas (degrees) of the joints that `_SIGMA_DEG` does not contain, in a T-pose, about the along, forward
-and flexion axes."""
+"""Sigmas (degrees) of the rotations of trunk joints in a T-pose. These joints are not in `_SIGMA_DEG`. The
+three sigmas are for rotations about the along, forward and flexion axes, see `anatomical_axes`."""
 
 
 def find_t_pose(
@@ -97,7 +98,7 @@ def _speed(points: FloatArray, times_ns: IntArray) -> FloatArray:
 def _longest_run(mask: BoolArray, times_ns: IntArray) -> tuple[int, int] | None:
     """Return the first and last time of the longest run of True in a mask (T,).
 
-    The result is None if this run is shorter than a T-pose.
+    Returns None if this run is shorter than `_MIN_DURATION_S`.
     """
     spans = [(int(times_ns[start]), int(times_ns[stop - 1])) for start, stop in runs(mask)]
     best = max(spans, key=lambda span: span[1] - span[0], default=(0, 0))
@@ -137,7 +138,10 @@ def with_t_pose_prior(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[B
 
 
 def _t_pose_rotation(skeleton: SkeletonModel, bone: Bone, bones: Sequence[Bone]) -> FloatArray:
-    """Return parent_from_bone (3,3) in a T-pose. The rig's zero pose may be a different pose."""
+    """Return the rotation parent_from_bone (3,3) in a T-pose.
+
+    The zero pose of the skeleton may differ from a T-pose.
+    """
     if bone.parent < 0:
         return np.eye(3)
     above, own = (_t_pose_orientation(skeleton, each.role) for each in (bones[bone.parent], bone))

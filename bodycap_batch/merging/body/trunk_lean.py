@@ -18,24 +18,25 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
 
 _MODE_RADIUS_RAD = float(np.radians(15.0))
-"""Maximum angle (radians) between directions that belong to one mode. In walking and standing, the angle
-between a trunk and its usual direction is smaller. Evidence: none."""
+"""Maximum angle (radians) between two similar directions of a trunk. While a person walks or stands, the
+angle between the trunk and its usual direction is smaller. Evidence: none."""
 _MAX_SAMPLES, _SPHERE_DIRECTIONS = 300, 1000
-"""First: maximum number of instants of a capture that are evaluated. Second: number of directions on the
-sphere that are evaluated. Both numbers bound the computing time."""
+"""`_MAX_SAMPLES` is the maximum number of instants of a capture that are evaluated. `_SPHERE_DIRECTIONS` is
+the number of directions on the sphere that are evaluated. Both numbers limit the computing time."""
 _UPRIGHT_SIGMA_DEG = 12.0
-"""Sigma (degrees) of the forward tilt of the trunk of a person who stands or walks. It contains 5 degrees of
-systematic bias; the rest is the error of the camera's mount. Evidence: none."""
+"""Sigma (degrees) of the forward tilt of the trunk while the person stands or walks. This sigma contains 5
+degrees of systematic bias. The rest is the error of the camera's mount. Evidence: none."""
 _LATERAL_SIGMA_DEG = 12.0
 """Sigma (degrees) of the sideways tilt of the trunk."""
 _UPRIGHT_SHARE, _FORWARD_SHARE, _BACKWARD_SHARE, _OUTLIER_SHARE = 0.57, 0.35, 0.07, 0.01
-"""Assumed fractions of the time in which a trunk is upright, bends forward, reclines, or does anything else.
-Evidence: none."""
+"""Assumed fractions of the time. In this order, they are for a trunk that is upright, a trunk that bends
+forward, a trunk that reclines, and all other orientations. Evidence: none."""
 _FORWARD_SCALE_DEG, _BACKWARD_SCALE_DEG, _OUTLIER_HALF_RANGE_DEG = 60.0, 15.0, 180.0
-"""Parameters (degrees) of the densities of the tilt. First and second: scales of the exponential densities of
-the forward tilt and the backward tilt. Third: half of the range of the uniform density of outliers. When a
-person picks things up, the trunk bends by a right angle and more. In a chair, the trunk reclines by up to 30
-degrees. Evidence: none."""
+"""Parameters (degrees) of the probability densities of the trunk's tilt. The first value is the scale of the
+exponential density of the forward tilt. The second value is the scale of the exponential density of the
+backward tilt. The third value is half of the range of the uniform density of outliers. When a person picks
+things up, the trunk bends by a right angle and more. In a chair, the trunk reclines by up to 30 degrees.
+Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +44,8 @@ class TrunkOrientation:
     """The orientation of a body's trunk over time.
 
     Attributes:
-        axes: (N,3,3) left, back and up directions of the trunk as columns.
-        front_known: Whether left and back are known; otherwise only the up direction is used.
+        axes: (N,3,3) left, back and up directions of the trunk as columns, in the axes of the map.
+        front_known: True if the left and back directions are known. If False, only the up direction is used.
     """
 
     axes: FloatArray
@@ -76,7 +77,7 @@ class TrunkOrientation:
     def negative_log_likelihood(self, ups: FloatArray) -> FloatArray:
         """Return the mean negative log-likelihood (C,), in nats, of the tilts for verticals `ups` (C,3).
 
-        The values are relative to the value of a trunk without tilt, so that such a trunk has about 0.
+        The value for a trunk without tilt is subtracted, so a trunk without tilt has a value of about 0.
         """
         return self._mean_nll(ups, _OUTLIER_SHARE)
 
@@ -104,7 +105,10 @@ class TrunkOrientation:
 
 
 def _pitch_nll(pitch_deg: FloatArray, outlier_share: float) -> FloatArray:
-    """Return the negative log-likelihood of tilts (forward positive), minus the value for no tilt."""
+    """Return the negative log-likelihood of tilts in degrees, minus the value for no tilt.
+
+    Tilts forward are positive. The result has the shape of `pitch_deg`.
+    """
 
     def density(pitch: FloatArray) -> FloatArray:
         forward, backward = np.maximum(pitch, 0.0), np.maximum(-pitch, 0.0)
@@ -120,7 +124,7 @@ def _pitch_nll(pitch_deg: FloatArray, outlier_share: float) -> FloatArray:
 
 
 def _lateral_nll(side_deg: FloatArray, outlier_share: float) -> FloatArray:
-    """Return the negative log-likelihood of sideways tilts, minus the value for no sideways tilt."""
+    """Return the negative log-likelihood of sideways tilts in degrees, minus the value for no tilt."""
     density = (1.0 - outlier_share) * np.exp(-0.5 * (side_deg / _LATERAL_SIGMA_DEG) ** 2) + outlier_share
     return np.asarray(-np.log(density))
 
@@ -170,8 +174,8 @@ def trunk_orientation_from_prior(bones: Sequence[Bone], trunk: CameraTrack, moun
 def modal_direction(directions: FloatArray) -> FloatArray:
     """Return the mean (3,) of the largest group of similar directions among (N,3).
 
-    For a person who bends in between, this is the direction of the upright trunk. The mean of all directions
-    would be tilted towards the bends.
+    For a trunk that bends from time to time, the result is the direction of the upright trunk. The mean of
+    all directions would be tilted towards the directions of the bent trunk.
     """
     sample = _subsample(directions)
     sample = sample / np.linalg.norm(sample, axis=1, keepdims=True)

@@ -46,8 +46,9 @@ class SkeletonErrorModes:
     """Error modes of a skeleton that was scaled from a stature. They increase the sigmas of the calibration.
 
     Attributes:
-        bone_lengths: Error modes because people of equal stature have different bone lengths.
-        joint_placement: Error modes because motion capture systems place the joints differently.
+        bone_lengths: Error modes of the bone lengths. People of equal stature have different bone lengths.
+        joint_placement: Error modes of the joint positions. Motion capture systems place the joints
+            differently.
     """
 
     bone_lengths: ErrorModes

@@ -141,8 +141,8 @@ def calibrate_body(
 ) -> BodyCalibration:
     """Estimate mounts, metric scale and vertical.
 
-    The free motion of the body determines the mounts and a first scale. This scale is then combined with the
-    other sources of scale, see ``scale.py``.
+    The calibration graph estimates the mounts and a first scale from the motion of the body. This scale is
+    then combined with the other sources of scale, see ``scale.py``.
 
     Args:
         inputs: Skeleton, mount priors, trajectories and map points.
@@ -155,7 +155,7 @@ def calibrate_body(
         The calibration of the body.
 
     Raises:
-        JobError: A frame of the known distance does not exist, or its two cameras share no map.
+        JobError: The known distance names a frame that does not exist, or two cameras in different maps.
         EstimationError: The data do not determine the calibration.
     """
     tracks, provisional = data.tracks, data.provisional

@@ -58,7 +58,7 @@ class PoseSigma(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ScaleUncertainty:
-    """Uncertainty of the metric scale, and how the mounts depend on it.
+    """Uncertainty of the metric scale, and how the mounts depend on the scale.
 
     Attributes:
         sigma_log: Sigma of the logarithm of the scale.
@@ -245,7 +245,7 @@ def measurement_jacobian(
 
 
 def scale_jacobian(graph: CalibrationGraph, linearised: LinearisedCalibration) -> FloatArray:
-    """Return the derivative of the residuals with respect to log scale, as far as their sigmas cause it.
+    """Return the part of the residuals' derivative with respect to log scale that the sigmas cause.
 
     The sigmas of camera centres and joint gaps are constant in map units. In metres these sigmas grow with
     the scale, so the whitened residuals shrink. The sigmas of rotations do not depend on the scale.

@@ -33,17 +33,17 @@ The cost is half the sum of squared residuals, so a residual of 4 sigma has the 
 because most people wear their cameras with the usual roll.
 """
 _MIN_DOWN_COSINE = 0.3
-"""Threshold of the mean cosine between the downward direction and the directions to the limbs' cameras.
+"""Minimum mean cosine at which the usual roll is accepted, see `mean_down_cosine`. Unit: 1.
 
-With at least this mean cosine, the usual roll is accepted. Seen from a camera on the chest, hanging hands are
-45° or more below the horizontal, which gives a cosine of 0.7. If the roll is wrong by 90°, the hands seem to
-be beside the camera, and the mean cosine is 0.
+The angles are between the downward direction and the directions to the limbs' cameras. Seen from a camera on
+the chest, hanging hands are 45° or more below the horizontal, which gives a cosine of 0.7. If the roll is
+wrong by 90°, the hands seem to be beside the camera, and the mean cosine is 0.
 """
 _MIN_COSINE_GAIN = 0.4
-"""Minimum increase of the mean cosine to select a roll other than the usual roll.
+"""Minimum increase of the mean cosine to select a roll other than the usual roll. Unit: 1.
 
-The mean cosine is between the downward direction and the directions to the limbs' cameras. Derivation: see
-`_MIN_DOWN_COSINE`. The right roll has a mean cosine of about 0.7, a roll that is wrong by 90° has 0.
+The mean cosine is the result of `mean_down_cosine`. The correct roll has a mean cosine of about 0.7. A roll
+that is wrong by 90° has a mean cosine of 0. Derivation: see `_MIN_DOWN_COSINE`.
 """
 _LEGS = frozenset({"UpLeg", "Leg", "Foot", "ToeBase"})
 _PARTS_BELOW = {
@@ -53,7 +53,7 @@ _PARTS_BELOW = {
     "Neck": _LEGS | {"Arm", "ForeArm", "Hand"},
     "Head": _LEGS | {"Shoulder", "Arm", "ForeArm", "Hand"},
 }
-"""Bones that are below the reference camera even if the elbows are bent, by the reference camera's bone.
+"""By bone of the reference camera, the body parts that are below this camera even if the elbows are bent.
 
 Working hands are above the belt, so a camera on the hips or the lower spine has only the legs below it.
 Shoulders are always above a camera on the chest.

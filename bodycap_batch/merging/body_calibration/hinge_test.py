@@ -24,13 +24,17 @@ from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCa
 from bodycap_batch.merging.graph.factors import HINGE_SLACK_RATIO
 
 FREE_SIGMA_M = 0.1
-"""Sigma of the distances of a freed hinge, metres: ten times `TIGHT_SIGMA_M`. Evidence: none."""
+"""Sigma of the distances of a freed hinge, metres.
+
+The distances of a hinge are those between its two anchors and the following joint, see `Hinge`. The value is
+ten times `TIGHT_SIGMA_M`. Evidence: none.
+"""
 TIGHT_SIGMA_M = HINGE_SLACK_RATIO * JOINT_SLACK_M
 """Sigma of the distances of a hinge that the motion obeys, metres."""
 _MIN_VARIANCE_RATIO = 1.5
-"""Threshold of the variance of a hinge's distances, relative to ``TIGHT_SIGMA_M**2``.
+"""Maximum ratio of the variance of a hinge's distances to ``TIGHT_SIGMA_M**2``.
 
-A hinge with at least this ratio is violated. Evidence: docs/decisions/body_calibration.md.
+A hinge with a larger ratio is violated. Unit: 1. Evidence: docs/decisions/body_calibration.md.
 """
 
 
@@ -54,7 +58,11 @@ def observable_hinges(hinges: Sequence[Hinge], measured: Collection[int]) -> lis
 
 
 def hinge_violation_sigma(linearised: LinearisedCalibration) -> dict[int, float]:
-    """Return the size of each hinge violation: the sigma of its distances in excess of `TIGHT_SIGMA_M`.
+    """Return the size of each hinge violation.
+
+    The variance of the hinge's distances is estimated from the residuals. The variance of a hinge that the
+    motion obeys, ``TIGHT_SIGMA_M**2``, is subtracted. The square root of the rest is the size of the
+    violation.
 
     Args:
         linearised: The calibration graph, linearised at its solution. Only its freed hinges are examined.

@@ -65,7 +65,7 @@ def known_distance(
         )
     if main_from_gauge is not None and gauge not in main_from_gauge:
         raise EstimationError(
-            f"{first} and {second} are in map {gauge}, which the body cannot place",
+            f"{first} and {second} are in map {gauge}, which was not aligned with the main map",
             hint="name two frames of a camera that is used; metrics.json lists the unused ones",
         )
     unit = 1.0 if main_from_gauge is None else main_from_gauge[gauge].scale

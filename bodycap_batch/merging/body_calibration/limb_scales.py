@@ -48,8 +48,8 @@ def limb_scales(
 ) -> tuple[ScaleSource, ...]:
     """Estimate a scale for each limb from the cameras of this limb and the reference camera.
 
-    This is a diagnostic only: the report shows these scales, and nothing else uses them. It costs three
-    solutions of a small calibration graph per limb.
+    These scales are a diagnostic: the report shows them, and nothing else uses them. For each limb, a small
+    calibration graph is solved three times.
 
     Args:
         skeleton: The skeleton of the body.

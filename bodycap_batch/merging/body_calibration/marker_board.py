@@ -184,8 +184,9 @@ def _select_observations(
     if len(selected) < _MIN_VIEWS:
         raise EstimationError(
             f"the marker board was found in {len(selected)} keyframes of one map, {_MIN_VIEWS} are needed",
-            hint="is merge.marker_board the board that was filmed (kind, columns, rows, dictionary, legacy)? "
-            "It has to be sharp, whole (a chessboard) and near: its squares 10 px and more",
+            hint="check that merge.marker_board describes the filmed board (kind, columns, rows, dictionary, "
+            "legacy), that this board is sharp in the video, and that its squares are at least 10 px wide; "
+            "a chessboard must be completely visible",
         )
     duration_ns = round(1e9 * MAP_ERROR_DURATION_S)
     shared = [f"{v.camera} {int(paths[v.camera].times_ns[v.frame]) // duration_ns}" for v in selected]

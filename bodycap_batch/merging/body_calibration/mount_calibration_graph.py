@@ -59,8 +59,9 @@ Each measured camera pose and each mount prior adds one factor per point to the 
 class CalibrationGraph:
     """The calibration graph of a set of cameras. Each solution starts from the previous solution.
 
-    The sigmas of camera centres and joint gaps are constant in map units, because the errors of the map cause
-    them. Sigmas fixed in metres would favour a small scale, because a small scale makes all residuals small.
+    The sigmas of camera centres and joint gaps are constant in map units, because these sigmas describe
+    errors of the map. Sigmas that are constant in metres would favour a small scale, because a small scale
+    makes all residuals small.
 
     Attributes:
         slack_factor: Factor on the sigma of the joint gaps.
@@ -72,8 +73,8 @@ class CalibrationGraph:
         samples: Camera poses at the sampled ticks.
         priors: By camera, its mount prior.
         provisional: Approximate scale, metres per map unit. The scale converts the sigma of a joint gap to
-            map units. In metres, this sigma is `JOINT_SLACK_M` times √n, where n samples share one error of
-            the map.
+            map units. In metres, this sigma is `JOINT_SLACK_M` times √n. The number n is the number of
+            samples that share one error of the map.
         step: Function that is called after each iteration. It may raise an exception to stop the work.
     """
 
@@ -173,9 +174,9 @@ class CalibrationGraph:
     def test_hinges(self) -> bool:
         """Test the hinges that cameras can contradict, and loosen the violated hinges.
 
-        A joint that violates its hinge violates it during a whole gesture. The samples of one gesture are
-        therefore not independent, and together they have the weight of one sample. With full weights, a
-        violated hinge would distort the mounts.
+        A hinge violation lasts for a whole gesture, so the samples of one gesture are not independent. If a
+        hinge is violated, all samples of one gesture together therefore get the weight of one sample. With
+        full weights, a violated hinge would distort the mounts.
 
         Returns:
             True if a hinge is violated. The graph then has loosened hinges and must be solved again.
@@ -195,10 +196,11 @@ class CalibrationGraph:
         return True
 
     def hinge_violation_m(self) -> dict[str, float]:
-        """Return the size of each hinge violation: the sigma of its distances in excess of a hinge's slack.
+        """Return the size of each hinge violation, as `test_hinges` estimated it.
 
         Returns:
-            Sigma in metres by role of the bone below the hinge.
+            By role of the bone below the hinge, the sigma of the distance between the far end of this bone
+            and the plane of the hinge, metres. Hinges without a violation are missing.
         """
         return {bone.role: bone.off_hinge_m for bone in self._rest_bones if bone.off_hinge_m > 0.0}
 

@@ -51,7 +51,7 @@ class RowType(IntEnum):
     MEASUREMENT = 1
     """Measured camera poses."""
     JOINT_GAP = 2
-    """Gaps of joints, and distances of hinges between their anchors and the following joint."""
+    """Gaps of joints, and the distances between the anchors of a hinge and the following joint."""
     JOINT_ROTATION = 3
     """Priors of joint rotations."""
     NAMED_MOUNT = 4

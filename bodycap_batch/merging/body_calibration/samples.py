@@ -35,16 +35,16 @@ Evidence: docs/decisions/body_calibration.md.
 T_POSE_SAMPLES = 8
 """Maximum number of additional sampled times in a T-pose. Evidence: none."""
 MIN_SAMPLES = 10
-"""Desired number of samples at which a camera and at least one other camera were measured, for each camera.
-Evidence: none.
+"""Desired number of samples per camera at which this camera and at least one other camera were measured.
 
-If the capture has fewer such instants, the camera gets fewer samples.
+If a camera has fewer such frames, it gets fewer samples. If all cameras together have fewer such frames, the
+calibration fails. Evidence: none.
 """
 MIN_COMMON_FRAMES = 15
 """Minimum number of common frames of a camera and the reference camera. Evidence: none.
 
-A camera with fewer common frames is not calibrated separately, neither for its roll nor for a limb's scale.
-The value is half a second at 30 fps.
+The roll search and the scales of the limbs skip a camera with fewer common frames. The value is half a second
+at 30 fps.
 """
 
 
@@ -74,8 +74,8 @@ class CalibrationSamples:
         sigma_rad: (C,) rotation sigma of each camera's poses, radians per axis.
         sigma_map: (C,) centre sigma of each camera's poses, map units per axis.
         correlated_samples: Number of samples that share one error of the map, at least 1.
-        white_noise_share: Independent noise of the camera centres, as a fraction of their variance, 0 to 1.
-            It is the mean over the cameras. The rest of the variance is error of the map.
+        white_noise_share: Fraction of the variance of the camera centres that is independent noise, 0 to 1.
+            The fraction is a mean over the cameras. The rest of the variance is error of the map.
         posture: Facts about the posture at the ticks.
     """
 
@@ -231,8 +231,8 @@ def _sample_times(tracks: Sequence[CameraTrack], count: int, t_pose_ns: tuple[in
     if len(tracks) > 1 and usable < MIN_SAMPLES:
         raise EstimationError(
             f"camera {tracks[0].camera!r} was localised together with another camera in only "
-            f"{len(shared)} frames, and no two others were more often",
-            hint=f"{MIN_SAMPLES} are needed to find how the cameras sit on the body; see frames.csv",
+            f"{len(shared)} frames, and no two other cameras have enough common frames",
+            hint=f"{MIN_SAMPLES} frames are needed to find how the cameras sit on the body; see frames.csv",
         )
     return np.unique(np.concatenate([times_ns[picked], *further]))
 

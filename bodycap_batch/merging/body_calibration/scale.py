@@ -170,7 +170,8 @@ def _nearest_solution(
 ) -> float:
     """Return the solved log scale nearest to ``centre + offset``.
 
-    Only solutions on the side of the centre to which the offset points are considered.
+    If the offset is positive, only solutions above the centre are considered. If the offset is negative, only
+    solutions below the centre are considered.
     """
     return min((x for x in mounts if (x - centre) * offset > 0.0), key=lambda x: abs(x - centre - offset))
 
@@ -202,7 +203,8 @@ def scale_from_floor(body: ScaleSource, height_m: float, standing_m: float) -> S
         standing_m: Height of the joint over the soles of the standing skeleton, metres.
 
     Returns:
-        The scale from the floor. It is marked as used if its difference from `body` is at most 2 sigma.
+        The scale from the floor. This source is marked as used if its scale differs from `body` by at most 2
+        sigma. If `height_m` is not positive, the source has the scale of `body`, and is marked as unused.
     """
     if height_m <= 0.0:
         return ScaleSource(name="floor", scale=body.scale, sigma_log=FLOOR_SIGMA, used=False)

@@ -12,11 +12,13 @@ from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack, 
 from bodycap_batch.model.geometry import invert
 
 _SEARCH_STEP_S = 0.05
-"""Time (seconds) between two shifts that are tried. It is a quarter of the accuracy of the result."""
+"""Difference (seconds) between successive shifts that are tried. The result is accurate to four times this
+difference."""
 _MAX_SHIFT_S = 3.0
 """Maximum shift (seconds) that is tried. Evidence: none."""
 _MIN_OVERLAP_RATIO = 3.0
-"""Minimum ratio of the time that both cameras share to the largest shift that is tried. Evidence: none."""
+"""Minimum ratio of the time that both cameras share to the largest shift that is tried. If the cameras share
+only a short time, large shifts are therefore not tried. Unit: 1. Evidence: none."""
 _MAX_SAMPLES = 200
 """Maximum number of frames of the limb's camera that are compared. It bounds the time of the search."""
 _MIN_SAMPLES = 30
@@ -47,13 +49,13 @@ def suspicious_clocks(tracks: Sequence[CameraTrack]) -> dict[str, dict[str, floa
     """Find cameras that move more rigidly with the body if their clock is shifted.
 
     In the axes of the trunk's camera, the position of a limb's camera varies with the movement of the limb.
-    With a wrong clock, this position also varies with the movement of the whole body during the clock's
-    error.
+    If the clock is wrong by some time, this position also varies with the movement of the whole body during
+    this time.
 
-    A straight walk does not reveal a wrong clock, because the clock's error then moves the limb's camera by a
-    constant vector. At a wrong shift, a swinging arm may then accidentally follow the rotations of the trunk.
-    A wrong shift increases the distance between the cameras; the correct shift hardly does. A shift is
-    therefore accepted only if it also decreases this distance.
+    In a straight walk, the clock's error moves the limb's camera by a constant vector, so the scatter does
+    not reveal the error. With a wrong shift, a swinging arm may then accidentally follow the rotations of the
+    trunk. A wrong shift increases the distance between the two cameras. The correct shift hardly increases
+    this distance. A shift is therefore accepted only if it also decreases this distance.
 
     Args:
         tracks: Tracks in one map, the track of the trunk's camera first.
@@ -108,9 +110,9 @@ def _position_scatter(trunk: CameraTrack, limb: CameraTrack, shift_s: float) -> 
 
 
 def _median_distance(trunk: CameraTrack, limb: CameraTrack, shift_s: float) -> float:
-    """Return the median distance (map units) of a limb's camera from the trunk's camera.
+    """Return the median distance (map units) of a limb's camera from the trunk's camera, for a clock shift.
 
-    Evidence: docs/decisions/merging.md.
+    Evidence that the correct shift decreases this distance: docs/decisions/merging.md.
     """
     return float(np.median(np.linalg.norm(_positions_in_trunk(trunk, limb, shift_s), axis=1)))
 

@@ -22,8 +22,8 @@ _MIN_UP_COSINE = 0.5
 """Minimum median cosine of the angle between the vertical and the trunk's up axis. The up axis follows from
 the mount prior. With a smaller cosine, the prior is wrong or the person lies down. Evidence: none."""
 _MIN_WRONG_RATIO = 0.8
-"""Minimum fraction of frames in which a camera must be on the wrong side, for its side to be treated as
-swapped. Evidence: docs/decisions/merging.md."""
+"""Minimum fraction of frames on the wrong side for a camera whose side is swapped. The sides are treated as
+swapped only if all limb cameras reach this fraction. Evidence: docs/decisions/merging.md."""
 
 
 def swapped_sides(
@@ -40,9 +40,9 @@ def swapped_sides(
         up: (3,) vertical in the map.
 
     Returns:
-        By camera, the fraction of frames on the wrong side. The result is empty if a limb is on the correct
-        side, or if the first camera does not show where the body faces. The latter happens if this camera is
-        on a limb or upside down, or if the person lies down.
+        By camera, the fraction of frames on the wrong side. The result is empty if a limb's camera is on the
+        correct side. It is also empty if the first camera is on a limb or upside down, or if the person lies
+        down, because the first camera then does not show where the body faces.
     """
     trunk_mount = mounts[tracks[0].camera]
     joint = tracks[0].map_from_cam[:, :3, :3] @ trunk_mount.joint_from_cam[:3, :3].T

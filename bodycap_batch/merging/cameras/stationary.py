@@ -13,19 +13,20 @@ from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
 
 _MAX_DEVIATION_RATIO, _MAX_DEVIATION_RAD = 0.005, float(np.radians(0.3))
-"""First: maximum deviation of a stationary camera from its median position, as a ratio to the deviation of
-the camera that moves most in the map. Second: maximum rotation (radians) of a stationary camera. Evidence:
-docs/decisions/merging.md."""
+"""Maximum deviations of a stationary camera. The first value is for the deviation from the median position,
+as a ratio to the deviation of the camera that moves most in the map. The second value is for the deviation
+from the mean orientation, in radians. Evidence: docs/decisions/merging.md."""
 _MAX_NOISE_FACTOR = 2.0
 """Maximum factor by which noise widens the maximum deviations of position and rotation. Without this maximum,
 moving cameras with noisy poses would be treated as stationary."""
 _WINDOW_FRAMES = 15
-"""Number of localised frames that are averaged: half a second at 30 fps. Noise is independent between frames;
-a movement of the body is not."""
+"""Number of localised frames that are averaged: half a second at 30 fps. The average reduces noise, because
+noise is independent between frames. A movement of the body is not independent between frames, so it
+remains."""
 _PERCENTILE, _PERCENTILE_SIGMAS = 90.0, 2.5
-"""Percentile of the deviations that is compared with the bounds, and its value in sigmas of the noise. For
-Gaussian noise with one sigma on three axes, the 90th percentile of the norm is 2.5 sigmas (chi distribution
-with three degrees of freedom)."""
+"""Percentile of the deviations that is compared with the bounds, and the value of this percentile in sigmas
+of the noise. For Gaussian noise with the same sigma on all three axes, the 90th percentile of the norm is 2.5
+sigmas (chi distribution with three degrees of freedom)."""
 _MIN_DURATION_RATIO = 0.5
 """Minimum localised time of a stationary camera, as a ratio to the longest localised time of all cameras. A
 person who stands still for a second gives no evidence about the rest of the time. Evidence: none."""
@@ -52,7 +53,7 @@ class _CameraPath:
     sigma_map: float
 
     def deviations_during(self, first_ns: int, last_ns: int) -> FloatArray:
-        """Return the distances (M,), map units, from the median centre, for the centres in a time span."""
+        """Return the distances (M,) of the centres in a time span from their median, map units."""
         inside = self.centres[(self.times_ns >= first_ns) & (self.times_ns <= last_ns)]
         return (
             np.asarray(np.linalg.norm(inside - np.median(inside, axis=0), axis=1)) if len(inside) else inside
@@ -63,8 +64,11 @@ def stationary_cameras(inputs: MergeInputs, trajectories: Sequence[Trajectory]) 
     """Find cameras that stand still while another camera of their map moves.
 
     Args:
-        inputs: Merge inputs, of which the clocks are used.
-        trajectories: Trajectories of the cameras with at least half a second of localised frames.
+        inputs: The inputs of the merge stage. Only the clocks are used.
+        trajectories: Trajectories of the cameras with at least `_WINDOW_FRAMES` localised frames.
+
+    Returns:
+        The names of the stationary cameras.
     """
     paths = {each.camera: _camera_path(inputs, each) for each in trajectories}
     seconds = {
@@ -100,7 +104,7 @@ def _keeps_orientation(path: _CameraPath) -> bool:
 
 
 def _keeps_position(path: _CameraPath, others: Iterable[_CameraPath]) -> bool:
-    """Return whether a camera keeps its position while another camera of its map moves."""
+    """Return True if a camera keeps its position while another camera of its map moves."""
     span = int(path.times_ns.min()), int(path.times_ns.max())
     deviations = [other.deviations_during(*span) for other in others if other.gauge == path.gauge]
     largest = max(
@@ -111,7 +115,7 @@ def _keeps_position(path: _CameraPath, others: Iterable[_CameraPath]) -> bool:
 
 
 def _deviates_little(deviations: FloatArray, limit: float, sigma: float) -> bool:
-    """Return whether deviations (N,3) are below a limit.
+    """Return True if deviations (N,3) are below a limit.
 
     Means over windows of frames must be below the limit. Single frames must be below a bound that allows for
     the noise of one frame.

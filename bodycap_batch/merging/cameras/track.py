@@ -14,30 +14,32 @@ from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_M
 
 OUTLIER_HALF_WINDOW = 6
-"""Number of frames before a frame, and also after it, that the frame is compared with: 0.2 s at 30 fps. Over
-this time, a quadratic follows a swinging hand to a few centimetres. Evidence: none."""
+"""Each frame is compared with this number of frames before it, and with this number of frames after it. The
+value is 0.2 s at 30 fps. Over this time, a quadratic function of time follows a swinging hand to a few
+centimetres. Evidence: none."""
 OUTLIER_LIMIT_M = 0.12
-"""Maximum distance (metres) of a pose from the quadratic. It is several times the deviation of a swinging
-hand from the quadratic; a pose at a larger distance is wrong. Evidence: none."""
+"""Maximum distance (metres) of a pose from the quadratic through the neighbouring frames. A swinging hand
+deviates from the quadratic by a fraction of this distance. A pose at a larger distance is wrong. Evidence:
+none."""
 
 MIN_SIGMA_M, MIN_SIGMA_RAD = 0.004, float(np.radians(0.4))
 """Minimum sigmas of a measured pose per axis (metres, radians). The covariance of PnP contains the image
 noise, but neither the error of the map nor the movement of the strap. Evidence: none."""
 
 _UNCALIBRATED_SIGMA_RAD, _UNCALIBRATED_SIGMA_M = 0.98 * NOMINAL_ERROR_RAD, 0.98 * NOMINAL_SIGMA_M
-"""Minimum sigmas (radians, metres per axis) of a mount that is treated as uncalibrated. They are slightly
-below the sigmas of the mount prior. Both sigmas of the mount must reach their minimum. The rotation sigma
-alone is not enough: even on a calibrated palm, the posture's systematic bias may cause such a rotation
-sigma."""
+"""Minimum sigmas (radians, metres per axis) of a mount that is treated as uncalibrated. The values are
+slightly below the sigmas of the mount prior. A mount is treated as uncalibrated only if both of its sigmas
+reach these values. The rotation sigma alone is no sufficient test, because the systematic bias of the posture
+may cause an equally large rotation sigma on a calibrated palm."""
 
 
 MAX_SAMPLE_GAP_NS = 100_000_000
-"""Maximum time (nanoseconds) between two frames, for interpolation in the calibration and the checks. Poses
-between frames that are further apart are not used. The value is three frame intervals at 30 fps. Evidence:
-none."""
+"""Maximum time (nanoseconds) between two frames for the interpolation of a pose. The calibration and the
+checks do not use poses between frames that are further apart. The value is three frame intervals at 30 fps.
+Evidence: none."""
 MAX_COARSE_GAP_NS = 200_000_000
-"""Maximum time (nanoseconds) between two frames, for interpolation in the initial values and in the search
-for a T-pose. These two uses need less accuracy than the calibration. Evidence: none."""
+"""Maximum time (nanoseconds) between two frames for the interpolation of a pose, if less accuracy is enough.
+Initial values and the search for a T-pose need less accuracy than the calibration. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +115,7 @@ def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> Camera
     """Return the localised frames of a trajectory on the common clock.
 
     Args:
-        inputs: Merge inputs, of which the clocks and the image rows of the poses are used.
+        inputs: The inputs of the merge stage. Only the clocks and the image rows of the poses are used.
         trajectory: Trajectory of one camera.
         bone: Index of the bone that the camera is mounted on.
     """
@@ -162,7 +164,7 @@ def transform_trajectory(trajectory: Trajectory, target_from_map: Similarity, ga
 
 
 def remove_outliers(track: CameraTrack, scale: float, fps: float) -> CameraTrack:
-    """Remove frames whose centre jumps off a robust quadratic through the neighbouring frames.
+    """Remove frames whose centre jumps away from the robust quadratic through the neighbouring frames.
 
     Args:
         track: The measured path.
@@ -178,16 +180,17 @@ def remove_outliers(track: CameraTrack, scale: float, fps: float) -> CameraTrack
     valid &= np.abs(time) <= OUTLIER_HALF_WINDOW + 0.5
     centre = scale * (track.map_from_cam[index, :3, 3] - track.map_from_cam[:, None, :3, 3])
     predicted = _robust_quadratic(time / OUTLIER_HALF_WINDOW, centre, valid)
-    # At the end of an interval, the quadratic extrapolates. A change of direction looks like an error there.
+    # A frame with fewer than two neighbours on one side is kept. For such a frame, the quadratic
+    # extrapolates, and a change of direction looks like an error.
     inner = ((time < 0) & valid).sum(axis=1).clip(max=2) + ((time > 0) & valid).sum(axis=1).clip(max=2) == 4
     bad = (np.linalg.norm(predicted, axis=1) > OUTLIER_LIMIT_M) & inner & (valid.sum(axis=1) >= 6)
     return track.keep(~_runs_with_jumps(bad, scale * track.map_from_cam[:, :3, 3]))
 
 
 def _runs_with_jumps(bad: BoolArray, centre_m: FloatArray) -> BoolArray:
-    """Return the runs of bad frames (N,) in which the path jumps.
+    """Return a mask (N,) of the runs of bad frames in which the path jumps.
 
-    The path of a thrown arm deviates from any quadratic, but it does not jump.
+    The path of a very fast arm deviates from any quadratic, but this path does not jump.
     """
     jump = np.zeros(len(bad), dtype=bool)
     jump[1:-1] = np.linalg.norm(np.diff(centre_m, n=2, axis=0), axis=1) > OUTLIER_LIMIT_M
@@ -198,7 +201,13 @@ def _runs_with_jumps(bad: BoolArray, centre_m: FloatArray) -> BoolArray:
 
 
 def _robust_quadratic(time: FloatArray, centre: FloatArray, valid: BoolArray) -> FloatArray:
-    """Fit quadratics with Cauchy weights to centres (N,W,3) at times (N,W); return values (N,3) at time 0."""
+    """Fit quadratics with Cauchy weights, and return their values (N,3) at time 0.
+
+    Args:
+        time: (N,W) times of the W frames around each frame.
+        centre: (N,W,3) camera centres at these times.
+        valid: (N,W) True if the centre is used.
+    """
     basis = np.stack([np.ones_like(time), time, time**2], axis=-1)
     weight = valid.astype(np.float64)
     for _ in range(8):
@@ -211,16 +220,16 @@ def _robust_quadratic(time: FloatArray, centre: FloatArray, valid: BoolArray) ->
 
 
 def is_uncalibrated(mount: Mount) -> bool:
-    """Return whether a mount is still as uncertain as the prior that the camera's name implies."""
+    """Return True if a mount is nearly as uncertain as the prior that follows from the camera's name."""
     return mount.sigma_rad >= _UNCALIBRATED_SIGMA_RAD and mount.sigma_m >= _UNCALIBRATED_SIGMA_M
 
 
 def inflate_sigmas(track: CameraTrack, mount: Mount) -> CameraTrack:
     """Add the uncertainty of an uncalibrated mount to the sigmas of its track.
 
-    A camera that is never localised together with other cameras keeps the mount that its name implies. The
-    sigmas of this mount are 9° and 2.9 cm per axis. The sigmas of the camera's poses are only millimetres.
-    With these alone, the track would bend the body to fit the inaccurate mount.
+    A camera that is never localised together with other cameras keeps the mount prior that follows from its
+    name. The sigmas of this prior are 9° and 2.9 cm per axis. The position sigmas of the camera's poses are
+    only millimetres. With such small sigmas, the track would distort the body to fit the inaccurate mount.
 
     Args:
         track: Track of the camera, poses in metres.

@@ -21,9 +21,9 @@ def scale_motion_noise(bones: Sequence[Bone], tracks: Sequence[CameraTrack]) -> 
 
     The function estimates the power spectral density q of the acceleration from the second differences of
     each camera's path. With a frame interval h, a second difference has the variance 2/3 q h³. Independent
-    noise of the poses with sigma σ adds 6 σ². The estimate divided by the usual value gives a factor for the
-    bone. A bone without a camera gets the largest factor of the bones below it, because a limb swings as a
-    whole.
+    noise of the poses with sigma σ adds 6 σ². The factor of a bone is the estimate
+    divided by the usual value of q. A bone without a camera gets the largest factor of its descendants,
+    because a limb swings as a whole.
 
     Args:
         bones: The graph's bones.

@@ -1,8 +1,7 @@
-"""Factors on the trunk's attitude from the posture: upright in walking, facing the direction of walking.
+"""Factors on the orientation of the trunk: upright in walking, facing the direction of walking.
 
-Such knowledge is wrong by an equal amount in every frame, because a person with a tilted trunk keeps this
-tilt. All factors of one kind therefore count as one observation together, however many frames they are
-applied to.
+A person with a tilted trunk keeps this tilt, so the error of these factors is equal at all ticks. All factors
+of one kind therefore count together as one observation, for any number of ticks.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from bodycap_batch.merging.graph.posture import Posture
 
 UPRIGHT_SIGMA_RAD, HEADING_SIGMA_RAD = float(np.radians(5.0)), float(np.radians(8.0))
 """Sigmas (radians) of the mean orientation of a walker's chest. First: tilt from the vertical. Second: angle
-between the heading of the chest and the direction of walking. The sigmas contain the person's systematic tilt
-of the trunk, and the rig's definition of the axes of the chest. Evidence: none."""
+between the heading of the chest and the direction of walking. The sigmas allow for the person's systematic
+tilt of the trunk, and for the skeleton's definition of the axes of the chest. Evidence: none."""
 STANDING_SIGMA_RAD = float(np.radians(7.0))
 """Sigma (radians) of the tilt of a chest at its highest position, in a capture without walking. A person who
-bends and lifts things stands up in between. The sigma contains the 5 degrees of a walker, and about 5 degrees
-of bending that the height does not reveal."""
+bends and lifts things stands upright between these movements. The sigma combines the 5 degrees of a walker
+with about 5 degrees of bending that the height of the chest does not show."""
 _TRUNK = ("Spine1", "Spine", "Hips")
 """Roles of the bones that the factors constrain."""
 _OWN_UP, _OWN_LEFT = gtsam.Unit3(np.array([0.0, 0.0, 1.0])), gtsam.Unit3(np.array([1.0, 0.0, 0.0]))

@@ -39,7 +39,7 @@ class ErrorModes:
     Attributes:
         mounts: By camera, (6,M) change of joint_from_cam: right perturbation, rotation first.
         log_scale: (M,) change of the logarithm of the metric scale.
-        rest: (B,3,M) rotation (radians) of each bone's rest pose, in the bone's own frame.
+        rest: (B,3,M) change of each bone's rest pose: rotation vector (radians) in the bone's own frame.
         offsets_m: (B,3,M) change of each joint's centre in the parent bone's frame.
     """
 
@@ -73,18 +73,21 @@ def joint_residual_jacobian(
     world_from_bone: FloatArray,
     modes: ErrorModes,
 ) -> Any:
-    """Return the change (R,M), sparse, of the residuals of joints and hinges per error mode.
+    """Return how each error mode changes the residuals of the joint and hinge factors.
 
-    The change has the sign of the right-hand side of the linearised graph. For this right-hand side, the
-    solution is the movement of the bones that compensates the error mode.
+    The change has the sign of the right-hand side of the linearised graph. The least-squares solution for
+    this right-hand side is the movement of the bones that the error mode causes.
 
     Args:
         linear: Linearised graph at the solution.
         body: Bones and hinges of the graph.
-        first_factor: Index of the first tick's first joint factor. Each tick adds its joints, then its
-            hinges.
+        first_factor: Index of the first tick's first joint factor. From this index on, the graph contains the
+            factors of one tick after the other: joint factors first, then hinge factors.
         world_from_bone: (T,B,4,4) solved poses of the bones.
         modes: Error modes of the calibration.
+
+    Returns:
+        Sparse matrix (R,M): the change of R residuals for each of M error modes.
     """
     ticks = np.arange(len(world_from_bone))
     children = [index for index, bone in enumerate(body.bones) if bone.parent >= 0]

@@ -1,7 +1,7 @@
 """The factors of the graphs: joints, hinges, camera measurements and mounts. All are GTSAM's own C++ factors.
 
 Letters of the keys: ``b`` for a bone's pose at a tick, ``v`` for a bone's velocity at a tick, ``m`` for the
-four points of a mount.
+four points of a mount. The motion graph also uses ``e`` (pose) and ``w`` (velocity) between the ticks.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ GEMAN_MCCLURE_C = 6.0
 length of 2.4 sigmas. Gross errors are removed before the graph is built. Evidence:
 docs/decisions/merging.md."""
 HINGE_SLACK_RATIO = 2.0
-"""Ratio of two sigmas: the sigma of the distances that define a hinge, and the sigma of the gap at a joint.
-Evidence: none."""
+"""Sigma of the distances that define a hinge, divided by the sigma of the gap at a joint. Evidence: none."""
 _AXIS_WEIGHT = 0.1
 """Ratio of the information of a mount's axis point to the information of the mount's centre point. The ratio
 is small, so that the rotation of the mount hardly depends on its translation."""
@@ -59,7 +58,8 @@ class MountPoints:
     """Four points, fixed to a camera, that together measure the camera's pose.
 
     The centre point has the standard deviation ``sigma_m``. Each axis point has a tenth of the centre point's
-    information. Its distance from the centre is such that the points measure the rotation with ``sigma_rad``.
+    information. The distance of the axis points from the centre point is chosen so that the points measure
+    the rotation with the standard deviation ``sigma_rad``.
 
     Attributes:
         sigma_rad: Sigma of the pose's rotation per axis, radians.
@@ -79,7 +79,10 @@ class MountPoints:
 
     @property
     def radius_m(self) -> float:
-        """Distance r (metres) of the axis points from the centre. The rotation's information is 2 r² / σ²."""
+        """Distance r (metres) of the axis points from the centre point.
+
+        With the sigma σ of an axis point, the information about the rotation is 2 r² / σ².
+        """
         return float(self.axis_sigma_m / (np.sqrt(2.0) * self.sigma_rad))
 
     def x_in_cam(self) -> FloatArray:

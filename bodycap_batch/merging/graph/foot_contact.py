@@ -19,13 +19,13 @@ from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions
 
 _HALF_WINDOW_S = 0.07
-"""Half of the duration (seconds) over which an ankle's speed is computed. At 30 Hz, 5 mm of noise then cause
-an error of 5 cm/s per axis."""
+"""Half of the duration (seconds) over which an ankle's speed is computed. With this duration and 30 ticks per
+second, a noise of 5 mm causes an error of 5 cm/s per axis."""
 _MAX_STANDING_SPEED_M_PER_S = 0.25
 """Maximum speed (m/s) of a standing ankle. Evidence: docs/decisions/merging.md."""
 _MAX_HEEL_RISE_M = 0.04
 """Maximum height (metres) of a standing ankle above its lowest position. The heel rises by more than this
-before the foot leaves the floor. Evidence: none."""
+height before the foot leaves the floor. Evidence: none."""
 _MIN_DURATION_S = 0.1
 """Minimum duration (seconds) of a contact. Evidence: none."""
 _FREE_ROTATION_SIGMA_RAD = 10.0
@@ -88,7 +88,8 @@ def find_contacts(
         tick_times_ns: (T,) times of the timeline's ticks.
 
     Returns:
-        The contacts of each foot with a camera on the shin or the foot; none for a timeline of one tick.
+        The contacts of each foot that has a camera on the shin or the foot. The tuple is empty if the
+        timeline has only one tick.
     """
     if len(tick_times_ns) < 2:
         return ()
@@ -135,7 +136,7 @@ def _contact_ticks(centre: FloatArray, measured: BoolArray, height: FloatArray, 
     rest &= height < np.percentile(height[measured], 5.0) + _MAX_HEEL_RISE_M
     out = np.zeros_like(rest)
     for start, stop in runs(rest):
-        # The first and the last tick are removed: the foot still comes down or already lifts off.
+        # Remove the first and the last tick, at which the foot may still come down or already lift off.
         if (stop - start) * tick_s >= _MIN_DURATION_S:
             out[start + 1 : stop - 1] = True
     return np.asarray(out, dtype=np.bool_)

@@ -59,16 +59,17 @@ def joint_covariance(
     """Return the covariance (T,B,3,3), m², of each joint's centre relative to the first bone's joint centre.
 
     The covariance is the sum of two parts. The first part is the marginal covariance of the graph, which
-    contains the noise of the measurements. The second part is J Σ Jᵀ, the effect of the calibration, which
-    the solver held fixed. Σ is the covariance of the calibration, given by its error modes. The function
-    propagates each error mode to the joints.
+    contains the noise of the measurements. The second part is J Σ Jᵀ, the effect of errors of the
+    calibration. The solver held the calibration fixed. Σ is the covariance of the calibration, given by its
+    error modes. J contains the derivatives of the joint centres with respect to the calibration. The function
+    computes J Σ Jᵀ by propagating each error mode to the joints.
 
     Args:
         solved: The graph at its solution.
         world_from_bone: (T,B,4,4) solved poses of the bones.
         error_modes: Error modes of the calibration.
-        begin: Called with the name of each part of the computation before the part starts. The call may
-            release freed memory.
+        begin: Called with the name of each part of the computation before the part starts. It may return
+            freed memory to the operating system.
 
     Returns:
         The covariance in the axes of the solution; NaN if the equations of the graph are singular.
@@ -81,7 +82,7 @@ def joint_covariance(
     try:
         normal = BlockTridiagonal.from_sparse((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     except np.linalg.LinAlgError:
-        # Some state is not observable. The solution exists, but its covariance does not.
+        # The measurements do not determine some state of the graph, so the covariance does not exist.
         return np.full((*world_from_bone.shape[:2], 3, 3), np.nan)
     begin("covariances of the measurements")
     changes = _measurement_residual_jacobian(solved, linear, error_modes)
@@ -94,7 +95,10 @@ def joint_covariance(
     out = np.zeros((ticks, count, 3, 3))
 
     def jacobian_at(tick: int) -> FloatArray:
-        """Return the derivatives (B-1,3,n) of relative joint centres with respect to a tick's states."""
+        """Return the derivatives (B-1,3,n) of relative joint centres.
+
+        The derivatives are with respect to the n unknowns of the tick's states.
+        """
         first = [
             int(position[linear.columns[bone_key(tick, bone)]]) - int(bounds[tick]) for bone in range(count)
         ]
@@ -190,13 +194,16 @@ def skeleton_covariance(
 def sigma_percentiles(
     roles: Sequence[str], covariance: FloatArray | None, observed: BoolArray
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Return percentiles of the joints' sigmas per axis by role, separately for observed and filled ticks.
+    """Return percentiles of the sigmas of the joints' centres, separately for observed and filled ticks.
 
     Args:
         roles: Roles of the J joints.
         covariance: (T,J,3,3) covariances of the joints' centres, NaN for joints that were not solved; None if
             they were not computed.
         observed: (T,J) whether cameras measured each joint at each tick. The other ticks are filled.
+
+    Returns:
+        By role of a joint, then by "observed" or "filled", then by "p50" or "p95": sigma (metres per axis).
     """
     out: dict[str, dict[str, dict[str, float]]] = {}
     if covariance is None:

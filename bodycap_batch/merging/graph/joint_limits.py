@@ -25,8 +25,9 @@ _SHOULDER_MOTION_M = 0.05
 """Distance (metres) that the centre of a shoulder moves relative to the trunk when the clavicle rotates by 15
 to 20°."""
 _ANCHOR_DISTANCE_M = 1.0
-"""Distance (metres) from a shoulder to the points that bound the height and the side of a palm. At this
-distance, spheres about the points are nearly planes."""
+"""Distance (metres) from a shoulder to two points: one above the shoulder, one to its side. A walker's palm
+stays below the shoulder and on its side of the body. Both rules are limits on the distance of the palm from
+one of these points. At this distance, a sphere about a point is nearly a plane."""
 _MAX_CROSSING_M = 0.1
 """Maximum distance (metres) of a walker's palm beyond the middle of the body. Evidence: none."""
 

@@ -20,16 +20,16 @@ GESTURE_DURATION_S = 4.0
 def widen_joint_priors(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray, times_ns: IntArray
 ) -> tuple[Bone, ...]:
-    """Widen the rotation priors of joints by the accidental choice of gestures in a capture.
+    """Widen the rotation priors of joints, because a capture contains only a limited number of gestures.
 
     The mean rotation of a joint over a capture differs from the rest pose for two reasons. The first is the
-    person's systematic bias, a fraction of the joint's everyday range. The second is the choice of gestures.
-    It contributes the standard deviation of the rotations, divided by the square root of the number of
-    gestures.
+    person's systematic bias, a fraction of the joint's everyday range. The second is the random choice of
+    gestures in the capture. The sigma of this second contribution is the standard deviation of the rotations,
+    divided by the square root of the number of gestures.
 
     Sometimes the mean rotation differs from the rest pose by more than these two reasons explain. An example
     is a person who lifts the arms all the time. The function then widens the everyday range until the sigma
-    of the bias equals the difference. With this sigma, the difference is most likely.
+    of the bias equals the difference. This value of the sigma makes the difference most likely.
 
     Args:
         skeleton: The body.

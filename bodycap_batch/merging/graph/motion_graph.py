@@ -1,4 +1,4 @@
-"""The motion graph of a timeline: bones in continuous time, measurements at their own times, fixed mounts."""
+"""The motion graph of a timeline: bones in continuous time, measurements at any time, fixed mounts."""
 
 from __future__ import annotations
 
@@ -90,7 +90,11 @@ class SolverProgress(Protocol):
     """Callback that reports the progress of the optimisation. It may raise to stop the optimisation."""
 
     def __call__(self, what: str = "", /) -> None:
-        """Report an iteration, or the start of the part of the computation that `what` names."""
+        """Report the end of an iteration, or the start of a part of the computation.
+
+        Args:
+            what: Name of the part that starts; empty at the end of an iteration.
+        """
 
 
 class MotionGraph:
@@ -140,8 +144,8 @@ class MotionGraph:
 
         Args:
             iterations: Maximum number of iterations.
-            step: Called after each iteration, and with the name of each part of the computation; may raise to
-                stop.
+            step: Called without a name after each iteration, and with the name of each part of the
+                computation before the part starts. It may raise an exception to stop the work.
             error_modes: Error modes of the calibration. Without them, the covariance of the joints is not
                 computed.
         """
@@ -199,7 +203,8 @@ class MotionGraph:
             for time, pose, noise in zip(track.times_ns.tolist(), poses, noises, strict=True):
                 state_time = self._nearest_tick(time)
                 if abs(state_time - time) > ON_TICK_TOLERANCE_NS:
-                    # Cameras of one bone share a state: two very close states make the equations singular.
+                    # Measurements of one bone within 1 ms share a state, because two states with almost
+                    # equal times make the equations singular.
                     state_time = _merge_state_time(times_off_ticks[track.bone], time)
                     if state_time not in nodes[track.bone]:
                         index = count_off_ticks[track.bone] * MAX_BONES + track.bone
@@ -371,7 +376,7 @@ def _initial_states(
 
 
 def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, FloatArray]:
-    """Return by role the distance (T,), metres, of each bone's joint from its place on the parent bone."""
+    """Return by role the distance (T,), metres, of each bone's joint from the joint's place on the parent."""
     out = {}
     for index, bone in enumerate(bones):
         if bone.parent >= 0:
@@ -383,9 +388,12 @@ def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, 
 def hinge_deviations(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray
 ) -> dict[str, FloatArray]:
-    """Return by role the distance (T,), metres, of the joint after each hinge from the hinge's plane.
+    """Return how far the far end of each hinge's lower bone is from the plane of the hinge.
 
-    The joint after a hinge is at the far end of the hinge's lower bone: for an elbow, it is the wrist.
+    For an elbow, the lower bone is the forearm, and its far end is the wrist.
+
+    Returns:
+        By role of the bone that starts at this far end: (T,) distances, metres.
     """
     out = {}
     for hinge in hinges(skeleton, tuple(bones)):

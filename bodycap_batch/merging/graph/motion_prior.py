@@ -13,12 +13,12 @@ from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.graph.factors import MotionState
 
 _VELOCITY_SIGMA = np.array([8.0, 8.0, 8.0, 3.0, 3.0, 3.0])
-"""Sigmas (rad/s, m/s) of a weak prior on a bone's first and last velocity. The motion prior links each of
-these two states to only one neighbour. Evidence: none."""
+"""Sigmas (rad/s, m/s) of a weak prior on the velocity in a bone's first and last state. The prior is needed
+because each of these two states has only one neighbouring state. Evidence: none."""
 _REST_VELOCITY_SIGMA = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
 """Sigmas (rad/s, m/s) of a prior on a bone's velocities before the first and after the last measurement of
-all cameras. The prior makes the body rest there. Without the prior, the body would keep its last velocity.
-Evidence: none."""
+all cameras. The prior makes the body rest at these times. Without the prior, the body would keep its
+velocity. Evidence: none."""
 
 
 def add_motion_prior(
@@ -27,14 +27,15 @@ def add_motion_prior(
     """Add the motion prior of one bone to a factor graph.
 
     Successive states are linked by white noise on acceleration. The velocity of the first and the last state
-    has a weak prior. Outside the time that cameras measured, each velocity has a prior of rest.
+    has a weak prior with mean zero. Before the first and after the last measurement of all cameras, each
+    velocity has a stronger prior with mean zero.
 
     Args:
         graph: The gtsam graph that receives the factors.
         bone: The bone, with the power spectral density of its acceleration.
         chain: The states of the bone in order of time.
-        start_ns: Time (nanoseconds) of second 0 in gtsam.
-        measured_ns: First and last time at which a camera measured.
+        start_ns: Start of the time axis for GTSAM, nanoseconds. GTSAM gets the seconds since this time.
+        measured_ns: Times (nanoseconds) of the first and the last measurement of all cameras.
 
     Source: T. D. Barfoot, C. H. Tong, S. Särkkä, "Batch continuous-time trajectory estimation as exactly
         sparse Gaussian process regression", RSS 2014.

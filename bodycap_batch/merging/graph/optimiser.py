@@ -9,8 +9,8 @@ import gtsam
 
 _MIN_DAMPING = 1e-5
 """Minimum damping (lambda) of Levenberg-Marquardt. The optimiser increases the damping tenfold until the
-error falls, and each attempt needs a solve. Near the solution, the error no longer falls, whatever the
-damping is. A smaller minimum of the damping would then only add failed attempts."""
+error falls. Each attempt solves the linear equations again. Near the solution, no value of the
+damping lowers the error. A smaller minimum of the damping would then only add failed attempts."""
 
 
 def levenberg_marquardt(
@@ -29,7 +29,7 @@ def levenberg_marquardt(
         values: The initial values.
         iterations: Maximum number of iterations.
         last: Keys of variables that are eliminated last, such as a calibration shared by all ticks.
-        step: Called after each iteration; may raise to stop.
+        step: Called after each iteration. It may raise an exception to stop the work.
         tolerance: Minimum relative decrease of the error per iteration. The optimiser stops after a smaller
             decrease.
 
@@ -65,7 +65,7 @@ def gauss_newton_then_lm(
         graph: The factors.
         values: The initial values, near the solution.
         iterations: Maximum number of iterations.
-        step: Called after each iteration; may raise to stop.
+        step: Called after each iteration. It may raise an exception to stop the work.
         tolerance: Minimum relative decrease of the error per iteration. The optimiser stops after a smaller
             decrease.
 
@@ -83,10 +83,11 @@ def gauss_newton_then_lm(
         step()
         decrease = error - optimizer.error()
         if decrease >= 0.0:
-            # `optimizer.values()` refers to memory of the optimiser that the next step overwrites.
+            # Copy the values: `optimizer.values()` refers to memory that the next step overwrites.
             values = gtsam.Values(optimizer.values())
         if abs(decrease) <= tolerance * max(error, 1e-9):
-            # With robust weights, full steps may end at an error slightly above the minimum.
+            # Stop also after a small increase: with robust weights, full steps may converge to an error
+            # slightly above the minimum.
             return values, count
         if not decrease >= 0.0:
             break

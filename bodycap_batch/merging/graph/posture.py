@@ -1,4 +1,4 @@
-"""Knowledge about the posture before the motion is solved: walking, standing or a T-pose, and direction."""
+"""Knowledge about the posture before the motion is solved: walking and its direction, standing, T-pose."""
 
 from __future__ import annotations
 
@@ -12,35 +12,37 @@ from bodycap_batch.merging.cameras.track import CameraTrack
 MIN_WALKING_SPEED_M_PER_S = 0.5
 """Minimum horizontal speed (m/s) of the trunk in walking. Evidence: none."""
 _STEP_NS = 500_000_000
-"""Duration (nanoseconds) over which the velocity is computed. It is about one step; within a step, the trunk
-sways."""
+"""Duration (nanoseconds) over which the velocity is computed. It is about the duration of one step. A
+velocity over a shorter duration would contain the sway of the trunk within a step."""
 _HIGHEST_PERCENTILE, _LOW_PERCENTILE = 95.0, 25.0
 """Percentiles of the trunk's height that are used as its highest position and as a low position. Evidence:
 none."""
 _STANDING_DROP_M = 0.02
-"""Maximum distance (metres) of an upright chest below its highest position. A chest half a metre above the
-hips is 2 cm lower if the trunk bends by 16 degrees."""
+"""Maximum distance (metres) of the chest of a standing person below its highest position. A chest half a
+metre above the hips is 2 cm lower if the trunk bends by 16 degrees."""
 _MIN_WALKING_SHARE = 0.125
-"""Minimum fraction of walking ticks in a capture that is treated as a walk. With a smaller fraction, the
-steps are steps aside during other work, mostly with a bent trunk. Evidence: none."""
+"""A capture with a smaller fraction of walking ticks is treated as a capture without walking. The person then
+only steps aside during other work, mostly with a bent trunk. Unit: 1. Evidence: none."""
 _BENT_DROP_M = 0.12
-"""Maximum distance (metres) of an upright chest below its usual height in walking. In a lower position, the
-trunk or the knees are bent. In normal walking, the chest's height varies by 5 cm."""
+"""Difference of the chest's height (metres) that shows a bent trunk or bent knees. In walking, the person is
+bent if the chest is lower than its usual height by more than this difference. In normal walking, the chest's
+height varies by 5 cm. A capture without walking has standing ticks only if the height varies by more than
+this difference."""
 _MAX_HEADING_CHANGE_RAD = float(np.radians(35.0))
-"""Maximum change (radians) of the angle between the camera's heading and the path. With a larger change from
-the usual angle, the person is not treated as walking forward. Evidence: none."""
+"""The angle between the camera's heading and the direction of walking has a usual value in a capture. If the
+angle differs from this value by this threshold (radians) or more, the person is not treated as walking
+forward. Evidence: none."""
 _BOUNCE_M = 0.03
-"""Scale (metres) of the vertical deviations of a walking trunk from its mean height. Its height varies by 4
-to 5 cm from the lowest to the highest position."""
+"""Scale (metres) of the robust weight of a point of a path, by its distance from the fitted horizontal plane.
+The height of a walking trunk varies by 4 to 5 cm from the lowest to the highest position."""
 _MIN_LEVEL_SHARE = 0.6
-"""Minimum fraction of a path's points that must lie in one horizontal plane, for a vertical from the path.
+"""A path gives no vertical if a smaller fraction of its points lies in one horizontal plane. Unit: 1.
 Evidence: none."""
 _MIN_LEVEL_POINTS = 30
-"""Minimum number of a path's points that must lie in one horizontal plane, for a vertical from the path.
-Evidence: none."""
+"""A path gives no vertical if fewer of its points lie in one horizontal plane. Evidence: none."""
 _MIN_PATH_WIDTH_M = 0.3
-"""Minimum standard deviation (metres) of a path across its main direction. At 0.3 m, ten steps with a bounce
-of 2 cm tilt the fitted plane by one degree."""
+"""A path gives no vertical if its standard deviation across its main direction is smaller (metres). At 0.3 m,
+ten steps with a bounce of 2 cm tilt the fitted plane by one degree."""
 _MAX_BODY_ANGLE_RAD = float(np.radians(30.0))
 """Maximum angle (radians) between the path's vertical and the body's vertical. Evidence: none."""
 _MAX_SAMPLES = 300
@@ -52,7 +54,7 @@ class Posture:
     """Knowledge about the posture at K sampled ticks.
 
     Attributes:
-        up: (3,) vertical in the map; None if only the body itself shows the vertical.
+        up: (3,) vertical in the map; None if it is unknown, or known only from the posture itself.
         walking: (K,) whether the person walks.
         walking_direction: (K,3) horizontal direction of walking; NaN where the person does not walk forward.
         t_pose: (K,) whether the person holds a T-pose.

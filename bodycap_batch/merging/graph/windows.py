@@ -21,16 +21,18 @@ from bodycap_batch.model.geometry import interpolate_pose
 WINDOW_TICKS = 500
 """Usual number of ticks of a window without its overlaps. Evidence: docs/decisions/merging.md."""
 OVERLAP_S = 3.0
-"""Time (seconds) by which a window is extended before its first tick and after its last tick. Two windows
-solve the ticks of their overlap differently, because each of them lacks the measurements outside itself. The
-influence of these measurements ends after three seconds. Evidence: none."""
+"""Time (seconds) by which a window is extended before its first tick and after its last tick. A window does
+not contain the measurements outside its ends. Its solution is therefore less accurate near its ends. The
+measurements outside hardly influence ticks that are more than three seconds away. Evidence: none."""
 _PREFERRED_OVERLAPS, _MIN_OVERLAPS = 4.0, 2.0
-"""Preferred and minimum length of a window at a high rate, as multiples of `OVERLAP_S`. With a length of four
-overlaps, each tick is solved 1.5 times on average; with a length of two overlaps, twice."""
+"""Preferred and minimum length of a window without its overlaps, as multiples of `OVERLAP_S`, for timelines
+with many ticks per second. With a length of four overlaps, each tick is solved 1.5 times on average. With a
+length of two overlaps, each tick is solved twice on average."""
 _MAX_WINDOW_BYTES = 5e8
 """Maximum memory (bytes) of a window with its overlaps. A window of the minimum length may need more."""
 _STATE_BYTES = 25e3
-"""Memory (bytes) of one tick for each bone, and for each camera with frames between the ticks. Evidence:
+"""Memory (bytes) of one state of the graph. `max_window_ticks` assumes one state per tick for each bone, and
+one state per tick for each camera, because the frames of a camera can lie between the ticks. Evidence:
 docs/decisions/merging.md."""
 _MIN_WINDOW_TICKS = 300
 """Minimum number of ticks of a window without its overlaps. Evidence: none."""
@@ -38,8 +40,8 @@ _BLEND_S = 1.0
 """Time (seconds) before and after a boundary in which the poses change gradually from one window's solution
 to the next. The other two seconds of each overlap are not used. Evidence: docs/decisions/merging.md."""
 _MAX_BOUNDARY_SHIFT = 0.25
-"""Maximum shift of a window's boundary, as a fraction of the window's length. The boundary moves to where
-more cameras are localised. Evidence: none."""
+"""Maximum shift of a window's boundary, as a fraction of the window's length. A boundary is shifted to a tick
+near which more cameras are localised. Evidence: none."""
 MAX_ITERATIONS = 20
 """Maximum number of iterations of the optimiser for one window. Evidence: none."""
 
@@ -74,8 +76,10 @@ def solve_windows(
         build: Makes the graph of a window from the times of its ticks and from its tracks.
         tick_times_ns: (T,) times of the timeline's ticks.
         tracks: Tracks without outliers, poses in metres.
-        step: Called after each iteration, and with the name of each part of the work; may raise to stop.
-        window_ticks: Maximum number of ticks of a window without its overlaps, before its boundaries move.
+        step: Called without a name after each iteration, and with the name of each part of the work before
+            the part starts. It may raise an exception to stop the work.
+        window_ticks: Maximum number of ticks of a window without its overlaps. The shift of the boundaries
+            may make a window longer by up to a quarter.
         error_modes: Error modes of the calibration. Without them, the covariance of the joints is not
             computed.
     """
@@ -126,14 +130,14 @@ def split_timeline(
 ) -> list[tuple[int, int]]:
     """Split the ticks into windows of about equal length that each contain measurements.
 
-    The boundaries lie where most cameras are localised. If a boundary were in a time without poses, neither
-    window would contain the poses at both ends of this time. Boundaries therefore move, and a window may be
-    longer than `window_ticks` by up to a quarter.
+    Each boundary is shifted to a tick near which most cameras are localised. If a boundary were in a time
+    without poses, neither window would contain the poses at both ends of this time. The shift may make a
+    window longer than `window_ticks` by up to a quarter.
 
     Args:
         tick_times_ns: (T,) times of the timeline's ticks.
         tracks: Tracks of the cameras.
-        window_ticks: Maximum number of ticks of a window before its boundaries move.
+        window_ticks: Maximum number of ticks of a window before the boundaries are shifted.
 
     Returns:
         Index of the first tick of each window, and index after its last tick.
@@ -156,7 +160,8 @@ def split_timeline(
 def _boundaries(tick_times_ns: IntArray, tracks: Sequence[CameraTrack], parts: int) -> list[int]:
     """Return the index after each window's last tick.
 
-    The boundaries lie where most cameras are localised, near the boundaries of windows of equal length.
+    The function starts from windows of equal length. It then shifts each boundary to a tick near which most
+    cameras are localised.
     """
     count = len(tick_times_ns)
     even = np.linspace(0, count, parts + 1).round().astype(int)
@@ -177,7 +182,7 @@ def _localised_cameras_near(tick_times_ns: IntArray, tracks: Sequence[CameraTrac
         after = np.searchsorted(track.times_ns, tick_times_ns)
         inside = (after > 0) & (after < len(track.times_ns))
         interval = np.diff(track.times_ns)
-        # The usual interval between the frames of a slow camera is not a time without poses.
+        # A camera with a low frame rate is treated as localised between two successive frames.
         max_gap = max(MAX_SAMPLE_GAP_NS, 2.0 * float(np.median(interval))) if len(interval) else 0.0
         cameras[inside] += interval[after[inside] - 1] <= max_gap
     total = np.concatenate([[0.0], np.cumsum(cameras)])
@@ -188,7 +193,10 @@ def _localised_cameras_near(tick_times_ns: IntArray, tracks: Sequence[CameraTrac
 
 
 def _time_span(tick_times_ns: IntArray, first: int, last: int) -> tuple[int, int]:
-    """Return the time of tick `first` and of tick `last`, unbounded at the ends of the timeline."""
+    """Return the times (nanoseconds) of the ticks `first` and `last`.
+
+    The first time is -2**62 if `first` is 0. The second time is 2**62 if `last` is the number of ticks.
+    """
     low = int(tick_times_ns[first]) if first > 0 else -(2**62)
     high = int(tick_times_ns[last]) if last < len(tick_times_ns) else 2**62
     return low, high
@@ -231,7 +239,7 @@ def _blend_windows(
 
 
 def _blend_poses(before: FloatArray, after: FloatArray, weight: FloatArray) -> FloatArray:
-    """Join the poses of two windows, and interpolate between them in their overlap.
+    """Join the poses of two windows. In the overlap, interpolate between the poses of both windows.
 
     Args:
         before: (M,...,4,4) poses of the earlier window.

@@ -1,8 +1,8 @@
 """Alignment of maps that share no view, through the body that wore their cameras.
 
 The centre of a joint is one point of both segments that meet there, even if the segments' cameras are in
-different maps. The body's calibration therefore determines the similarity of each further map, as additional
-unknowns. Initial values come from the rest pose and from the path of the body. All cameras share this path
+different maps. The calibration of the body can therefore estimate the similarity of each further map to the
+main map. Initial values come from the rest pose and from the path of the body. All cameras share this path
 once the swing of the limbs is averaged out.
 """
 
@@ -54,19 +54,21 @@ _MAX_SAMPLES = 240
 """Maximum number of instants at which the cameras are sampled. It bounds the computing time. Evidence:
 none."""
 _REACH_SIGMA = 0.05
-"""Sigma of the logarithm of the scale that follows from the limbs' reach. The sigma allows for walking
-elbows, which keep 15 to 30 degrees of flexion. With separate maps, errors of mounts and errors of the scale
-can compensate each other. The limbs' reach is therefore used as a source of the scale."""
+"""Sigma of the logarithm of the scale that follows from the limbs' reach. The sigma allows for the elbows of
+a walking person, which keep 15 to 30 degrees of flexion. The limbs' reach is used as a source of the scale,
+because in separate maps, errors of mounts can compensate errors of the scale."""
 _SEPARATE_MAPS_SIGMA = 0.15
-"""Sigma of the logarithm of the scale that follows from the limbs' reach, if no map contains both a camera of
-the trunk and a camera at the end of a limb. The error of a mount is then about a tenth of the length that
-determines the scale, half of an arm. Evidence: docs/decisions/merging.md."""
+"""Sigma of the logarithm of the scale that follows from the limbs' reach. It is used instead of
+`_REACH_SIGMA` if no map contains both a camera on the trunk and a camera at the end of a limb. Half of an arm
+then determines the scale, and the error of a mount is about a tenth of this length. Evidence:
+docs/decisions/merging.md."""
 _UNOBSERVABLE_SIGMA = 0.4
-"""Sigma of the logarithm of the scale that follows from the limbs' reach, if all knowledge about the scale
-comes from this reach or from two cameras near each other. Evidence: docs/decisions/merging.md."""
+"""Sigma of the logarithm of the scale that follows from the limbs' reach. It is used instead of
+`_REACH_SIGMA` and `_SEPARATE_MAPS_SIGMA` if only the limbs' reach, or two cameras near each other, determine
+the scale. Evidence: docs/decisions/merging.md."""
 _MAX_STRAIN = 2.0
 """Maximum difference, in sigmas, between the log scale from the limbs' reach and the solved log scale. With a
-larger difference, the body does not determine the maps. Evidence: none."""
+larger difference, the alignment is rejected. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,7 +100,7 @@ class UsableCameras:
         trajectories: Trajectories in the gauge of the main map, the trajectory of the trunk's camera first.
         main_from_gauge: By gauge of each used map, the similarity to the main map.
         sigmas: By camera of a further map, the sigmas of the map's alignment.
-        unused: By camera that is not used, the reason.
+        unused: By name of each unused camera, the reason why it is not used.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -124,14 +126,17 @@ def align_cameras(
     step: Callable[[], None],
     options: MergeOptions | None = None,
 ) -> UsableCameras:
-    """Transform the cameras of further maps into the main map, if the body determines their similarities.
+    """Transform the cameras of further maps into the main map, if the body determines the maps' similarities.
 
     Args:
-        inputs: Merge inputs, of which the skeleton, mounts and clocks are used.
+        inputs: The inputs of the merge stage.
         main: Trajectories of the main map's cameras, the trajectory of the trunk's camera first.
         further: Trajectories of the cameras of other maps.
-        step: Called after each iteration; may raise to stop.
-        options: Merge options, of which ``known_distance`` and ``marker_board`` are used.
+        step: Function that is called after each iteration. It may raise an exception to stop the work.
+        options: Options of the merge stage. Only ``known_distance`` and ``marker_board`` are used.
+
+    Returns:
+        The cameras of the main map and of the aligned maps, and the reasons why other cameras are not used.
     """
     identity = Similarity(1.0, np.eye(3), np.zeros(3))
     if not further:
@@ -179,18 +184,18 @@ def _align_all(
     tracks: dict[str, list[CameraTrack]],
     step: Callable[[], None],
 ) -> tuple[tuple[AlignedMap, ...], dict[str, str]]:
-    """Align all further maps together, or each alone if that fails.
+    """Align all further maps together. If this fails, align each further map separately.
 
     Args:
-        inputs: Merge inputs, of which the skeleton and mounts are used.
-        options: Merge options, of which ``known_distance`` and ``marker_board`` are used.
+        inputs: The inputs of the merge stage.
+        options: Options of the merge stage. Only ``known_distance`` and ``marker_board`` are used.
         bones: The graph's bones, for all cameras.
         tracks: By gauge, the tracks of each map. The main map is first, with the trunk's camera first. The
             function removes maps that it cannot align.
-        step: Called after each iteration; may raise to stop.
+        step: Function that is called after each iteration. It may raise an exception to stop the work.
 
     Returns:
-        The aligned maps, and by camera the reason why its map could not be aligned.
+        The aligned maps. Also, for each camera whose map could not be aligned, the reason by camera name.
     """
     (main, (trunk, *_)), *others = tracks.items()
     unused: dict[str, str] = {}
@@ -212,7 +217,8 @@ def _align_all(
         if len(tracks) == 2:
             exclude(next(name for name in tracks if name != main), error.message)
             return (), unused
-    # One map that fits no person makes the alignment of all maps fail. So each map is aligned alone.
+    # A single map that does not fit the body makes the alignment of all maps fail. Each map is therefore
+    # aligned separately.
     found: tuple[AlignedMap, ...] = ()
     for gauge in [name for name in tracks if name != main]:
         try:
@@ -226,7 +232,7 @@ def _exclusion_reason(gauge: str, trunk_camera: str, main_gauge: str, why: str) 
     """Return the message for a camera whose map could not be aligned with the trunk's map."""
     return (
         f"its map {gauge} shares no view with {trunk_camera}'s {main_gauge}, "
-        f"and the body cannot place it: {why}"
+        f"and the two maps could not be aligned through the body: {why}"
     )
 
 
@@ -235,7 +241,8 @@ class _Start:
     """The initial values for the refinement of the alignment.
 
     Attributes:
-        inputs: Merge inputs. The mount of the trunk's camera has the estimated roll of this camera.
+        inputs: The inputs of the merge stage. The mount prior of the trunk's camera is rotated by the
+            estimated roll of this camera.
         alignment: Initial similarities and scale.
         up: The vertical in the main map; None if it is unknown.
     """
@@ -264,7 +271,12 @@ def _initialise(
 
 
 def _require_one_scale(strain: float, reach_sigma: float) -> None:
-    """Raise if the scale from the limbs' reach and the solved scale differ by too many sigmas."""
+    """Raise an EstimationError if the scale from the limbs' reach and the solved scale contradict each other.
+
+    Args:
+        strain: Absolute difference of the two log scales, in sigmas.
+        reach_sigma: Sigma of the log scale from the limbs' reach.
+    """
     if strain > _MAX_STRAIN:
         raise EstimationError(
             f"the limbs' reach and the way the cameras move disagree on the scale by "
@@ -287,15 +299,18 @@ def align_maps(
     """Estimate the similarities of further maps to the main map.
 
     Args:
-        inputs: Merge inputs, of which the skeleton and mounts are used.
-        options: Merge options, of which ``known_distance`` and ``marker_board`` are used.
+        inputs: The inputs of the merge stage.
+        options: Options of the merge stage. Only ``known_distance`` and ``marker_board`` are used.
         bones: The graph's bones, for all cameras.
         tracks: By gauge, the tracks of each map. The main map is first, with the trunk's camera first.
-        step: Called after each iteration; may raise to stop.
+        step: Function that is called after each iteration. It may raise an exception to stop the work.
+
+    Returns:
+        One alignment per further map. A map whose alignment is too uncertain has a `reason`.
 
     Raises:
-        EstimationError: The cameras' distances or movements fit no person, or too few frames of different
-            cameras were localised at the same time.
+        EstimationError: The cameras' distances or movements are impossible for a person, or too few frames of
+            different cameras were localised at the same time.
     """
     (main_gauge, main), *others = tracks.items()
     stated = stated_constraints(inputs, options, main_gauge)
@@ -317,7 +332,7 @@ def align_maps(
         calibration, list(names.values()), provisional, reach_sigma=reach_sigma, stated=stated.scales
     )
     problem.solve()
-    # If the job gives the scale, the limbs' reach and the movement may disagree.
+    # A scale that the job gives may contradict the limbs' reach. Only other scales must agree with the reach.
     if not stated.scales:
         _require_one_scale(abs(problem.scale_residual()), reach_sigma)
         points = map_points_of(inputs, together[0].camera)
@@ -329,9 +344,9 @@ def align_maps(
         why = None
         if not sigma.position_m <= MAX_SIGMA_M:
             why = (
-                f"the body determines it only to {100 * sigma.position_m:.0f} cm; what helps is bending "
-                "forward and aside, turns in the walk, an upper arm's camera, a common view, "
-                "a known distance or a marker board"
+                f"the aligned camera positions have a sigma of {100 * sigma.position_m:.0f} cm; it helps to "
+                "bend forward and sideways, to turn while walking, to wear a camera on an upper arm, to film "
+                "one place with cameras of both maps, or to give a known distance or a marker board"
             )
         out.append(
             AlignedMap(

@@ -29,18 +29,19 @@ _SMOOTHING_S = 0.75
 """Half of the duration (seconds) over which paths are averaged. The average removes the swing of a walker's
 arms, which lasts about a second."""
 _REST_POSE_WEIGHT = 0.06
-"""Weight of the rest pose's orientation relative to the shape of the path, both normalised. With this weight,
-20 degrees count as much as 15 cm on a walk of a few metres. Evidence: none."""
+"""Weight of the camera orientations in the rest pose, relative to the shape of the path. Both are normalised.
+With this weight, an orientation error of 20 degrees has the same effect as a path error of 15 cm on a walk of
+a few metres. Evidence: none."""
 _MIN_COMMON_S = 4.0
-"""Minimum time (seconds) that two cameras must share. It is about four strides; a shorter path has no
-shape."""
+"""Minimum time (seconds) that two cameras must share. The value is about four strides. The shape of a shorter
+path does not determine the alignment."""
 _MIN_INSTANTS = 3
 """Minimum number of points of the shared path. Three points determine a rotation."""
 _MIN_COMMON_FRAMES = 10
 """Minimum number of frames in which both cameras are localised at the same time. Evidence: none."""
 _MAX_SCALE_SIGMA = 0.25
-"""Maximum sigma of the scale's logarithm for an observable scale. The sigma comes from the uncertainty of the
-mounts. Evidence: docs/decisions/merging.md."""
+"""Maximum sigma of the log of an observable scale. A scale with a larger sigma is treated as not observable.
+The sigma comes from the uncertainty of the mounts. Evidence: docs/decisions/merging.md."""
 _ITERATIONS = 3
 """Number of times that the initial similarities and the metric scale are estimated in turn. The first
 similarities are estimated without a scale."""
@@ -53,9 +54,9 @@ class InitialAlignment:
     Attributes:
         main_from_gauge: By gauge of a further map, the similarity from this map to the main map.
         metres_per_unit: Scale of the main map, metres per map unit.
-        scale_observable: Whether distances that do not depend on the rest pose determine the scale well.
-        one_map_spans_a_limb: Whether one map contains cameras of the trunk and of the end of a limb. The
-            scale then does not depend on the alignment.
+        scale_observable: True if distances that do not depend on the rest pose determine the scale well.
+        one_map_spans_a_limb: True if one map contains a camera on the trunk and a camera at the end of a
+            limb. The scale then does not depend on the alignment.
     """
 
     main_from_gauge: dict[str, Similarity]
@@ -84,7 +85,7 @@ def align_maps_initially(
         mounts: Mount of each camera by camera name.
 
     Raises:
-        EstimationError: Nothing determines the scale, or the cameras' distances fit no person.
+        EstimationError: Nothing determines the scale, or the cameras' distances are impossible for a person.
     """
     groups = [main, *(group for _, group in others)]
     information = _scale_information(bones, groups, mounts)
@@ -105,7 +106,10 @@ def align_maps_initially(
 
 
 def _one_map_spans_a_limb(bones: Sequence[Bone], groups: Sequence[Sequence[CameraTrack]]) -> bool:
-    """Return whether one map contains cameras of the trunk and of a limb below the upper arm or thigh."""
+    """Return True if one map contains a camera on the trunk and a camera near the end of a limb.
+
+    Cameras on shoulders, upper arms and thighs are not near the end of a limb.
+    """
     roles = [[split_side(bones[track.bone].role) for track in group] for group in groups]
     near = ("Shoulder", "Arm", "UpLeg")
     return any(
@@ -159,7 +163,7 @@ def _scale_information(
     if without_swing and not information:
         raise EstimationError(
             "the distance of {!r} from {!r} in another map does not determine the scale, "
-            "nor does anything else".format(*without_swing[0]),
+            "and no other distance does".format(*without_swing[0]),
             hint="an upper arm's camera helps, or two cameras of the body in one map",
         )
     return _ScaleInformation(uninformative, 1.0 / np.sqrt(information) if information else np.inf)

@@ -44,13 +44,14 @@ def stated_constraints(inputs: MergeInputs, options: MergeOptions, gauge: str) -
     Scales and verticals for other maps are used later, after all maps are aligned.
 
     Args:
-        inputs: Merge inputs, of which the trajectories and the views of the board are used.
-        options: Merge options, of which ``known_distance`` and ``marker_board`` are used.
+        inputs: The inputs of the merge stage. Only the trajectories and the views of the board are used.
+        options: Options of the merge stage. Only ``known_distance`` and ``marker_board`` are used.
         gauge: Gauge of the map.
     """
     own_map = {gauge: Similarity(1.0, np.eye(3), np.zeros(3))}
     distance, board = None, None
-    # Errors here concern other maps. They are reported after all maps are aligned.
+    # A distance or a board in another map causes an error here. After all maps are aligned, the calibration
+    # calls both functions again and reports the remaining errors.
     with suppress(EstimationError):
         distance = known_distance(inputs.trajectories, options.known_distance, own_map)
     with suppress(EstimationError):
@@ -64,12 +65,12 @@ def stated_constraints(inputs: MergeInputs, options: MergeOptions, gauge: str) -
 def scale_from_walked_floor(
     inputs: MergeInputs, track: CameraTrack, up: Vertical | None, body: ScaleSource, points: FloatArray
 ) -> ScaleSource | None:
-    """Return the scale from the height of the walking trunk above the floor.
+    """Return the scale from the trunk's height above the floor while the person walks.
 
-    Only walking is used, because a person who sits or squats is less tall.
+    Other instants are not used, because sitting or squatting lowers the trunk.
 
     Args:
-        inputs: Merge inputs, of which the skeleton and the mount priors are used.
+        inputs: The inputs of the merge stage. Only the skeleton and the mount priors are used.
         track: Track of the trunk's camera, map units.
         up: The vertical; None if it is unknown.
         body: Approximate scale from the body, with its sigma.

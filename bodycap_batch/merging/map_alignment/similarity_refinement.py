@@ -22,8 +22,8 @@ from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.geometry import Similarity, so3_exp
 
 _SLACK_SCHEDULE = (16.0, 4.0, 1.0)
-"""Factors on the slack of the joints, one for each successive solve. With a large slack, an initial error of
-a decimetre keeps its full weight, and is not treated as a gross error."""
+"""Factors on the slack of the joints, one for each successive solution. With a large slack, a joint gap of a
+decimetre keeps its full weight, and the robust loss does not treat this gap as a gross error."""
 _MAX_STEPS = 8
 """Maximum number of steps of one descent. Evidence: none."""
 _CONVERGED = 1e-3
@@ -58,6 +58,9 @@ class _Step:
 
 class MapAlignmentProblem:
     """A calibration with the similarities of further maps as unknowns. All other unknowns are eliminated.
+
+    Attributes:
+        corrections: For each further map, the similarity from the initial alignment to the solved alignment.
 
     Args:
         calibration: Graph of the calibration, with all maps at their initial similarities.
@@ -129,7 +132,11 @@ class MapAlignmentProblem:
                 break
 
     def sigmas(self, index: int) -> AlignmentSigma:
-        """Return the sigmas of a further map's rotation and of the sampled positions of the map's cameras."""
+        """Return the sigmas of a map's rotation and of the sampled positions of this map's cameras.
+
+        Args:
+            index: Index of the further map.
+        """
         centres, middle = self._centres(index)
         unknowns = slice(1 + 7 * index, 8 + 7 * index)
         values, vectors = np.linalg.eigh(self._covariance[unknowns, unknowns])

@@ -92,8 +92,8 @@ Derivation: with 15 joints and four blocks of 18 kB per tick, a window takes 180
 OVERLAP_S = 4.0
 """Duration of the overlap that extends a window on each side, seconds.
 
-Derivation: the correction has a sigma of 3°, and its change in 1/30 s has a sigma of 0.3°. A tick therefore
-influences other ticks by an amount that decreases by a tenth every 1/30 s. After 4 s the influence is e^-12.
+Derivation: the correction has a sigma of 3°, and its change in 1/30 s has a sigma of 0.3°. The influence of a
+tick on other ticks therefore decreases by a tenth every 1/30 s. After 4 s the influence is e^-12.
 """
 
 
@@ -324,7 +324,7 @@ def _graph_error(problem: ProjectionProblem, world: FloatArray, ticks: slice) ->
 def _scaled_correction(
     problem: ProjectionProblem, motion: RigidMotion, graph_error: FloatArray
 ) -> FloatArray:
-    """Return the correction in units of the sigmas with which it may change from tick to tick.
+    """Return the correction, divided by the sigmas of its change from tick to tick.
 
     Args:
         problem: The problem, which contains the poses of the motion graph.
@@ -372,7 +372,7 @@ def cost(problem: ProjectionProblem, motion: RigidMotion) -> float:
 
 
 def _slip(standing: StandingJoint, world: FloatArray) -> FloatArray:
-    """Return the movement (T-1,3) of a joint between ticks in sigmas, or zero if the joint may move."""
+    """Return the movement (T-1,3) of a joint between ticks, in sigmas; zero if the foot does not stand."""
     movement = np.diff(world[:, standing.joint, :3, 3], axis=0)
     return np.asarray(np.where(standing.held[:, None], movement / standing.sigma_m, 0.0))
 
@@ -384,7 +384,7 @@ class NormalEquations:
     Attributes:
         blocks: (T,n,n) blocks on the diagonal.
         coupling: (T-1,n,n) blocks that link each tick with the next tick.
-        gradient: (T,n) half the gradient of the cost.
+        gradient: (T,n) half of the gradient of the cost.
     """
 
     blocks: FloatArray

@@ -1,4 +1,4 @@
-"""Write one sentence per estimated quantity: how well it is known, and advice for a better capture.
+"""Write one sentence per estimated quantity: how well the quantity is known, and advice for a better capture.
 
 The sentences are part of the stored results. The report page splits each sentence at "; to know it better, ".
 """
@@ -62,7 +62,8 @@ def describe_clock(camera: str, shift_s: float, scatter_left: float, offset_s: f
     direction = "behind" if shift_s > 0.0 else "ahead"
     return (
         f"{camera} moves about the body as if its clock were {abs(shift_s):.1f} s {direction}; with "
-        f"an offset_s of about {offset_s:.1f} its place would scatter {1.0 - scatter_left:.0%} less"
+        f"an offset_s of about {offset_s:.1f} its position relative to the trunk would vary "
+        f"{1.0 - scatter_left:.0%} less"
     )
 
 
@@ -114,14 +115,21 @@ def describe_hinge(role: str, off_m: float) -> str:
     side, part = split_side(role)
     joint = f"{side.lower()} {'elbow' if part == 'ForeArm' else 'knee'}"
     return (
-        f"the {joint} bends {100.0 * off_m:.1f} cm (1 sigma) out of its plane and is not held to it; "
-        f"to know it better, strap the cameras above and below the {joint} so that none slides, and check "
-        f"their clocks (offset_s) and which way its axis lies in the skeleton"
+        f"the {joint} bends {100.0 * off_m:.1f} cm (1 sigma) out of its plane, and the solver permits this; "
+        f"to know it better, strap the cameras above and below the {joint} so that no camera slides, and "
+        f"check the cameras' clocks (offset_s) and the direction of the {joint}'s axis in the skeleton"
     )
 
 
 def describe_scale(calibration: BodyCalibration) -> str:
-    """Describe how well the metric scale is known."""
+    """Describe how well the metric scale is known.
+
+    Args:
+        calibration: The calibration of the body, with the scale.
+
+    Returns:
+        A sentence for the report. If the scale is not well known, the sentence contains advice.
+    """
     scale = calibration.scale
     text = f"the metric scale is known to {100.0 * scale.sigma_log:.1f} % (1 sigma)"
     used = {source.name for source in scale.sources if source.used}
@@ -130,8 +138,8 @@ def describe_scale(calibration: BodyCalibration) -> str:
     ways = ["name a known distance (merge.known_distance) or a board in the room (merge.marker_board)"]
     if len({mount.role for mount in calibration.mounts}) == 1:
         return (
-            f"{text}: all cameras sit on one bone, so that it rests on their distance alone; to know it "
-            f"better, wear one on another bone as well (a hand, an upper arm or the head), or {ways[0]}"
+            f"{text}: all cameras are on one bone, so only their distances determine the scale; to know it "
+            f"better, wear a camera on another bone as well (a hand, an upper arm or the head), or {ways[0]}"
         )
     if "mean stature" in used:
         ways.insert(0, "give the subject's height (height_m)")
@@ -141,17 +149,24 @@ def describe_scale(calibration: BodyCalibration) -> str:
 
 
 def describe_vertical(vertical: Vertical) -> str:
-    """Describe how well the vertical is known."""
-    text = f"up is known to {vertical.sigma_deg:.1f}° (1 sigma), from the {vertical.source}"
+    """Describe how well the vertical is known.
+
+    Args:
+        vertical: The estimated vertical.
+
+    Returns:
+        A sentence for the report. If the vertical is not well known, the sentence contains advice.
+    """
+    text = f"the vertical is known to {vertical.sigma_deg:.1f}° (1 sigma), from the {vertical.source}"
     if vertical.rests_on_lean_only():
         text = (
-            f"{text}, and not for certain: it rests on the posture alone, and a lean that lasts all the time "
+            f"{text}, but it is not certain: only the posture shows it, and a constant lean of the trunk "
             "cannot be seen in the posture"
         )
     elif not vertical.is_determined():
         text = (
-            f"{text}, and not for certain: another direction, at about a right angle to it, explains the "
-            f"posture nearly as well"
+            f"{text}, but it is not certain: another, clearly different direction explains the observations "
+            f"nearly as well"
         )
     elif vertical.source != "body":
         return text

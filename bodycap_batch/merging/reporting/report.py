@@ -66,8 +66,8 @@ class MotionFacts:
         dropped: By camera, (N,) numbers of the frames with gross errors.
         floor: The floor.
         unused: By name of an unused camera, the reason why the camera is not used.
-        aligned: By camera, uncertainty of the pose of this camera's map in the main map. It contains only
-            cameras whose map was aligned to the main map.
+        aligned: By camera, uncertainty of the pose of this camera's map in the main map. The mapping contains
+            only cameras whose map was aligned to the main map.
         joint_sigma_m: By role of a joint, then by ``observed`` or ``filled`` ticks, percentiles of the sigma
             of the joint's centre, metres per axis.
         joint_gap_m: By role of a joint, (T,) distance of the joint from its place on the parent bone, metres.

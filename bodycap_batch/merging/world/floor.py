@@ -20,15 +20,15 @@ SLAB_M = 0.03
 """Thickness (metres) of a horizontal slab in which points are counted. The slab of a found floor is twice as
 thick. Evidence: none."""
 _MIN_POINTS = 100
-"""Minimum number of map points for a search for the floor among all of them. Evidence: none."""
+"""Minimum number of map points for a search for the floor among all map points. Evidence: none."""
 _MIN_FLOOR_POINTS = 30
 """Minimum number of points in the slab of a floor. Evidence: none."""
 _MIN_FLOOR_RATIO = 3.0
 """Minimum ratio of the number of points in the slab of a floor to the median number in all slabs. The points
 of other objects are spread evenly over the heights. Evidence: none."""
 _MAX_BELOW_RATIO = 0.2
-"""Maximum ratio of the number of points below a floor to the number of points in its slab. A table top has
-the many points of the floor below it, so that it is not mistaken for the floor. Evidence: none."""
+"""Maximum ratio of the number of points below a floor to the number of points in the floor's slab. A table
+top has a larger ratio, because the many points of the floor are below the table top. Evidence: none."""
 _SEARCH_RATIO = 0.25
 """Maximum distance of the floor from its expected height, as a ratio to the trunk's standing height. The body
 gives the expected height. Evidence: none."""
@@ -39,7 +39,7 @@ _MIN_PATH_POINTS = 5
 """Minimum number of points near the path in the slab of a floor. Evidence: none."""
 _MIN_PATH_SHARE = 0.5
 """Minimum fraction of the points near the path that lie in the slab of a floor. Only points at possible
-heights of the floor are used. Evidence: none."""
+heights of the floor are counted (see `_SEARCH_RATIO`). Evidence: none."""
 _LEGLESS_HIP_M = 0.9
 """Assumed height (metres) of the hips above the floor, for a skeleton without legs. It is used only if the
 zero pose does not give this height."""
@@ -86,9 +86,10 @@ class LegLengths:
 def floor_from_points(heights_m: FloatArray, up: Vertical, expected_m: float, standing_m: float) -> Floor:
     """Find the floor among the heights of the map's points.
 
-    The floor is a slab with many points near the soles of the standing body, and few points below the slab.
-    The function searches for this slab only if the vertical comes from the map. Other verticals may be
-    tilted. A tilt of two degrees spreads the points of a floor over a decimetre.
+    The floor is a horizontal slab at about the height of the soles. Many points lie in this slab, and few
+    points lie below it. The function searches for the slab only if the vertical comes from the map. Other
+    verticals may be wrong by some degrees. An error of two degrees spreads the points of a floor over a
+    decimetre.
 
     Args:
         heights_m: (P,) heights of the map's points along up, metres.
@@ -193,8 +194,8 @@ def leg_lengths(skeleton: SkeletonModel) -> list[LegLengths]:
 def standing_height(skeleton: SkeletonModel, joint: int) -> float:
     """Return the height (metres) of a trunk joint above the soles of a person with straight legs.
 
-    The height is the sum of the lengths of the bones. The zero pose of a rig does not give this height,
-    because its legs may be spread and its root may be at any height.
+    The height is the sum of the lengths of the bones. The zero pose of a skeleton does not give this height,
+    because the legs may be spread and the root may be at any height.
     """
     rest = rest_positions(skeleton)
     above_root = float(rest[joint][2] - rest[0][2])

@@ -42,8 +42,8 @@ _AGREEMENT_DEG = 1.0
 which the plane deviates from horizontal or from vertical, whichever is smaller."""
 _MIN_INFORMATION_SHARE = 0.12
 """Minimum information about the vertical, as a fraction of the number of points of all planes. The vertical
-can tilt about two horizontal axes, and each tilt must reach this minimum. A point of a floor adds one
-unit for both tilts; a point of a wall adds one unit for one tilt. Evidence: none."""
+can tilt about two horizontal axes. The information about each of the two tilts must reach this minimum. A
+point of a floor adds one unit to both tilts. A point of a wall adds one unit to one tilt. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class Plane:
 
 @dataclass(frozen=True, slots=True)
 class PlaneVertical:
-    """A vertical that was found from planes of the map. Most of the planes are horizontal or vertical.
+    """A vertical to which most planes of the map are parallel or perpendicular.
 
     Attributes:
         up: (3,) unit vector that points up.

@@ -1,7 +1,8 @@
 """The vertical in the solved frame, selected from hypotheses of the map, the walk, the body and the job.
 
 For each hypothesis, the module computes the negative log-likelihood (nats) of all observations, on the
-assumption that the hypothesis is right. The constants of this sum are set by hand.
+assumption that the hypothesis is right. The negative log-likelihood is a sum of terms. The constants of the
+terms are set by hand.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from bodycap_batch.merging.world.planes import (
 )
 
 _LEAN_SAMPLES = 3.0
-"""Number of independent observations that the trunk's tilt (its lean) over a whole capture counts as. The
-number is small because the posture's systematic bias is equal at all instants. Evidence: none."""
+"""The tilt of the trunk (its lean) over a whole capture counts as this number of independent observations.
+The number is small because the posture's systematic bias is equal at all instants. Evidence: none."""
 _PLANE_SHARE_NATS = 6.0
 """Maximum cost (nats) of planes that do not agree with a vertical from planes. The cost is this maximum times
 the fraction of the planes' points that do not agree. Evidence: none."""
@@ -49,8 +50,8 @@ _MIN_MARGIN_NATS = 3.0
 """Minimum difference (nats) between the negative log-likelihoods of the best rival and the vertical. With a
 smaller difference, the vertical is not determined. Three nats are odds of twenty to one."""
 _STATED_SIGMAS = 3.0
-"""Maximum angle between a vertical given in the job and a vertical from planes that replaces it. Its unit is
-the sigma of the given vertical."""
+"""A vertical from planes replaces a vertical given in the job if the angle between the two is smaller than
+this number of sigmas of the given vertical."""
 _DISTINCT_DEG = 20.0
 """Minimum angle (degrees) between the vertical and a rival. A hypothesis at a smaller angle is treated as the
 same vertical with a small error. Evidence: none."""
@@ -103,9 +104,9 @@ class Vertical:
         sigma_deg: Sigma (degrees) of the vertical.
         alternatives: Best hypothesis of each other source, and the best rival.
         negative_log_likelihood: Negative log-likelihood (nats) of all observations.
-        margin_nats: Negative log-likelihood of the best rival minus that of the vertical; None without a
-            rival. A rival is a hypothesis with a clearly different direction that does not come from the
-            body. If the job gives verticals, only these are rivals.
+        margin_nats: Negative log-likelihood (nats) of the best rival minus `negative_log_likelihood`; None if
+            there is no rival. A rival is a hypothesis with a clearly different direction that does not come
+            from the body. If the job gives verticals, only these verticals can be rivals.
     """
 
     up: FloatArray
@@ -169,8 +170,8 @@ def estimate_vertical(
         scene: The map and the path of the trunk.
         rng: Random generator for the search for planes.
         stated: Verticals given in the job. If there are any, the most likely of them is selected, even if
-            another hypothesis is more likely. A vertical from planes that agrees with the selected vertical
-            replaces it.
+            another hypothesis is more likely. If a vertical from planes agrees with the selected vertical,
+            the vertical from planes is used.
     """
     planes = find_planes(scene.points_m, rng)
     hints = [body.modal_up(), body.mean_up(), body.upright_up()]
@@ -217,8 +218,8 @@ def _cost(hypothesis: VerticalHypothesis) -> float:
 def _select(hypotheses: Sequence[VerticalHypothesis], stated: Collection[str]) -> VerticalHypothesis:
     """Return the hypothesis with the lowest negative log-likelihood.
 
-    If the job gives verticals, only these are candidates. A hypothesis from planes that agrees with the best
-    candidate within 3 sigma then replaces this candidate.
+    If the job gives verticals, only these verticals are candidates. A hypothesis from planes that agrees
+    with the best candidate within 3 sigma then replaces this candidate.
     """
     best = min((each for each in hypotheses if not stated or each.source in stated), key=_cost)
     agreeing = [

@@ -13,8 +13,8 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp, transform_points
 
 _RAY_STEP = 1e-4
-"""Step of the central differences, in units of the ray (x/z, y/z). For a function of unit scale, the cube
-root of the float64 precision (6e-6) is the step with the smallest error. This step is 16 times larger.
+"""Step of the central differences, in units of the ray (x/z, y/z). For a function of unit scale, a step of
+6e-6 has the smallest error: the cube root of the float64 precision. The step used here is 16 times larger.
 Evidence: none."""
 _CHUNK_FRAMES = 48
 """Number of frames solved together. More frames reduce numpy's overhead per frame; fewer frames fit into the
@@ -25,15 +25,17 @@ the memory of its result."""
 _MAX_ITERATIONS = 20
 """Maximum number of Gauss–Newton iterations. Evidence: none."""
 _CONVERGED_PX = 1e-2
-"""Pixels: threshold of convergence. Iteration ends when the projected points move by less than this. Origin:
-a third of the standard error of the mean of 200 points with 0.5 px of noise. Evidence:
-docs/decisions/registration.md."""
+"""Maximum movement of the projected points in the last iteration. Unit: pixels. The iterations of a pose end
+if the points move by a smaller distance. Origin: a third of the standard error of the mean of 200 points with
+0.5 px of noise. Evidence: docs/decisions/registration.md."""
 _MAX_STEP_RAD = 0.5
 """Radians: maximum rotation in one iteration. Origin: the linearisation is not valid for larger rotations.
 Evidence: none."""
 _CUTOFF_MEDIANS = 3.0
-"""Cut-off of residuals in early iterations, as a multiple of the frame's median residual. It is only used
-while it exceeds the inlier limit, because the pose is then still inaccurate. Evidence: none."""
+"""Cut-off of residuals, as a multiple of the frame's median residual. An observation with a larger residual
+has no weight. If this cut-off is smaller than the inlier limit, the inlier limit is used instead. In early
+iterations the pose is inaccurate and the median is large, so the cut-off exceeds the inlier limit.
+Evidence: none."""
 MIN_COUNTED_WEIGHT = 0.05
 """Minimum weight of an observation that is used for the noise estimate and for RANSAC. If too few
 observations have this weight, RANSAC uses all observations. Evidence: none."""
@@ -116,7 +118,8 @@ class PoseQuality:
         inliers: (F,) number of observations whose residual is below the inlier limit.
         error_px: (F,) mean residual of the inliers, pixels.
         inlier_weight_ratio: (F,) ratio of the inliers' weight to the weight of all observations.
-        noise_px: (F,) median absolute residual along one image axis, multiplied by the root of the weight.
+        noise_px: (F,) noise of the observations, pixels. Each residual has an x and a y component. The noise
+            is the median of the absolute components, each multiplied by the root of its observation's weight.
             Only inliers with a weight of at least `MIN_COUNTED_WEIGHT` are used.
         depth: (F,) median depth of the inliers, in the unit of the gauge.
         information: (F,6,6) Gauss–Newton information matrix of each pose, for 1 px of noise. It refers to a
@@ -180,7 +183,7 @@ def refine_poses(
 
     Args:
         observations: Observations of F frames.
-        cam_from_gauge: (F,4,4) poses to start from.
+        cam_from_gauge: (F,4,4) initial poses.
         limit_px: Inlier limit, pixels.
         threads: Number of threads that solve chunks of frames. The result does not depend on it.
 
@@ -308,8 +311,9 @@ def _gauss_newton_step(
 def _segment_medians(value: FloatArray, owner: IntArray, starts: IntArray, counts: IntArray) -> FloatArray:
     """Return, for each frame, the lower median of its `counts` smallest values.
 
-    The values of all frames are sorted together. Before sorting, an offset for its frame is added to each
-    value, so that the values of the frames stay separate.
+    The values of all frames are sorted together. Before sorting, an offset is added to each value. All values
+    of one frame have the same offset, and later frames have larger offsets. Sorting therefore does not mix
+    the values of different frames.
 
     Args:
         value: (M,) values, ordered by frame.

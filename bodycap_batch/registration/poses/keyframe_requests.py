@@ -10,8 +10,8 @@ _WINDOW_FRAMES = 3
 """Number of successive lost frames in a window. Only the sharpest frame of each window is requested.
 Evidence: none."""
 _END_OFFSET_FRAMES = 1
-"""Distance (number of frames) from a lost interval to the frame with a pose that is requested next to it. A
-distance of 1 means the adjacent frame."""
+"""Distance from each end of a lost interval to a frame outside the interval. Unit: frames. This frame has a
+pose and is requested too. A distance of 1 means the frame adjacent to the interval."""
 _MIN_BUDGET = 20
 """Number of frames that may always be requested in a round, even if few frames were offered before. Evidence:
 none."""
@@ -37,8 +37,8 @@ def request_keyframes(localised: BoolArray, sharpness: FloatArray, tried: IntArr
         tried: Indices of the frames that were offered to the mapper before.
 
     Returns:
-        Indices of the selected frames, increasing. Their number is at most 20, or half the number of frames
-        offered before if that is larger.
+        Indices of the selected frames, increasing. At most 20 frames are selected. If more than 40 frames
+        were offered before, at most half this number of frames are selected.
 
     Source: Algorithm 1 of Vo, Kim, Choudhary, "Motion capture using body mounted cameras in an unknown
         environment".

@@ -14,20 +14,21 @@ from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, ransac_pose
 from bodycap_batch.registration.tracking.klt import Tracks
 
 _MIN_TRACKS = 15
-"""Minimum number of tracks between two keyframes that are needed to test the poses of the keyframes. Origin:
-about the minimum number of inliers of a pose. Evidence: none."""
+"""Minimum number of tracks between two keyframes. With fewer tracks, the poses of the two keyframes are not
+tested. Origin: about the minimum number of inliers of a pose. Evidence: none."""
 _MAX_MEDIAN_ERROR = 4.0
 """Maximum median distance between tracked and predicted pixels, as a multiple of the inlier limit. If the
 median between two keyframes is larger, the tracks may contradict the poses. Evidence:
 docs/decisions/registration.md."""
 _UNSEEN_ERROR_PX = 1e5
-"""Pixels: error assigned to a point that the keyframe cannot see. It exceeds every limit."""
+"""Error of a point that is behind the keyframe's camera or cannot be projected. Unit: pixels. The value
+exceeds every limit."""
 
 
 _MIN_OTHER_POSE_RATIO = 0.5
 """Minimum fraction of the tracks arriving in a keyframe that must agree on another pose of this keyframe.
-Otherwise the tracks have probably slipped, and do not contradict the map. Evidence:
-docs/decisions/registration.md."""
+With a smaller fraction, the tracks have probably moved to wrong points, and the pose in the map is not
+treated as wrong. Evidence: docs/decisions/registration.md."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +86,8 @@ def find_misplaced_keyframes(
         Row indices of the misregistered keyframes in the map.
 
     Source: Zach, Klopschitz, Pollefeys, "Disambiguating visual relations using loop constraints", CVPR 2010.
-        Tracking and the map form a loop here, which is the simplest loop constraint.
+        Here each loop is as short as possible: the tracks from one keyframe to the next, and the poses of
+        both keyframes in the map.
     """
     rows = scene_map.keyframes_of(camera)
     arriving = _arriving_tracks(camera, scene_map, rows, tracks)

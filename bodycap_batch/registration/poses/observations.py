@@ -52,7 +52,7 @@ class RigMember:
         tracks: Tracked observations in the frames of this camera, ordered by frame.
         cam_from_rig: (4,4) pose of the camera in the rig. The estimated poses of frames are poses of the rig.
         rig_frame: (N,) index of the rig's frame at the instant of each frame of this camera; -1 if the rig
-            has no frame then.
+            has no frame at this instant.
     """
 
     camera: CaptureCamera
@@ -154,9 +154,9 @@ class RigObservations:
 
     @property
     def rolling(self) -> bool:
-        """True if a camera has a rolling shutter.
+        """True if at least one camera has a rolling shutter.
 
-        Its observations must then be moved to the instant of the middle row.
+        The observations of such a camera must be moved to the instant of the middle row.
         """
         return any(self.scene_map.readout_s.get(member.camera.name, 0.0) for member in self.members)
 

@@ -33,13 +33,13 @@ error, so the computed covariance is too small. Evidence: docs/decisions/registr
 _UNCONSTRAINED_VARIANCE = 1e12
 """Variance assumed for a pose that the observations do not determine. It exceeds every limit."""
 _WEIGHT_RATIO_FLOOR = 1e-3
-"""Lower limit of the inlier weight ratio when sigmas are divided by this ratio. It prevents a division by
-zero."""
+"""Minimum divisor of the noise. The noise is divided by the inlier weight ratio. A smaller ratio is replaced
+by this minimum, to prevent a division by zero."""
 _MAX_TRIALS = 2000
 """Maximum number of RANSAC iterations. Evidence: none."""
 TRUSTED_WEIGHT_RATIO = 0.6
-"""Minimum inlier weight ratio of a pose for which RANSAC is not tried. For such poses, RANSAC never found a
-better pose."""
+"""Minimum inlier weight ratio of a refined pose for which RANSAC is skipped. With a smaller ratio, RANSAC is
+tried too. For poses with a larger ratio, RANSAC never found a better pose."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,10 +66,10 @@ class FramePose:
     """The estimated pose of one frame, or the reason why the frame has no pose.
 
     Attributes:
-        status: Status of the frame. `REGISTERED`, `KEYFRAME` and `RIG` have a pose; any other status is the
-            reason why there is none.
-        gauge_from_cam: (4,4) pose; None if there is none.
-        covariance: (6,6) covariance as in `Trajectory`; None if there is no pose.
+        status: Status of the frame. A frame with the status `REGISTERED`, `KEYFRAME` or `RIG` has a pose. Any
+            other status is the reason why the frame has no pose.
+        gauge_from_cam: (4,4) pose; None if the frame has no pose.
+        covariance: (6,6) covariance as in `Trajectory`; None if the frame has no pose.
         inliers: Number of inliers.
         inlier_weight_ratio: Ratio of the inliers' weight to the weight of all observations.
         error_px: Mean reprojection error of the inliers, pixels.
@@ -93,19 +93,19 @@ def solve_poses(
 ) -> list[FramePose]:
     """Estimate the poses of all frames of a camera or a rig from the observed map points.
 
-    Each pose is refined from its start. A frame without a start, or with a low inlier weight ratio, is solved
-    again from a RANSAC pose. The result with the higher inlier weight ratio is kept.
+    Each initial pose is refined. A frame without an initial pose, or with a low inlier weight ratio, is
+    solved again from a RANSAC pose. The result with the higher inlier weight ratio is kept.
 
     Args:
         lenses: The camera model, or the models of all cameras of the rig.
         observations: (M) observations, ordered by frame.
         px: (M,2) observed pixels of these observations.
-        start: (F,4,4) cam_from_gauge to start from; NaN for a frame without a start.
+        start: (F,4,4) initial poses cam_from_gauge; NaN for a frame without an initial pose.
         criteria: The conditions that a pose must meet.
         threads: Number of threads that solve chunks of frames. The result does not depend on it.
 
     Returns:
-        The pose of each frame, or the reason why there is none.
+        The pose of each frame, or the reason why the frame has no pose.
     """
     has_start = np.asarray(np.isfinite(start).all(axis=(1, 2)))
     initial = np.where(has_start[:, None, None], start, np.eye(4))

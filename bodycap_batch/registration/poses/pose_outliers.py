@@ -16,10 +16,10 @@ _MIN_NEIGHBOUR_RESPONSE = 0.5
 difference that the neighbours' second differences cancel. It is 1 at a single outlier and 0 at a jerk of the
 camera. Origin: the middle of 0 and 1."""
 _SLOW_SPAN_NS, _MIN_NEIGHBOUR_RESPONSE_SLOW = 90_000_000, 0.8
-"""_SLOW_SPAN_NS: maximum time in nanoseconds between the two neighbours at which _MIN_NEIGHBOUR_RESPONSE is
-used. _MIN_NEIGHBOUR_RESPONSE_SLOW: minimum response if this time is longer. During a longer time, a fast
-gesture may also bend the path at a single frame. The response of a gesture is smaller than the response of an
-outlier. Evidence: docs/decisions/registration.md."""
+"""If the time between the two neighbours exceeds _SLOW_SPAN_NS (nanoseconds), the minimum response is
+_MIN_NEIGHBOUR_RESPONSE_SLOW. Otherwise the minimum response is _MIN_NEIGHBOUR_RESPONSE. During a longer time,
+a fast gesture may also bend the path at a single frame. The response of a gesture is smaller than the
+response of an outlier. Evidence: docs/decisions/registration.md."""
 _GAP_MIN_SIGMAS = 4.0
 """Minimum deviation of an outlier next to a lost interval, in standard deviations. Evidence:
 docs/decisions/registration.md."""
@@ -30,20 +30,21 @@ _RUN_LENGTHS = (2, 3)
 """Numbers of successive poses that are tested together as a run of outliers. A longer run may be real
 motion."""
 _MAX_RUN_SPAN_NS = 140_000_000
-"""Nanoseconds: maximum time from the frame before a run to the frame after it. Origin: three poses at 30 Hz.
-In a longer time a body can move there and back."""
+"""Maximum time from the frame before a run to the frame after the run. Unit: nanoseconds. Origin: a run of
+three poses at 30 Hz. In a longer time, a body can really move away and return."""
 _MIN_KINK_RATIO = 2.0
 """Minimum deviation of a run, as a multiple of the deviation that a sudden stop of the body explains.
 Evidence: none."""
 _MAX_EXTRAPOLATION_RATIO = 0.5
 """Maximum extrapolation error at the pose after the run, as a fraction of the run's deviation. If the error
-is larger, the path has moved aside and stays there. The run is then not an outlier. Evidence: none."""
+is larger, the path does not return to its earlier course after the run. The run is then treated as motion and
+not as an outlier. Evidence: none."""
 _SECOND_MIN_RESPONSE, _FIRST_MAX_RESPONSE, _SECOND_MAX_RESPONSE = 0.25, 0.45, 1.0
 """Thresholds of the response after a lost interval. The response is the fraction of the second pose's second
 difference that the third pose's second difference cancels. The first pose may be wrong if the response is
 below _FIRST_MAX_RESPONSE. The second pose may be wrong if the response is between _SECOND_MIN_RESPONSE and
-_SECOND_MAX_RESPONSE. Origin: a wrong first pose gives 0, a wrong second pose 0.5, a wrong third pose 2.
-Evidence for the thresholds between these values: none."""
+_SECOND_MAX_RESPONSE. Origin: the response is 0 if the first pose is wrong, 0.5 if the second pose is wrong,
+and 2 if the third pose is wrong. Evidence for the thresholds between these values: none."""
 _SCALE_WINDOW = 12
 """Number of frames on either side that determine the typical second difference. Evidence: none."""
 ISOLATED_INLIER_FACTOR = 4
@@ -146,7 +147,7 @@ def _outlier_runs(
 def _local_scale(size: FloatArray, start: int, stop: int, window: int) -> float:
     """Return the typical length of a second difference: the median over `window` frames on either side.
 
-    The frames from `start` to `stop` are not used. The result is infinite if too few second differences are
+    The frames [start, stop) are not used. The result is infinite if too few second differences are
     known.
     """
     nearby = np.concatenate([size[max(0, start - window) : start], size[stop : stop + window]])
@@ -173,13 +174,16 @@ def _second_differences(centres: FloatArray, sigma: FloatArray) -> tuple[FloatAr
 def _outliers_after_gaps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
     """Return a mask (N,) of the wrong poses among the first two poses after each lost interval.
 
-    A wrong first pose changes the second difference of the second pose by half of its deviation. It does not
-    change the second difference of the third pose. A wrong second pose changes its own second difference by
-    its full deviation. It changes the second difference of the third pose by half of that, with the opposite
-    sign. If the response does not distinguish these two cases, both poses are rejected.
+    If the first pose is wrong, the second difference of the second pose changes by half of the first pose's
+    deviation. The second difference of the third pose does not change.
 
-    A wrong third pose changes its own second difference twice as much as the second difference of the second
-    pose. The third pose has both neighbours and is tested like any other frame.
+    If the second pose is wrong, its own second difference changes by its full deviation. The second
+    difference of the third pose changes by half of this deviation, with the opposite sign. If the response
+    does not distinguish a wrong first pose from a wrong second pose, both poses are rejected.
+
+    If the third pose is wrong, its own second difference changes twice as much as the second difference of
+    the second pose. The third pose is not tested here, because it has both neighbours: `_single_outliers`
+    tests it.
     """
     offset, noise = _second_differences(centres, sigma)
     size = np.linalg.norm(offset, axis=1)

@@ -62,7 +62,7 @@ def estimate_relative_poses(own: RegisteredCamera, others: Sequence[RegisteredCa
 def rig_members(
     own: RegisteredCamera, others: Sequence[RegisteredCamera], relative: Sequence[RelativePose]
 ) -> list[RigMember]:
-    """Return the cameras of a rig: the camera at its origin, and the cameras with a well-known relative pose.
+    """Return the cameras of a rig: the camera at its origin, and the cameras with a rigid relative pose.
 
     Args:
         own: The camera at the origin of the rig.
@@ -93,7 +93,7 @@ def rig_members(
 def initial_rig_poses(
     own: RegisteredCamera, others: Sequence[RegisteredCamera], members: Sequence[RigMember]
 ) -> FloatArray:
-    """Return poses rig_from_map (F,4,4) to start from; NaN for frames in which no camera has a pose.
+    """Return initial poses rig_from_map (F,4,4); NaN for frames in which no camera has a pose.
 
     The pose of the first camera is used if it is known. Otherwise the pose is derived from another camera.
 

@@ -13,8 +13,9 @@ _MIN_KEYFRAME_RATIO = 0.5
 """Minimum fraction of a camera's keyframes that must see enough static points. If the fraction is smaller,
 all points are treated as static for this camera. Evidence: none."""
 _MIN_STATIC_POINTS = 12
-"""Number of static points in a keyframe that is enough for `_MIN_KEYFRAME_RATIO`. If a single camera never
-returns to the same place, its keyframes see fewer static points. Evidence: none."""
+"""Minimum number of static points that a keyframe must see. `_MIN_KEYFRAME_RATIO` is the minimum fraction of
+such keyframes. If a single camera never returns to the same place, its keyframes see fewer static points.
+Evidence: none."""
 
 
 def static_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:

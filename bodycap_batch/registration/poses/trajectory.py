@@ -37,14 +37,14 @@ _INLIER_SIGMAS = 3.5
 """Maximum reprojection error of an inlier, in standard deviations of an observation. Origin: it covers 99.8 %
 of a 2D normal distribution."""
 _BLUR_WINDOW_FRAMES = 15
-"""Number of frames on each side of a frame. The sharpness of the frame is compared with theirs. Evidence:
-none."""
+"""Number of frames on each side of a frame, for the detection of blur. The sharpness of the frame is compared
+with the median sharpness of this window. Evidence: none."""
 _REPEATS = 1
 """Number of repeated solutions for a global shutter. Each repetition weights the points by their agreement
 with the previous poses."""
 _REPEATS_ROLLING = 2
-"""Number of repeated solutions for a rolling shutter. Each repetition first corrects the pixels with the
-previous poses, because these determine the velocities of points in the image."""
+"""Number of repeated solutions for a rolling shutter. Each repetition first corrects the pixels. The
+correction needs the velocities of points in the image, which are computed from the previous poses."""
 
 
 def acceptance_criteria(
@@ -97,7 +97,7 @@ def solve_rig(
         members: The cameras of the rig. The first camera is at the origin of the rig, and its frames are the
             frames of the rig.
         scene_map: The map.
-        start: (F,4,4) rig_from_map to start from; NaN for a frame without a start.
+        start: (F,4,4) initial poses rig_from_map; NaN for a frame without an initial pose.
         criteria: The conditions that a pose must meet.
         threads: Number of threads that solve chunks of frames. The result does not depend on it.
 
@@ -148,10 +148,10 @@ def _solve(
 
     Args:
         rig: The cameras of the rig and the map.
-        start: (F,4,4) rig_from_map to start from; NaN for a frame without a start.
+        start: (F,4,4) initial poses rig_from_map; NaN for a frame without an initial pose.
         criteria: The conditions that a pose must meet.
         threads: Number of threads that solve chunks of frames.
-        reliability: Reliability of each point in the solution before; None in the first solution.
+        reliability: Reliability of each point in the previous solution; None for the first solution.
         path: (F,4,4) poses map_from_rig for the correction of the rolling shutter; None for a global shutter.
     """
     count = len(start)
@@ -233,7 +233,7 @@ def build_trajectory(
 def _frame_statuses(poses: Sequence[FramePose], sharpness: FloatArray) -> list[FrameStatus]:
     """Return the status of each frame.
 
-    A frame with too few tracks that is much less sharp than the frames around it gets the status BLUR.
+    The status is BLUR if a frame has too few tracks and is much less sharp than the frames around it.
     """
     statuses = []
     for index, pose in enumerate(poses):
@@ -291,7 +291,7 @@ def _reject_outliers(
 
 
 def _reject(poses: list[FramePose], rejected: BoolArray, status: FrameStatus) -> list[FramePose]:
-    """Return the poses, with each pose selected by `rejected` (F,) replaced by a status."""
+    """Remove the poses that the mask `rejected` (F,) selects, and give these frames the status `status`."""
     return [
         FramePose(status=status, inliers=pose.inliers, error_px=pose.error_px) if rejected[frame] else pose
         for frame, pose in enumerate(poses)

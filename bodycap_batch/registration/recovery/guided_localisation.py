@@ -149,7 +149,7 @@ class SearchFrame:
 
     Attributes:
         pyramid: Image pyramid of the frame.
-        keyframe_row: Row index of the frame among the map's keyframes, or -1 if it is no keyframe.
+        keyframe_row: Row index of the frame among the map's keyframes, or -1 if the frame is not a keyframe.
     """
 
     pyramid: Pyramid
@@ -203,7 +203,7 @@ class GuidedLocaliser:
             search_frame: The frame.
             priors: Expected poses cam_from_map (4,4), the most likely pose first.
             neighbour: Pose of the frame before or after.
-            predicted: Camera position that the motion predicts.
+            predicted: Camera position that is expected from the camera's motion.
 
         Returns:
             The pose, or None if a search fails.
@@ -225,11 +225,11 @@ class GuidedLocaliser:
     def relocalise(
         self, search_frame: SearchFrame, pose: FloatArray, neighbour: NeighbourPose
     ) -> PoseEstimate | None:
-        """Estimate the pose of a frame again, near a good pose.
+        """Estimate the pose of a frame again, with only the finest search.
 
         Args:
             search_frame: The frame.
-            pose: (4,4) good pose cam_from_map.
+            pose: (4,4) pose cam_from_map from an earlier search of this frame.
             neighbour: Pose of the frame before or after.
 
         Returns:

@@ -11,8 +11,9 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 
 _PERCENTILE = 80.0
-"""Percentile that is used as the sigma of a camera's third and fourth differences. The percentile is high,
-because frames are lost mainly during fast movements. Evidence: none."""
+"""Percentile of the size of the third or fourth differences of a camera's centres in successive frames. This
+percentile of the sizes is used as the sigma of the differences. The percentile is high, because frames are
+lost mainly during fast movements. Evidence: none."""
 _MAX_INTERVAL_DEVIATION = 0.1
 """Maximum deviation of a frame interval from the median interval, as a fraction of the median. Differences
 across an interval with a larger deviation are not used. Evidence: none."""
@@ -22,12 +23,12 @@ _LOSS_WIDTH = 4.0
 """Width of the Cauchy loss: the squared Mahalanobis distance at which a position or a motion residual has
 half of its full weight. Evidence: none."""
 _VELOCITY_SIGMA_JERKS, _ACCELERATION_SIGMA_JERKS = 30.0, 4.0
-"""Sigma of an unknown velocity and sigma of an unknown acceleration, in units of the camera's jerk sigma.
-Evidence: none."""
+"""Initial sigma of the velocity and initial sigma of the acceleration in the Kalman filter, in units of the
+camera's jerk sigma. Evidence: none."""
 MAX_DISAGREEMENT = 11.3
 """Maximum squared Mahalanobis distance between a found centre and its smoothed position. If the distance is
-larger, the centre or the smoothed position is wrong, and the smoothed position is not used. Origin: 99 % of a
-chi-squared variable with three degrees of freedom."""
+larger, the centre or the smoothed position is wrong, and the smoothed position is not used. Origin: the 99 %
+quantile of the chi-squared distribution with three degrees of freedom."""
 _NEIGHBOURS = 4
 """Number of neighbouring frames that determine a cubic path: two frames before and two frames after."""
 _PRIOR = 1e-9

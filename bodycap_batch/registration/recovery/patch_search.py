@@ -30,8 +30,9 @@ _MAX_LOG_SCALE = 0.8
 """Maximum absolute logarithm of the distance ratio. This ratio is the distance between point and keyframe,
 divided by the distance between point and frame. Evidence: none."""
 _SCALE_PENALTY, _SHARPNESS_REWARD = 0.3, 0.1
-"""Weights in the score of a keyframe: of the absolute logarithm of the distance ratio, and of the sharpness.
-The cosine of the viewing angle has weight 1. Evidence: none."""
+"""Weights in the score of a keyframe. _SCALE_PENALTY: weight of the absolute logarithm of the distance ratio,
+which lowers the score. _SHARPNESS_REWARD: weight of the keyframe's sharpness, which raises the score. The
+cosine of the angle between the two lines of sight has weight 1. Evidence: none."""
 _MAX_BLUR_PX = 40.0
 """Pixels at 640 px image width: maximum length of rendered motion blur. Evidence: none."""
 _MAX_BLUR_SAMPLES = 5
@@ -245,8 +246,9 @@ def match_patches(
     step = view.pyramid.step_px[level.pyramid_level]
     motion = _image_motion(view, points, px)
     images, is_inside = _render_patches(patches, rows, warp, _motion_blur(view, motion), level, step)
-    # The row of the point at mid-row time is used as its real row. During the readout a point moves little,
-    # so both rows are nearly equal.
+    # The shift to the point's real pixel depends on the image row at which the point is exposed. This row is
+    # unknown. The row at the instant of the middle row is used instead: a point moves little during the
+    # readout, so the two rows are nearly equal.
     expected_px = px_at_mid_row(lens, px, motion, -view.readout_ratio)
     found_px, score = np.full((len(rows), 2), np.nan), np.zeros(len(rows))
     target = view.pyramid.levels[level.pyramid_level].astype(np.float32)

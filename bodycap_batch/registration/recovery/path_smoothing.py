@@ -1,4 +1,4 @@
-"""Smooth the camera centres whose observations are less exact than a prediction from the camera's motion."""
+"""Smooth the camera centres that are less certain than a prediction from the camera's motion."""
 
 from __future__ import annotations
 
@@ -63,5 +63,5 @@ def smooth_weak_centres(path: Trajectory, adjustable: BoolArray | None = None) -
 
 
 def smooth_if_final(path: Trajectory) -> Trajectory:
-    """Smooth the weak centres of a trajectory, unless recovery follows: it needs the measured poses."""
+    """Smooth the weak centres of a trajectory if no recovery follows. Recovery needs the measured poses."""
     return smooth_weak_centres(path) if (~path.localised).sum() < LEAST_LOST else path

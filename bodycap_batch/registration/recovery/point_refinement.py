@@ -20,8 +20,8 @@ _WELL_SUPPORTED_FACTOR = 4
 """Minimum number of inliers of a pose that is kept next to a lost interval, as a multiple of the minimum
 number for other poses. Evidence: docs/decisions/registration.md."""
 _MAX_BOUNDARY_FRAMES = 8
-"""Maximum number of frames removed at each end of a lost interval. Without this limit, a camera that always
-sees few points would lose all poses. Evidence: none."""
+"""Maximum number of frames whose poses are removed at each end of a lost interval. Without this limit, all
+poses of a camera that always sees few points would be removed. Evidence: none."""
 _NOISE_PX = 0.8
 """Pixels at 640 px image width: standard deviation of an observation. Evidence: none."""
 _LOSS_SIGMAS, _MAX_SIGMAS = 2.0, 5.0
@@ -40,7 +40,7 @@ _CHUNK_ROWS = 1 << 15
 
 
 def remove_weak_boundary_poses(path: Trajectory, min_inliers: int) -> Trajectory:
-    """Remove poses next to lost intervals that too few points support.
+    """Remove weakly supported poses next to lost intervals: poses with few inliers.
 
     A keyframe next to a lost interval sees mainly points that it helped to triangulate. These points agree
     with its pose even if the pose is wrong. Recovery searches the frames of the removed poses again, like all
@@ -76,9 +76,10 @@ def remove_weak_boundary_poses(path: Trajectory, min_inliers: int) -> Trajectory
 
 
 def _first_supported(weak: BoolArray, frame: int, step: int) -> int:
-    """Return the first frame with a pose that is not weak, from `frame` in steps of `step`.
+    """Return the first frame that is not weak, from `frame` in steps of `step`.
 
-    The search ends after `_MAX_BOUNDARY_FRAMES` frames.
+    At most `_MAX_BOUNDARY_FRAMES` frames are tested. If all tested frames are weak, the next frame is
+    returned. This frame may be just outside the video.
     """
     last = frame + step * _MAX_BOUNDARY_FRAMES
     while frame != last and 0 <= frame < len(weak) and weak[frame]:
@@ -89,8 +90,9 @@ def _first_supported(weak: BoolArray, frame: int, step: int) -> int:
 def refine_points(scene_map: Map, paths: Sequence[Trajectory]) -> Map:
     """Refine the points of a map from the poses of the frames.
 
-    Keyframes at the ends of lost intervals may have poses in the map that are far from the poses of tracking.
-    The points that these keyframes see are then displaced too. Evidence: docs/decisions/registration.md.
+    At the ends of lost intervals, the pose of a keyframe in the map may be far from the pose that was
+    estimated from tracks. The points that this keyframe sees are then displaced too. Evidence:
+    docs/decisions/registration.md.
 
     Args:
         scene_map: The map.
@@ -98,9 +100,9 @@ def refine_points(scene_map: Map, paths: Sequence[Trajectory]) -> Map:
 
     Returns:
         The map in the same gauge, with refined points and with keyframes at the poses of the trajectories.
-        Keyframes of lost frames keep their poses but lose their observations. Observations that disagree with
-        the refined points are removed. Observations of points with fewer than two remaining observations are
-        removed too.
+        If the frame of a keyframe is lost, the keyframe keeps its pose and its observations are removed.
+        Observations that disagree with the refined points are removed. Observations of points with fewer than
+        two remaining observations are removed too.
     """
     poses, covariance = scene_map.map_from_cam.copy(), np.zeros((len(scene_map.keyframe_frame), 6, 6))
     has_pose = np.ones(len(poses), dtype=bool)
@@ -167,7 +169,7 @@ def _split_by_point(point: IntArray) -> list[slice]:
 def _refine_points_gauss_newton(
     scene_map: Map, points: FloatArray, rows: IntArray, px: FloatArray, covariance: FloatArray
 ) -> BoolArray:
-    """Refine, in place, the points (P,3) that the given observations see.
+    """Refine the points of the given observations in place.
 
     Args:
         scene_map: The map.

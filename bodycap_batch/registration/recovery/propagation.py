@@ -40,16 +40,17 @@ _SEED_MIN_INLIERS, _SEED_MIN_INLIER_WEIGHT_RATIO = 15, 0.5
 interval). These minimums are higher than in other lost frames, because no predicted motion supports the pose.
 Evidence: none."""
 _MAX_PREDICTION_DISTANCE = 16.0
-"""Maximum squared Mahalanobis distance between the found and the predicted centre. Origin: 99.9 % of a
-chi-squared variable with three degrees of freedom."""
+"""Maximum squared Mahalanobis distance between the found and the predicted centre. With a larger distance,
+the found pose is rejected. Origin: about the 99.9 % quantile of the chi-squared distribution with three
+degrees of freedom."""
 _MAX_MISSES = 3
 """Maximum number of successive frames without a found pose. After one more such frame the propagation ends,
 because the error of the prediction exceeds the search range. Evidence: none."""
 _SEED_SIGMA_JERKS = 40.0
 """Sigma of a seed's centre along each axis, in units of the camera's jerk sigma. Evidence: none."""
 _INITIAL_FRAMES = 6
-"""Maximum number of frames with poses before an interval that initialise the motion filter. Evidence:
-none."""
+"""Maximum number of frames that initialise the motion filter. They are the frames with poses next to the
+interval, at the end from which the propagation starts. Evidence: none."""
 _MAX_CORNERS, _CORNER_SPACING_PX, _GRID_SIDE = 48, 12.0, 4
 """_MAX_CORNERS: maximum number of corners for the image motion. _CORNER_SPACING_PX: minimum distance between
 two corners, in pixels of the reduced image. _GRID_SIDE: number of points along each side of a grid; the
@@ -217,7 +218,12 @@ class Propagation:
         return _PropagationState(end, poses[end].cam_from_map, rotation_step, motion_filter)
 
     def _propagate(self, state: _PropagationState, direction: int) -> None:
-        """Propagate frame by frame, until too many frames are missed or the interval ends."""
+        """Propagate the pose frame by frame in one direction (1 forward, −1 backward).
+
+        The propagation ends in four cases: at the end of the interval, at a frame without an image pyramid,
+        at a frame that already has a pose from this direction, or after more than `_MAX_MISSES` successive
+        frames without a found pose.
+        """
         interval, misses = self.interval, 0
         while misses <= _MAX_MISSES:
             frame = state.frame + direction

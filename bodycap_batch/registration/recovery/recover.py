@@ -50,7 +50,7 @@ reaches frames deeper inside the intervals. Evidence: docs/decisions/registratio
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecoveryInputs:
-    """What `recover_lost_frames` needs besides the registration of the camera.
+    """The inputs of `recover_lost_frames`, except the registration of the camera to recover.
 
     Attributes:
         capture: All cameras. The first camera is the camera to recover.
@@ -116,13 +116,14 @@ def find_lost_poses(
     """Search the lost frames of a camera, and accept the poses that are well supported.
 
     Frames are searched one after another, from both ends of a lost interval and from the seeds in it. A seed
-    is a keyframe whose pose was not accepted. In each frame the map points are searched at the pixels that
-    the predicted motion gives. They are recognised by their appearance in keyframes of any camera.
+    is a keyframe whose pose was not accepted. In each frame the map points are searched near the pixels that
+    follow from the predicted motion. The points are recognised by their appearance in keyframes of any
+    camera.
 
     The centres found are smoothed together with the centres around the interval, because the acceleration of
     a body-worn camera changes little from frame to frame. A pose is accepted if enough points agree, if its
-    centre is near the smoothed centre, and if its sigma is small. Frames that are still lost next to accepted
-    poses are searched again, until no more poses are found.
+    centre is near the smoothed centre, and if its sigma is small. Lost intervals next to newly accepted poses
+    are searched again, until no more poses are found or `_MAX_PASSES` passes are done.
 
     Args:
         registration: Registration of the camera, from tracking.
@@ -262,7 +263,11 @@ def _smooth(estimates: Mapping[int, PoseEstimate], interval: LostInterval) -> Sm
 
 
 def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> dict[int, PoseEstimate]:
-    """Return the smoothed poses of an interval that have enough support, by frame."""
+    """Search an interval and return the accepted poses with smoothed centres, by frame.
+
+    A pose is accepted if it has enough support, if its centre is near the smoothed centre, and if the sigma
+    of the centre is small.
+    """
     estimates = propagation.run()
     if not estimates:
         return {}

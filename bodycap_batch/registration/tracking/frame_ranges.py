@@ -15,8 +15,8 @@ from bodycap_batch.model.scene import FrameStatus, Registration
 from bodycap_batch.registration.tracking.klt import KeyframePoints, Tracks, track_range
 
 _MIN_RANGE_FRAMES = 15
-"""Minimum number of frames in the last part of a frame range that is split between threads. A shorter part is
-not worth opening another video decoder. Evidence: none."""
+"""Minimum number of frames in the last part of a frame range, if the range is split between threads. A
+shorter part is not split off, because it is not worth opening another video decoder. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,14 +145,15 @@ def _merge_ranges(intervals: list[tuple[int | None, int | None]], count: int) ->
 
 
 def _reusable(tracks: Tracks, intervals: list[tuple[int | None, int | None]], count: int) -> Tracks:
-    """Select the tracks that can be reused: they lie in a given interval and start at a keyframe at its end.
+    """Select the tracks that are in a given interval and start at one of the two keyframes that bound it.
 
-    A keyframe bounds two intervals, one before it and one after it. If one of them is tracked again, the old
-    tracks from the keyframe into that interval are removed, so that they are not used twice.
+    A keyframe bounds two intervals, one before it and one after it. If one of the two intervals is tracked
+    again, the old tracks from the keyframe into this interval are removed. Otherwise the interval would have
+    two copies of each track.
     """
     kept_frames = np.zeros(
         (count, 2), dtype=np.int64
-    )  # number of frames before and after each keyframe that keep its tracks
+    )  # number of frames before (column 0) and after (column 1) a keyframe in which its tracks are kept
     for first, last in intervals:
         if first is not None:
             kept_frames[first, 1] = (count if last is None else last) - first

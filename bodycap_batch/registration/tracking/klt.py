@@ -211,8 +211,9 @@ class _ActiveTracks:
     def advance(self, first: _VideoFrame, second: _VideoFrame, motion: ImageMotion | None) -> bool:
         """Follow the tracks from the first frame into the second; return False if too few remain."""
         guess = None if motion is None else apply_homography(self.px, motion.homography)
-        # The check by tracking back is slow. It is only done if many tracks may slip to other points. A
-        # single slipped track is rejected later, when the pose is estimated.
+        # The check tracks each point back to the first frame, which is slow. It is only done if the image
+        # motion is unknown or unreliable, because many tracks may then move to wrong points. A single wrong
+        # track is rejected later, when the pose is estimated.
         with_check = motion is None or not motion.is_reliable
         tracked = track_points(first.grey, second.grey, self.px, guess, with_check=with_check)
         keep = tracked.ok & second.camera.is_unmasked(tracked.px)
@@ -257,8 +258,8 @@ def track_range(
 ) -> Iterator[Tracks]:
     """Track from every keyframe in [start, stop) forward to the next and backward to the previous keyframe.
 
-    At most `_MAX_BUFFERED_FRAMES` frames are held in memory. The order of the yielded observations is not
-    defined.
+    At most `_MAX_BUFFERED_FRAMES` frames are held in memory, so backward tracks have at most this number of
+    frames. The order of the yielded observations is not defined.
 
     Args:
         camera: The camera.

@@ -62,7 +62,10 @@ class UnoptimisedBone:
 
 
 def find_unoptimised_bones(inputs: ReportInputs) -> list[UnoptimisedBone]:
-    """Return, for each camera on the body, the bone as the camera's poses and assumed mount place it."""
+    """Return the bone of each camera on the body, placed only by the camera's poses and assumed mount.
+
+    The list is empty without a body. A camera without poses in the world is omitted.
+    """
     merge = inputs.merge
     if merge is None:
         return []
@@ -100,7 +103,8 @@ def find_unoptimised_bones(inputs: ReportInputs) -> list[UnoptimisedBone]:
 def draw_before_and_after(inputs: ReportInputs, colours: dict[str, str]) -> str:
     """Draw the body at a few times, viewed from the body's front.
 
-    Bones before the optimisation have the colours of their cameras. Bones after it have the text colour.
+    Bones before the optimisation have the colours of their cameras. Bones after the optimisation have the
+    text colour.
 
     Args:
         inputs: The results of the job.

@@ -25,7 +25,7 @@ _STATUS_HEIGHT, _CURVE_HEIGHT, _MARGIN = 18.0, 44.0, 10.0
 MAX_COLUMNS = 480
 """Maximum number of points on a curve. Neighbouring points are two pixels apart on a wide screen."""
 _MIN_COLUMNS = 12
-"""Minimum number of points on a curve, for a page with little detail. Evidence: none."""
+"""Minimum number of points on a curve, however small the detail of the page is. Evidence: none."""
 _MIN_BAR_WIDTH = 0.8
 """Minimum width of a bar, SVG units. A single lost frame must remain visible."""
 _MIN_RANGE_HEIGHT = 0.6
@@ -90,10 +90,10 @@ def draw_camera_timeline(
         losses: The lost intervals of the camera.
         bridged_s: Maximum time (seconds) between two measurements that the body's motion bridges; 0 if the
             motion bridges no gap of this camera.
-        detail: Fraction of the columns that are drawn, 0 to 1.
+        detail: Fraction of the points on each curve that are drawn, 0 to 1.
 
     Returns:
-        The drawing as SVG; "" if the camera has neither frames with poses nor a keyframe selection.
+        The drawing as SVG; "" if the camera has neither a trajectory nor a keyframe selection.
     """
     columns = column_count(detail)
     selection, path = inputs.selection(camera), inputs.path(camera)
@@ -210,8 +210,8 @@ def _frame_interval_s(times: FloatArray) -> float:
 
 
 def _lost_bar(loss: FrameLoss, times: FloatArray, bridged_s: float) -> _StatusBar:
-    # Smoothness bridges a gap between two measurements. It does not bridge the time before the first
-    # measurement or after the last measurement.
+    # The smoothness of the motion bridges a gap between two measurements. The time before the first
+    # measurement and the time after the last measurement are not bridged.
     is_between = loss.first > 0 and loss.last < len(times) - 1
     gap_s = float(times[loss.last + 1] - times[loss.first - 1]) if is_between else np.inf
     kind = "bridged" if gap_s <= bridged_s else "lost"

@@ -10,7 +10,10 @@ from bodycap_batch.report.recommendations import count_shared_points
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _CELL, _LEFT, _TOP = 74.0, 130.0, 26.0
-"""Width of a cell, and width and height of the margins for the names at the left and the top, SVG units."""
+"""Width of a cell, width of the left margin, and height of the top margin, SVG units.
+
+The margins contain the names of the cameras.
+"""
 _ASPECT = 0.6
 """Ratio of a cell's height to its width."""
 _MAX_CAMERAS = 24
@@ -25,7 +28,11 @@ _FULL_SHADE_SHARE, _STRONG_TEXT_SHARE = 0.5, 0.3
 def draw_shared_landmarks(inputs: ReportInputs) -> str:
     """Draw a matrix with one row and one column for each camera.
 
-    A cell's shade shows which fraction of the row's camera's points the column's camera also sees.
+    Each cell belongs to two cameras: the camera of the row and the camera of the column. The shade of the
+    cell shows the fraction of the row camera's points that the column camera also sees.
+
+    Returns:
+        The drawing as SVG; "" if there are fewer than two cameras or no maps.
     """
     names = inputs.cameras[:_MAX_CAMERAS]
     if len(names) < 2 or not inputs.maps:

@@ -11,7 +11,7 @@ from bodycap_batch.core.arrays import FloatArray
 
 
 def number(value: float) -> str:
-    """Return a coordinate as text with one decimal. A screen cannot show more."""
+    """Return a coordinate as text with one decimal. More decimals would make no visible difference."""
     return f"{value:.1f}".removesuffix(".0")
 
 
@@ -73,7 +73,8 @@ def bin_statistics(values: FloatArray, count: int) -> FloatArray:
         count: Number of parts.
 
     Returns:
-        (count,3) minimum, median and maximum of the finite values of each part; NaN without finite values.
+        (count,3) minimum, median and maximum of the finite values of each part; NaN for a part
+            without finite values.
     """
     edges = np.linspace(0, len(values), count + 1).round().astype(int)
     statistics = np.full((count, 3), np.nan)

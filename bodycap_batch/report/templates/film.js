@@ -10,7 +10,7 @@ class Film {
     this.part = null;
     this.wanted = null;
     this.frameIsPending = false;
-    // A browser that saves data may decode nothing before a seek, so each of these events is handled.
+    // A browser in data saving mode may decode no frame before a seek. Therefore each of these events is handled.
     for (const event of ["loadedmetadata", "loadeddata", "seeked"]) video.addEventListener(event, () => this.afterSeek());
     video.addEventListener("error", () => {
       if (!this.part) return;
@@ -69,7 +69,7 @@ class Film {
     }
     this.video.playbackRate = speed;
     if (Math.abs(this.video.currentTime - videoTime) > SLACK_S) this.seek(videoTime);
-    // The browser rejects this if a pause or a new chapter interrupts it; the next step tries again.
+    // The browser rejects the call of `play` if a pause or a new chapter interrupts it. The next step calls it again.
     if (this.video.paused && !this.video.ended) this.video.play().catch(() => {});
   }
 
@@ -81,7 +81,7 @@ class Film {
     }
   }
 
-  // A frame can be displayed before the video reports it, so it is handled when a seek has ended.
+  // The frame of a seek can be displayed before the video reports it. Therefore it is handled when the seek ends.
   afterSeek() {
     const { video, part, wanted } = this;
     this.wanted = null;

@@ -7,8 +7,8 @@ function webgl() {
   return Boolean(gl);
 }
 
-// The library is stored as text and parsed only if WebGL is available: parsing takes longer than all the rest.
-// It would add its own style sheets for formulas and menus, which this page does not use; they are discarded.
+// Parse the library, which is stored as text, only if WebGL is available: parsing takes longer than all the rest.
+// The library adds style sheets for formulas and menus. This page does not use them, so they are discarded.
 function loadThree() {
   let made = null;
   const discarded = document.createElement("div");

@@ -20,7 +20,7 @@ function scaled(block) {
   return out;
 }
 
-// Return the index of the last of increasing times that is not after t, or 0 if all of them are.
+// Return the index of the last time that is at most t, or 0 if all times are after t. The times increase.
 function before(times, t) {
   let low = 0;
   let high = times.length - 1;
@@ -37,7 +37,8 @@ function nearest(times, t) {
   return i + 1 < times.length && times[i + 1] - t < t - times[i] ? i + 1 : i;
 }
 
-// Return the value at t of a line through points (xs, ys), xs increasing; it is extrapolated at both ends.
+// Interpolate linearly between points (xs, ys) and return the value at t. The xs increase. Values of t before
+// the first point or after the last point are extrapolated.
 function between(xs, ys, t) {
   const i = Math.min(before(xs, t), Math.max(xs.length - 2, 0));
   const j = Math.min(i + 1, xs.length - 1);
@@ -83,7 +84,7 @@ function bodyAt(body, t, out) {
   return share < 0.5 ? i : j;
 }
 
-// Return the index of a camera's pose at a time, −1 if it has none.
+// Return the index of a camera's pose at a time, or −1 if the camera has no pose at this time.
 function poseAt(path, t) {
   if (!path.times.length) return -1;
   const i = nearest(path.times, t);

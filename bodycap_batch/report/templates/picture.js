@@ -66,7 +66,8 @@ class Picture {
     this.drawOverlay(frame);
   }
 
-  // Draw the overlay of the video's frame: its own, or that of a stored picture of the same frame, or none.
+  // Draw the overlay of the displayed video frame. If this overlay is not loaded, draw the overlay of a stored
+  // picture of the same frame. Without such a picture, draw no overlay.
   onVideoFrame(index) {
     if (!this.film.active) return;
     this.index = index;

@@ -1,7 +1,8 @@
 // The 3D view, drawn by three.js only when something has changed.
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
-// Milliseconds between frames. Above SLOW_MS fewer points are drawn while something moves, below FAST_MS more.
-// After STILL_MS without a change all points are drawn.
+// Times in milliseconds. While something moves, fewer points are drawn if two frames are more than SLOW_MS apart,
+// and more points are drawn if they are less than FAST_MS apart. After STILL_MS without a change all points are
+// drawn.
 const [SLOW_MS, FAST_MS, STILL_MS] = [31, 20, 250];
 // This shader draws only points with a colour. The material of three.js takes twice as long without a graphics card.
 const POINT_SHADER = `
@@ -74,7 +75,8 @@ class Solid {
     requestAnimationFrame(loop);
   }
 
-  // Return what the first view must show: the body at all times, and the camera paths except distant parts.
+  // Return the points that the first view must show: the body at all times, and the camera paths without their
+  // distant parts.
   pointsInFirstView() {
     const { body, paths, solid } = this.data;
     const out = [];
@@ -178,7 +180,7 @@ class Solid {
     return geometry;
   }
 
-  // Add a pyramid for each camera; its base is the image. Its points are moved one by one.
+  // Add a pyramid for each camera. The base of the pyramid is the image. The corners are moved one by one.
   addFrusta(material) {
     const { three } = this;
     const [w, h, d] = [0.1, 0.07, 0.15].map((each) => each * this.unit);

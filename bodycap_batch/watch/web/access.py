@@ -38,8 +38,8 @@ class Access:
     Attributes:
         host: Name or address to listen on.
         port: Port to listen on.
-        token: Token that a browser must send; "" if no token is required. Only a loopback address may do
-            without a token.
+        token: Token that a browser must send; "" if no token is required. Every address other than loopback
+            requires a token.
     """
 
     host: str
@@ -61,7 +61,7 @@ class Access:
         """
         host = headers.get("host", "").lower()
         if not self._is_this_page(host):
-            return 421, "this page does not have that name"
+            return 421, "the Host header is not a name of this page"
         origin = headers.get("origin")
         changes = method not in _READING_METHODS
         if (changes and origin is None) or (origin is not None and origin.lower() != f"http://{host}"):
@@ -70,7 +70,7 @@ class Access:
         if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none") and not is_link:
             return 403, "the request comes from another page"
         if self.token and not self._shows_token(headers, "" if changes else query):
-            return 401, "a token is needed: open the page as /?token=…"
+            return 401, "a token is needed: open the page as /?token=TOKEN"
         return None
 
     def token_in(self, query: str) -> bool:

@@ -21,7 +21,8 @@ limit is shorter than the page's update period of 1 s."""
 _MAX_ENDED = 500
 """Maximum number of ended jobs on the page. The page shows the most recent jobs. Evidence: none."""
 _MAX_LOG_BYTES = 64 << 10
-"""Maximum size (bytes) of the end of a log that the page shows. Evidence: none."""
+"""Maximum size (bytes) of the log text that the page shows. If a log is longer, the page shows its end.
+Evidence: none."""
 
 
 class JobList:
@@ -30,7 +31,7 @@ class JobList:
     Args:
         spool: The folders of the watcher.
         trouble: Function that returns why the watcher cannot access its folders; "" if it can access them.
-        clock: Function that returns the time of this process's own clock, seconds.
+        clock: Function that returns the time (seconds) of this process's monotonic clock.
     """
 
     def __init__(

@@ -136,7 +136,7 @@ class Uploads:
                 raise JobError(f"{some}: still being sent", hint="finish when every file is complete")
             if not any(PurePosixPath(name).suffix.lower() in VIDEO_SUFFIXES for name in upload.files):
                 raise JobError(
-                    "no video was sent", hint="name them torso.mp4, left_palm.mp4, right_palm.mp4 …"
+                    "no video was sent", hint="name the videos torso.mp4, left_palm.mp4, right_palm.mp4"
                 )
             with disk_errors(upload.folder):
                 (upload.folder / READY).touch()
@@ -196,15 +196,15 @@ class Uploads:
         video = path.suffix.lower() in VIDEO_SUFFIXES
         if not video and path.name not in _OTHER_FILES and not path.name.lower().endswith(_OTHER_SUFFIXES):
             known = ", ".join((*_OTHER_FILES, *_OTHER_SUFFIXES))
-            raise JobError(f"{path.name} is neither a video nor any of {known}", hint="leave it out")
+            raise JobError(f"{path.name} is neither a video nor any of {known}", hint="leave this file out")
         sent = {*upload.files, *upload.coming}
         # Compare the names in lower case: some disks do not distinguish upper and lower case.
         if name.lower() in {other.lower() for other in sent} or (upload.folder / path).exists():
             raise JobError(f"{name} was sent twice", hint="give each file its own name")
         if any(str(path.parent) == other or str(PurePosixPath(other).parent) == name for other in sent):
-            raise JobError(f"{name} is both a file and a folder", hint="give each its own name")
+            raise JobError(f"{name} is both a file and a folder", hint="rename one of them")
         if len(sent) >= self._limits.files:
-            raise CaptureError(f"more than {self._limits.files:g} files", hint="one folder per recording")
+            raise CaptureError(f"more than {self._limits.files:g} files", hint="send one recording only")
         most = 1e9 * self._limits.video_gb if video else _MAX_OTHER_BYTES
         if not 0 < size <= most:
             hint = "cut the recording, or ask the operator to raise --limit video_gb"
@@ -224,7 +224,7 @@ class Uploads:
 
 
 def _unknown_upload() -> JobError:
-    return JobError("there is no such upload, or no longer", hint="drop the folder again")
+    return JobError("the upload does not exist or has ended", hint="drop the folder again")
 
 
 def remove_abandoned_uploads(inbox: Path) -> None:
@@ -253,7 +253,7 @@ async def _receive_file(target: Path, size: int, chunks: AsyncIterator[bytes], u
     try:
         written = await _write_chunks(partial, size, chunks, upload)
         if written != size:
-            message = f"received {written} bytes, {size} were stated"
+            message = f"received {written} bytes, the browser stated {size}"
             raise CaptureError(message, path=target.name, hint="send it again")
         partial.rename(target)
     finally:
@@ -261,7 +261,10 @@ async def _receive_file(target: Path, size: int, chunks: AsyncIterator[bytes], u
 
 
 async def _write_chunks(path: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> int:
-    """Write the content of a file, and return the number of bytes received. Stop if there are too many."""
+    """Write the content of a file, and return the number of bytes received.
+
+    Stop if more than `size` bytes arrive.
+    """
     written = 0
     with path.open("xb") as stream:
         async for chunk in chunks:
