@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _MIN_KEPT_RATIO = 0.75
-"""Minimum fraction of the requested frames that have a stored copy, for reading the copies. With fewer
-copies, all requested frames are decoded from the video. The reason is that nearly the whole video must then
-be decoded anyway. Evidence: none."""
+"""The stored copies are read only if at least this fraction of the requested frames has a stored copy.
+Otherwise, all requested frames are decoded from the video, because the frames without a copy already require
+the decoding of nearly the whole video. Unit: 1. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,7 +183,7 @@ class CaptureCamera:
         indices = np.arange(len(self.frame_numbers), dtype=np.int64)
         for index, frame, video in self._frames(indices):
             if keep_all:
-                # Only the reduced planes are held in memory, because they are far smaller than the frame.
+                # Only the planes at the work size are held in memory. They are far smaller than the frame.
                 planes = work_planes(frame, video.orientation, size)
                 yield FrameCandidate(index, grey_from_planes(planes, size), partial(_identity, planes))
             else:
@@ -205,7 +205,7 @@ class CaptureCamera:
                 try:
                     image = next(kept_images)
                 except CaptureError as error:  # the frame can still be decoded from the video
-                    logger.warning("%s: read from the video, since its kept copy fails: %s", self.name, error)
+                    logger.warning("%s: the kept copy fails, so the video is read: %s", self.name, error)
                     yield from replace(self, kept=None)._decode(indices[position:], colour=colour)
                     return
                 yield index, image
@@ -253,5 +253,8 @@ class Capture:
 
 
 def _identity(planes: tuple[Planes, Colours]) -> tuple[Planes, Colours]:
-    """Return the planes unchanged: the function for a frame whose planes have already been computed."""
+    """Return the planes unchanged.
+
+    This function is used for `FrameCandidate.planes` if the planes have already been computed.
+    """
     return planes

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 def decode_frames(video: VideoFile, indices: IntArray, threads: int = 0) -> Iterator[tuple[int, VideoFrame]]:
     """Decode the frames with the given indices.
 
-    The frames between the requested frames are skipped if no other frame depends on them. In H.264, these are
-    most B-frames.
+    A frame between the requested frames is skipped if no other frame depends on the skipped frame. In H.264,
+    most B-frames can be skipped.
 
     Args:
         video: The video.
@@ -176,5 +176,5 @@ def _undecodable_frame(video: VideoFile, index: int) -> CaptureError:
     return CaptureError(
         f"frame {index} (at {seconds:.2f} s) cannot be decoded",
         path=video.path,
-        hint="re-encode it (ffmpeg -i in.mp4 -fps_mode passthrough out.mp4), or cut before it with end_s",
+        hint="re-encode the video (ffmpeg -i in.mp4 -fps_mode passthrough out.mp4), or set an earlier end_s",
     )

@@ -96,8 +96,8 @@ def work_planes(frame: VideoFrame, orientation: Orientation, size: tuple[int, in
     is_full = _is_full_range(frame)
     colours = (_FULL_RANGE if is_full else int(frame.color_range), int(frame.colorspace))
     if frame.format.name not in ("yuv420p", "yuvj420p"):
-        # Without an explicit target range, FFmpeg would convert grey frames to studio range. The same applies
-        # to formats whose name implies full range.
+        # Without an explicit target range, FFmpeg would convert two kinds of frames to studio range: grey
+        # frames, and frames in a format whose name implies full range.
         frame = frame.reformat(format="yuv420p", dst_color_range=_FULL_RANGE if is_full else None)
     half_size = ((size[0] + 1) // 2, (size[1] + 1) // 2)
     luma = _resize_upright(_plane_array(frame, 0), orientation, size)

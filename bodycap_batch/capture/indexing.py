@@ -114,7 +114,7 @@ def _scan_packets(
             hint=COPY_AGAIN,
         ) from error
     if read < expected:
-        message = f"the video is cut short: {read} of the {expected} frames its index lists"
+        message = f"the video is cut short: it has {read} of the {expected} frames that its index lists"
         raise CaptureError(message, path=path, hint=COPY_AGAIN)
     if not pts:
         raise CaptureError("the video holds no frame", path=path, hint=COPY_AGAIN)
@@ -143,7 +143,7 @@ def _pixel_aspect(stated: Fraction | None) -> Fraction:
 
 
 def _creation_time(metadata: dict[str, str]) -> float | None:
-    """Return the creation time, Unix seconds. Return None if it is missing or if the clock was not set."""
+    """Return the creation time, Unix seconds; None if the time is missing or the clock was not set."""
     text = metadata.get("creation_time", "")
     try:
         stamp = datetime.fromisoformat(text.replace("Z", "+00:00"))
@@ -157,7 +157,7 @@ def _creation_time(metadata: dict[str, str]) -> float | None:
 def _focal_35mm(metadata: dict[str, str]) -> float | None:
     """Return the 35 mm equivalent focal length, millimetres, from the metadata of a phone.
 
-    It is None if the metadata do not contain a plausible value.
+    Returns None if the metadata do not contain a plausible value.
     """
     for key, text in metadata.items():
         if key.lower().endswith("focal_length.35mm_equivalent"):

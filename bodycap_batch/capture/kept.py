@@ -28,9 +28,9 @@ identified by their numbers, not by their times."""
 _FRAME_TICKS = TIME_BASE_HZ // _FPS
 """Time between two frames of the video with the copies, in units of its time base."""
 _LARGE_RATIO = 2.0
-"""Minimum number of pixels in a frame of the video, divided by the number of pixels at the work size, for
-storing copies of all frames. For such a large video, decoding again costs more than writing and reading the
-copies. Evidence: docs/decisions/capture.md."""
+"""Copies of all frames are stored only if the number of pixels of a frame in the video, divided by the number
+of pixels at the work size, is at least this ratio. For such a large video, decoding again costs more than
+writing and reading the copies. Unit: 1. Evidence: docs/decisions/capture.md."""
 _GROUP_FRAMES = 12
 """Number of frames from one codec key frame to the next (GOP length), if all frames are kept. Evidence:
 none."""
@@ -181,7 +181,7 @@ class FrameKeeper:
             size = (planes.shape[1], planes.shape[0] * 2 // 3)
             quality: Quality = "near" if self.keep_all else "exact"
             self._writer = VideoWriter(self._path, _FPS, size, quality, colours)
-        if colours == self._colours:  # frames with other colours are not kept
+        if colours == self._colours:  # a frame with another range or matrix is not kept
             self._writer.add_planes(planes)
             self._frames.append(shot.index)
 

@@ -52,7 +52,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> BoolArray:
     if mask.mean() < _MIN_WHITE_RATIO:
         raise error_because(
             f"the mask leaves only {100 * mask.mean():.1f} % of the picture visible",
-            "white is the room, black the wearer: is it inverted?",
+            "the room must be white, the wearer black: is the mask inverted?",
         )
     mask.flags.writeable = False
     return mask

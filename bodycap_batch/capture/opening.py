@@ -21,8 +21,9 @@ from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera, with_two_focal_lengths
 
 _GUESSED_FOV_DEG = 70.0
-"""Field of view, degrees, along the long side of the image, that is assumed if the true value is unknown. The
-widest common lenses of webcams and phones have this field of view. Mapping refines the value."""
+"""Field of view along the long side of the image. The program assumes this value if the true field of view is
+unknown. Unit: degrees. The widest common lenses of webcams and phones have this field of view. Mapping
+refines the value."""
 _FULL_FRAME_MM = 36.0
 """Width of a 35 mm film frame, millimetres. The definition of the 35 mm equivalent focal length uses this
 width."""
@@ -54,7 +55,8 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         threads: Number of threads of the decoder, as in `CaptureCamera`.
 
     Raises:
-        CaptureError: For the same reasons as in `open_capture`.
+        CaptureError: A video of the camera, its timestamps or its calibration cannot be used, or there is no
+            frame between start_s and end_s.
     """
     videos = tuple(index_video(path, threads) for path in config.video)
     _check_one_format(videos)
@@ -128,10 +130,10 @@ def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Cam
         is_turned = _same_aspect(calibration, height, width)
         raise CaptureError(
             f"calibrated at {calibration.width}×{calibration.height}, but the video shows {width}×{height}: "
-            "another aspect",
+            "another aspect ratio",
             path=video.path,
             field="calibration",
-            hint="the video is turned against the calibration: calibrate it as a player shows it"
+            hint="the video is rotated relative to the calibration: calibrate as a player shows it"
             if is_turned
             else "calibrate in the video mode that was recorded (a crop cannot be guessed), or use `auto`",
         )
@@ -191,7 +193,7 @@ def _check_one_format(videos: tuple[VideoFile, ...]) -> None:
                 f"this chapter shows {video.shown_size[0]}×{video.shown_size[1]}, the first one "
                 f"{videos[0].shown_size[0]}×{videos[0].shown_size[1]}",
                 path=video.path,
-                hint="chapters of one camera come from one recording; make it a camera of its own",
+                hint="chapters of one camera come from one recording; list this video as another camera",
             )
 
 
@@ -212,7 +214,7 @@ def _no_frames_error(
     """Return the error for a camera that has no frame between start_s and end_s."""
     first, last = times_ns[0] / 1e9 + offset_s, times_ns[-1] / 1e9 + offset_s
     return CaptureError(
-        f"camera {config.name} has no frame between start_s and end_s: it runs from {first:.2f} s to "
+        f"camera {config.name} has no frame between start_s and end_s: its video runs from {first:.2f} s to "
         f"{last:.2f} s on the common clock",
         path=config.video[0],
         field="capture.start_s" if spec.start_s is not None else "capture.end_s",

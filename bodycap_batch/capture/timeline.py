@@ -74,7 +74,7 @@ def read_timestamps(path: Path) -> IntArray:
             times.append(_parse_seconds(text, path, number))
             if len(times) > 1 and times[-1] <= times[-2]:
                 raise CaptureError(
-                    f"time {text} does not come after the one before",
+                    f"time {text} is not later than the previous time",
                     path=path,
                     line=number,
                     hint="one time for each frame, in seconds, increasing",
@@ -102,8 +102,9 @@ def join_chapters(videos: tuple[VideoFile, ...], sidecars: tuple[Path, ...]) -> 
     """Compute the times of the frames of all chapters on the clock of the camera.
 
     Sidecar files have priority over the containers. Without sidecar files, the timestamps of the containers
-    are used. If the timestamps of a chapter start again at zero, the chapter follows the previous chapter
-    without a gap. There is a gap only if the creation times show that more than two seconds are missing.
+    are used. If the timestamps of a chapter start again at zero, the chapter is placed directly after the
+    previous chapter. If the creation times show that more than two seconds are missing between the two
+    chapters, there is a gap of this length.
 
     Args:
         videos: The chapters in the order of the recording.
@@ -155,7 +156,8 @@ def _container_times(videos: tuple[VideoFile, ...]) -> list[IntArray]:
 def _missing_between_ns(before: VideoFile, video: VideoFile) -> int:
     """Return the time that is missing between two chapters, according to their creation times.
 
-    The missing time is 0 if the creation times are unknown, or if it is not longer than their error.
+    The result is 0 if the creation times are unknown, or if the missing time is not longer than the error of
+    the creation times.
     """
     if before.created_s is None or video.created_s is None:
         return 0

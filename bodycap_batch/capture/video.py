@@ -24,7 +24,7 @@ orientation · stored. x points to the right and y down. The matrix is a signed 
 
 COPY_AGAIN = "copy it again from the camera's card, or leave this camera out"
 """Hint of the error about a damaged file."""
-MAY_READ = "let the user who runs this read the file and enter its folders (chmod)"
+MAY_READ = "let the user who runs this program read the file and enter its folders (chmod)"
 """Hint of the error about a file that the user has no permission to read."""
 
 
@@ -108,7 +108,7 @@ def open_container(path: Path) -> InputContainer:
         raise CaptureError("no permission to read it", path=path, hint=MAY_READ) from error
     except (av.error.FFmpegError, OSError) as error:
         raise CaptureError(
-            f"not a readable video ({error_reason(error)}); recordings cut short have no index",
+            f"not a readable video ({error_reason(error)}); a recording that was cut short has no index",
             path=path,
             hint=COPY_AGAIN,
         ) from error

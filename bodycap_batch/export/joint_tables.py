@@ -81,7 +81,8 @@ def write_joint_arrays(path: Path, motion: Motion, sigma_m: FloatArray | None = 
     Args:
         path: Path of the file to write.
         motion: The motion in the world.
-        sigma_m: (T,J) standard deviation as described for `write_joint_table`.
+        sigma_m: (T,J) standard deviation per axis of each joint's centre, metres; NaN if unknown. It is
+            relative to the centre of the first solved joint.
 
     Raises:
         StoreError: The file cannot be written.

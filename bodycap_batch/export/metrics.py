@@ -83,7 +83,7 @@ def observation_errors(scene: Map, trajectories: Sequence[Trajectory]) -> FloatA
     Args:
         scene: The map.
         trajectories: The trajectories of the cameras. Only trajectories in the map's gauge are used. The
-            rolling-shutter correction computes the motion of the keyframes from them.
+            rolling-shutter correction computes the motion of the keyframes from these trajectories.
     """
     paths = {path.camera: path for path in trajectories if path.gauge == scene.gauge}
     out = np.full(len(scene.obs_px), np.nan)
@@ -234,7 +234,7 @@ def _motion_metrics(motion: Motion, gap: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _finite_mean(values: FloatArray) -> float | None:
-    """Return the mean of the finite values, or None without finite values."""
+    """Return the mean of the finite values; None if there are no finite values."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None
 

@@ -19,15 +19,15 @@ from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
 POSITION_TOLERANCE_M = 1e-4
-"""Maximum accepted difference (metres) of a joint centre.
+"""Maximum accepted distance (metres) between a joint centre in the file and in the motion.
 
-Derivation: it is larger than the rounding of all formats and smaller than an animator can see.
+Derivation: the limit is larger than the rounding of all formats, and an animator cannot see it.
 """
 
 ANGLE_TOLERANCE_DEG = 0.01
-"""Maximum accepted difference (degrees) of an orientation.
+"""Maximum accepted angle (degrees) between the orientations of a joint in the file and in the motion.
 
-Derivation: it moves the end of a bone of 0.6 m by 0.1 mm.
+Derivation: a rotation by this angle moves the end of a bone of 0.6 m by 0.1 mm.
 """
 
 _RATE_TOLERANCE = 1e-6
@@ -95,7 +95,7 @@ def _verify(path: Path, motion: Motion, read: Callable[[Path], Motion | None]) -
         raise StoreError(
             f"the motion read back differs by {position_m * 1000:.3g} mm and {angle_deg:.3g}°",
             path=path,
-            hint="check the disk; if it is sound, this is a bug worth reporting",
+            hint="check the disk; if the disk has no errors, report this as a bug",
         )
 
 

@@ -104,7 +104,7 @@ def _header_comments(trajectory: Trajectory) -> list[str]:
 
 
 def write_colmap(inputs: ExportInputs) -> list[Path]:
-    """Write one COLMAP model for each map: ``colmap/0``, ``colmap/1`` and so on.
+    """Write one COLMAP model for each map, in the folder ``colmap/<n>``; n is counted from 0.
 
     The maps in the world come first.
 

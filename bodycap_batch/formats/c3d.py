@@ -84,7 +84,7 @@ def read_c3d(path: Path) -> LabelledPoints:
         content = ezc3d.c3d(str(path))
     except (OSError, RuntimeError, ValueError) as error:
         raise JobError(
-            f"cannot be read as C3D: {error}", path=path, hint="run the job again; it writes the file anew"
+            f"cannot be read as C3D: {error}", path=path, hint="run the job again to write a new file"
         ) from error
     group = content["parameters"]["POINT"]
     return LabelledPoints(

@@ -31,7 +31,8 @@ _COLMAP_MODEL_IDS = {
     "RADIAL_FISHEYE": 9,
     "THIN_PRISM_FISHEYE": 10,
 }
-"""By name of the camera model, its number in COLMAP's binary files. Source: COLMAP, sensor/models.h."""
+"""Number of each camera model in COLMAP's binary files. The keys are the names of the models. Source: COLMAP,
+sensor/models.h."""
 
 _POINT2D = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 """Type of one 2D point of an image in images.bin: pixel position, and id of the 3D point."""
@@ -64,8 +65,9 @@ def write_colmap_model(
         scene: The map.
         target_from_map: Similarity from the map to another frame of reference, usually the world. None for
             the identity.
-        frame_numbers: By camera name, (N,) number of each frame in the video. The names of the images contain
-            these numbers. For a camera without an entry, the names contain the frame index.
+        frame_numbers: (N,) number of each frame in the video, for each camera. The keys are camera names. The
+            names of the images contain these numbers. For a camera without an entry, the names contain the
+            frame index.
 
     Returns:
         The paths of the written files.

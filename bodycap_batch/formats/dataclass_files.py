@@ -64,7 +64,7 @@ def read_dataclass(cls: type[T], folder: Path, name: str) -> T:
         arrays = read_npz(archive) if archive.exists() else {}
         return typing.cast(T, _decode(document["value"], cls, _Location(folder, arrays)))
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        hint = "remove the folder; it is made again by the next run"
+        hint = "remove the folder; the next run creates it again"
         raise StoreError(f"cannot be read: {error}", path=path, hint=hint) from error
 
 
@@ -89,7 +89,7 @@ class _Location:
 
     Attributes:
         folder: Folder that the stored paths are relative to.
-        arrays: By dotted name, all arrays of the instance.
+        arrays: All arrays of the instance. The keys are the dotted names of the arrays.
         name: Dotted name of the value; "" for the instance itself.
     """
 
@@ -133,7 +133,7 @@ def _encode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911
     return _json_value(value)
 
 
-def _decode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911 - one case a kind of type
+def _decode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911 - one return per kind of type
     """Convert JSON values from `_encode` back to a value of type `hint`."""
     hint = _strip_none(hint)
     origin = typing.get_origin(hint) or hint

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from bodycap_batch.core.errors import JobError
 
 _LIBRARY_MODULES = {"usd": "pxr", "c3d": "ezc3d"}
-"""By name of the format, the Python module that the format needs."""
+"""Python module that each format needs. The keys are the names of the formats."""
 
 
 def require_libraries(formats: Iterable[str]) -> None:

@@ -11,7 +11,7 @@ CAMERA_COLOURS: tuple[Colour, ...] = (
     (10, 118, 126), (144, 102, 69),
 )  # fmt: skip
 """Colours of the cameras, RGB, 0 to 255. People with any colour vision deficiency can distinguish the
-colours: as such people see them, any two colours differ by at least 16 in CIELAB (1976). Each colour has a
+colours: in a simulation of such vision, two colours differ by at least 16 in CIELAB (1976). Each colour has a
 contrast ratio of at least 3 to white and to the dark background of the preview. Orange and blue are late in
 the list, because the preview draws the limbs in orange and blue. Source of the simulated vision: G. Machado
 et al., "A physiologically-based model for simulation of color vision deficiency", 2009."""

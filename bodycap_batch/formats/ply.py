@@ -111,7 +111,7 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
     content.colors = open3d.utility.Vector3dVector(cloud.colors / 255.0)
     with atomic_replacement(path) as temporary:
         # If the disk is full, Open3D prints many lines without the reason. Therefore a file of sufficient
-        # size is written first. If the disk is full, this raises the error of the operating system.
+        # size is written first. If the disk is full, this write raises the error of the operating system.
         temporary.write_bytes(bytes(_HEADER_BYTES + _VERTEX_BYTES * len(cloud.points)))
         if not open3d.io.write_point_cloud(temporary, content, write_ascii=False):
             hint = "check that the disk is not full"

@@ -30,10 +30,8 @@ _HALF_WIDTH_RANGE_M = (0.008, 0.03)
 affect the appearance."""
 
 _FACES = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [5, 1, 2], [5, 2, 3], [5, 3, 4], [5, 4, 1]])
-
-
-"""Corner indices (`_spindle_corners`) of the eight triangles of an octahedron, counter-clockwise as seen from
-outside."""
+"""Corner indices of the eight triangles of an octahedron, counter-clockwise as seen from outside. An index is
+a row of the result of `_spindle_corners`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

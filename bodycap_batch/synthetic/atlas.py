@@ -19,7 +19,8 @@ _STEPS = 2
 degree is the mean of this level and the next level."""
 _BORDER = 2**_OCTAVES
 """Width (texels of level 0) of the border around each image. It equals the width of one texel of the coarsest
-level. Image positions are multiples of it, so that a texel of the coarsest level never mixes two images."""
+level. Image positions are multiples of this width, so that a texel of the coarsest level never mixes two
+images."""
 _BATCH_COLUMNS = 1024
 """Number of columns of the array that passes look-ups to cv2.remap. cv2.remap refuses arrays with
 more than 32,767 rows, so one long column is not possible."""

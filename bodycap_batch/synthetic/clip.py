@@ -68,6 +68,6 @@ def load_clip(path: Path, start_s: float, length_s: float) -> Clip:
             f"the motion lasts {lasts:.2f} s, the capture needs {start_s:.2f} to {start_s + length_s:.2f} s",
             path=path,
             field="motion",
-            hint="a smaller seconds or motion_start_s",
+            hint="set seconds or motion_start_s to a smaller value",
         )
     return Clip(motion, start_s, length_s)

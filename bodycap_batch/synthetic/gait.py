@@ -104,7 +104,7 @@ class _ArmReach:
     pronation: float
 
     def weight(self, t_s: FloatArray) -> FloatArray:
-        """Return the weight (T,) of the additional angles at common times (T,). It is smooth, 0 … 1."""
+        """Return the weight (T,) of the additional angles at common times (T,). It is smooth, 0 to 1."""
         up = np.clip((t_s - self.start_s) / self.ramp_s, 0, 1)
         down = np.clip((t_s - self.start_s - self.ramp_s - self.hold_s) / self.ramp_s, 0, 1)
         return np.asarray(_smooth_step(up) - _smooth_step(down))

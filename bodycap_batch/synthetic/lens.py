@@ -66,7 +66,7 @@ def is_fisheye(model: str) -> bool:
 def _rational(plane: FloatArray, radial: FloatArray, p1: float, p2: float) -> FloatArray:
     """Return points (...,2) after distortion by Brown's model with a rational radial term.
 
-    `radial` holds k1 … k6.
+    `radial` holds the coefficients k1 to k6.
 
     Sources: Brown, "Decentering distortion of lenses", 1966; OpenCV for the rational term.
     """
@@ -172,7 +172,7 @@ def undistort(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, B
 
 
 def _undistort_block(distort: Distortion, distorted: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Invert a distortion for a block of points (N,2). The results are as for `undistort`."""
+    """Invert a distortion for a block of points (N,2). Return the same results as `undistort`."""
     plane = distorted.copy()
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):

@@ -1,4 +1,4 @@
-"""Write a synthetic capture. Its folder gets its name only when the capture is complete."""
+"""Write a synthetic capture. The folder of the capture gets its final name when the capture is complete."""
 
 from __future__ import annotations
 
@@ -277,7 +277,9 @@ def _check_output_folder(out_dir: Path, overwrite: bool) -> None:
     if not overwrite:
         raise JobError("exists already", path=out_dir, hint="name another folder, or delete this one")
     if not (out_dir / MARKER).is_file():
-        raise JobError("is no synthetic capture, so it stays", path=out_dir, hint="name another folder")
+        raise JobError(
+            "is not a synthetic capture, so it is not overwritten", path=out_dir, hint="name another folder"
+        )
 
 
 @contextmanager

@@ -41,8 +41,8 @@ class SynthOptions(Options):
     seed: int = Field(0, ge=0, description="seed of body, mounts, walk, textures and noise")
     subject_height_m: float = Field(1.75, ge=1.2, le=2.2, description="stature of the built-in walker")
     motion: Path | None = Field(None, description="BVH file to follow instead of the built-in walk")
-    motion_start_s: float = Field(0.0, ge=0, description="where in the BVH file the capture begins")
-    t_pose_s: float = Field(0.0, ge=0, description="seconds the built-in walker first stands in a T-pose")
+    motion_start_s: float = Field(0.0, ge=0, description="time (s) in the BVH file at the capture's start")
+    t_pose_s: float = Field(0.0, ge=0, description="duration of the T-pose before the built-in walk, s")
     proportion_range: float = Field(
         0.05, ge=0, lt=0.5, description="bone lengths of the built-in walker differ by up to this ratio"
     )
@@ -50,18 +50,26 @@ class SynthOptions(Options):
         0.0,
         ge=0,
         le=3,
-        description="offset of the built-in walker's posture from the mean of people; 1: as people differ",
+        description="random posture of the built-in walker; 1: varies as between people, 0: mean of people",
     )
-    mount_sigma_deg: float = Field(15.0, ge=0, description="how far mounts are turned off nominal, in all")
-    mount_sigma_m: float = Field(0.05, ge=0, description="how far mounts sit off nominal, in all")
-    noise: float = Field(2.0, ge=0, le=50, description="image noise at mid grey, grey levels of 255")
-    exposure_s: float = Field(0.0, ge=0, description="exposure time: motion blur, timestamp at its middle")
+    mount_sigma_deg: float = Field(
+        15.0, ge=0, description="standard deviation of mount rotations from nominal, total of three axes"
+    )
+    mount_sigma_m: float = Field(
+        0.05, ge=0, description="standard deviation of mount positions from nominal, total of three axes"
+    )
+    noise: float = Field(
+        2.0, ge=0, le=50, description="standard deviation of noise at mid grey, grey levels of 0 to 255"
+    )
+    exposure_s: float = Field(
+        0.0, ge=0, description="exposure time, s: causes motion blur; the timestamp is at its middle"
+    )
     rolling_shutter_s: float = Field(0.0, ge=0, description="time from the first row to the last")
     offsets_s: Mapping[str, float] = Field(
         default_factory=dict, description="clock offset by camera: common time = camera time + offset"
     )
     drop_frames: float = Field(
-        0.0, ge=0, lt=0.5, description="share of frames lost; writes <camera>.timestamps.txt"
+        0.0, ge=0, lt=0.5, description="fraction of frames that are lost; writes <camera>.timestamps.txt"
     )
     body_in_view: bool = Field(False, description="render the wearer's own body")
     arms_ahead: float = Field(
@@ -77,7 +85,7 @@ class SynthOptions(Options):
     repeated_posters: bool = Field(False, description="hang one and the same poster in several places")
     pressed_s: Mapping[str, tuple[float, float]] = Field(
         default_factory=dict,
-        description="by camera on a hand: from when to when (s) it lies against the wearer's chest",
+        description="for a camera on a hand: start and end (s) of a time with the hand on the wearer's chest",
     )
     poses_only: bool = Field(False, description="write noisy camera poses, no video")
     pose_sigma_m: float = Field(0.005, ge=0, description="poses only: noise of each position, per axis")
@@ -86,7 +94,7 @@ class SynthOptions(Options):
     lost: float = Field(0.02, ge=0, lt=0.9, description="poses only: share of frames lost, in gaps")
     gap_frames: tuple[int, int] = Field((10, 20), description="poses only: shortest and longest gap")
     rates_fps: Mapping[str, float] = Field(
-        default_factory=dict, description="poses only: by camera, its own frame rate"
+        default_factory=dict, description="poses only: frame rate of each camera that differs from fps"
     )
     quality: Literal["high", "lossless"] = Field("high", description="H.264 at CRF 16, or lossless")
 
@@ -124,7 +132,7 @@ class SynthOptions(Options):
         if self.rates_fps and not self.poses_only:
             raise ValueError("rates_fps: videos have one rate; set poses_only")
         if min(self.rates_fps.values(), default=self.fps) <= 0.0:
-            raise ValueError("rates_fps: a rate is positive")
+            raise ValueError("rates_fps: a rate must be positive")
         if not 1 <= self.gap_frames[0] <= self.gap_frames[1]:
             raise ValueError("gap_frames: shortest first, one frame or more")
 

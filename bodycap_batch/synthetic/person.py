@@ -77,7 +77,7 @@ _POSTURE_SIGMA_DEG = {
     "Elbow": 3.6,
     "Twist": 14.7,
 }
-"""Standard deviation (degrees) between people of each joint angle in relaxed standing. `WalkStyle.posture`
+"""Standard deviation (degrees) of each joint angle in relaxed standing, between people. `WalkStyle.posture`
 explains the names.
 
 Sources: The values of shoulder girdle, shoulder and elbow are interquartile ranges divided by 1.349. They

@@ -19,7 +19,7 @@ def _word(rng: np.random.Generator) -> str:
 def _write(image: Image, x: float, y: float, size: float, rng: np.random.Generator) -> None:
     """Draw a random word into an image. The letters are about `size` texels tall.
 
-    Its top left corner is at x, y (texels).
+    The top left corner of the word is at x, y (texels).
     """
     at = (round(x), round(y + size))
     thickness = max(1, round(size / 9))

@@ -17,8 +17,8 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import segment_axes
 
 RAMP_S = 0.5
-"""Time (seconds) in which a hand moves from its walking position to the chest, and also from the chest back.
-"""
+"""Duration of the movement of a hand from its walking position to the chest. The movement back takes the same
+time. Unit: seconds."""
 _CHEST_RADIUS_M = 0.125
 """Distance (metres) of the chest's surface from the bone of the trunk."""
 _CHEST_HEIGHT_RATIO = 0.45

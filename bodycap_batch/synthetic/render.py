@@ -190,7 +190,7 @@ class SceneRenderer:
             rows: Range of the rows to render.
 
         Returns:
-            (rows,W,3) RGB image, 0 … 255, without noise.
+            (rows,W,3) RGB image, 0 to 255, without noise.
         """
         poses = world_from_cam.reshape(-1, 4, 4)
         size = grid.valid[rows].shape

@@ -24,12 +24,12 @@ scale (texels per metre) and a random generator."""
 def colour(
     rng: np.random.Generator, saturation: float = 0.6, value: tuple[float, float] = (0.3, 0.95)
 ) -> Grey:
-    """Return a random RGB colour (3,), 0 … 255.
+    """Return a random RGB colour (3,), 0 to 255.
 
     Args:
         rng: Source of randomness.
-        saturation: Maximum saturation, 0 … 1.
-        value: Minimum and maximum brightness, 0 … 1.
+        saturation: Maximum saturation, 0 to 1.
+        value: Minimum and maximum brightness, 0 to 1.
     """
     hsv = np.array([[[rng.uniform(0, 360), rng.uniform(0.2, 1.0) * saturation, rng.uniform(*value)]]])
     return np.asarray(cv2.cvtColor(hsv.astype(np.float32), cv2.COLOR_HSV2RGB)[0, 0] * 255.0, dtype=np.float32)

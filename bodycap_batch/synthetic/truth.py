@@ -32,14 +32,14 @@ _README = """Ground truth of a synthetic capture. Metres, Z up, floor at z = 0.
 
 <camera>.tum   world_from_camera (OpenCV axes), one line a frame: timestamp tx ty tz qx qy qz qw.
                Timestamps are the camera's own; common time = camera time + offsets_s of calib.json.
-               With a rolling shutter this is the pose of the middle of the image; with motion blur that
-               of the middle of the exposure.
+               With a rolling shutter, it is the pose at the exposure of the middle row of the image. With
+               motion blur, it is the pose at the middle of the exposure.
 joints.npz     names (J,), t (T,) s on the common clock, world (T,J,3) m: joint centres.
 motion.bvh     the motion on the common clock, at the cameras' rate; frame 0 is the earliest frame.
-mounts.json    joint_from_cam of each camera: its true mount. It differs from the nominal one of its name.
+mounts.json    joint_from_cam of each camera: the true mount, which differs from the nominal mount.
 synth.json     the options the capture was made with.
 
-The body's true proportions are those of ../skeleton.bvh and of motion.bvh.
+The files ../skeleton.bvh and motion.bvh have the true proportions of the body.
 """
 MARKER = Path("gt", "synth.json")
 """Path of the file that marks a folder as a complete synthetic capture, relative to the folder."""

@@ -40,8 +40,8 @@ _CAP_RINGS = 3
 _TEXELS_PER_M = 300.0
 """Detail (texels per metre) of the body's textures."""
 _CLEARANCE_M = 0.02
-"""Threshold of the distance (metres) between a limb's surface and a camera outside the limb. A camera within
-this distance is treated as inside the limb."""
+"""A camera outside a limb is treated as inside the limb if its distance from the limb's surface is not larger
+than this threshold. Unit: metres."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

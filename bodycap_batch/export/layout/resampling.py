@@ -16,15 +16,15 @@ from bodycap_batch.model.geometry import (
 from bodycap_batch.model.skeleton import Motion
 
 _TICK_TOLERANCE = 1e-9
-"""Maximum time between a new tick and an old tick that coincide, as a ratio to the old tick interval.
+"""A new tick and an old tick are treated as the same time if their distance is at most this tolerance.
 
-Derivation: it is larger than the rounding of tick times.
+Unit: interval of the old ticks. Derivation: the tolerance is larger than the rounding of tick times.
 """
 
 _LAST_TICK_TOLERANCE = 1e-6
-"""Maximum time by which the last new tick may exceed the last old tick, as a ratio to the new tick interval.
+"""The last new tick may be later than the last old tick by at most this tolerance.
 
-Derivation: it is larger than the rounding of tick times.
+Unit: interval of the new ticks. Derivation: the tolerance is larger than the rounding of tick times.
 """
 
 _TWO_PASS_CUTOFF_RATIO = float((2**0.5 - 1) ** 0.25)

@@ -1,4 +1,4 @@
-"""Add the T-pose frame. Assign the root motion to the hips or to a root joint on the floor, or remove it."""
+"""Add a T-pose frame, and assign the root motion to a joint or remove its horizontal path."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def heading_rad(world_from_hips: FloatArray) -> FloatArray:
     """Return the heading (T,) of the hips over time: the twist of their rotation about Z, radians.
 
     The heading is continuous over time. At a tick with an undefined heading, the latest defined heading is
-    returned; before the first defined heading, the first one is returned.
+    returned. At a tick before the first defined heading, the first defined heading is returned.
 
     Args:
         world_from_hips: (T,3,3) rotation of the hips in the world.

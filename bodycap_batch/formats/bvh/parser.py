@@ -13,7 +13,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
 
 _CHANNELS = {name.lower(): name for axis in "XYZ" for name in (f"{axis}position", f"{axis}rotation")}
-"""By lower-case name of a channel, the name with the spelling of the BVH specification."""
+"""Channel names as the BVH specification spells them. The keys are the same names in lower case."""
 
 _MAX_JOINTS = 10_000
 """Maximum number of joints. Derivation: a production skeleton with face and fingers has a few hundred joints,
@@ -254,7 +254,7 @@ def _read_motion(
     """Parse the MOTION block.
 
     Returns:
-        The values (T, channels), and the Frame Time as text. If the file has no frames, None and "".
+        The values (T, channels), and the Frame Time as text. Returns (None, "") if the file has no frames.
     """
     frames = _read_header(lines, "FRAMES")
     if frames is None:

@@ -25,13 +25,13 @@ _MAX_METRE_EXTENT = 10.0
 otherwise it is in centimetres. Derivation: the extent of a body is 1 to 2 m, which is 100 to 200 cm."""
 
 _MOTION_THRESHOLD = 1e-3
-"""Maximum change, file units, of a joint's position relative to the parent that is treated as no change.
-Derivation: 10 µm for a file in centimetres. This is larger than the rounding error of numbers with the usual
-six decimals."""
+"""A joint whose position relative to its parent changes by less than this threshold is treated as not moving.
+Unit: file unit. Derivation: the threshold is 10 µm for a file in centimetres. This is larger than the
+rounding error of numbers with the usual six decimals."""
 
 _WARNING_THRESHOLD = 1.0
-"""Minimum change, file units, of a joint's position relative to the parent that gives a warning. Derivation:
-1 cm for a file in centimetres; such a change is visible."""
+"""If the position of a joint relative to its parent changes by more than this threshold, a warning is logged.
+Unit: file unit. Derivation: the threshold is 1 cm for a file in centimetres; such a change is visible."""
 
 
 def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, Motion | None]:
@@ -113,7 +113,7 @@ def _channel_slices(joints: list[FileJoint]) -> list[slice]:
 
 
 def _have_hips_own_translation(joints: list[FileJoint], values: FloatArray) -> bool:
-    """Return True if the first child of the root is the hips, and its position changes."""
+    """Return True if the first child of the root is the hips, and the position of the hips changes."""
     parents = [joint.parent for joint in joints]
     if len(joints) < 2 or assign_roles([joint.name for joint in joints], parents)[:2] != ("", "Hips"):
         return False

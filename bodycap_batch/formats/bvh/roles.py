@@ -77,7 +77,8 @@ Therefore it affects only the choice between selections with otherwise equal sco
 
 _MIN_OFFSET_M = 1e-9
 """Minimum distance, metres, between a joint and its parent. A joint with a shorter distance is treated as a
-helper joint without a bone. Derivation: zero, except for rounding errors."""
+helper joint without a bone. Derivation: the distance of helper joints is zero, except for rounding
+errors."""
 
 _WORD_PATTERN = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 
@@ -103,8 +104,8 @@ def assign_roles(
 
     Returns:
         (J,) role of each joint, with the names of HumanIK: Hips, Spine, Spine1 (the joint at which the arms
-        branch off), Neck, Head, LeftShoulder (the collar bone), LeftArm and so on. It is "" for a joint
-        without a role. Each role occurs at most once.
+        branch off), Neck, Head, LeftShoulder (the collar bone), LeftArm and the other names in `ROLES`. A
+        joint without a role has the role "". Each of the other roles occurs at most once.
     """
     names = [_split_name(name) for name in _strip_common_prefix(joints)]
     ancestors = [_ancestors(joint, parents) for joint in range(len(joints))]
@@ -183,7 +184,7 @@ def _best_chain(
         scores: Score of each slot.
 
     Returns:
-        By slot, the index of the selected joint.
+        The index of the selected joint for each slot. The keys are the slots.
     """
     best: dict[tuple[int, int], tuple[float, dict[int, int]]] = {}
     top: tuple[float, dict[int, int]] = (0.0, {})
@@ -206,8 +207,8 @@ def _assign_trunk(
     """Add Hips, Spine, Spine1, Neck and Head to the roles of the limbs.
 
     Args:
-        found: By role, the index of the joint with this role. The roles of the trunk are added to this
-            mapping.
+        found: Index of the joint with each role. The keys are the roles. The roles of the trunk are added to
+            this mapping.
         bases: (J,) name of each joint in lower case; "" for joints with a side.
         ancestors: (J,) ancestors of each joint, from its parent to the root.
         has_bone: (J,) False for helper joints of zero length.
@@ -249,7 +250,7 @@ def _assign_trunk(
 def _lowest_common_ancestor(joints: Sequence[int | None], ancestors: Sequence[list[int]]) -> int | None:
     """Return the joint farthest from the root that is an ancestor of all given joints.
 
-    It is None if one of the given joints is None, or if there is no such ancestor.
+    Returns None if one of the given joints is None, or if the given joints have no common ancestor.
     """
     present = [joint for joint in joints if joint is not None]
     if len(present) < len(joints):

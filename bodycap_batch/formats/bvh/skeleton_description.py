@@ -15,11 +15,11 @@ _DIRECTIONS = {
     "left": (1, 0, 0), "right": (-1, 0, 0), "up": (0, 0, 1), "down": (0, 0, -1), "forward": (0, -1, 0),
     "back": (0, 1, 0),
 }  # fmt: skip
-"""By name, the unit vectors of the six directions of the body, in world axes."""
+"""Unit vectors of the six directions of the body, in world axes. The keys are the names of the directions."""
 
 _MAX_NAMED_DIRECTION_DEG = 10.0
-"""Maximum angle, degrees, between a bone and one of the six directions, for describing the bone with this
-direction only, without an angle. Evidence: none."""
+"""If the angle between a bone and one of the six directions is smaller than this limit, the description of
+the bone is only the name of this direction, without an angle. Unit: degrees. Evidence: none."""
 
 _MIN_HEIGHT_DIFFERENCE_M = 0.2
 """Minimum height, metres, of the head above the hips, and of the hips above the feet, in a standing pose.
@@ -27,7 +27,7 @@ Derivation: both heights are larger even for a child with a stature of 1 m."""
 
 _MIN_BONE_M = 1e-6
 """Minimum length, metres, of a bone. A shorter bone is treated as a bone without direction. Derivation: the
-rounding error of numbers with six decimals is smaller, if the BVH file is in centimetres."""
+limit is larger than the rounding error of numbers with six decimals in a BVH file in centimetres."""
 
 _NEXT_PART = {
     "Shoulder": "Arm",
@@ -37,7 +37,7 @@ _NEXT_PART = {
     "Leg": "Foot",
     "Foot": "ToeBase",
 }
-"""By part of a limb, the next part of the limb. The bone of a part ends at the joint of the next part."""
+"""Next part of a limb for each part. The bone of a part ends at the joint of the next part."""
 
 _OPTIONAL_PARTS = ("Shoulder", "ToeBase")
 """Parts of limbs that many skeletons do not have. There is no warning if these parts are missing."""
@@ -53,8 +53,8 @@ class JointDescription:
         parent: Name of the parent; "" for the root.
         bone_m: Length of the bone, metres. The bone ends at the next joint of the limb. If there is no next
             joint, it ends at the only child, or at the End Site.
-        points: Direction that the bone points in, in the T-pose: ``left``, ``down, 20° left`` …; "" for a
-            bone without length.
+        points: Direction of the bone in the T-pose, for example ``left`` or ``down, 20° left``; "" for a bone
+            without length.
         note: Note about the joint; "" if there is no note.
     """
 
@@ -76,9 +76,9 @@ def describe_joints(skeleton: SkeletonModel) -> tuple[JointDescription, ...]:
         length = float(np.linalg.norm(bone))
         role = skeleton.roles[joint]
         is_helper = parent >= 0 and float(np.linalg.norm(skeleton.offsets_m[joint])) < _MIN_BONE_M
-        note = "stays at zero" if not role else ""
+        note = "rotation stays zero" if not role else ""
         if is_helper:
-            note = f"{note}, " * bool(note) + "sits on its parent"
+            note = f"{note}, " * bool(note) + "same position as its parent"
         out.append(
             JointDescription(
                 name=name,
@@ -95,7 +95,7 @@ def describe_joints(skeleton: SkeletonModel) -> tuple[JointDescription, ...]:
 def _bone_vector(skeleton: SkeletonModel, rest: FloatArray, joint: int) -> FloatArray:
     """Return the vector (3,) of the bone that starts at a joint, in the world, metres.
 
-    It is zero for a joint with several children, if none of them is the next joint of a limb.
+    The vector is zero for a joint with several children, if none of the children is the next joint of a limb.
 
     Args:
         skeleton: The skeleton.
@@ -132,7 +132,7 @@ def describe_direction(vector: FloatArray) -> str:
 
 
 def describe_arm_pose(skeleton: SkeletonModel) -> str:
-    """Describe how the arms are held in the T-pose. The axes of the limbs are computed in this pose."""
+    """Describe how the arms are held in the T-pose. The axes of the limbs are computed in the T-pose."""
     rest, arms = rest_pose(skeleton), []
     for side in ("Left", "Right"):
         joint = skeleton.index_of_role(f"{side}Arm")
@@ -162,18 +162,25 @@ def skeleton_warnings(skeleton: SkeletonModel) -> Iterator[str]:
     missing = [role for role in missing_roles(skeleton) if not role.endswith(_OPTIONAL_PARTS)]
     if missing:
         yield (
-            f"no joint has the role {', '.join(missing)}: name one with --map JOINT=ROLE; "
+            f"no joint has the role {', '.join(missing)}: give the role to a joint with --map JOINT=ROLE; "
             "no camera can be mounted there"
         )
     rest = rest_pose(skeleton)
     head, hips, foot = (skeleton.index_of_role(role) for role in ("Head", "Hips", "LeftFoot"))
     height, margin = rest[:, 2, 3], _MIN_HEIGHT_DIFFERENCE_M
     if head is not None and hips is not None and not height[head] > height[hips] + margin:
-        yield "the head is not above the hips in this pose: name a frame that stands with --tpose-frame N"
+        yield (
+            "the head is not above the hips in the T-pose: "
+            "choose a frame in which the person stands, with --tpose-frame N"
+        )
     elif foot is not None and hips is not None and not height[foot] < height[hips] - margin:
-        yield "the feet are not below the hips in this pose: name a frame that stands with --tpose-frame N"
+        yield (
+            "the feet are not below the hips in the T-pose: "
+            "choose a frame in which the person stands, with --tpose-frame N"
+        )
     left, right = (skeleton.index_of_role(f"{side}UpLeg") for side in ("Left", "Right"))
     if left is not None and right is not None and not rest[left, 0, 3] > rest[right, 0, 3]:
         yield (
-            "the left leg is not on +X (facing +Z in the file): name a frame that stands with --tpose-frame N"
+            "the left leg is not on +X (facing +Z in the file): "
+            "choose a frame in which the person stands, with --tpose-frame N"
         )

@@ -85,7 +85,7 @@ def _override_roles(path: Path, skeleton: SkeletonModel, user_roles: Mapping[str
     assigned = [role for role in user_roles.values() if role != NO_ROLE]
     repeated = next((role for role in assigned if assigned.count(role) > 1), None)
     if repeated is not None:
-        hint = "only one joint can have a role"
+        hint = "give each role to only one joint"
         raise JobError(f"{repeated} is given to two joints", path=path, field="skeleton_map", hint=hint)
     for index, name in enumerate(skeleton.joints):
         if name in user_roles:
@@ -105,7 +105,7 @@ def _tpose_rotations(path: Path, skeleton: SkeletonModel, motion: Motion | None,
     """Return the local rotations (J,3,3) of a frame. The whole body is rotated so that it faces −Y."""
     count = 0 if motion is None else len(motion.root_in_world_m)
     if motion is None or not 0 <= frame < count:
-        hint = f"frames count from 0; the file has {count}"
+        hint = f"frames are counted from 0; the file has {count} frames"
         raise JobError(f"it has no frame {frame}", path=path, field="tpose_frame", hint=hint)
     local: FloatArray = motion.local_rotation[frame].copy()
     pose = rest_pose(replace(skeleton, tpose_rotation=local))

@@ -12,7 +12,7 @@ from pathlib import Path
 from bodycap_batch.core.errors import JobError
 
 BLENDER_VARIABLE = "BODYCAP_BLENDER"
-"""Name of the environment variable that holds a path: of Blender, or of a Python with the module ``bpy``."""
+"""Name of the environment variable for the path of Blender, or of a Python that has the module ``bpy``."""
 
 _HINT = (
     f"`make blender` installs it as a Python module (Python 3.11); or set {BLENDER_VARIABLE} to a Python "

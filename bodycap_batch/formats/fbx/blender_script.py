@@ -41,7 +41,7 @@ def convert(source: str, target: str, fps: float, frames: int) -> None:
     bpy.ops.import_scene.gltf(filepath=source, disable_bone_shape=True)
     scene.frame_start, scene.frame_end = 0, frames - 1
     header = export_fbx_bin.fbx_header_elements
-    # Blender writes the current time into the header. Then equal motions would give different bytes.
+    # Blender would write the current time into the header, and equal motions would give different bytes.
     # Therefore the time is replaced by a constant.
     export_fbx_bin.fbx_header_elements = functools.partial(header, time=dt.datetime(1970, 1, 1))
     bpy.ops.export_scene.fbx(

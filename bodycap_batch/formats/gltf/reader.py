@@ -79,7 +79,7 @@ def _read_skeleton(document: Any, name: str, joint_of_node: dict[int, int]) -> S
     Args:
         document: The parsed file.
         name: Name of the skeleton.
-        joint_of_node: By index of a node, the index of the joint.
+        joint_of_node: Index of the joint for each node. The keys are the indices of the nodes.
     """
     nodes = [document.nodes[node] for node in joint_of_node]
     parents = np.full(len(nodes), -1)

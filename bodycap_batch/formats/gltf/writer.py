@@ -37,14 +37,14 @@ def write_glb(
     """Write a motion as a skinned, animated stick figure.
 
     The joints are nodes below a node ``Armature``. The mesh is bound to the joints in the T-pose. Every joint
-    has a LINEAR rotation channel. The root also has a translation channel, and so have hips that move freely
-    relative to the root. The time of frame k is k / fps seconds.
+    has a LINEAR rotation channel. The root also has a translation channel. If the hips move freely relative
+    to the root, the hips have a translation channel too. The time of frame k is k / fps seconds.
 
     Args:
         path: Path of the file, which is replaced atomically.
         motion: The motion, in world axes and metres.
-        file_from_up: (3,3) additional rotation of the whole scene; None for no rotation. It is used if a
-            converter, such as Blender, reverses this rotation.
+        file_from_up: (3,3) additional rotation of the whole scene; None for no rotation. It is needed if a
+            converter, such as Blender, applies the inverse rotation to the scene.
 
     Raises:
         StoreError: The file cannot be written.
@@ -109,7 +109,7 @@ class _BinaryBuffer:
         """Append an array to the buffer.
 
         Args:
-            array: (N, …) array.
+            array: (N,...) array.
             kind: Accessor type, a key of `ELEMENT_WIDTHS`.
             target: Target of the buffer view; None for no target.
             component: Number of the component type.
