@@ -20,11 +20,11 @@ from bodycap_batch.model.optical_flow import (
     fit_rotation,
     make_coarse_image,
     pixel_scale,
-    sharpness,
     track_points,
     unit_directions,
 )
 from bodycap_batch.model.scene import KeyframeSelection
+from bodycap_batch.model.sharpness import sharpness
 
 _CORNERS = 120
 """Maximum number of corners that are tracked from each keyframe. Evidence: none."""

@@ -35,6 +35,7 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
         {"matching"},
         {"reconstruction"},
         {"intrinsics", "mapping_context"},
+        {"re_registration"},
         {"validation", "initial_models"},
         {"inputs"},
         {"results"},
@@ -48,7 +49,8 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
         {"world"},
         {"body_calibration"},
         {"map_alignment", "reporting"},
-        {"camera_selection", "camera_paths"},
+        {"main_map", "camera_paths"},
+        {"camera_selection"},
         {"stage"},
     ),
 }

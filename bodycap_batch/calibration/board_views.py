@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bodycap_batch.calibration.boards import CalibrationBoard
+from bodycap_batch.calibration.board_detection import CalibrationBoard
 from bodycap_batch.capture import Capture
 from bodycap_batch.config.options import MarkerBoard
 from bodycap_batch.core.arrays import FloatArray, IntArray

@@ -11,7 +11,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from bodycap_batch.calibration.boards import BoardCorners, CalibrationBoard, GreyImage
+from bodycap_batch.calibration.board_detection import BoardCorners, CalibrationBoard, GreyImage
 from bodycap_batch.calibration.intrinsics_fit import ImageSize, IntrinsicsFit, fit_intrinsics
 from bodycap_batch.capture import CaptureCamera, open_camera
 from bodycap_batch.config.models import CameraConfig, CaptureConfig

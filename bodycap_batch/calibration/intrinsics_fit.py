@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bodycap_batch.calibration.boards import BoardCorners
+from bodycap_batch.calibration.board_detection import BoardCorners
 from bodycap_batch.core.arrays import FloatArray
 
 ImageSize = tuple[int, int]

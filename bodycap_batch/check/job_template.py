@@ -16,7 +16,7 @@ from typing import Any, Literal
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from bodycap_batch.capture.indexing import index_video
+from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.config.folder import recordings_in
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of

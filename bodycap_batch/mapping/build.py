@@ -32,7 +32,7 @@ from bodycap_batch.mapping.matching.database import (
 from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint, exclude_flipped_cameras
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
-from bodycap_batch.mapping.reconstruction.models import write_models
+from bodycap_batch.mapping.reconstruction.model_files import write_models
 from bodycap_batch.mapping.results import finalise_models, make_result
 from bodycap_batch.mapping.validation.camera_distance_check import Reach, check_distances
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage

@@ -29,9 +29,10 @@ from bodycap_batch.mapping.matching.database import (
 )
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
-from bodycap_batch.mapping.reconstruction.models import read_model, registered_ids, write_models
+from bodycap_batch.mapping.re_registration import re_register_images
+from bodycap_batch.mapping.reconstruction.model_files import read_model, registered_ids, write_models
 from bodycap_batch.mapping.results import finalise_models, make_result
-from bodycap_batch.mapping.validation.repair import re_register_images, remove_misregistered
+from bodycap_batch.mapping.validation.repair import remove_misregistered
 from bodycap_batch.model.scene import MapResult
 
 

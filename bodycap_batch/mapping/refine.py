@@ -19,7 +19,7 @@ from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
 from bodycap_batch.mapping.matching.database import read_camera_ids
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
-from bodycap_batch.mapping.reconstruction.models import read_model, write_models
+from bodycap_batch.mapping.reconstruction.model_files import read_model, write_models
 from bodycap_batch.mapping.reconstruction.two_step_adjustment import adjust_in_two_steps
 from bodycap_batch.mapping.results import make_result
 from bodycap_batch.model.scene import MapResult, Trajectory

@@ -11,7 +11,7 @@ from bodycap_batch.mapping.inputs import common_times_ns
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robustly
 from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction
-from bodycap_batch.mapping.reconstruction.models import registered_ids
+from bodycap_batch.mapping.reconstruction.model_files import registered_ids
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
 from bodycap_batch.model.scene import MapResult
 

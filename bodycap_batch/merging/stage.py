@@ -22,7 +22,8 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
 from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSigma
 from bodycap_batch.merging.camera_paths import trajectory_in_world, with_solved_centres
 from bodycap_batch.merging.camera_selection import select_cameras
-from bodycap_batch.merging.cameras.track import CameraTrack, inflate_sigmas, make_track, remove_outliers
+from bodycap_batch.merging.cameras.track import CameraTrack, inflate_sigmas, make_track
+from bodycap_batch.merging.cameras.track_outliers import remove_outliers
 from bodycap_batch.merging.graph.adaptive_motion_noise import scale_motion_noise
 from bodycap_batch.merging.graph.foot_contact import (
     contact_statistics,
@@ -31,7 +32,7 @@ from bodycap_batch.merging.graph.foot_contact import (
     standing_joints,
 )
 from bodycap_batch.merging.graph.joint_covariance import sigma_percentiles, skeleton_covariance
-from bodycap_batch.merging.graph.joint_limits import soft_limits
+from bodycap_batch.merging.graph.joint_distance_limits import soft_limits
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution, hinge_deviations, joint_gaps
 from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, max_window_ticks, solve_windows
 from bodycap_batch.merging.projection.project import project_motion

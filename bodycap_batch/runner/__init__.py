@@ -6,7 +6,7 @@ argument.
 
 from bodycap_batch.runner.child_process import CHILD_COMMAND
 from bodycap_batch.runner.children import Children, Executor, TaskEnvironment
-from bodycap_batch.runner.parent import NotStored, Rules, Runner
 from bodycap_batch.runner.task import Task
+from bodycap_batch.runner.task_runner import NotStored, Rules, Runner
 
 __all__ = ["CHILD_COMMAND", "Children", "Executor", "NotStored", "Rules", "Runner", "Task", "TaskEnvironment"]

@@ -1,4 +1,4 @@
-"""Record which artefacts the jobs' results refer to, and remove all other artefacts."""
+"""Record which artefacts the results of jobs refer to."""
 
 from __future__ import annotations
 
@@ -6,17 +6,15 @@ import contextlib
 import fcntl
 import json
 import os
-import shutil
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from bodycap_batch.core.errors import StoreError
 from bodycap_batch.store.artefacts import Store, disk_errors
 from bodycap_batch.store.digests import json_digest, write_atomically
 
-_FOLDER = "references"
+REFERENCES_FOLDER = "references"
 """Subfolder of the store. It holds one file for each folder of results. The file lists the artefacts that
 these results refer to."""
 _LOCK = "in-use"
@@ -43,11 +41,11 @@ class References:
         self._root = store.root
         self._places = [str(place) for place in dict.fromkeys((owner.resolve(), *also))]
         self._lock = threading.Lock()
-        self.named = set(_read(self._path)[1])
+        self.named = set(read_references(self._path)[1])
 
     @property
     def _path(self) -> Path:
-        return self._root / _FOLDER / f"{json_digest(self._places[0])[:32]}.json"
+        return self._root / REFERENCES_FOLDER / f"{json_digest(self._places[0])[:32]}.json"
 
     def add(self, artefact: Path) -> None:
         """Add a reference to an artefact, given its folder. Raises `StoreError`."""
@@ -114,26 +112,6 @@ def moving(store: Store, before: Path, *, wait: bool = True) -> Iterator[Callabl
             old.forget()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Garbage:
-    """Describes what cleaning the store removes, and what it keeps.
-
-    Attributes:
-        artefacts: Folders of the artefacts that no job refers to, relative to the store.
-        corrupt: Folder names of damaged artefacts that were set aside.
-        gone: Paths of folders of results that no longer exist; their references are removed.
-        kept: Number of artefacts that jobs refer to.
-        freed_bytes: Disk space (bytes) that the removal frees. The removal of a file that also has a hard
-            link in a folder of results frees no space.
-    """
-
-    artefacts: tuple[str, ...]
-    corrupt: tuple[str, ...]
-    gone: tuple[str, ...]
-    kept: int
-    freed_bytes: int
-
-
 @contextlib.contextmanager
 def in_use(store: Store, *, wait: bool = False) -> Iterator[None]:
     """Prevent the cleaning of the store while it is in use.
@@ -142,41 +120,23 @@ def in_use(store: Store, *, wait: bool = False) -> Iterator[None]:
     `StoreBusy`.
     """
     kind = fcntl.LOCK_SH if wait else fcntl.LOCK_SH | fcntl.LOCK_NB
-    with _locked(store, kind, "the store is being cleaned", "start again when `bodycap gc` has ended"):
+    with locked(store, kind, "the store is being cleaned", "start again when `bodycap gc` has ended"):
         yield
 
 
-def collect_garbage(store: Store, *, delete: bool) -> Garbage:
-    """Find the artefacts that no job refers to, and remove them if `delete` is True.
+@contextlib.contextmanager
+def locked(store: Store, kind: int, refusal: str, hint: str) -> Iterator[None]:
+    """Hold a lock of the whole store.
+
+    Args:
+        store: The store.
+        kind: Kind of the lock, as for `fcntl.flock`.
+        refusal: Message of the error if the lock is not free.
+        hint: Hint of this error.
 
     Raises:
-        StoreError: A job is using the store, or the disk fails.
+        StoreBusy: The lock is not free, and `kind` contains ``LOCK_NB``.
     """
-    busy = "a job is running on this store", "wait until it has ended"
-    with _locked(store, fcntl.LOCK_EX | fcntl.LOCK_NB, *busy), disk_errors(store.root):
-        lists = {path: _read(path) for path in sorted((store.root / _FOLDER).glob("*.json"))}
-        gone = {path: places[0] for path, (places, _) in lists.items() if not any(map(_exists, places))}
-        used = {name for path, (_, names) in lists.items() if path not in gone for name in names}
-        found = [path for path in sorted((store.root / "artefacts").glob("*/*")) if path.is_dir()]
-        unused = [path for path in found if path.relative_to(store.root).as_posix() not in used]
-        corrupt = sorted((store.root / "corrupt").iterdir())
-        garbage = Garbage(
-            artefacts=tuple(path.relative_to(store.root).as_posix() for path in unused),
-            corrupt=tuple(path.name for path in corrupt),
-            gone=tuple(gone.values()),
-            kept=len(found) - len(unused),
-            freed_bytes=sum(_freed_bytes(path) for path in (*unused, *corrupt)),
-        )
-        if delete:
-            _remove((*unused, *corrupt), store.root / "tmp")
-            for path in gone:
-                path.unlink()
-            store.sweep()
-    return garbage
-
-
-@contextlib.contextmanager
-def _locked(store: Store, kind: int, refusal: str, hint: str) -> Iterator[None]:
     with disk_errors(store.root):
         handle = os.open(store.root / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
     try:
@@ -189,7 +149,7 @@ def _locked(store: Store, kind: int, refusal: str, hint: str) -> Iterator[None]:
         os.close(handle)
 
 
-def _read(path: Path) -> tuple[list[str], list[str]]:
+def read_references(path: Path) -> tuple[list[str], list[str]]:
     """Read the paths and the artefacts of one folder of results.
 
     If the list is missing or damaged, return one empty path and no artefacts.
@@ -200,24 +160,3 @@ def _read(path: Path) -> tuple[list[str], list[str]]:
         return [str(place) for place in places], [str(name) for name in content["artefacts"]]
     except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
         return [""], []
-
-
-def _exists(place: str) -> bool:
-    """Return True if a path exists.
-
-    If the disk fails, this function raises `OSError`, and no artefact is removed by mistake.
-    """
-    return bool(place) and Path(place).exists()
-
-
-def _freed_bytes(folder: Path) -> int:
-    stats = (path.lstat() for path in folder.rglob("*") if path.is_file())
-    return sum(stat.st_size for stat in stats if stat.st_nlink == 1)
-
-
-def _remove(folders: Iterable[Path], trash: Path) -> None:
-    """Remove folders. Each folder is first moved to `trash`, so that no incomplete artefact can remain."""
-    for folder in folders:
-        moved = trash / f"removed-{folder.name}"
-        os.replace(folder, moved)
-        shutil.rmtree(moved, ignore_errors=True)

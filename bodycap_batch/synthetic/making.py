@@ -21,16 +21,16 @@ from bodycap_batch.formats.atomic_files import store_error_from_os_error
 from bodycap_batch.formats.mp4 import VideoWriter
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
+from bodycap_batch.synthetic.camera_renderer import CameraRenderer, MovingBody, Sensor, camera_poses_at
 from bodycap_batch.synthetic.clip import load_clip
-from bodycap_batch.synthetic.filming import CameraRenderer, MovingBody, Sensor, camera_poses_at
 from bodycap_batch.synthetic.gait import Walk, WalkStyle
 from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
 from bodycap_batch.synthetic.measured import disturb_poses
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
 from bodycap_batch.synthetic.pressing import find_press
-from bodycap_batch.synthetic.render import SceneRenderer, triangles_from_surfaces
 from bodycap_batch.synthetic.room import build_room
+from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, triangles_from_surfaces
 from bodycap_batch.synthetic.truth import (
     MARKER,
     common_ticks_ns,

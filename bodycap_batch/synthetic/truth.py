@@ -17,7 +17,7 @@ from bodycap_batch.formats.bvh import write_bvh
 from bodycap_batch.formats.tum import TimedPoses, seconds_text, write_tum
 from bodycap_batch.model.geometry import quat_xyzw_from_rotation
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
-from bodycap_batch.synthetic.filming import MovingBody, joint_poses_at
+from bodycap_batch.synthetic.camera_renderer import MovingBody, joint_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 
 JOINT_ROLES = {

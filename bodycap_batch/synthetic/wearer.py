@@ -10,8 +10,8 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions, split_side
 from bodycap_batch.synthetic import textures
-from bodycap_batch.synthetic.render import Triangles
 from bodycap_batch.synthetic.surfaces import UINT8
+from bodycap_batch.synthetic.triangle_renderer import Triangles
 
 _RADII = {
     "Hips": (0.15, 0.14),

@@ -44,7 +44,7 @@ PLACED_M = 0.05
 
 def run_case(split: str, seed: int, seconds: float) -> dict[str, Any]:
     """Simulate one walk, align its maps, and compare with the truth."""
-    from bodycap_batch.merging.camera_selection import candidate_main_maps  # gtsam takes a second to import
+    from bodycap_batch.merging.main_map import candidate_main_maps  # gtsam takes a second to import
     from bodycap_batch.merging.map_alignment.align import align_cameras
 
     cameras = ARMS if len(SPLITS[split]) == len(ARMS) else PALMS

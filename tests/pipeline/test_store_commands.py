@@ -16,7 +16,8 @@ import pytest
 from bodycap_batch.core.errors import Cancelled, StoreError
 from bodycap_batch.pipeline import Settings, explain_job, run_job
 from bodycap_batch.store.artefacts import ArtefactKey, Store
-from bodycap_batch.store.references import References, collect_garbage, in_use, moving
+from bodycap_batch.store.garbage_collection import collect_garbage
+from bodycap_batch.store.references import References, in_use, moving
 from bodycap_batch.tasks.order import StageName, stages_from
 from tests.pipeline.test_run import ALL, CHILD, PER_CAMERA, REGISTERED, Bench, bench, done, done_once
 

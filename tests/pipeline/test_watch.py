@@ -20,7 +20,7 @@ from bodycap_batch.config.limits import Limits
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import Store
-from bodycap_batch.store.references import collect_garbage
+from bodycap_batch.store.garbage_collection import collect_garbage
 from bodycap_batch.watch import JobPermissions, cancel_job, inbox_claim, job_rows, retry_job
 from bodycap_batch.watch.claim import Claim, create_claim, take_over_job
 from bodycap_batch.watch.commands import job_row

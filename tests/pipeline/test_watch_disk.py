@@ -67,7 +67,7 @@ def test_the_watcher_waits_for_a_folder_that_cannot_be_read(
     assert bench.status("walk")["state"] == "done"
     failures = [line for line in bench.lines if "Input/output error" in line]
     assert len(failures) == 1, "reported once"
-    assert any("answers again" in line for line in bench.lines)
+    assert any("is accessible again" in line for line in bench.lines)
 
 
 def test_the_watcher_waits_for_a_missing_inbox_and_does_not_create_it(bench: SpoolFixture) -> None:

@@ -252,7 +252,7 @@ def test_a_discarded_upload_is_removed_while_a_file_is_being_sent(
     wait_for(lambda: any(bench.spool.inbox.glob(".upload-*/*.part")))
     assert client.ask("DELETE", f"/api/uploads/{key}")[0] == 200
     code, data = partial.send_rest()
-    assert (code, json.loads(data)["message"]) == (400, "there is no such upload, or no longer")
+    assert (code, json.loads(data)["message"]) == (400, "the upload does not exist or has ended")
     assert list(bench.spool.inbox.iterdir()) == []
 
 

@@ -13,7 +13,7 @@ from bodycap_batch.cli import main
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.pipeline import Settings
 from bodycap_batch.store.artefacts import Store
-from bodycap_batch.store.references import collect_garbage
+from bodycap_batch.store.garbage_collection import collect_garbage
 from bodycap_batch.watch import cancel_job, commands, inbox_claim, job_worker, retry_job
 from bodycap_batch.watch.inbox_entries import InboxEntry, take_snapshot
 from bodycap_batch.watch.job_status import JobStatusFile
@@ -215,7 +215,7 @@ def test_a_job_that_ends_during_the_cancellation_is_done(
 
     monkeypatch.setattr(Path, "touch", end)
     assert main(["cancel", "walk"]) == 0
-    assert "it ended before it could be stopped: done" in capfd.readouterr().out
+    assert "the job ended before it could be stopped: done" in capfd.readouterr().out
 
 
 def test_parallel_jobs_share_their_stage_turns(bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch) -> None:

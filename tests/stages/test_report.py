@@ -178,7 +178,7 @@ def test_a_lens_that_the_map_contradicts_is_not_graded_good(
     metrics["mapping"]["freed_lenses"] = ["left_palm", "torso"]
     (freed,) = (each for each in judge(metrics, None).criteria if "Lenses" in each.name)
     assert freed.grade is Grade.FAIR
-    assert "what fits was used instead" in freed.finding
+    assert "the lens that fits was used instead" in freed.finding
     # With a larger error the estimated lens does not fit either, as a pinhole for a wide lens does not.
     strained = json.loads(json.dumps(metrics))
     strained["total"]["mean_reprojection_error_px"] = 1.1

@@ -68,4 +68,4 @@ def test_the_page_stays_under_15_mb_at_any_length(frames: int, tmp_path: Path) -
     # There are no videos here. Their pictures have their own budget; a lost frame's picture is about 16 kB.
     assert len(text.encode()) + SERIES_BUDGET + 24 * 16_000 <= 15_000_000
     if frames > 5_000:
-        assert re.search(r"To keep it small it shows [\d,]+ of [\d,]+ ", text)
+        assert re.search(r"To keep this page small, it shows only [\d,]+ of [\d,]+ ", text)

@@ -18,7 +18,7 @@ def test_the_table_holds_the_errors_of_the_code() -> None:
 WITHOUT_REMEDY = {
     "holds a …, not a …",  # a store mixed up by hand; `run` rebuilds it
     "no joint has the role …",  # refused earlier, with the joints there are
-    "… are one keyframe",  # two init_frames of the same place
+    "… have the same nearest keyframe",  # two init_frames of the same place
 }
 
 

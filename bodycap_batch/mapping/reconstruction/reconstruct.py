@@ -16,7 +16,7 @@ from bodycap_batch.mapping.matching.database import DATABASE_NAME, read_matched_
 from bodycap_batch.mapping.reconstruction.incremental_mapper import progress_counter, register_images
 from bodycap_batch.mapping.reconstruction.initial_pair import InitialPair
 from bodycap_batch.mapping.reconstruction.mapper_options import MIN_MODEL_KEYFRAMES
-from bodycap_batch.mapping.reconstruction.models import keyframe_names, model_order
+from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, model_order
 
 if TYPE_CHECKING:
     import pycolmap

@@ -20,7 +20,7 @@ from bodycap_batch.mapping.reconstruction.bundle_adjustment import (
     adjust_robustly,
     sub_model,
 )
-from bodycap_batch.mapping.reconstruction.models import registered_ids
+from bodycap_batch.mapping.reconstruction.model_files import registered_ids
 
 if TYPE_CHECKING:
     import pycolmap

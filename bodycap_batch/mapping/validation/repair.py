@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, read_image_ids
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, sub_model
-from bodycap_batch.mapping.reconstruction.incremental_mapper import with_new_images
-from bodycap_batch.mapping.reconstruction.models import registered_ids
+from bodycap_batch.mapping.re_registration import adjust_unless_large, re_register_images
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model
+from bodycap_batch.mapping.reconstruction.model_files import registered_ids
 from bodycap_batch.mapping.validation.epipolar_consistency import (
     evaluate_pairs,
     find_misregistered_images,
@@ -95,7 +95,7 @@ def repair_model(
     ratio = round(inconsistent_match_ratio(pairs), 4)
     model, removed = _remove_images(model, wrong)
     if removed:
-        _adjust_unless_large(model, context)
+        adjust_unless_large(model, context)
     return model, {"rounds": log, "cut": removed, "contradicted_share": ratio}
 
 
@@ -109,7 +109,7 @@ def remove_misregistered(model: pycolmap.Reconstruction, context: MappingContext
     """
     kept, removed, _ = remove_without_adjustment(model, context)
     if removed:
-        _adjust_unless_large(kept, context)
+        adjust_unless_large(kept, context)
     return kept, removed
 
 
@@ -148,40 +148,3 @@ def _untried_pairs(ids: Mapping[ImageRef, int], images: set[int], tried: set[Pai
     refs: Sequence[ImageRef] = sorted(ids)
     chosen = [ref for ref in refs if ids[ref] in images]
     return sorted({(min(a, b), max(a, b)) for a in chosen for b in refs if a != b} - tried)
-
-
-def re_register_images(
-    model: pycolmap.Reconstruction, image_ids: Collection[int], context: MappingContext, total: int
-) -> Any:
-    """Remove some images from a model. Then register these images and all new images of the database.
-
-    Args:
-        model: A reconstruction; not changed.
-        image_ids: Ids of the images to remove and to register again.
-        context: Workspace, intrinsics, mapper options.
-        total: Number of all keyframes, for the progress.
-
-    Returns:
-        A copy of the model in which these images are registered, as far as they fit. All poses of the copy
-        are adjusted if the model is not large.
-    """
-    rest = sub_model(model, set(model.reg_image_ids()) - set(image_ids))
-    extended = with_new_images(
-        context.workspace,
-        rest,
-        context.mapper_options(),
-        context.stage,
-        total,
-        adjust_globally=not context.is_large(rest.num_reg_frames()),
-    )
-    _adjust_unless_large(extended, context)
-    return extended
-
-
-def _adjust_unless_large(model: pycolmap.Reconstruction, context: MappingContext) -> None:
-    """Adjust a model in place, unless the model is large.
-
-    At the end of the stage, the new images of a large model are adjusted (`finalise_models`).
-    """
-    if not context.is_large(model.num_reg_images()):
-        adjust_and_filter(model, context.mapper_options(), context.calibrated_ids)

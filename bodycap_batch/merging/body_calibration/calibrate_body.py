@@ -13,7 +13,6 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose
 from bodycap_batch.merging.body.trunk_lean import trunk_orientation, trunk_orientation_from_prior
-from bodycap_batch.merging.body_calibration.anthropometry import skeleton_error_modes
 from bodycap_batch.merging.body_calibration.calibration_covariance import (
     PoseSigma,
     ScaleUncertainty,
@@ -40,6 +39,7 @@ from bodycap_batch.merging.body_calibration.scale import (
     scale_from_bones,
     scale_from_floor,
 )
+from bodycap_batch.merging.body_calibration.skeleton_error_modes import skeleton_error_modes
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.error_modes import ErrorModes
 from bodycap_batch.merging.graph.posture import is_mostly_walking

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body_calibration.anthropometry import SkeletonErrorModes
 from bodycap_batch.merging.body_calibration.joint_variability import transient_variance_shares
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import JOINT_PRIOR_SCALE, CalibrationGraph
 from bodycap_batch.merging.body_calibration.mount_covariance import (
@@ -21,6 +20,7 @@ from bodycap_batch.merging.body_calibration.mount_covariance import (
     RowType,
 )
 from bodycap_batch.merging.body_calibration.samples import CalibrationSamples
+from bodycap_batch.merging.body_calibration.skeleton_error_modes import SkeletonErrorModes
 from bodycap_batch.merging.graph.error_modes import (
     POSTURE_BIAS_SHARE,
     ErrorModes,

@@ -5,7 +5,7 @@ their names in the report:
 
 - ``skeleton``, ``height``, ``mean stature``: the bones. `estimate_scale` finds the scale at which the
   calibration graph has the lowest cost; `scale_from_bones` adds the uncertainty of the bone lengths
-  (`PROPORTION_SIGMA` in ``anthropometry.py``). The name says where the bone lengths come from.
+  (`PROPORTION_SIGMA` in ``skeleton_error_modes.py``). The name says where the bone lengths come from.
 - ``floor``: the height of the reference camera's joint over the floor, see `scale_from_floor`. The module
   ``world/floor.py`` finds the floor that the person walks on.
 - ``known distance``: a distance given in the job, see ``known_distance.py``.
@@ -31,8 +31,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body_calibration.anthropometry import PROPORTION_SIGMA
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.skeleton_error_modes import PROPORTION_SIGMA
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO
 
 MEAN_STATURE = "mean stature"

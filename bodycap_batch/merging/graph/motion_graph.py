@@ -30,7 +30,7 @@ from bodycap_batch.merging.graph.factors import (
 )
 from bodycap_batch.merging.graph.foot_contact import FootContact
 from bodycap_batch.merging.graph.joint_covariance import SolvedGraph, joint_covariance
-from bodycap_batch.merging.graph.joint_limits import DistanceLimit
+from bodycap_batch.merging.graph.joint_distance_limits import DistanceLimit
 from bodycap_batch.merging.graph.motion_prior import add_motion_prior
 from bodycap_batch.merging.graph.optimiser import gauss_newton_then_lm
 from bodycap_batch.model.geometry import interpolate_pose, invert, so3_log

@@ -24,13 +24,8 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
 )
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
-from bodycap_batch.merging.cameras.track import (
-    CameraTrack,
-    make_track,
-    remove_outliers,
-    transform_track,
-    transform_trajectory,
-)
+from bodycap_batch.merging.cameras.track import CameraTrack, make_track, transform_track, transform_trajectory
+from bodycap_batch.merging.cameras.track_outliers import remove_outliers
 from bodycap_batch.merging.map_alignment.initial_alignment import (
     InitialAlignment,
     align_maps_initially,

@@ -10,8 +10,8 @@ from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.core.arrays import IntArray, evenly_spaced
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.geometry import invert
-from bodycap_batch.model.optical_flow import sharpness
 from bodycap_batch.model.scene import Map, Trajectory
+from bodycap_batch.model.sharpness import sharpness
 from bodycap_batch.registration.poses.static_points import static_points
 from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser
 from bodycap_batch.registration.recovery.patch_search import (

@@ -8,7 +8,7 @@ import pytest
 
 from bodycap_batch import cli
 from bodycap_batch.calibration import CalibrationBoard, calibrate_clip, write_calibration, write_preview
-from bodycap_batch.calibration.boards import BoardCorners
+from bodycap_batch.calibration.board_detection import BoardCorners
 from bodycap_batch.calibration.clip_calibration import corner_coverage, select_diverse_views
 from bodycap_batch.calibration.intrinsics_fit import fit_intrinsics
 from bodycap_batch.capture import open_camera
@@ -160,7 +160,7 @@ def test_the_command_writes_calibration_and_preview(clip, tmp_path, capsys):
         (["--charuco", "nine"], "not a board size"),
         (["--charuco", "2x2"], "too small"),
         (["--charuco", "9x6", "--dictionary", "9X9"], "unknown markers"),
-        (["--charuco", "9x6", "--marker", "1.5"], "cannot be 1.5 of a square"),
+        (["--charuco", "9x6", "--marker", "1.5"], "cannot be 1.5 times as wide as a square"),
     ],
 )
 def test_wrong_options_are_refused(clip, tmp_path, capsys, words, message):

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodycap_batch.capture import open_camera, open_capture
-from bodycap_batch.capture.opening import work_size
+from bodycap_batch.capture.initial_intrinsics import work_size
 from bodycap_batch.config.calibration import Calibration, read_calibration
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
@@ -101,7 +101,7 @@ def test_another_size_of_the_same_aspect_is_scaled(wide: Path) -> None:
     assert lens.params.tolist() == [200.0, 205.0, 165.0, 85.0]
 
 
-@pytest.mark.parametrize(("size", "hint"), [((640, 480), "video mode"), ((360, 640), "turned")])
+@pytest.mark.parametrize(("size", "hint"), [((640, 480), "video mode"), ((360, 640), "rotated")])
 def test_another_aspect_is_refused(wide: Path, size: tuple[int, int], hint: str) -> None:
     with pytest.raises(CaptureError, match="another aspect") as caught:
         lens_of(wide, calibration=pinhole(*size))

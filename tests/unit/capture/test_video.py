@@ -15,8 +15,8 @@ import pytest
 from av.video.frame import VideoFrame
 
 from bodycap_batch.capture import CaptureCamera, decoding, open_camera
+from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.capture.images import turn_upright
-from bodycap_batch.capture.indexing import index_video
 from bodycap_batch.capture.prefetch import prefetch
 from bodycap_batch.capture.video import open_container
 from bodycap_batch.config.models import CameraConfig, CaptureConfig

@@ -30,6 +30,7 @@ from bodycap_batch.mapping.matching.database import (
     write_image,
 )
 from bodycap_batch.mapping.matching.pair_matching import find_mutual_matches, match_pairs
+from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
 from bodycap_batch.mapping.reconstruction.incremental_mapper import register_images
 from bodycap_batch.mapping.reconstruction.initial_pair import find_user_pair, rank_initial_pairs
@@ -40,7 +41,7 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
     evaluate_pairs,
     find_misregistered_images,
 )
-from bodycap_batch.mapping.validation.repair import re_register_images, remove_misregistered, repair_model
+from bodycap_batch.mapping.validation.repair import remove_misregistered, repair_model
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import align_points, invert, make_transform, so3_exp

@@ -8,8 +8,11 @@ import pytest
 
 from bodycap_batch.core.errors import EstimationError, JobError
 from bodycap_batch.merging.body.bones import kinematic_chain
-from bodycap_batch.merging.body_calibration.anthropometry import bone_length_modes, joint_placement_modes
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
+from bodycap_batch.merging.body_calibration.skeleton_error_modes import (
+    bone_length_modes,
+    joint_placement_modes,
+)
 from bodycap_batch.merging.reporting.advice import describe_mount, describe_scale
 from bodycap_batch.model.geometry import Similarity, so3_exp
 from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount

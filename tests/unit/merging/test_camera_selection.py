@@ -13,13 +13,9 @@ from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging import camera_selection, merge_trajectories
 from bodycap_batch.merging.body_calibration.calibrate_body import preliminary_vertical
 from bodycap_batch.merging.body_calibration.samples import MAP_ERROR_RAD, take_samples
-from bodycap_batch.merging.camera_selection import (
-    align_usable_cameras,
-    candidate_main_maps,
-    excluded_cameras,
-    rarely_localised,
-)
+from bodycap_batch.merging.cameras.excluded_cameras import excluded_cameras, rarely_localised
 from bodycap_batch.merging.cameras.track import MIN_SIGMA_RAD, make_track
+from bodycap_batch.merging.main_map import align_usable_cameras, candidate_main_maps
 from bodycap_batch.merging.map_alignment import align, similarity_refinement
 from bodycap_batch.merging.map_alignment.align import AlignedMap, align_cameras
 from bodycap_batch.merging.stage import timeline

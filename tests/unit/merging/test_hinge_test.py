@@ -93,5 +93,5 @@ def test_a_violated_hinge_is_described_with_advice():
     assert "left elbow bends 10.0 cm" in sentence
     assert "; to know it better, strap" in sentence
     # A palm's clock that is 60 ms off looks like a violated hinge as well.
-    assert "check their clocks (offset_s)" in sentence
+    assert "check the cameras' clocks (offset_s)" in sentence
     assert "right knee" in describe_hinge("RightLeg", 0.02)

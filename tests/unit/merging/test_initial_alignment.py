@@ -10,8 +10,8 @@ import pytest
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.provisional_scale import provisional_scale
-from bodycap_batch.merging.camera_selection import candidate_main_maps
 from bodycap_batch.merging.cameras.track import make_track
+from bodycap_batch.merging.main_map import candidate_main_maps
 from bodycap_batch.merging.map_alignment.initial_alignment import align_maps_initially
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import SPLITS

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
+from bodycap_batch.calibration.board_detection import CalibrationBoard
 from bodycap_batch.calibration.board_views import find_board_views
-from bodycap_batch.calibration.boards import CalibrationBoard
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.options import MarkerBoard, MergeOptions

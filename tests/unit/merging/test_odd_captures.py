@@ -12,7 +12,6 @@ from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.provisional_scale import reach_constraint
 from bodycap_batch.merging.body_calibration import mount_calibration_graph
-from bodycap_batch.merging.body_calibration.anthropometry import skeleton_error_modes
 from bodycap_batch.merging.body_calibration.calibration_covariance import (
     ScaleUncertainty,
     error_modes,
@@ -22,6 +21,7 @@ from bodycap_batch.merging.body_calibration.known_distance import known_distance
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.body_calibration.scale import estimate_scale
+from bodycap_batch.merging.body_calibration.skeleton_error_modes import skeleton_error_modes
 from bodycap_batch.merging.cameras.track import inflate_sigmas, make_track
 from bodycap_batch.merging.graph.motion_graph import MotionGraph
 from bodycap_batch.merging.graph.windows import with_overlap
@@ -203,7 +203,7 @@ def test_a_known_distance_in_a_further_map_is_in_that_maps_units(body, recorded)
     alone = known_distance(inputs.trajectories, asked)
     placed = known_distance(inputs.trajectories, asked, {"map-0": half, "map-1": half})
     assert placed.scale == pytest.approx(2.0 * alone.scale)
-    with pytest.raises(EstimationError, match="cannot place"):
+    with pytest.raises(EstimationError, match="not aligned with the main map"):
         known_distance(inputs.trajectories, asked, {"map-0": half})
 
 

@@ -20,7 +20,8 @@ from bodycap_batch.merging.body_calibration.scale import (
     scale_from_floor,
     weighted_mean,
 )
-from bodycap_batch.merging.cameras.track import CameraTrack, remove_outliers
+from bodycap_batch.merging.cameras.track import CameraTrack
+from bodycap_batch.merging.cameras.track_outliers import remove_outliers
 from bodycap_batch.merging.graph.adaptive_motion_noise import scale_motion_noise
 from bodycap_batch.merging.graph.factors import (
     MountPoints,
@@ -30,7 +31,7 @@ from bodycap_batch.merging.graph.factors import (
     mount_from_points,
     mount_jacobian,
 )
-from bodycap_batch.merging.graph.joint_limits import activity_limits, arm_reach_limits, hinge_limits
+from bodycap_batch.merging.graph.joint_distance_limits import activity_limits, arm_reach_limits, hinge_limits
 from bodycap_batch.merging.world.floor import (
     floor_beside_path,
     floor_from_feet,

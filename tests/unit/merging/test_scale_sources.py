@@ -12,8 +12,8 @@ from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.calibrate_body import reference_camera_roll
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
-from bodycap_batch.merging.camera_selection import candidate_main_maps
 from bodycap_batch.merging.cameras.track import CameraTrack, make_track
+from bodycap_batch.merging.main_map import candidate_main_maps
 from bodycap_batch.merging.map_alignment import align
 from bodycap_batch.merging.map_alignment.align import align_cameras
 from bodycap_batch.merging.map_alignment.scale_sources import (

@@ -106,7 +106,7 @@ def test_a_constant_lean_is_unknown_unless_the_person_walks(forward_deg, share):
     assert 38.0 < found.sigma_deg < 50.0
     assert _off_deg(found) < 2.5 * found.sigma_deg
     assert not found.is_determined()
-    assert "not for certain: it rests on the posture alone" in describe_vertical(found)
+    assert "not certain: only the posture shows it" in describe_vertical(found)
     if share == 1.0:
         walked = _found(axes, path, np.zeros((0, 3)), walks=True)
         assert walked.sigma_deg == pytest.approx(15.0, abs=0.5)

@@ -14,10 +14,10 @@ from bodycap_batch.model.optical_flow import (
     fit_rotation,
     make_coarse_image,
     pixel_scale,
-    sharpness,
     track_points,
     unit_directions,
 )
+from bodycap_batch.model.sharpness import sharpness
 
 
 def _texture(seed: int = 0, width: int = 320, height: int = 240) -> np.ndarray:

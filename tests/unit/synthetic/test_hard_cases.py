@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from bodycap_batch.synthetic.filming import camera_poses_at, joint_poses_at
+from bodycap_batch.synthetic.camera_renderer import camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.making import build_renderers, draw_subject
 from bodycap_batch.synthetic.options import SynthOptions
-from bodycap_batch.synthetic.render import SceneRenderer
 from bodycap_batch.synthetic.room import build_room
+from bodycap_batch.synthetic.triangle_renderer import SceneRenderer
 
 SMALL = {"width": 64, "height": 48, "seconds": 5.0, "body_in_view": True}
 

@@ -11,10 +11,10 @@ from bodycap_batch.model.geometry import invert, make_transform, so3_exp
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.synthetic.atlas import Atlas, select_filter
-from bodycap_batch.synthetic.filming import CameraRenderer, Sensor, camera_poses_at
+from bodycap_batch.synthetic.camera_renderer import CameraRenderer, Sensor, camera_poses_at
 from bodycap_batch.synthetic.lens import ray_grid
-from bodycap_batch.synthetic.render import SceneRenderer, triangles_from_surfaces
 from bodycap_batch.synthetic.surfaces import Surface, box_faces, surface_facing
+from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, triangles_from_surfaces
 from bodycap_batch.synthetic.wearer import Wearer
 
 SQUARES, TEXELS = 6, 40

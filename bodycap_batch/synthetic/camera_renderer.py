@@ -13,7 +13,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.skeleton import Mount, SkeletonModel, forward_kinematics
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.lens import RayGrid
-from bodycap_batch.synthetic.render import SceneRenderer, Triangles, concatenate_triangles
+from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, Triangles, concatenate_triangles
 from bodycap_batch.synthetic.wearer import Wearer
 
 _BLUR_STEP_PX = 1.0

@@ -1,0 +1,45 @@
+"""Find the cameras that contain no information about the body's motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from bodycap_batch.merging.cameras.stationary import stationary_cameras
+from bodycap_batch.model.merge_data import MergeInputs
+from bodycap_batch.model.scene import Trajectory
+
+MIN_LOCALISED_FRAMES = 15
+"""Minimum number of localised frames of a camera: half a second at 30 fps. Evidence: none."""
+
+
+def excluded_cameras(inputs: MergeInputs) -> dict[str, str]:
+    """Find the cameras that contain no information about the body's motion.
+
+    Args:
+        inputs: Trajectories, mounts and clocks.
+
+    Returns:
+        By name of an excluded camera, the reason why the camera is excluded.
+    """
+    rare = rarely_localised(inputs.trajectories)
+    still = stationary_cameras(inputs, [each for each in inputs.trajectories if each.camera not in rare])
+    reason = "it stands still while the other cameras move: nobody wears it, or its video is frozen"
+    return {**rare, **dict.fromkeys(still, reason)}
+
+
+def rarely_localised(trajectories: Sequence[Trajectory]) -> dict[str, str]:
+    """Find the cameras with fewer localised frames than `MIN_LOCALISED_FRAMES`.
+
+    Args:
+        trajectories: The trajectories of all cameras.
+
+    Returns:
+        By name of an excluded camera, the reason why the camera is excluded.
+    """
+    counts = {each.camera: int(each.localised.sum()) for each in trajectories}
+    needed = f"{MIN_LOCALISED_FRAMES} needed"
+    return {
+        each.camera: f"{counts[each.camera]} localised frames of {len(each.status)}, {needed}"
+        for each in trajectories
+        if counts[each.camera] < MIN_LOCALISED_FRAMES
+    }

@@ -1,0 +1,130 @@
+"""Choose the main map and its reference camera, and align the maps of all usable cameras to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import permutations
+from typing import NamedTuple
+
+from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.merging.body.bones import kinematic_chain
+from bodycap_batch.merging.body.provisional_scale import reach_constraint
+from bodycap_batch.merging.cameras.excluded_cameras import excluded_cameras
+from bodycap_batch.merging.map_alignment.align import UsableCameras, align_cameras
+from bodycap_batch.model.merge_data import MergeInputs
+from bodycap_batch.model.scene import Trajectory
+from bodycap_batch.model.skeleton import SkeletonModel
+
+REFERENCE_ROLES = ("Spine1", "Spine", "Hips", "Neck", "Head")
+"""Preferred bones for the reference camera, the best bone first: trunk, then neck and head.
+
+Cameras on limbs are considered after the cameras on these bones, because limbs move relative to the trunk.
+"""
+
+
+_MIN_TIME_RATIO = 0.25
+"""Minimum localised time of a good reference camera, as a fraction of the longest time of any camera.
+
+A camera with a smaller fraction is considered after all cameras with a larger fraction. Evidence: none.
+"""
+
+
+class MainMapCandidate(NamedTuple):
+    """A map that may become the main map.
+
+    Attributes:
+        cameras: Trajectories in this map. The trajectory of the reference camera is the first.
+        further: Trajectories in all other maps. These maps may be aligned to this map.
+    """
+
+    cameras: list[Trajectory]
+    further: list[Trajectory]
+
+
+def align_usable_cameras(
+    inputs: MergeInputs,
+    step: Callable[[], None],
+    options: MergeOptions | None = None,
+    excluded: Mapping[str, str] | None = None,
+) -> UsableCameras:
+    """Select the main map, and align the maps of all usable cameras to the main map.
+
+    The main map is the best candidate for which the cameras determine the scale.
+
+    Args:
+        inputs: Trajectories, skeleton, mounts and clocks.
+        step: Function that is called after each iteration. It may raise an exception to stop the work.
+        options: Options of the stage, with the known distance and the marker board of the job.
+        excluded: The result of `excluded_cameras`; None to compute it.
+
+    Returns:
+        The usable cameras, with trajectories in the gauge of the main map.
+
+    Raises:
+        EstimationError: No map contains two cameras whose distance is limited by the skeleton.
+    """
+    excluded = excluded_cameras(inputs) if excluded is None else excluded
+    unused: dict[str, str] = {}
+    for candidate in candidate_main_maps(inputs, excluded):
+        aligned = align_cameras(inputs, candidate.cameras, candidate.further, step, options)
+        roles = [inputs.mount_of(each.camera).role for each in aligned.trajectories]
+        if _can_determine_scale(inputs.skeleton, roles):
+            return replace(aligned, unused={**excluded, **aligned.unused})
+        unused = unused or dict(aligned.unused)
+    unused = {**excluded, **unused}
+    usable = [each.camera for each in inputs.trajectories if each.camera not in unused]
+    reasons = "; ".join(f"{camera!r}: {reason}" for camera, reason in sorted(unused.items()))
+    raise EstimationError(
+        f"no two cameras determine the size of the body: {', '.join(map(repr, usable)) or 'none'} can be used"
+        + (f"; {reasons}" if reasons else ""),
+        hint="a skeleton needs one map with two cameras on trunk, head or the same limb; frames.csv has the "
+        "reasons of lost frames; more texture, more light or a slower start help",
+    )
+
+
+def candidate_main_maps(
+    inputs: MergeInputs, excluded: Mapping[str, str] | None = None
+) -> list[MainMapCandidate]:
+    """Return all maps as candidates for the main map, the best candidate first.
+
+    The rank of a map is the rank of its best reference camera. Cameras are ranked by their bone: first trunk,
+    then head, then limbs. The number of localised frames decides between cameras with equally good bones.
+    Cameras that were localised for a short time come after all other cameras.
+
+    Args:
+        inputs: Trajectories, mounts and clocks.
+        excluded: The result of `excluded_cameras`; None to compute it.
+
+    Returns:
+        One candidate per map.
+    """
+    counts = {each.camera: int(each.localised.sum()) for each in inputs.trajectories}
+    seconds = {camera: count / inputs.clocks[camera].nominal_fps for camera, count in counts.items()}
+    excluded = excluded_cameras(inputs) if excluded is None else excluded
+
+    def rank(trajectory: Trajectory) -> tuple[bool, int, int]:
+        camera, role = trajectory.camera, inputs.mount_of(trajectory.camera).role
+        is_short = seconds[camera] < _MIN_TIME_RATIO * max(seconds.values())
+        order = REFERENCE_ROLES.index(role) if role in REFERENCE_ROLES else len(REFERENCE_ROLES)
+        return is_short, order, -counts[camera]
+
+    ranked = sorted((each for each in inputs.trajectories if each.camera not in excluded), key=rank)
+    return [
+        MainMapCandidate(
+            [each for each in ranked if each.gauge == gauge], [each for each in ranked if each.gauge != gauge]
+        )
+        for gauge in dict.fromkeys(each.gauge for each in ranked)
+    ]
+
+
+def _can_determine_scale(skeleton: SkeletonModel, roles: Sequence[str]) -> bool:
+    """Return True if the skeleton limits the distance between at least two cameras on these bones."""
+    if len(roles) < 2:
+        return False
+    bones = kinematic_chain(skeleton, set(roles))
+    index = {bone.role: number for number, bone in enumerate(bones)}
+    return any(
+        reach_constraint(bones, index[one], index[other]) is not None for one, other in permutations(roles, 2)
+    )
