@@ -45,8 +45,8 @@ _ExecutorOption = Annotated[
     str,
     typer.Option(
         metavar="local|ADDRESS|slurm|pbs",
-        help="Place of the tasks: this machine, the workers of a Dask scheduler (tcp://HOST:8786), "
-        "or a queue.",
+        help="Where the tasks run: on this machine, on the workers of a Dask scheduler (tcp://HOST:8786), "
+        "or in a queue.",
     ),
 ]
 
@@ -75,9 +75,9 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
 ) -> None:
     """Run many jobs, on one machine or on several.
 
-    A failed job does not stop the others; the exit code is that of the worst job. If the batch is started
-    again, it continues after the finished stages. On a cluster, the jobs, their videos, the store and the
-    results must be on a disk that all machines mount under the same path.
+    A failed job does not stop the others. The exit code is the highest exit code of all jobs. If the batch is
+    started again, it continues after the finished stages. On a cluster, the jobs, their videos, the store and
+    the results must be on a disk that all machines mount under the same path.
 
     \b
     Examples:
@@ -162,8 +162,8 @@ def _with_worker_note(cluster: Cluster) -> Cluster:
 def _batch_results_folder(job: Job, folder: Path) -> Path:
     """Return the results folder of a job.
 
-    If the job gives no `out`, the results folder is a subfolder of `folder` (the batch's folder) with the
-    job's name.
+    The `out` of a loaded job is the default folder if the job file does not give `out`. In this case, the
+    results folder is a subfolder of `folder` (the batch's folder) with the job's name.
     """
     busy_jobs = default_out() / job.name
     return folder / job.name if job.out in (None, busy_jobs) else results_folder(job)

@@ -37,10 +37,10 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
         str | None, typer.Option(metavar="CxR", help="A ChArUco board, by its squares, for example 7x5.")
     ] = None,
     dictionary: Annotated[str, typer.Option(help="ChArUco: dictionary of its markers.")] = "4X4_50",
-    marker: Annotated[
-        float, typer.Option(help="ChArUco: side of a marker over the side of a square.")
-    ] = 0.75,
-    legacy: Annotated[bool, typer.Option("--legacy", help="ChArUco: drawn by an OpenCV before 4.6.")] = False,
+    marker: Annotated[float, typer.Option(help="ChArUco: side of a marker / side of a square.")] = 0.75,
+    legacy: Annotated[
+        bool, typer.Option("--legacy", help="ChArUco: the board comes from OpenCV before 4.6.")
+    ] = False,
     lens: Annotated[
         CameraModelOption,
         typer.Option(help="Camera model; auto selects opencv, or fisheye if it fits better."),
@@ -48,7 +48,8 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
     camera: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="Add the result to the file for this camera (default: for all cameras)."
+            metavar="NAME",
+            help="Camera to calibrate. The file keeps its other cameras. Default: one result for all.",
         ),
     ] = None,
     out: Annotated[
@@ -64,9 +65,9 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
     """Calibrate a camera from a clip of a board.
 
     Print a board, and glue it on something flat. Film it with the camera settings of your captures:
-    stabilisation off, the same size, zoom and lens mode. Move it slowly to every corner of the picture, near
-    and far, tilted to all sides; half a minute is enough. The command writes calib.json and a preview of the
-    picture without distortion.
+    stabilisation off, the same size, zoom and lens mode. Move the board slowly to every corner of the
+    picture, near and far, tilted to all sides; half a minute is enough. The command writes calib.json and a
+    preview picture from which the distortion is removed.
 
     \b
     Examples:

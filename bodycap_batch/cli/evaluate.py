@@ -48,7 +48,8 @@ def evaluate(
         str | None,
         typer.Option(
             metavar="CAMERA",
-            help="Also compare every camera relative to this one, in metres without scaling.",
+            help="Also compare the position of every other camera relative to this camera, in metres, "
+            "without scaling.",
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print all figures as JSON.")] = False,
@@ -158,13 +159,13 @@ _CAMERA_COLUMNS = f"{'ATE rmse':>10}{'max':>8}{'cm':>4}{'turn rmse':>11}{'deg':>
 _MOTION_ROWS = (
     ("mpjpe_m", "joints, cm", 100),
     ("root_relative_m", "joints from the root, cm", 100),
-    ("procrustes_m", "joints, shape alone, cm", 100),
+    ("procrustes_m", "joints, each pose aligned, cm", 100),
     ("angle_deg", "angles, degrees", 1),
-    ("angle_offset_free_deg", "angles less a constant, degrees", 1),
+    ("angle_offset_free_deg", "angles, offset removed, degrees", 1),
 )
 """Rows of the table of joint errors. Each row holds the key of a value, the label with the unit, and the
 factor that converts the value to this unit."""
-_RELATIVE_ROWS = (("vector_m", "vector, cm"), ("in_reference_m", "in its frame, cm"))
+_RELATIVE_ROWS = (("vector_m", "vector, cm"), ("in_reference_m", "in reference camera's frame, cm"))
 """Rows of the table for a pair of cameras. Each row holds the key of a value, and the label with the unit."""
 
 

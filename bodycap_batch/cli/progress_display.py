@@ -20,8 +20,8 @@ _LINE_PERIOD_S = 5.0
 _LINE_PAUSE_S = 1.0
 """Minimum time (seconds) between two progress lines of a stage. Evidence: none."""
 _LINE_PROGRESS = 0.1
-"""Progress (fraction of the whole stage) since the last line that makes a stage print its next line.
-Evidence: none."""
+"""A stage prints its next progress line before `_LINE_PERIOD_S` if it has advanced at least by this fraction
+since the last line. Unit: 1 (the whole stage). Evidence: none."""
 
 
 class ProgressDisplay(Protocol):

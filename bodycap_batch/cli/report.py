@@ -33,9 +33,9 @@ def report(
 ) -> None:
     """Write a job's report.html again, from the content of the store.
 
-    Every run writes the report. This command repeats that, for example with a newer bodycap. The job may also
-    be given by its results folder. No other stage is computed. The report of an interrupted job states how
-    far it got.
+    Every run writes the report. This command writes the report again, for example with a newer bodycap. The
+    job may also be given by its results folder. No other stage is computed. The report of an interrupted job
+    states how far the job got.
 
     \b
     Examples:

@@ -59,8 +59,8 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
 ) -> None:
     """Compute the map, the camera paths and the motion of a capture.
 
-    Finished stages are kept. A run that was stopped, or is started again with other options, continues after
-    them. The last printed line names the results folder.
+    Finished stages are kept. A run that was stopped, or is started again with other options, computes only
+    the stages that are missing. The last printed line names the results folder.
 
     \b
     Examples:

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 @app.command()
 def skeleton(
-    file: Annotated[Path, typer.Argument(metavar="FILE.bvh", help="A character's rig.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE.bvh", help="The skeleton of a subject or a character.")
+    ],
     roles: Annotated[
         list[str] | None,
         typer.Option("--map", metavar="JOINT=ROLE", help="Role of a joint (none: no role). Repeatable."),

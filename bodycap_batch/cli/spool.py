@@ -25,8 +25,8 @@ NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the j
 _AGE_UNITS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
 """Units for the display of a job's age: the length (seconds) and the symbol of each unit."""
 _MAX_CAUSE_LENGTH = 200
-"""Maximum number of characters that the table shows of the cause of a failure. A longer text would make the
-row hard to read."""
+"""Maximum length, in characters, of the text for the cause of a failure in the table. A longer text is cut,
+because it would make the row hard to read."""
 
 
 @app.command(short_help="List the jobs of a watched folder and their states.")
@@ -91,9 +91,9 @@ def cancel(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
 
     place = cancel_job(_find_spool(spool), name)
     if place is None:
-        _print(f"{name}: no watcher has stopped it yet; the next active watcher cancels it")
+        _print(f"{name}: no watcher has stopped the job yet; the next active watcher cancels the job")
     elif (state := read_status(place).get("state")) != "cancelled":
-        _print(f"{name}: it ended before it could be stopped: {state}, {place.path}")
+        _print(f"{name}: the job ended before it could be stopped: {state}, {place.path}")
     else:
         _print(f"cancelled: {place.path}")
 

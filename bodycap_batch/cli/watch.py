@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 RootOption = Annotated[
     list[Path] | None,
-    typer.Option(metavar="DIR", help="A folder with files that every job may name. Repeatable."),
+    typer.Option(metavar="DIR", help="A folder with files that every job may use. Repeatable."),
 ]
 LimitOption = Annotated[
     list[str] | None,
@@ -85,13 +85,13 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
 ) -> None:
     """Run every folder of videos, or job file, that is dropped into INBOX.
 
-    A folder is complete when it has not changed for a while and holds no *.part or hidden file, or at once
-    when it holds a file named READY. Jobs move from inbox/ to running/ and then to done/ or failed/ beside
-    it. done/NAME/result/ holds the results, done/NAME/input/ the dropped files. Stop the command with Ctrl-C
-    at any time: the jobs continue at the next start. Several watchers, also on several machines, may share
-    the folders.
+    A folder is complete when it has not changed for a while and holds no *.part or hidden file. A folder with
+    a file named READY is complete at once. Jobs move from inbox/ to running/, then to done/ or failed/. These
+    folders are next to inbox/. done/NAME/result/ holds the results, done/NAME/input/ the dropped files. Stop
+    the command with Ctrl-C at any time: the jobs continue at the next start. Several watchers, also on
+    several machines, may share the folders.
 
-    A dropped job may name files in its own folder and below --root, nothing else.
+    A dropped job may only use files in its own folder and in the folders given by --root.
 
     \b
     Examples:

@@ -88,7 +88,7 @@ def gc(
       bodycap gc out/.store --delete
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.store.artefacts import Store
-    from bodycap_batch.store.references import collect_garbage
+    from bodycap_batch.store.garbage_collection import collect_garbage
 
     store_dir = store or Path(os.environ.get(STORE_VARIABLE) or default_store(default_out()))
     if not (store_dir / "artefacts").is_dir():

@@ -30,7 +30,10 @@ models with one focal length. For all other models the index is 2."""
 
 
 class Calibration(BaseModel):
-    """Intrinsics of a camera for the size of its upright calibration images (as a player shows them)."""
+    """Intrinsics of a camera at the size of its calibration images.
+
+    The images are upright, as a video player shows them.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -172,7 +175,7 @@ def _no_such_camera(path: Path, camera: str, cameras: object) -> CaptureError:
         f"no calibration of a camera named {camera!r}",
         path=path,
         field="cameras",
-        hint=f"did you mean {near[0]!r}?" if near else f"it holds: {', '.join(names) or 'none'}",
+        hint=f"did you mean {near[0]!r}?" if near else f"the file has: {', '.join(names) or 'none'}",
     )
 
 

@@ -39,7 +39,7 @@ class Problem(typing.NamedTuple):
     Attributes:
         location: Location of the problem in the job.
         message: Description of the problem.
-        hint: Advice for the user; None without advice.
+        hint: Advice for the user; None if there is no advice.
     """
 
     location: Location
@@ -138,7 +138,10 @@ def _location_in(loc: Sequence[str | int], data: object, *, missing: bool) -> Lo
 
 
 def _description(location: Location, model: type[BaseModel]) -> str:
-    """Return the description of the field at a location; without one, that of the nearest enclosing field."""
+    """Return the description of the field at a location, for the hint of a message.
+
+    If the field has no description, the description of the nearest enclosing field is returned.
+    """
     while location:
         fields = _fields_at(location[:-1], model)
         text = fields[str(location[-1])].description if str(location[-1]) in fields else None

@@ -126,8 +126,8 @@ def folder_capture(folder: Path) -> dict[str, object]:
 
     Raises:
         CaptureError: The folder holds no video, or it cannot be read.
-        JobError: Two cameras have the same name, or one of several cameras has a name that is not a known
-            place on the body.
+        JobError: Two cameras have the same name. Or there are several cameras, and the name of one camera is
+            not a known place on the body.
     """
     videos = videos_in(folder)
     _refuse_missing_videos(folder)

@@ -148,7 +148,7 @@ def _load(
     resolved = _resolved(job, base, safe_name(name), full, source)
     if policy is None:
         _require_apart(resolved, full)
-    else:  # no check of the folder of results here: the operator chooses it
+    else:  # the folder of the results is not checked, because the operator chooses it
         policy.require_resolved(resolved)
     return resolved
 
@@ -162,7 +162,7 @@ def synthetic_folder(job: Job, base: Path) -> Path:
     folders = {(base / video).resolve().parent for camera in job.capture.cameras for video in camera.video}
     if len(folders) > 1:
         raise JobError(
-            "a synthetic capture's videos lie in one folder, these lie in several",
+            "the videos of a synthetic capture must be in one folder, but these are in several",
             field="capture.cameras",
             hint="bodycap synth writes <folder>/<camera>.mp4",
         )
@@ -288,7 +288,7 @@ def _require_apart(job: Job, full: Path) -> None:
             f"the results would go to the folder of the job's own files, {job.out}",
             path=full,
             field="out",
-            hint=f"a folder of their own, for example {Path(str(job.out)) / 'results'}",
+            hint=f"use a separate folder for the results, for example {Path(str(job.out)) / 'results'}",
         )
 
 

@@ -62,5 +62,5 @@ def limits_from(settings: Iterable[str]) -> Limits:
             values[name] = float(value)
         except ValueError as error:
             hint = f"NAME=NUMBER, with NAME one of {', '.join(known)}"
-            raise JobError(f"no limit: {setting!r}", field="--limit", hint=hint) from error
+            raise JobError(f"not a limit: {setting!r}", field="--limit", hint=hint) from error
     return Limits(**values)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 LEAST_LOST = 3
-"""Minimum number of lost frames of a camera; with fewer lost frames, recovery does not run for this camera. A
-recovery of fewer frames does not justify that all keyframes are decoded again. Evidence: none."""
+"""Minimum number of lost frames of a camera. Recovery does not run for a camera with fewer lost frames.
+Reason: recovery decodes all keyframes again, which costs too much for so few frames. Evidence: none."""
 LEAST_POSED = 20
-"""Minimum number of localised frames of a camera; with fewer localised frames, recovery does not run for this
-camera. Fewer frames do not determine the prior of the camera's motion. Evidence: none."""
+"""Minimum number of localised frames of a camera. Recovery does not run for a camera with fewer localised
+frames. Reason: fewer frames do not determine the prior of the camera's motion. Evidence: none."""

@@ -75,8 +75,8 @@ class CameraConfig(_Block):
     video: tuple[Path, ...] = Field(
         min_length=1, description="video file, folder of chapters, or list of chapters"
     )
-    mount: str | None = Field(None, description="place on the body; default: the place that its name says")
-    segment: str | None = Field(None, description="bone that carries it, if no mount's name fits")
+    mount: str | None = Field(None, description="place on the body; default: from the camera's name")
+    segment: str | None = Field(None, description="bone of the camera, if no mount name fits")
     joint_from_cam: AnyPose | None = Field(
         None, description="measured mount: 4x4 matrix, or translation_m and quat_xyzw"
     )
@@ -129,7 +129,7 @@ class CaptureConfig(_Block):
         min_length=1, max_length=64, description="a list of blocks: - {name: torso, video: torso.mp4}"
     )
     calibration: AnyCalibration | None = Field(
-        None, description="calibration of every camera that has none of its own"
+        None, description="calibration of every camera that does not give a calibration itself"
     )
     rig: Literal["free", "synced"] = Field(
         "free",
@@ -138,7 +138,7 @@ class CaptureConfig(_Block):
     start_s: Seconds | None = Field(None, description="first moment used, common clock")
     end_s: Seconds | None = Field(None, description="last moment used, common clock")
     work_px: int = Field(
-        960, ge=160, le=8192, description="long side the frames are worked at; never enlarged"
+        960, ge=160, le=8192, description="long side of the frames, pixels; larger frames are reduced to it"
     )
     synthetic: dict[str, Any] | None = Field(
         None, description="options of `bodycap synth`: the videos are rendered on first use"
@@ -163,10 +163,11 @@ class Job(_Block):
         None, description="none, upper_body, full_body or a BVH file; default upper_body, none for one camera"
     )
     skeleton_map: dict[str, str] = Field(
-        default_factory=dict, description="role by joint name of a skeleton file, over what its names say"
+        default_factory=dict,
+        description="role by joint name of a skeleton file; replaces the role found from the joint's name",
     )
     tpose_frame: int | None = Field(
-        None, ge=0, description="frame of the skeleton file that holds its T-pose, where zero is none"
+        None, ge=0, description="frame of the skeleton file with the T-pose, if the zero pose is not a T-pose"
     )
     height_m: float | None = Field(
         None, ge=0.4, le=2.6, description="the subject's height in metres, e.g. 1.75"

@@ -25,40 +25,48 @@ class KeyframeOptions(Options):
     """Options of stage 1, the selection of keyframes."""
 
     parallax_px: float = Field(
-        15.0, gt=0, description="parallax without rotation that causes a keyframe, at 640 px width"
+        15.0,
+        gt=0,
+        description="a larger parallax causes a keyframe; pixels at a long side of 640 px, rotation removed",
     )
-    min_survival: float = Field(0.5, gt=0, lt=1, description="share of tracks left that causes a keyframe")
+    min_survival: float = Field(
+        0.5, gt=0, lt=1, description="a keyframe is selected if a smaller share of the tracks is left"
+    )
     max_gap_s: float = Field(0.5, gt=0, description="largest time between two keyframes")
     min_gap_s: float = Field(0.05, ge=0, description="smallest time between two keyframes")
     max_per_min: float | None = Field(
-        None, gt=0, description="most keyframes a minute; those that add least are left out"
+        None, gt=0, description="most keyframes per minute; the keyframes that add least are left out"
     )
-    window: int = Field(4, ge=1, description="frames among which the sharpest becomes the keyframe")
+    window: int = Field(
+        4, ge=1, description="number of last frames; the sharpest of these frames becomes the keyframe"
+    )
 
 
 class MapOptions(Options):
     """Options of stage 2, mapping."""
 
-    features: int = Field(512, ge=128, description="SIFT features a keyframe, the strongest")
+    features: int = Field(
+        512, ge=128, description="number of SIFT features per keyframe; the strongest features are used"
+    )
     pairs: Literal["retrieval", "exhaustive"] = Field(
-        "retrieval", description="keyframe pairs to match: neighbours and similar ones, or all"
+        "retrieval", description="keyframe pairs to match: neighbours and similar keyframes, or all pairs"
     )
     init_frames: tuple[FrameName, FrameName] | None = Field(
-        None, description="two frames to start from, each camera:frame; default: found"
+        None, description="two frames to start from, each camera:frame; default: selected automatically"
     )
     seed: int = Field(0, ge=0, description="seed of every random choice")
     min_coverage: float = Field(
-        0.1, ge=0, le=1, description="share of keyframes below which the map is refused"
+        0.1, ge=0, le=1, description="smallest share of the keyframes that the map must contain"
     )
 
 
 class RegistrationOptions(Options):
     """Options of stage 3, the registration of every frame."""
 
-    rounds: int = Field(3, ge=0, description="how often the map may be extended where frames were lost")
-    min_inliers: int = Field(15, ge=4, description="PnP inliers below which a frame is refused")
+    rounds: int = Field(3, ge=0, description="how often the map may be extended to localise lost frames")
+    min_inliers: int = Field(15, ge=4, description="smallest number of PnP inliers of a frame")
     max_sigma_depth: float = Field(
-        0.015, gt=0, description="largest centre sigma as a share of the median depth"
+        0.015, gt=0, description="largest sigma of the camera centre, as a share of the median depth"
     )
 
 
@@ -79,31 +87,38 @@ class MarkerBoard(Options):
 
     square_m: float = Field(gt=0, le=2, description="side of one square, metres, as measured on the print")
     columns: int = Field(ge=3, description="chessboard: inner corners in a row; ChArUco: squares in a row")
-    rows: int = Field(ge=3, description="the same down a column")
+    rows: int = Field(ge=3, description="chessboard: inner corners in a column; ChArUco: squares in a column")
     kind: Literal["charuco", "chessboard"] = Field("charuco", description="kind of board")
     dictionary: str = Field("4X4_50", description="ChArUco: family of its markers, as OpenCV names it")
-    marker: float = Field(0.75, gt=0.1, lt=1, description="ChArUco: side of a marker over that of a square")
-    legacy: bool = Field(False, description="ChArUco: drawn by an OpenCV older than 4.6")
+    marker: float = Field(0.75, gt=0.1, lt=1, description="ChArUco: side of a marker / side of a square")
+    legacy: bool = Field(False, description="ChArUco: true for a board from OpenCV before 4.6")
     placed: Literal["lying", "hanging"] | None = Field(
         None,
-        description="lying on a level floor or table, or hanging on a wall with its edges level and upright: "
-        "then it gives the vertical as well",
+        description="lying on a level floor or table, or hanging on a wall with its edges level and upright; "
+        "if given, the board also determines the vertical",
     )
 
 
 class MergeOptions(Options):
     """Options of stage 4, the motion of the skeleton."""
 
-    fps: float | None = Field(None, gt=0, description="rate of the motion; default the torso camera's")
-    max_gap_s: float = Field(1.0, gt=0, description="longest gap that is filled without a mark")
+    fps: float | None = Field(
+        None, gt=0, description="rate of the motion; default: the rate of the torso camera"
+    )
+    max_gap_s: float = Field(
+        1.0, gt=0, description="longest gap between the poses of a camera that is not marked as filled"
+    )
     t_pose_s: float | None = Field(
-        None, ge=0, description="how long a T-pose is held at the start; default: detected; 0: none"
+        None,
+        ge=0,
+        description="duration of the T-pose at the start; default: detected; 0: there is no T-pose",
     )
     camera_paths: Literal["joint", "measured"] = Field(
-        "joint", description="every frame's camera as solved together with the body, or as measured alone"
+        "joint", description="camera centres: joint = solved together with the body, measured = as registered"
     )
     foot_contact: bool = Field(
-        True, description="standing feet do not slide, if cameras on shins or feet show that they stand"
+        True,
+        description="keep standing feet from sliding, if cameras on shins or feet show that the feet stand",
     )
     known_distance: tuple[FrameName, FrameName, Annotated[float, Field(gt=0)]] | None = Field(
         None, description="two frames, each camera:frame, and the metres between their lenses; sets the scale"
@@ -122,14 +137,16 @@ class ExportOptions(Options):
     units: Literal["cm", "m"] = Field("cm", description="unit of the BVH")
     names: NamePreset = Field("hik", description="joint names and spine count of the files for animation")
     root: RootMode = Field(
-        "hips", description="travel on the hips, on an extra root on the ground, or none at all"
+        "hips", description="joint that holds the travel: the hips, an extra root on the ground, or none"
     )
     fps: float | None = Field(
-        None, gt=0, le=1000, description="rate of the files for animation; default the motion's own"
+        None, gt=0, le=1000, description="rate of the files for animation; default: the rate of the motion"
     )
     tpose: bool = Field(False, description="a T-pose as frame 0 of the files for animation")
     smoothing_hz: float | None = Field(
-        None, gt=0, description="low-pass for the files for animation, 6 is usual; default none"
+        None,
+        gt=0,
+        description="cutoff of a low-pass filter for the files for animation, usually 6; default: no filter",
     )
     euler_order: Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"] = Field(
         "ZXY", description="rotation channels"

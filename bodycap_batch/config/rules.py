@@ -1,4 +1,7 @@
-"""Rules for a job that the types of its fields do not check: names, mounts, skeleton, times, rig, board."""
+"""Rules that check a whole job after the type of each field has been checked.
+
+The rules concern names, mounts, skeleton, times, rig and marker board.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ decimals causes smaller deviations."""
 
 
 def problems_in(job: Job) -> list[Problem]:
-    """Return the problems of a job that the types of its fields do not exclude. No file is opened."""
+    """Check a job by all rules of this module and return the problems. No file is opened."""
     problems: list[Problem] = []
     for index, camera in enumerate(job.capture.cameras):
         for found in (*_camera_names(job, index), *_mount(job, camera), *_pose(camera), *_paths(camera)):
@@ -41,8 +44,8 @@ def problems_in(job: Job) -> list[Problem]:
 def skeleton_of(job: Job) -> str:
     """Return the skeleton of a job.
 
-    If the job does not give a skeleton, the result is ``none`` if all cameras are mounted on one bone, and
-    the preset of the upper body otherwise.
+    A job without a skeleton gets a default. The default is ``none`` if all cameras are mounted on one bone;
+    otherwise it is the preset of the upper body.
     """
     if job.skeleton is not None:
         return job.skeleton
@@ -60,7 +63,7 @@ def _camera_names(job: Job, index: int) -> Iterator[Problem]:
             yield Problem(
                 ("name",),
                 f"two cameras named {name!r}",
-                "names differ, segments may be shared: torso and torso_back",
+                "give each camera a different name; cameras on one segment: torso and torso_back",
             )
         elif set(other.video) & set(job.capture.cameras[index].video):
             yield Problem(("video",), f"the same video as camera {other.name!r}", "give each camera its own")
@@ -161,8 +164,8 @@ def _size(job: Job) -> Iterator[Problem]:
     if skeleton_of(job) != NO_SKELETON and all_differ and all(limb is not None for _, limb in limbs):
         yield Problem(
             ("skeleton",),
-            "these cameras do not determine the size of the body: each is on a limb of its own",
-            "add one on the trunk or the head (torso), or a second one on the same limb; "
+            "these cameras do not determine the size of the body: each is on a different limb",
+            "add a camera on the trunk or the head (torso), or a second camera on one of the limbs; "
             "`skeleton: none` gives the cameras' paths and the map",
         )
 
@@ -176,8 +179,10 @@ def _times(job: Job) -> Iterator[Problem]:
 def _rig(job: Job) -> Iterator[Problem]:
     """Yield a problem if a job has a synchronised rig, but no two cameras on the same body segment."""
     if job.capture.rig == "synced" and not job.capture.segments():
-        message = "`synced` needs cameras on one segment, and no two share one"
-        yield Problem(("capture", "rig"), message, "give them one `mount` or `segment`, or leave it out")
+        message = "`synced` needs two cameras on one segment, but no two cameras share a segment"
+        yield Problem(
+            ("capture", "rig"), message, "give them the same `mount` or `segment`, or leave out `rig`"
+        )
 
 
 def named_frames(job: Job) -> Iterator[tuple[tuple[str, str, int], str, int]]:
@@ -209,18 +214,20 @@ def _board(job: Job) -> Iterator[Problem]:
     if board.kind == "chessboard":
         if board.columns == board.rows:
             same = f"a chessboard of {size} looks the same from all four sides"
-            yield Problem(where, same, "one with a row more than columns, or a ChArUco board")
+            yield Problem(where, same, "use a board with one row more than columns, or a ChArUco board")
         return
     if min(board.columns, board.rows) < 4:
         small = f"a ChArUco board of {size} squares has too few corners"
-        yield Problem(where, small, "four squares and more each way, for example 7 columns and 5 rows")
+        yield Problem(where, small, "at least four squares each way, for example 7 columns and 5 rows")
     count = MARKER_COUNTS.get(board.dictionary.upper().removeprefix("DICT_"))
     if count is None:
         nearest = _nearest(board.dictionary, tuple(MARKER_COUNTS))
         yield Problem((*where, "dictionary"), f"unknown markers {board.dictionary[:40]!r}", nearest)
     elif board.columns * board.rows // 2 > count:
         many = f"a ChArUco board of {size} squares takes more markers than {board.dictionary} has"
-        yield Problem((*where, "dictionary"), many, "name the family that was printed, a larger one")
+        yield Problem(
+            (*where, "dictionary"), many, "name the family of the printed markers; it must be a larger one"
+        )
 
 
 def _nearest(value: str, known: tuple[str, ...]) -> str:

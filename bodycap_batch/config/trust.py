@@ -1,4 +1,4 @@
-"""The files that a job may name if another user submitted it.
+"""Restrict the paths in a job that another user submitted.
 
 The user's own job may name any readable path. Another user may drop a job into a watched folder, or send it
 to the live page. Such a job may name the files that were submitted together with it. It may also name files

@@ -29,7 +29,8 @@ _WORDS: dict[str, bool | None] = {"": None, "~": None, "null": None, "Null": Non
 _WORDS |= {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
 _TAB_INDENT = re.compile(r" *\t")
 _MAX_INT = 1 << 63
-"""Smallest absolute value of a number that is refused. An integer of this size does not fit into int64."""
+"""A number is refused if its absolute value is this value or larger. Reason: such an integer does not fit
+into int64."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +49,11 @@ class YamlSource:
     lines: dict[Location, int]
 
     def line_of(self, location: Location) -> int | None:
-        """Return the line of a location, or of the nearest enclosing value with a known line, or None."""
+        """Return the line of the value at a location.
+
+        If this line is unknown, return the line of the nearest enclosing value with a known line. Return None
+        if there is no such value.
+        """
         while location not in self.lines:
             if not location:
                 return None

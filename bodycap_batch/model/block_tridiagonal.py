@@ -1,8 +1,8 @@
 """Solver for symmetric positive definite block-tridiagonal systems, with the marginals of the inverse.
 
 Such systems are the normal equations of estimation problems along time. The unknowns of one block are coupled
-only with each other and with the unknowns of the two neighbouring blocks. Time
-and memory grow linearly with the number of blocks.
+only with each other and with the unknowns of the two neighbouring blocks. Time and memory grow linearly with
+the number of blocks.
 
 Source: block-tridiagonal Cholesky factorisation. The backward pass that computes the inverse is the smoother
 of H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", AIAA

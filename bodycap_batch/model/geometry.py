@@ -162,13 +162,15 @@ def poses_at(
     """Interpolate timed poses at the requested times, between the previous and the next given pose.
 
     Args:
-        times_ns: (N,) times of the given poses, increasing.
+        times_ns: (N,) times of the given poses, nanoseconds, increasing.
         poses: (N,4,4) given poses.
-        at_ns: (M,) requested times.
-        max_gap_ns: Maximum time between two neighbouring given poses for interpolation between them.
-        snap_ns: Maximum time between a requested time and the nearest given pose, for requested times without
-            interpolation. Within this limit, the nearest given pose is returned unchanged. There is no
-            interpolation in a gap longer than `max_gap_ns` and outside the range of `times_ns`.
+        at_ns: (M,) requested times, nanoseconds.
+        max_gap_ns: Maximum time, nanoseconds, between two neighbouring given poses for interpolation between
+            them.
+        snap_ns: Maximum time, nanoseconds, between a requested time and the nearest given pose. It is used
+            only for requested times that are in a longer gap than `max_gap_ns`, or outside the range of
+            `times_ns`. Poses are not interpolated at these times. Instead, the nearest given pose is returned
+            unchanged if it is within this limit.
 
     Returns:
         The poses (M,4,4) at the requested times, and a mask (M,) that is True where there is a pose. Where

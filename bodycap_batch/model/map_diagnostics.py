@@ -44,8 +44,8 @@ class MapDiagnostics:
         excluded_from_pair: Names of the excluded cameras that belong to the user's initial image pair. If
             there is such a camera, mapping did not use the user's pair.
         misfit_factors: By camera name, the focal length that fits the map, divided by the given focal length.
-            A camera has an entry only if the map contradicts its given intrinsics. None before this was
-            checked.
+            A camera has an entry only if the map contradicts its given intrinsics. None if the intrinsics
+            were not checked.
         recalibrated: Names of the cameras whose given intrinsics were replaced by refined intrinsics.
         refined_intrinsics: By camera name, the refined intrinsics of the recalibrated cameras.
         extensions: For each extension of the map, the entry that describes the extension in the log.

@@ -153,8 +153,9 @@ class SolvedBody:
         skeleton: The skeleton that was solved, with J joints.
         fps: Ticks per second.
         start_ns: Common time of tick 0, nanoseconds.
-        graph_world_from_joint: (T,J,4,4) pose of every joint in the world. For a joint with ``solved``, it is
-            the solution of the graph. Any other joint has its rest rotation relative to the parent.
+        graph_world_from_joint: (T,J,4,4) pose of every joint in the world. If `solved` is True for a joint,
+            its pose is the solution of the graph. Any other joint has its rest rotation relative to the
+            parent.
         solved: (J,) True if the joint was a variable of the graph.
         observed: (T,J) True if cameras measured the joint at the tick.
         trajectories: The trajectories of the cameras in use, in the gauge "world". The camera centres were
@@ -194,8 +195,8 @@ class SolvedBody:
 class MergeResult(SolvedBody):
     """The result of the merging stage: the body and the cameras in the world (metres, z up).
 
-    The page, the video and all exported files show `motion`. The joint poses from the factor graph are kept
-    only to compute figures about the solution of the graph.
+    The report, the preview and all exported files show `motion`. The joint poses from the factor graph are
+    kept only to compute figures about the solution of the graph.
 
     Attributes:
         motion: The motion of the skeleton with rigid bones that is nearest to the solution of the graph.
@@ -203,7 +204,8 @@ class MergeResult(SolvedBody):
             from the joints of the graph, distances from the cameras, and the sliding speed of standing feet.
         world_from_map: By gauge, the similarity from the map to the world. A gauge with an unknown similarity
             has no entry.
-        unused_cameras: By name of a camera whose map could not be linked to the body, the reason.
+        unused_cameras: By camera name, the reason why the camera's map could not be linked to the body. Only
+            cameras with such a map have an entry.
         report: Sources, values, residuals and doubts. It is stored as plain JSON values.
         joint_covariance_m2: (T,J,3,3) covariance of the position of each joint relative to the first solved
             joint, in world axes. It contains the errors of measurements, mounts and scale, but not the error

@@ -35,7 +35,7 @@ class ScaleSourceReport:
         name: Name of the source.
         metres_per_map_unit: Scale from this source, metres per map unit.
         relative_sigma: Sigma of the logarithm of this scale.
-        off: Natural logarithm of this scale divided by the selected scale.
+        off: Natural logarithm of the ratio: this scale / selected scale.
         used: False if the source was rejected, or replaced by a better source.
     """
 
@@ -141,8 +141,8 @@ class VerticalReport:
         sigma_deg: Sigma of the selected vertical, degrees.
         body_off_deg: Angle between the selected vertical and the vertical from the body, degrees. None if the
             vertical from the body was selected.
-        plane_points_share: Fraction, 0 to 1, of the points on planes whose plane agrees with the selected
-            vertical.
+        plane_points_share: Of all map points on planes, the fraction (0 to 1) that is on a plane that agrees
+            with the selected vertical.
         others: The candidates from other sources. They were not selected.
         known_to: Sentence about the uncertainty of the vertical, with advice.
     """
@@ -253,7 +253,7 @@ class SwappedSidesReport:
     """The cameras on limbs that were found on the wrong side of the body, as if left and right were swapped.
 
     Attributes:
-        cameras: By camera name, the fraction of its time that the camera is on the wrong side, 0 to 1.
+        cameras: By camera name, the fraction (0 to 1) of time that the camera is on the wrong side.
         says: Sentence about these cameras for the user.
     """
 
@@ -330,7 +330,8 @@ class MergeReport:
         cameras: By camera name, the measurements of the camera.
         doubted_clocks: By camera name, the clock of a camera whose clock seems wrong.
         exchanged_sides: Cameras that seem to be on the wrong side of the body; None if there are none.
-        unused_cameras: By name of a camera whose map could not be linked to the body, the reason.
+        unused_cameras: By camera name, the reason why the camera's map could not be linked to the body. Only
+            cameras with such a map have an entry.
         joined_cameras: By name of a camera in an aligned map, the uncertainty of the map's pose.
         joint_gap_m: By role of a joint, percentiles of its gap: the distance, metres, between the ends of the
             two bones that meet at the joint.

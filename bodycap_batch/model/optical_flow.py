@@ -1,6 +1,6 @@
 """Track points from one frame to another and check the result by tracking back.
 
-All pixel coordinates have COLMAP's origin, unless a text names OpenCV's pixels.
+All pixel coordinates have COLMAP's origin, unless a docstring says that they are in OpenCV's pixels.
 """
 
 from __future__ import annotations
@@ -112,9 +112,9 @@ def track_points(
         second: (H,W) uint8 image in which the points are searched.
         px: (N,2) float32 points in the first image.
         guess_px: (N,2) expected positions in the second image; None if they are unknown.
-        with_check: True to check each point: it is also tracked back to the first image, and rejected if it
-            does not return to its start. False to skip this check. Without the check, only the surroundings
-            of `guess_px` are searched, if it is given. This reduces the cost to a quarter.
+        with_check: True to check each point: the point is also tracked back to the first image, and rejected
+            if it does not return to its start. False to skip this check. If `guess_px` is given and the check
+            is skipped, only the surroundings of `guess_px` are searched. This reduces the cost to a quarter.
         window_px: Side length, pixels, of the square window around a point. The tracker compares the content
             of this window in both images.
 
@@ -270,7 +270,8 @@ def _match_image_pieces(first: GreyImage, second: GreyImage) -> list[Pixels]:
     """Search pieces of the first image in the second image.
 
     Returns:
-        The shifts (2,) from the first to the second image of the pieces with the best matches, in pixels.
+        For each of the pieces with the best matches, the shift (2,) of the piece from the first image to the
+        second image, in pixels of these images. The best match comes first.
 
     Source: Lewis, "Fast normalized cross-correlation", 1995.
     """
@@ -321,19 +322,6 @@ def detect_corners(grey: GreyImage, count: int, spacing_px: float, mask: BoolArr
     if corners is None:
         return np.zeros((0, 2), np.float32)
     return np.asarray(corners.reshape(-1, 2) + CV2_PIXEL_OFFSET_PX, dtype=np.float32)
-
-
-def sharpness(grey: GreyImage) -> float:
-    """Return the sharpness of an image: the standard deviation of its second derivative.
-
-    Blur decreases the sharpness. The values of neighbouring frames can be compared.
-
-    Source: Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000.
-    """
-    import cv2
-
-    small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return float(cv2.meanStdDev(cv2.Laplacian(small, cv2.CV_16S, ksize=1))[1][0, 0])
 
 
 def unit_directions(rays: FloatArray) -> FloatArray:

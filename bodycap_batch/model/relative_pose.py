@@ -156,7 +156,7 @@ def mean_rotation(rotations: FloatArray) -> FloatArray:
 
 
 def match_instants(first_ns: IntArray, second_ns: IntArray) -> IntArray:
-    """Find for each frame of a second camera the frame of a first camera at the same instant.
+    """Match each frame of a second camera with the frame of a first camera at the same instant.
 
     Args:
         first_ns: (F,) common times of the first camera's frames, nanoseconds, increasing.
@@ -189,7 +189,7 @@ def not_rigid_note(relative: RelativePose) -> str:
         )
     found_deg, expected_deg = np.degrees(relative.spread_rad), np.degrees(relative.explained_rad)
     return (
-        f"{pair}: their relative rotation scatters by {found_deg:.2f} degrees, that of a rig would by "
+        f"{pair}: their relative rotation scatters by {found_deg:.2f} degrees, in a rig it would scatter by "
         f"{expected_deg:.2f}: each camera is treated separately. Check offset_s, and that one trigger "
         "exposes both"
     )

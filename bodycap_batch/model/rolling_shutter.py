@@ -18,9 +18,10 @@ from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.scene import Map, Registration
 
 _MAX_GAP_FRAMES = 3.0
-"""Maximum time, in frame intervals, between a frame and a neighbouring frame that is used for its image
-velocity. After a longer time without frames, the velocity would be wrong; only the other neighbour is then
-used. Evidence: docs/decisions/registration.md."""
+"""Maximum time between a frame and a neighbouring frame that is used for its image velocity. Unit: the median
+frame interval. A neighbouring frame with a larger time difference is not used, because the velocity would be
+wrong. The velocity is then computed from the other neighbouring frame. Evidence:
+docs/decisions/registration.md."""
 _MIN_POINTS = 30
 """Minimum number of observations in a frame. Frames with fewer observations are not used. Origin: a camera
 motion has six unknowns, and the observations must determine these unknowns well. Evidence: none."""
@@ -36,11 +37,12 @@ _SCREENED_OBSERVATIONS = 100_000
 """Approximate number of observations that are used to decide whether a camera has a rolling shutter. They are
 taken from frames spread over the whole video."""
 _MIN_APPARENT_S = 0.0005
-"""Minimum readout time, seconds, that shows a rolling shutter. The readout time is estimated from residuals.
-Origin: for a camera with a global shutter, the estimate is less than 0.0003 s."""
+"""A rolling shutter is visible only if the absolute value of the estimated readout time exceeds this value.
+The readout time is estimated from residuals. Unit: seconds. Origin: for a camera with a global shutter, the
+estimate is less than 0.0003 s."""
 _MIN_SIGMAS = 8.0
-"""Minimum ratio of the estimated readout time to the standard deviation of the estimate. A smaller ratio does
-not show a rolling shutter. Evidence: none."""
+"""A rolling shutter is visible only if the absolute value of the estimated readout time exceeds this multiple
+of the standard deviation of the estimate. Unit: 1. Evidence: none."""
 
 
 def image_velocity(

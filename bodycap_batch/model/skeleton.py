@@ -102,9 +102,9 @@ class Motion:
             pose, all rotations are the identity.
         observed: (T,J) True if cameras measured the joint at the tick; False if only priors determine its
             pose.
-        hips_in_root_m: (T,3) positions of the hips in the frame of the root, metres. It is used for skeletons
-            whose root is on the floor; the hips, the root's first child, then move freely relative to the
-            root. None for all other skeletons: their bones have constant lengths.
+        hips_in_root_m: (T,3) positions of the hips in the frame of the root, metres. Given only for a
+            skeleton whose root is on the floor: its hips are the first child of the root and move freely
+            relative to the root. None for all other skeletons, whose bones have constant lengths.
     """
 
     skeleton: SkeletonModel

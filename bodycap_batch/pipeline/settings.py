@@ -10,7 +10,7 @@ from bodycap_batch.config.limits import Limits
 from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.core.progress import Listener
 from bodycap_batch.runner import CHILD_COMMAND, Children, Executor, Rules, Runner, Task
-from bodycap_batch.runner.parent import allow, always
+from bodycap_batch.runner.task_runner import allow, always
 from bodycap_batch.runner.turns import Turns, TurnTakingExecutor
 from bodycap_batch.store.artefacts import Store
 

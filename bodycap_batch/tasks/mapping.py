@@ -75,7 +75,7 @@ class ExtendTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefineTask:
-    """Remove from a map the deformation that rolling shutters cause.
+    """Correct the deformation that rolling shutters cause in a map.
 
     Attributes:
         options: The stage's options.

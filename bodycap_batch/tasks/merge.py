@@ -68,7 +68,7 @@ def run_merge(task: MergeTask, context: StageContext, files: Path) -> None:
         add_flip_hint(error, load_map(task.map.path).diagnostics)
         raise
     write_dataclass(result, files, "merge")
-    notes = [f"camera {name} is no part of the body: {why}" for name, why in result.unused_cameras.items()]
+    notes = [f"camera {name} is not used for the body: {why}" for name, why in result.unused_cameras.items()]
     notes += [clock.says for clock in result.report.doubted_clocks.values()]
     notes += [result.report.exchanged_sides.says] if result.report.exchanged_sides is not None else []
     write_summary(files, unused_cameras=dict(result.unused_cameras), notes=notes)

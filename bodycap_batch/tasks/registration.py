@@ -32,8 +32,8 @@ class RegistrationTask:
         capture: The video of the camera.
         keyframes: The camera's selected keyframes, by camera name (one entry).
         map: The map.
-        previous: The camera's registration against an earlier round of the map; its tracks are reused. None
-            in the first round.
+        previous: The camera's registration against the map of an earlier round. The tracks of this
+            registration are reused. None in the first round.
     """
 
     options: RegistrationOptions = field(metadata=NOT_ROUNDS)

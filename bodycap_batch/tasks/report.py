@@ -28,11 +28,13 @@ class ReportTask:
         name: The job's name.
         failure: The error that stopped the job (``BodycapError.to_dict``) and the stage where it occurred;
             None if the job was not stopped.
-        max_gap_s: Maximum length (seconds) of a time without measurements that merging fills without marking
-            the filled frames.
+        max_gap_s: Maximum time (seconds) between two successive poses of a camera. In a longer gap, merging
+            marks the motion as filled.
         capture: The videos of all cameras.
-        keyframes: The selected keyframes of each camera, by camera name; empty if the stage did not finish.
-        registrations: The registration of each camera, by camera name; empty if the stage did not finish.
+        keyframes: The selected keyframes of each camera, by camera name; empty if the stage `keyframes` did
+            not finish.
+        registrations: The registration of each camera, by camera name; empty if the stage `registration` did
+            not finish.
         map: The map; None if mapping did not finish.
         merge: The skeleton's motion; None if there is no motion.
         export: The result files; None if the export did not finish.
@@ -100,9 +102,14 @@ def _load_merge(merge: ArtefactRef | None) -> MergeResult | None:
 
 
 def _open_capture(task: ReportTask, threads: int) -> Capture | None:
-    """Open the videos.
+    """Open the videos of a job.
 
-    If they cannot be read, return None for a job that failed: the videos may be the cause. Otherwise raise.
+    Returns:
+        The capture. None if the videos cannot be read and the job has failed: the unreadable videos may be
+        the cause of the failure.
+
+    Raises:
+        CaptureError: The videos cannot be read, but the job has not failed.
     """
     from bodycap_batch.core.errors import CaptureError
 

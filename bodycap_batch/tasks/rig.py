@@ -13,7 +13,7 @@ from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 
 def run_rig(task: CameraGroupTask, context: StageContext, files: Path) -> None:
-    """Solve the frames of the task's first camera from what all cameras of the rig observe.
+    """Solve the frames of the task's first camera from the observations of all cameras of the rig.
 
     The artefact holds the camera's poses and the relative poses of the rig's cameras.
     """
