@@ -11,9 +11,10 @@ from bodycap_batch.merging.projection.project import Projection, project_motion
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 from bodycap_batch.model.merge_data import CameraClock, MergeResult, SolvedBody
 from bodycap_batch.model.merge_report import MergeReport
+from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
-from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.model.skeleton_presets import load_skeleton
 
 CAMERAS = {"torso": "Spine1", "left_palm": "LeftHand", "right_palm": "RightHand"}
 ARMS = ("Spine1", "LeftArm", "LeftForeArm", "LeftHand", "RightArm", "RightForeArm", "RightHand")

@@ -247,7 +247,7 @@ CASES = (
     Case("unknown lens model", calibrated(model="PINHOLLE"), 3, CALIB, "did you mean PINHOLE"),
     Case("calibration of other cameras", replace_text(CALIB, '{"cameras": {"left": {}}}'), 3, CALIB, "torso"),
     Case("too few timestamps", few_timestamps, 3, TIMES, "2 timestamps for 40 frames"),
-    Case("timestamps go back", replace_text(TIMES, "0.0\n0.2\n0.1\n"), 3, TIMES, "does not come after"),
+    Case("timestamps go back", replace_text(TIMES, "0.0\n0.2\n0.1\n"), 3, TIMES, "is not later than"),
     Case("timestamps are words", replace_text(TIMES, "0.0\nnoon\n"), 3, TIMES, "is not a time in seconds"),
     Case(
         "timestamps are binary", replace_text(TIMES, b"\xff\xfe\x00"), 3, TIMES, "cannot read the timestamps"

@@ -18,7 +18,7 @@ from bodycap_batch.capture.decoding import decode_frames
 from bodycap_batch.capture.images import Colours, Image, Planes, work_image
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
-from bodycap_batch.formats.mp4 import TIME_BASE_HZ, Quality, VideoWriter
+from bodycap_batch.formats.mp4_writer import TIME_BASE_HZ, Quality, VideoWriter
 
 KEPT_NAME = "kept"
 """Name of the stored `KeptFrames` in a keyframe artefact, and name of the video file with the copies."""

@@ -1,8 +1,8 @@
 """Check a job before it runs: open all files that the job needs, without computing any result."""
 
 from bodycap_batch.check.check_report import CameraSummary, CheckReport
+from bodycap_batch.check.operator_limits import require_within_limits
 from bodycap_batch.check.preflight import check_job, check_path, require_ready
-from bodycap_batch.check.video_limits import require_within_limits
 
 __all__ = [
     "CameraSummary",

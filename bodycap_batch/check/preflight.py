@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera, open_camera
-from bodycap_batch.check.advice import advise
 from bodycap_batch.check.camera_settings import setting_notes
 from bodycap_batch.check.check_report import CameraSummary, CheckReport
 from bodycap_batch.check.file_mixups import require_distinct_videos
 from bodycap_batch.check.picture_quality import check_picture_quality
+from bodycap_batch.check.recording_advice import advise
 from bodycap_batch.config.folder import job_file_in
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, CaptureConfig, Job

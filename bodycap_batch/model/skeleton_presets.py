@@ -1,12 +1,9 @@
-"""Preset skeletons scaled to a stature, the anatomical axes of segments, and the nominal camera mounts."""
+"""Preset skeletons scaled to a stature, and the anatomical axes of segments."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
 from functools import cache
 from importlib import resources
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -14,8 +11,7 @@ import yaml
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.model.geometry import make_transform
-from bodycap_batch.model.skeleton import Mount, SkeletonModel, rest_pose
+from bodycap_batch.model.skeleton import SkeletonModel, rest_pose
 
 PRESETS = ("upper_body", "full_body")
 """Names of the preset skeletons. Both presets contain all joints of the body. The cameras, not the preset,
@@ -30,28 +26,6 @@ _STATURE_RANGE_M = (0.5, 2.8)
 """Minimum and maximum stature, metres. Derivation: the range from small children to the tallest people, with
 a margin. A stature in centimetres or feet is outside this range and is therefore refused."""
 
-NOMINAL_SIGMA_RAD = float(np.radians(15.0))
-"""Sigma, radians per axis, of the prior on a mount's rotation, if the job does not give the rotation.
-
-The nominal rotation is then chosen from the camera's name. The sigma is larger than the expected error
-`NOMINAL_ERROR_RAD`, so that the posture of the body has more influence on the rotation. Evidence:
-docs/decisions/export.md."""
-
-NOMINAL_SIGMA_M = 0.029
-"""Sigma, metres per axis, of a mount's nominal position, if the job does not give the position. Derivation:
-5 cm for the three axes together, because straps move and bodies differ."""
-
-NOMINAL_ERROR_RAD = float(np.radians(15.0 / np.sqrt(3.0)))
-"""Expected error, radians per axis, of a mount's nominal rotation, if the job does not give the rotation.
-Derivation: 15° for the three axes together."""
-
-STATED_SIGMA_RAD = float(np.radians(5.0))
-"""Sigma, radians per axis, of a mount rotation, if the job gives the rotation but not its accuracy.
-Derivation: 15° are three sigmas."""
-
-STATED_SIGMA_M = 0.015
-"""Sigma, metres per axis, of a mount position, if the job gives the position but not its accuracy.
-Derivation: 4.5 cm are three sigmas."""
 
 _UP, _FORWARD, _LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 """Unit vectors of a standing body in the axes of the skeleton: z up, −y forward."""
@@ -71,7 +45,7 @@ limit is far below the length of any real bone and above rounding errors."""
 
 
 @cache
-def _load_preset_data(name: str) -> dict[str, Any]:
+def load_preset_data(name: str) -> dict[str, Any]:
     """Return the content of a data file of ``bodycap_batch/presets``."""
     text = resources.files("bodycap_batch.presets").joinpath(name).read_text(encoding="utf-8")
     return dict(yaml.safe_load(text))
@@ -97,7 +71,7 @@ def load_skeleton(preset: str, height_m: float | None = None) -> SkeletonModel:
         raise JobError(
             f"a stature of {height} m is not plausible", field="height_m", hint="give it in metres"
         )
-    joints: dict[str, Any] = _load_preset_data("humanoid.yaml")["joints"]
+    joints: dict[str, Any] = load_preset_data("humanoid.yaml")["joints"]
     names = tuple(joints)
     at = {name: height * np.array(entry["at"], dtype=np.float64) for name, entry in joints.items()}
     origin = {
@@ -196,119 +170,3 @@ def segment_axes(skeleton: SkeletonModel, role: str) -> FloatArray:
     forward /= np.linalg.norm(forward)
     outward = np.cross(forward, along) if side == "Left" else np.cross(along, forward)
     return np.asarray(turn.T @ np.stack([along, forward, outward], axis=1))
-
-
-def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
-    """Return the nominal mount of a camera on the bone with an anatomical role.
-
-    A camera on trunk or head is mounted on the back if the camera's name contains the word "back", as in
-    ``torso_back``.
-
-    Raises:
-        JobError: The skeleton has no joint with this role.
-    """
-    if skeleton.index_of_role(role) is None:
-        raise JobError(
-            f"camera {camera!r} is mounted on {role}, which the skeleton {skeleton.name!r} does not have",
-            field="capture.cameras",
-            hint=f"it has {', '.join(name for name in skeleton.roles if name)}",
-        )
-    entry = _load_preset_data("mounts.yaml")[split_side(role)[1]]
-    axes = segment_axes(skeleton, role)
-    bone = bone_vector(skeleton, role)
-    length = 0.0 if bone is None else float(np.linalg.norm(bone))
-    centre = np.array(entry["centre_m"]) + np.array([entry.get("along", 0.0) * length, 0.0, 0.0])
-    facing = np.array([1.0, -1.0 if _faces_back(camera, role) else 1.0, 1.0])
-    centre, view = facing * centre, facing * np.array(entry["view"], float)
-    view, down = axes @ view, axes @ np.array(entry["down"], float)
-    view, down = view / np.linalg.norm(view), down / np.linalg.norm(down)
-    rotation = np.stack([np.cross(down, view), down, view], axis=1)
-    return Mount(
-        camera=camera,
-        role=role,
-        joint_from_cam=make_transform(rotation, axes @ centre),
-        sigma_rad=NOMINAL_SIGMA_RAD,
-        sigma_m=NOMINAL_SIGMA_M,
-        by_name=True,
-    )
-
-
-def _faces_back(camera: str, role: str) -> bool:
-    """Return True if a camera on trunk or head is mounted on the back, according to the camera's name."""
-    return not split_side(role)[0] and "back" in re.split(r"[_\-. ]", camera.lower())
-
-
-_ARTICULATED = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase", "Neck", "Head")
-"""Parts of the body that move relative to their parent. The spine is treated as rigid."""
-
-_REACH_MARGIN_RATIO = 0.15
-"""Margin for the possible distances between two cameras, as a fraction of the distance. The smallest distance
-is decreased by this fraction, and the largest distance is increased by it, because bodies differ from the
-skeleton. Evidence: none."""
-
-_REACH_MARGIN_M = 0.05
-"""Margin, metres, for the possible distances between two cameras. It is subtracted from the smallest distance
-and added to the largest distance, because straps slip. Evidence: none."""
-
-_MIN_DISTANCE_M = 0.08
-"""Minimum distance, metres, between two cameras on different bones. Derivation: the distance of each camera
-from its bone is 4 to 5 cm (mounts.yaml)."""
-
-
-def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple[str, str, float, float]]:
-    """Return the smallest and the largest possible distance of each pair of cameras, over all postures.
-
-    Args:
-        skeleton: The skeleton.
-        mounts: The mount of each camera.
-
-    Returns:
-        For each pair of cameras, a row (name of the first camera, name of the second camera, smallest
-        distance, largest distance). The distances are in metres, rounded to centimetres. They include the
-        margins `_REACH_MARGIN_RATIO` and `_REACH_MARGIN_M`.
-
-    Derivation: the joints between two cameras form a chain of ball joints. The largest distance occurs if all
-        links form one straight line. The smallest distance occurs if the longest link points in one direction
-        and all other links point in the opposite direction.
-    """
-    rest = rest_positions(skeleton)
-    rows = []
-    for first, second in combinations(sorted(mounts, key=lambda mount: mount.camera), 2):
-        paths = [_joints_to_root(skeleton, mount) for mount in (first, second)]
-        shared = set(paths[0]) & set(paths[1])
-        ends = [
-            rest[path[0]] + mount.joint_from_cam[:3, 3]
-            for path, mount in zip(paths, (first, second), strict=True)
-        ]
-        limbs = [
-            [rest[joint] for joint in path if joint not in shared and _is_articulated(skeleton, joint)]
-            for path in paths
-        ]
-        chain = np.array([ends[0], *limbs[0], *limbs[1][::-1], ends[1]])
-        links = np.linalg.norm(np.diff(chain, axis=0), axis=1)
-        most = float(links.sum())
-        least = max(0.0, 2.0 * float(links.max()) - most)
-        low = (
-            max(_MIN_DISTANCE_M, (1 - _REACH_MARGIN_RATIO) * least - _REACH_MARGIN_M)
-            if len(chain) > 2
-            else 0.5 * least
-        )
-        high = (1 + _REACH_MARGIN_RATIO) * most + _REACH_MARGIN_M
-        rows.append((first.camera, second.camera, round(low, 2), round(high, 2)))
-    return rows
-
-
-def _joints_to_root(skeleton: SkeletonModel, mount: Mount) -> list[int]:
-    """Return the index of the joint that a camera is mounted on, followed by its ancestors up to the root."""
-    joint = skeleton.index_of_role(mount.role)
-    if joint is None:
-        raise JobError(f"no joint has the role {mount.role}", field="capture.cameras")
-    path = [joint]
-    while skeleton.parents[path[-1]] >= 0:
-        path.append(int(skeleton.parents[path[-1]]))
-    return path
-
-
-def _is_articulated(skeleton: SkeletonModel, joint: int) -> bool:
-    """Return True if a joint moves relative to its parent. The spine is treated as rigid."""
-    return split_side(skeleton.roles[joint])[1] in _ARTICULATED

@@ -14,7 +14,7 @@ from bodycap_batch.capture import Capture
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.atomic_files import atomic_replacement
-from bodycap_batch.formats.mp4 import VideoWriter
+from bodycap_batch.formats.mp4_writer import VideoWriter
 from bodycap_batch.formats.palette import camera_colours
 from bodycap_batch.overlay import BoneMotion, CameraView, RgbImage
 from bodycap_batch.preview.labels import AMBER, GREY, draw_text, shorten_to_width

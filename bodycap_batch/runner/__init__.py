@@ -4,8 +4,8 @@ This package does not import the stages; `child_main.main` receives the function
 argument.
 """
 
+from bodycap_batch.runner.child_pool import Children, Executor, TaskEnvironment
 from bodycap_batch.runner.child_process import CHILD_COMMAND
-from bodycap_batch.runner.children import Children, Executor, TaskEnvironment
 from bodycap_batch.runner.task import Task
 from bodycap_batch.runner.task_runner import NotStored, Rules, Runner
 

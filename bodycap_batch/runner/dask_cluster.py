@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from bodycap_batch.core.errors import BodycapError, Cancelled, JobError, error_from_dict
 from bodycap_batch.runner import CHILD_COMMAND, Task, TaskEnvironment
-from bodycap_batch.runner.children import STOPPED
+from bodycap_batch.runner.child_pool import STOPPED
 from bodycap_batch.runner.remote import remote_order, run_order
 from bodycap_batch.runner.turns import Turns
 

@@ -15,8 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from bodycap_batch.core.errors import Cancelled
+from bodycap_batch.runner.child_pool import STOPPED, Children, TaskEnvironment
 from bodycap_batch.runner.child_process import CHILD_COMMAND
-from bodycap_batch.runner.children import STOPPED, Children, TaskEnvironment
 from bodycap_batch.runner.task import Task
 from bodycap_batch.runner.turns import Turns
 

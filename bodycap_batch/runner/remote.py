@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.core.errors import BodycapError, StoreError
-from bodycap_batch.runner.children import Children, TaskEnvironment
+from bodycap_batch.runner.child_pool import Children, TaskEnvironment
 from bodycap_batch.runner.task import Task, task_from_json
 from bodycap_batch.store.artefacts import Store
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from bodycap_batch.core.errors import BodycapError, Cancelled, StoreError
 from bodycap_batch.core.progress import Event, Listener
-from bodycap_batch.runner.children import Executor, TaskEnvironment
+from bodycap_batch.runner.child_pool import Executor, TaskEnvironment
 from bodycap_batch.runner.task import Task
 from bodycap_batch.store.artefacts import Artefact, Store
 

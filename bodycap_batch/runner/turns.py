@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bodycap_batch.core.errors import Cancelled
-from bodycap_batch.runner.children import STOPPED, Executor, TaskEnvironment
+from bodycap_batch.runner.child_pool import STOPPED, Executor, TaskEnvironment
 from bodycap_batch.runner.task import Task
 
 _POLL_S = 0.1

@@ -18,7 +18,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.atomic_files import store_error_from_os_error
-from bodycap_batch.formats.mp4 import VideoWriter
+from bodycap_batch.formats.mp4_writer import VideoWriter
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.camera_renderer import CameraRenderer, MovingBody, Sensor, camera_poses_at

@@ -10,8 +10,9 @@ import numpy as np
 from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import make_transform, so3_exp
+from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
-from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount, rest_positions, split_side
+from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions, split_side
 
 
 def draw_body(height_m: float, proportion_range: float, rng: np.random.Generator) -> SkeletonModel:

@@ -23,7 +23,7 @@ def camera_distances(body: BodyInput) -> list[tuple[str, str, float, float]]:
     Returns:
         Rows (first camera, second camera, smallest distance, largest distance), in metres.
     """
-    from bodycap_batch.model.skeleton_presets import camera_reach
+    from bodycap_batch.model.nominal_mounts import camera_reach
 
     # The map's scale is unknown, so mapping uses only the ratios of these distances. The stature is removed,
     # so that the map stays the same if the user adds the stature to the job later.
@@ -38,8 +38,8 @@ def mount_prior(mount: MountInput, skeleton: SkeletonModel) -> Mount:
     """
     import numpy as np
 
+    from bodycap_batch.model.nominal_mounts import STATED_SIGMA_M, STATED_SIGMA_RAD, nominal_mount
     from bodycap_batch.model.skeleton import Mount
-    from bodycap_batch.model.skeleton_presets import STATED_SIGMA_M, STATED_SIGMA_RAD, nominal_mount
 
     nominal = nominal_mount(mount.place, mount.role, skeleton)
     pose, sigma_deg, sigma_m = mount.joint_from_cam, mount.sigma_deg, mount.sigma_m

@@ -10,9 +10,9 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import Similarity, so3_exp
 from bodycap_batch.model.merge_data import CameraClock, MergeInputs
+from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Mount
-from bodycap_batch.model.skeleton_presets import nominal_mount
 from bodycap_batch.synthetic.camera_renderer import MovingBody, camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.making import Subject, draw_subject, frame_times_ns
 from bodycap_batch.synthetic.measured import disturb_poses

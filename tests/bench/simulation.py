@@ -31,9 +31,10 @@ from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.merge_data import CameraClock, MergeInputs, MergeResult
+from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
-from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.synthetic import SynthOptions, synthesise
 
 PALMS = ("torso", "left_palm", "right_palm")

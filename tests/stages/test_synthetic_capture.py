@@ -16,7 +16,8 @@ from bodycap_batch.formats.atomic_files import store_error_from_os_error
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.model.geometry import interpolate_pose, invert, rotation_angle_rad
-from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount, rest_positions
+from bodycap_batch.model.nominal_mounts import nominal_mount
+from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions
 from bodycap_batch.synthetic import SynthOptions, synthesise
 
 TINY = {"width": 64, "height": 48, "seconds": 0.3, "cameras": ("torso", "left_palm")}
@@ -238,7 +239,7 @@ def test_a_folder_in_use_is_not_changed(capture, tmp_path):
     (tmp_path / "mine" / "thesis.txt").write_text("important")
     with pytest.raises(JobError, match="exists already"):
         _make(tmp_path / "mine")
-    with pytest.raises(JobError, match="no synthetic capture"):
+    with pytest.raises(JobError, match="not a synthetic capture"):
         _make(tmp_path / "mine", overwrite=True)
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
 

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 from bodycap_batch.model.merge_data import CameraClock, MergeInputs
+from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Mount, SkeletonModel, forward_kinematics
-from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.model.skeleton_presets import load_skeleton
 
 ROLES = {"torso": "Spine1", "left_palm": "LeftHand", "right_palm": "RightHand"}
 AXES = dict(zip("xyz", np.eye(3), strict=True))

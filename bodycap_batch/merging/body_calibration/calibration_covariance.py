@@ -32,8 +32,8 @@ from bodycap_batch.merging.graph.error_modes import (
 )
 from bodycap_batch.merging.graph.factors import MountPoints, mount_keys
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph
+from bodycap_batch.model.nominal_mounts import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_RAD
 from bodycap_batch.model.skeleton import Mount
-from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_RAD
 
 _TRANSIENT_SHARE = float(np.sqrt(1.0 - POSTURE_BIAS_SHARE**2))
 """Transient part of the sigma of a joint's rotation prior, as a fraction of this sigma.

@@ -9,9 +9,9 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from bodycap_batch.model.geometry import Similarity, interpolate_pose
 from bodycap_batch.model.merge_data import MergeInputs
+from bodycap_batch.model.nominal_mounts import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_M
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Mount
-from bodycap_batch.model.skeleton_presets import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_M
 
 MIN_SIGMA_M, MIN_SIGMA_RAD = 0.004, float(np.radians(0.4))
 """Minimum sigmas of a measured pose per axis (metres, radians). The covariance of PnP contains the image

@@ -91,8 +91,8 @@ def test_a_sidecar_decides(tmp_path: Path) -> None:
     ("lines", "message", "line"),
     [
         ("0.0\n0.1\nhalf\n", "is not a time", 3),
-        ("0.0\n0.1\n0.1\n", "does not come after", 3),
-        ("0.2\n0.1\n", "does not come after", 2),
+        ("0.0\n0.1\n0.1\n", "is not later than", 3),
+        ("0.2\n0.1\n", "is not later than", 2),
         ("nan\n", "is not a time", 1),
         ("1e400\n", "is not a time", 1),
         ("0\n1\n2\n", "3 timestamps for 12 frames", None),

@@ -65,7 +65,7 @@ def test_a_camera_that_ends_early_or_runs_slowly_is_named(tmp_path: Path) -> Non
 
 
 def test_the_duration_of_a_long_capture_is_estimated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bodycap_batch.check.advice._LONG_CAPTURE_S", 4.0)
+    monkeypatch.setattr("bodycap_batch.check.recording_advice._LONG_CAPTURE_S", 4.0)
     assert "5 s of video in all: expect 1 to 1 minutes" in advice(walk(tmp_path))
 
 

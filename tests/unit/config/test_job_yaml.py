@@ -322,7 +322,7 @@ def test_a_synchronised_rig_is_made_of_cameras_on_one_segment(tmp_path: Path) ->
         ("dictionary: nonsense", ".dictionary", ("unknown markers 'nonsense'", "ARUCO_ORIGINAL")),
         ("columns: 11, rows: 10", ".dictionary", ("takes more markers than 4X4_50 has", "a larger one")),
         ("columns: 3, rows: 3", "", ("3x3 squares has too few corners", "at least four squares")),
-        ("kind: chessboard, columns: 6, rows: 6", "", ("6x6 looks the same", "a row more")),
+        ("kind: chessboard, columns: 6, rows: 6", "", ("6x6 looks the same", "one row more")),
     ],
 )
 def test_a_board_that_cannot_be_found_is_refused_before_anything_runs(

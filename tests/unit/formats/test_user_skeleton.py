@@ -19,6 +19,7 @@ from bodycap_batch.formats.bvh.skeleton_description import (
     skeleton_warnings,
 )
 from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.skeleton import (
     Motion,
     SkeletonModel,
@@ -26,7 +27,7 @@ from bodycap_batch.model.skeleton import (
     with_file_zero_pose,
     with_tpose_as_zero_pose,
 )
-from bodycap_batch.model.skeleton_presets import bone_vector, load_skeleton, nominal_mount, segment_axes
+from bodycap_batch.model.skeleton_presets import bone_vector, load_skeleton, segment_axes
 from tests.bodies import reaching
 
 
@@ -96,7 +97,7 @@ def test_overrides_move_roles(tmp_path: Path) -> None:
         (RigOptions(roles={"Neck": "Tentacle"}), "no role 'Tentacle'", "one of"),
         (RigOptions(roles={"Neck": "Head", "Spine": "Head"}), "two joints", "one joint"),
         (RigOptions(tpose_frame=2), "no frame 2", "the file has 2"),
-        (RigOptions(tpose_frame=-1), "no frame -1", "count from 0"),
+        (RigOptions(tpose_frame=-1), "no frame -1", "counted from 0"),
     ],
 )
 def test_what_does_not_exist_is_named(tmp_path: Path, options: RigOptions, message: str, hint: str) -> None:

@@ -15,8 +15,9 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
     inconsistent_match_ratio,
 )
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.nominal_mounts import camera_reach, nominal_mount
 from bodycap_batch.model.scene import Map
-from bodycap_batch.model.skeleton_presets import camera_reach, load_skeleton, nominal_mount
+from bodycap_batch.model.skeleton_presets import load_skeleton
 
 _LENS = Camera(model="PINHOLE", width_px=64, height_px=48, params=np.array([50.0, 50.0, 32.0, 24.0]))
 _KEYFRAMES = 30

@@ -224,7 +224,7 @@ def test_keyframes_that_cannot_be_repaired_are_removed(
     model, poses, mapping, pairs = built
     wrong = _with_moved_block(model, {ref.frame: number for ref, number in _ids(mapping).items()})
     # The mapper registers the block with the same wrong poses again.
-    module = sys.modules[repair_model.__module__]
+    module = sys.modules[re_register_images.__module__]
     monkeypatch.setattr(module, "with_new_images", lambda *_, **__: pycolmap.Reconstruction(wrong))
     monkeypatch.setattr(module, "adjust_and_filter", lambda *_: None)
     refs = sorted(_ids(mapping))

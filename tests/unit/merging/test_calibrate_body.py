@@ -15,7 +15,8 @@ from bodycap_batch.merging.body_calibration.skeleton_error_modes import (
 )
 from bodycap_batch.merging.reporting.advice import describe_mount, describe_scale
 from bodycap_batch.model.geometry import Similarity, so3_exp
-from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.model.nominal_mounts import nominal_mount
+from bodycap_batch.model.skeleton_presets import load_skeleton
 from tests.stages.walker import make_inputs, make_walk, record
 
 GAUGE = Similarity(0.25, so3_exp([0.3, 1.0, -0.2]), np.array([2.0, 0.0, 1.0]))

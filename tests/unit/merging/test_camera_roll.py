@@ -16,7 +16,8 @@ from bodycap_batch.merging.body_calibration.camera_roll import (
 )
 from bodycap_batch.merging.body_calibration.samples import PostureHints
 from bodycap_batch.merging.cameras.track import make_track
-from bodycap_batch.model.skeleton_presets import STATED_SIGMA_RAD, load_skeleton, nominal_mount
+from bodycap_batch.model.nominal_mounts import STATED_SIGMA_RAD, nominal_mount
+from bodycap_batch.model.skeleton_presets import load_skeleton
 from tests.stages.walker import ROLES, Walk, make_inputs, make_walk, record
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -10,9 +10,11 @@ import pytest
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging import camera_selection, merge_trajectories
+from bodycap_batch.merging import merge_trajectories
+from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.calibrate_body import preliminary_vertical
 from bodycap_batch.merging.body_calibration.samples import MAP_ERROR_RAD, take_samples
+from bodycap_batch.merging.camera_selection import correlate_mount_priors
 from bodycap_batch.merging.cameras.excluded_cameras import excluded_cameras, rarely_localised
 from bodycap_batch.merging.cameras.track import MIN_SIGMA_RAD, make_track
 from bodycap_batch.merging.main_map import align_usable_cameras, candidate_main_maps
@@ -181,7 +183,8 @@ def test_cameras_that_all_stand_still_are_kept(capture):
 
 def test_stationary_cameras_are_searched_once(walked, monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(camera_selection, "stationary_cameras", lambda *args: asked.append(args) or [])
+    searched = "bodycap_batch.merging.cameras.excluded_cameras.stationary_cameras"
+    monkeypatch.setattr(searched, lambda *args: asked.append(args) or [])
     merge_trajectories(walked, MergeOptions(), StageContext(work_dir=tmp_path))
     assert len(asked) == 1
 
@@ -233,7 +236,7 @@ def test_hands_alone_do_not_determine_the_scale_and_the_error_names_what_is_miss
 
 def test_a_camera_on_a_limb_gives_no_vertical(capture):
     inputs = capture.inputs
-    bones = camera_selection.kinematic_chain(inputs.skeleton, {mount.role for mount in inputs.mounts})
+    bones = kinematic_chain(inputs.skeleton, {mount.role for mount in inputs.mounts})
     arm = next(mount for mount in inputs.mounts if mount.camera == "left_upper_arm")
     place = [bone.role for bone in bones].index(arm.role)
     trajectory = next(each for each in inputs.trajectories if each.camera == arm.camera)
@@ -303,7 +306,7 @@ def _with_twin(inputs, **changes):
 def test_cameras_at_one_position_are_together_as_uncertain_as_one(capture):
     inputs = capture.inputs
     alone = inputs.mount_of("torso")
-    shared = camera_selection.correlate_mount_priors(_with_twin(inputs))
+    shared = correlate_mount_priors(_with_twin(inputs))
     for camera in ("torso", "torso_2"):
         mount = shared.mount_of(camera)
         assert mount.sigma_m == pytest.approx(np.sqrt(2.0) * alone.sigma_m)
@@ -313,18 +316,13 @@ def test_cameras_at_one_position_are_together_as_uncertain_as_one(capture):
     behind = alone.joint_from_cam.copy()
     behind[1, 3] += 0.2
     for other in ({"joint_from_cam": behind}, {"sigma_rad": 0.02, "sigma_m": 0.01, "by_name": False}):
-        assert camera_selection.correlate_mount_priors(_with_twin(inputs, **other)).mount_of("torso") == alone
-    assert (
-        camera_selection.correlate_mount_priors(_lose(_with_twin(inputs), "torso_2", 6)).mount_of("torso")
-        == alone
-    )
-    assert camera_selection.correlate_mount_priors(inputs).mounts == inputs.mounts
+        assert correlate_mount_priors(_with_twin(inputs, **other)).mount_of("torso") == alone
+    assert correlate_mount_priors(_lose(_with_twin(inputs), "torso_2", 6)).mount_of("torso") == alone
+    assert correlate_mount_priors(inputs).mounts == inputs.mounts
 
 
 def test_the_error_of_a_map_counts_once_for_two_cameras_on_a_bone(capture):
-    bones = camera_selection.kinematic_chain(
-        capture.inputs.skeleton, {mount.role for mount in capture.inputs.mounts}
-    )
+    bones = kinematic_chain(capture.inputs.skeleton, {mount.role for mount in capture.inputs.mounts})
     index = {bone.role: place for place, bone in enumerate(bones)}
     for inputs, alike in ((capture.inputs, 1), (_with_twin(capture.inputs), 2)):
         tracks = [

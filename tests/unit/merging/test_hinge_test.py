@@ -10,8 +10,9 @@ from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.reporting.advice import describe_hinge
 from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.skeleton import forward_kinematics
-from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.model.skeleton_presets import load_skeleton
 from tests.bodies import reaching
 
 ROLES = {

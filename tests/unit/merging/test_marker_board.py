@@ -23,8 +23,9 @@ from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, invert, make_transform, so3_exp, transform_points
 from bodycap_batch.model.merge_data import BoardView, CameraClock, MergeInputs
+from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import FrameStatus, Trajectory
-from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.model.skeleton_presets import load_skeleton
 from tests.rooms import LENS, look
 from tests.videos import write_video
 

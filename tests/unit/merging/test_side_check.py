@@ -12,7 +12,8 @@ from bodycap_batch.merging.cameras.side_check import swapped_sides
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.reporting.advice import describe_swapped_sides
 from bodycap_batch.model.geometry import make_transform, so3_exp
-from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount
+from bodycap_batch.model.nominal_mounts import nominal_mount
+from bodycap_batch.model.skeleton_presets import load_skeleton
 
 ROLES = {"torso": "Spine1", "left_palm": "LeftHand", "right_palm": "RightHand", "head": "Head"}
 BODY = load_skeleton("upper_body", 1.75)

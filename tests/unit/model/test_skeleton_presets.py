@@ -8,13 +8,13 @@ from numpy.testing import assert_allclose
 
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
 from bodycap_batch.model.skeleton_presets import (
     MEAN_HEIGHT_M,
     PRESETS,
     bone_vector,
     load_skeleton,
-    nominal_mount,
     rest_positions,
     segment_axes,
 )

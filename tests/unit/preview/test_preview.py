@@ -10,7 +10,7 @@ import pytest
 
 from bodycap_batch.capture import open_capture
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.formats.mp4 import yuv420_from_rgb
+from bodycap_batch.formats.mp4_writer import yuv420_from_rgb
 from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.overlay import ObservedPoints
 from bodycap_batch.preview.layout import HEIGHT, ROOM_WIDTH, WIDTH, Box, lay_out_videos

@@ -29,7 +29,7 @@ from bodycap_batch.core.errors import (
 from bodycap_batch.core.progress import Event
 from bodycap_batch.runner import Children, NotStored, Rules, Runner, Task
 from bodycap_batch.runner.child_main import DiskFailures
-from bodycap_batch.runner.children import CHILDREN_LOG
+from bodycap_batch.runner.child_pool import CHILDREN_LOG
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 
 ROOT = Path(__file__).parents[3]

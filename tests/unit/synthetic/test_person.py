@@ -6,8 +6,9 @@ import pytest
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.bvh import write_bvh
 from bodycap_batch.model.geometry import invert, rotation_angle_rad
+from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.skeleton import Motion, forward_kinematics
-from bodycap_batch.model.skeleton_presets import load_skeleton, nominal_mount, rest_positions
+from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions
 from bodycap_batch.synthetic.camera_renderer import camera_poses_at
 from bodycap_batch.synthetic.clip import load_clip
 from bodycap_batch.synthetic.gait import Walk, WalkStyle

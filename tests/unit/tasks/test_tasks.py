@@ -14,16 +14,16 @@ import pytest
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import CaptureError, DiskAway, JobError
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.rolling_shutter import mean_row_fraction
-from bodycap_batch.model.scene import FrameStatus, Registration, Trajectory
-from bodycap_batch.model.skeleton import Mount
-from bodycap_batch.model.skeleton_presets import (
+from bodycap_batch.model.nominal_mounts import (
     NOMINAL_SIGMA_RAD,
     STATED_SIGMA_M,
     STATED_SIGMA_RAD,
-    load_skeleton,
     nominal_mount,
 )
+from bodycap_batch.model.rolling_shutter import mean_row_fraction
+from bodycap_batch.model.scene import FrameStatus, Registration, Trajectory
+from bodycap_batch.model.skeleton import Mount
+from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.pipeline.inputs import body_input, camera_digest
 from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.body import mount_prior
