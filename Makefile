@@ -11,7 +11,8 @@ BLENDER := .venv-blender
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 # More than one test at a time, each in one thread; those of a file share what they need, so they stay together.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist loadfile
+# The files keep the order of tests/conftest.py, which begins with the longest.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 # Slow tests wait for processes of their own half of the time: one more of them than there are cores.
 SLOW := $(subst -n logical,-n $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1),$(PYTEST))
 COMPILE := $(BIN)/uv pip compile --quiet --generate-hashes --no-emit-index-url --custom-compile-command "make lock"

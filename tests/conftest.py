@@ -1,4 +1,4 @@
-"""Fixtures shared by all tests."""
+"""Fixtures shared by all tests, and the order of the test files."""
 
 from __future__ import annotations
 
@@ -8,6 +8,36 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+LONGEST = (
+    "pipeline/test_hard_captures.py",
+    "pipeline/test_hard_lenses.py",
+    "pipeline/test_resume_proof.py",
+    "pipeline/test_field_captures.py",
+    "data",
+    "pipeline/test_damage_proof.py",
+    "browser",
+    "pipeline/test_watch.py",
+    "pipeline/test_watch_disk.py",
+    "pipeline/test_permissions.py",
+    "pipeline/test_end_to_end.py",
+    "unit/test_fuzz.py",
+    "test_imports.py",
+    "cluster",
+    "pipeline",
+    "stages",
+)
+"""Files and folders of tests, from the longest time to the shortest; all others are short."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files with the longest time first, so that no process is left with one of them at the end."""
+    items.sort(key=_place)
+
+
+def _place(item: pytest.Item) -> int:
+    path = item.path.relative_to(REPOSITORY / "tests")
+    names = {path.as_posix(), *(folder.as_posix() for folder in path.parents)}
+    return next((place for place, name in enumerate(LONGEST) if name in names), len(LONGEST))
 
 
 @pytest.fixture(scope="session")

@@ -30,10 +30,14 @@ numpy.savez_compressed(folder / "arrays.npz", image=image)
 assert (numpy.load(folder / "arrays.npz")["image"] == image).all()
 """
 # Copies of this process import one module each: the libraries, and the job's models, are loaded once.
+# What is loaded already is not looked through for garbage in each copy.
 ALONE = """
-import importlib, os, sys, traceback, zlib
+import concurrent.futures.thread, filecmp, gc, html, http.server, importlib, os, queue, shlex, sys, traceback
+import webbrowser, zlib
 import numpy, pydantic, scipy.spatial.transform, scipy.optimize, scipy.sparse, scipy.linalg, typer, yaml
+import cv2, gtsam
 import bodycap_batch.config.models
+gc.disable()
 for name in sys.argv[1:]:
     if pid := os.fork():
         if os.waitpid(pid, 0)[1]:

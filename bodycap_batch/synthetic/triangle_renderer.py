@@ -106,6 +106,16 @@ def _dot(first: Float32, second: Float32) -> Float32:
     return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
 
 
+def _in_cameras(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Return vectors (F,3) of the world in the axes of B cameras (B,3,3), as an array (3,B,F).
+
+    `np.einsum` gives the same bits, but takes twice as long for the many poses of a rolling shutter.
+    """
+    axes = rotation.transpose(2, 1, 0)[..., None]
+    x, y, z = vectors.T[:, None]
+    return np.asarray(axes[:, 0] * x + axes[:, 1] * y + axes[:, 2] * z)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Texels:
     """Texture coordinates of the points that N rays meet.
@@ -223,13 +233,13 @@ class SceneRenderer:
         """
         shape, out = self._triangles, np.empty((3, 3, len(poses), len(self._triangles.faces)))
         rotation, centre = poses[:, :3, :3], poses[:, :3, 3]
-        normal = np.einsum("bji,fj->ibf", rotation, shape.normal)
+        normal = _in_cameras(rotation, shape.normal)
         offset = shape.point[None] - centre[:, None]
         depth = np.einsum("fj,bfj->bf", shape.normal, offset)
         for axis in range(2):
             gradient = shape.texels_per_m[:, axis]
             here = shape.texel_at_point[:, axis] - np.einsum("fj,bfj->bf", gradient, offset)
-            out[axis] = here * normal + depth * np.einsum("bji,fj->ibf", rotation, gradient)
+            out[axis] = here * normal + depth * _in_cameras(rotation, gradient)
         out[2] = normal
         return out.reshape(9, -1).astype(np.float32)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,9 +27,19 @@ def sound_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Place:
-    """The job after an uninterrupted run."""
-    place = Place(tmp_path_factory.mktemp("reference"))
-    assert main(["run", str(place.folder / "tiny.yaml"), "--out", str(place.out)]) == 0
+    """The job after an uninterrupted run, made once for all test processes. No test changes it."""
+    shared = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = shared.parent
+    folder, complete = shared / "reference", shared / "reference-complete"
+    with (shared / "reference-lock").open("w") as making:
+        fcntl.flock(making, fcntl.LOCK_EX)
+        if not complete.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            place = Place(folder)
+            assert main(["run", str(folder / "tiny.yaml"), "--out", str(place.out)]) == 0
+            complete.touch()
+    place = Place.existing(folder)
     names = set(place.content())
     assert {"motion.bvh", "frames.csv", "metrics.json", "trajectories/torso.tum"} <= names
     assert {name.split("/")[1] for name in names if name.startswith("artefacts/")} >= set(STAGES)

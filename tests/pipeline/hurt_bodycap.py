@@ -6,6 +6,8 @@ The environment names a JSON file with the orders:
 just before or just after the first rename at which no earlier run was killed. Only renames with the text in
 their target count.
 - ``{"fill": stage, "disk": folder}``: the disk is filled to the last byte when this stage starts.
+
+It also names a JSON file with the version of each stage's algorithm, which the test computed once.
 """
 
 from __future__ import annotations
@@ -24,10 +26,12 @@ from typing import Any
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.runner import child_main
 from bodycap_batch.runner.task import TaskFunction
+from bodycap_batch.store import code_version
 from bodycap_batch.tasks.stages import STAGES
 
 ORDERS = "BODYCAP_HURT_ORDERS"
 PIDS = "BODYCAP_HURT_PIDS"
+VERSIONS = "BODYCAP_HURT_VERSIONS"
 CHILD = (sys.executable, __file__, "--child")
 BALLAST = "ballast.bin"
 
@@ -106,6 +110,8 @@ if __name__ == "__main__":
     stages = prepare_failure()
     if sys.argv[1] == "--child":
         sys.exit(child_main.main(sys.argv[2:], stages))
+    versions = json.loads(Path(os.environ[VERSIONS]).read_text())
+    code_version.algorithm_version = versions.__getitem__
     from bodycap_batch import pipeline
     from bodycap_batch.cli import main
 

@@ -81,6 +81,4 @@ def full_disk(disk: Path, reference: Path) -> None:
     place.order()
     code, _, err = place.run()
     assert code == 0, err
-    wanted = Place.__new__(Place)
-    wanted.folder, wanted.out, wanted.store = reference, reference / "out", reference / "out" / ".store"
-    same(place, wanted)
+    same(place, Place.existing(reference))

@@ -17,7 +17,7 @@ import pytest
 from bodycap_batch.cli import main
 from bodycap_batch.evaluate import evaluate_trajectories
 from bodycap_batch.formats.bvh import read_bvh
-from tests.pipeline.tiny_job import JOB
+from tests.pipeline.tiny_job import JOB, Place
 from tests.results import results_of
 
 pytestmark = pytest.mark.slow
@@ -43,12 +43,9 @@ def example(name: str, *words: str, cwd: Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(reference: Place, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The capture is rendered and the job has been run."""
-    folder = tmp_path_factory.mktemp("tiny")
-    (folder / "tiny.yaml").write_text(JOB)
-    assert main(["run", str(folder / "tiny.yaml"), "--out", str(folder / "out")]) == 0
-    return folder
+    return Path(shutil.copytree(reference.folder, tmp_path_factory.mktemp("tiny") / "job", symlinks=True))
 
 
 def test_every_frame_is_placed_where_the_camera_was(folder: Path) -> None:

@@ -6,6 +6,7 @@ They are in a file of their own because the tests of a file run in one process, 
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -23,22 +24,29 @@ from tests.pipeline.hard_captures import (
 
 pytestmark = pytest.mark.slow
 
-CASES: dict[str, dict[str, Any]] = {
-    "fisheye": FISHEYE,
-    "on the spot": {"on_the_spot": True, "cameras": ("torso", "head"), "seconds": 5.0},
-}
+TURN: dict[str, Any] = {"on_the_spot": True, "cameras": ("torso", "head"), "seconds": 5.0}
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_a_hard_lens_or_turn_is_registered_and_right(case: str, tmp_path: Path) -> None:
-    check_is_right(render(tmp_path, **CASES[case]))
+@pytest.fixture(scope="module")
+def fisheye(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture with a fisheye, rendered once; each test works on a copy."""
+    return render(tmp_path_factory.mktemp("fisheye"), **FISHEYE)
 
 
-@pytest.mark.parametrize("lens", [{}, FISHEYE], ids=["usual", "fisheye"])
-def test_a_lens_that_is_not_given_is_found(lens: dict[str, Any], tmp_path: Path) -> None:
+@pytest.mark.parametrize("case", ["fisheye", "on the spot"])
+def test_a_hard_lens_or_turn_is_registered_and_right(case: str, fisheye: Path, tmp_path: Path) -> None:
+    check_is_right(_copy(fisheye, tmp_path) if case == "fisheye" else render(tmp_path, **TURN))
+
+
+def _copy(capture: Path, folder: Path) -> Path:
+    return Path(shutil.copytree(capture, folder / capture.name))
+
+
+@pytest.mark.parametrize("lens", ["usual", "fisheye"])
+def test_a_lens_that_is_not_given_is_found(lens: str, fisheye: Path, tmp_path: Path) -> None:
     import pycolmap
 
-    capture = render(tmp_path, **lens)
+    capture = _copy(fisheye, tmp_path) if lens == "fisheye" else render(tmp_path)
     true_focal_px = json.loads((capture / "calib.json").read_text())["params"][0]
     (capture / "calib.json").unlink()
     assert run(capture) == 0

@@ -15,7 +15,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tests.pipeline.hurt_bodycap import ORDERS, PIDS
+from bodycap_batch.store.code_version import algorithm_version
+from bodycap_batch.tasks.stages import STAGES as ALL_STAGES
+from tests.pipeline.hurt_bodycap import ORDERS, PIDS, VERSIONS
 from tests.processes import END_WITH_PARENT
 from tests.results import results_of
 
@@ -37,16 +39,28 @@ class Place:
     """A job with an empty store, on a capture that is there already."""
 
     def __init__(self, folder: Path, capture: Path | None = None) -> None:
-        self.folder = folder
-        self.out = folder / "out"
-        self.store = self.out / ".store"
+        self._name_folders(folder)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "tiny.yaml").write_text(JOB)
         (folder / "done.txt").touch()
         (folder / "pids").mkdir(exist_ok=True)
+        versions = {stage.module: algorithm_version(stage.module) for stage in ALL_STAGES.values()}
+        (folder / "versions.json").write_text(json.dumps(versions))
         if capture is not None:
             shutil.copytree(capture, folder / "capture", copy_function=os.link)
         self.order()
+
+    def _name_folders(self, folder: Path) -> None:
+        self.folder = folder
+        self.out = folder / "out"
+        self.store = self.out / ".store"
+
+    @classmethod
+    def existing(cls, folder: Path) -> Place:
+        """Return the job of a folder without a change to its files."""
+        place = cls.__new__(cls)
+        place._name_folders(folder)
+        return place
 
     def order(self, **orders: Any) -> None:
         (self.folder / "orders.json").write_text(json.dumps(orders))
@@ -59,6 +73,7 @@ class Place:
             "PYTHONPATH": str(ROOT),
             ORDERS: str(self.folder / "orders.json"),
             PIDS: str(self.folder / "pids"),
+            VERSIONS: str(self.folder / "versions.json"),
         }
         environment.pop("BODYCAP_STORE", None)
         return subprocess.Popen(

@@ -8,6 +8,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,17 @@ from bodycap_batch.store import code_version
 from bodycap_batch.tasks.stages import STAGES
 
 PACKAGE = Path(code_version.__file__).parent.parent
+_PARSED: dict[tuple[str, bytes], code_version._Source] = {}
+"""What the package finds in a file, by the file's suffix and content."""
+_read = code_version._source.__wrapped__
+
+
+def parsed_once(path: Path) -> code_version._Source:
+    """Read a file, and parse it unless an earlier test parsed the same content."""
+    key = path.suffix, path.read_bytes()
+    if key not in _PARSED:
+        _PARSED[key] = _read(path)
+    return _PARSED[key]
 
 
 def forget() -> None:
@@ -25,7 +37,7 @@ def forget() -> None:
 
 
 @pytest.fixture
-def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The package's sources in a folder of their own, where they may be changed."""
     folder = tmp_path / "bodycap_batch"
     shutil.copytree(PACKAGE, folder, ignore=shutil.ignore_patterns("__pycache__"))
@@ -33,6 +45,13 @@ def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     forget()
     yield folder
     forget()
+
+
+@pytest.fixture
+def copied(unread: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The same; every file is read again after `forget`, but equal contents are parsed once for all tests."""
+    monkeypatch.setattr(code_version, "_source", cache(parsed_once))
+    return unread
 
 
 def versions() -> dict[str, str]:
@@ -60,7 +79,7 @@ def test_the_same_sources_have_the_same_version(copied: Path) -> None:
 
 
 def test_each_file_is_parsed_once_and_only_when_a_stage_needs_it(
-    copied: Path, monkeypatch: pytest.MonkeyPatch
+    unread: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parse, parsed = ast.parse, Counter[str]()
 
@@ -71,11 +90,11 @@ def test_each_file_is_parsed_once_and_only_when_a_stage_needs_it(
     monkeypatch.setattr(ast, "parse", counting)
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(code_version.algorithm_version, [STAGES["check"].module] * 4))
-    assert str(copied / "check" / "__init__.py") in parsed
-    assert str(copied / "mapping" / "build.py") not in parsed
+    assert str(unread / "check" / "__init__.py") in parsed
+    assert str(unread / "mapping" / "build.py") not in parsed
     for stage in STAGES.values():
         code_version.algorithm_version(stage.module)
-    assert str(copied / "mapping" / "build.py") in parsed
+    assert str(unread / "mapping" / "build.py") in parsed
     assert set(parsed.values()) == {1}
 
 
