@@ -20,12 +20,11 @@ from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.config.folder import recordings_in
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
+from bodycap_batch.config.rules import UNKNOWN_MOUNT
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.atomic_files import write_text
 
 JOB_FILE = "job.yaml"
-UNKNOWN_MOUNT = "<where on the body?>"
-"""Placeholder for an unknown mount. The mount is unknown if the camera's file name does not contain it."""
 _STAGES = ("keyframes", "map", "registration", "merge", "export")
 _OPTION_WIDTH = 34
 """Number of characters in the column of options, before the column of their meanings."""

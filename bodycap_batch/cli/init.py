@@ -26,7 +26,8 @@ def init(
       bodycap init my_walk/
       bodycap check my_walk/job.yaml
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.check.job_template import UNKNOWN_MOUNT, write_job_template
+    from bodycap_batch.check.job_template import write_job_template
+    from bodycap_batch.config.rules import UNKNOWN_MOUNT
 
     path = write_job_template(folder, replace=force)
     text = path.read_text(encoding="utf-8")

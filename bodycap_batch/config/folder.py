@@ -101,17 +101,32 @@ def _has_chapters(folder: Path) -> bool:
 def recordings_in(folder: Path) -> list[tuple[str, tuple[Path, ...]]]:
     """Return the recordings in a folder: the name of each recording, and its videos in order.
 
-    A recording is a video file, a folder of chapters, or all chapters of one GoPro video.
+    A recording is a video file, a folder of chapters, or all chapters of one GoPro video. Several recordings
+    can have the same name: ``torso.mp4`` and ``torso.mov``.
 
     Raises:
         CaptureError: The folder holds no video, or a folder cannot be read.
     """
-    found: dict[str, list[Path]] = {}
+    found: dict[tuple[str, str], list[Path]] = {}
     for path in videos_in(folder):
-        gopro = None if path.is_dir() else _GOPRO.match(path.stem)
-        name = f"{gopro.group(1)}-{gopro.group(3)}" if gopro else path.name if path.is_dir() else path.stem
-        found.setdefault(name.replace("GP-", "GO-"), []).append(path)
-    return [(name, tuple(sorted(paths, key=natural_key))) for name, paths in found.items()]
+        gopro = _gopro_name(path)
+        key = (gopro, "chapters") if gopro else (recording_name(path), path.name)
+        found.setdefault(key, []).append(path)
+    return [(name, tuple(sorted(paths, key=natural_key))) for (name, _), paths in found.items()]
+
+
+def _gopro_name(path: Path) -> str | None:
+    """Return the name that all chapters of one GoPro video share; None for any other file or folder."""
+    gopro = None if path.is_dir() else _GOPRO.match(path.stem)
+    if gopro is None:
+        return None
+    kind = gopro.group(1).upper()
+    return f"{'GO' if kind == 'GP' else kind}-{gopro.group(3)}"
+
+
+def recording_name(path: Path) -> str:
+    """Return the name of a video file or of a folder of chapters."""
+    return path.name if path.is_dir() else path.stem
 
 
 def job_file_in(folder: Path) -> Path | None:
@@ -131,7 +146,7 @@ def folder_capture(folder: Path) -> dict[str, object]:
     """
     videos = videos_in(folder)
     _refuse_missing_videos(folder)
-    named = [(path.name if path.is_dir() else path.stem, path) for path in videos]
+    named = [(recording_name(path), path) for path in videos]
     _refuse_equal_names(named)
     if len(named) > 1:
         _refuse_unknown_mounts(named)

@@ -9,10 +9,12 @@ from typing import Any
 import pytest
 import yaml
 
-from bodycap_batch.check.job_template import UNKNOWN_MOUNT, job_template, write_job_template
+from bodycap_batch.check.job_template import job_template, write_job_template
 from bodycap_batch.cli import main
+from bodycap_batch.config.folder import recordings_in
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import Job
+from bodycap_batch.config.rules import UNKNOWN_MOUNT
 from bodycap_batch.core.errors import CaptureError, JobError
 from tests.broken import BVH, FRAMES, LENS
 from tests.videos import write_video
@@ -87,6 +89,18 @@ def test_chapters_are_one_camera_with_an_unknown_mount(
     text = (folder / "job.yaml").read_text().replace(f'"{UNKNOWN_MOUNT}"', "head")
     (folder / "job.yaml").write_text(text)
     assert len(load_job(folder / "job.yaml").capture.cameras) == 3
+
+
+def test_chapters_of_a_gopro_are_one_recording_in_any_case(tmp_path: Path) -> None:
+    for name in ("gp010123.mp4", "GOPR0123.MP4", "MYGP-1.mp4", "torso.mov", "torso.mp4"):
+        (tmp_path / name).write_bytes(b"not opened")
+    found = [(name, [path.name for path in paths]) for name, paths in recordings_in(tmp_path)]
+    assert found == [
+        ("GO-0123", ["GOPR0123.MP4", "gp010123.mp4"]),
+        ("MYGP-1", ["MYGP-1.mp4"]),
+        ("torso", ["torso.mov"]),
+        ("torso", ["torso.mp4"]),
+    ]
 
 
 def options_without_comment_signs(text: str) -> dict[str, Any]:
