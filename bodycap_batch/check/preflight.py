@@ -164,11 +164,6 @@ def _intrinsics_notes(camera: CaptureCamera) -> list[str]:
     lens = camera.camera
     long_side = max(lens.width_px, lens.height_px)
     notes = []
-    if any(video.is_interlaced for video in camera.videos):
-        notes.append(
-            "the video is interlaced: convert it to full frames first "
-            "(ffmpeg -i in -vf bwdif=send_frame out.mp4)"
-        )
     if not 0.2 < lens.focal_px / long_side < 3.0:
         notes.append(
             f"a focal length of {lens.focal_px / long_side:.2f} image widths is unusual; is it the "

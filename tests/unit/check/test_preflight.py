@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bodycap_batch.capture import open_capture
+from bodycap_batch.capture import CaptureCamera, open_camera, open_capture
 from bodycap_batch.check import check_job, check_path, preflight, require_ready
 from bodycap_batch.check.picture_quality import sample_indices
 from bodycap_batch.config.job import Overrides, load_job
+from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.errors import Cancelled, JobError, StoreError
 from bodycap_batch.formats import optional_libraries
@@ -72,6 +74,16 @@ def test_short_grey_and_partly_black_videos_are_reported(tmp_path: Path) -> None
     assert any("contrast" in note for note in torso.notes)
     assert any("hardly enough movement" in note for note in torso.notes)
     assert any("are black" in note for note in head.notes)
+
+
+def test_an_interlaced_video_is_reported_once(walk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def open_interlaced(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
+        camera = open_camera(spec, config)
+        return replace(camera, videos=tuple(replace(video, is_interlaced=True) for video in camera.videos))
+
+    monkeypatch.setattr(preflight, "open_camera", open_interlaced)
+    for camera in check_path(walk).cameras:
+        assert sum("interlaced" in note for note in camera.notes) == 1
 
 
 def test_cameras_that_never_ran_together(walk: Path) -> None:
