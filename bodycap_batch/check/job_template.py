@@ -80,6 +80,8 @@ def job_template(folder: Path) -> str:
         "  # start_s: 12.0",
         "  # end_s: 95.5",
         *(_mount_lines() if any(mount_of(name) is None for name, _ in recordings) else ()),
+        "  # Videos in this folder that are not listed here become cameras, too.",
+        "  # cameras_only: true         # use the listed cameras only",
         "  cameras:",
     ]
     for safe, (name, files) in zip(_unique_names([name for name, _ in recordings]), recordings, strict=True):
@@ -113,7 +115,8 @@ def _calibration_lines(folder: Path) -> list[str]:
     return [
         "  # The lens is estimated together with the map. Better: film a board, then",
         "  #   bodycap calibrate board.mp4 --charuco 7x5 --out calib.json",
-        "  calibration: auto            # or calib.json",
+        "  # The file calib.json in this folder is used as soon as it exists.",
+        "  # calibration: auto          # always estimate the lens",
     ]
 
 

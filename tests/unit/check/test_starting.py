@@ -103,6 +103,32 @@ def test_chapters_of_a_gopro_are_one_recording_in_any_case(tmp_path: Path) -> No
     ]
 
 
+def test_init_prints_where_settings_come_from_and_what_is_not_used(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_video(folder / "GX010042.mp4", FRAMES[:10])
+    (folder / "notes.txt").touch()
+    assert main(["init", str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "  calibration: auto (default), starting at 70° (default)" in lines
+    assert "  timestamps: frame times (from the video metadata)" in lines
+    assert (
+        f"  mount: {UNKNOWN_MOUNT} (from the job file); pose on the bone: typical of the place (default)"
+        in lines
+    )
+    assert "not used (not a video, and no setting names it): notes.txt" in lines
+    (folder / "calib.json").write_text("{}")
+    assert main(["init", str(folder), "--force"]) == 0
+    assert "problem: " in capsys.readouterr().out
+
+
+def test_a_calibration_that_is_made_after_init_is_used(folder: Path) -> None:
+    path = write_job_template(folder)
+    assert {camera.calibration for camera in load_job(path).capture.cameras} == {"auto"}
+    (folder / "calib.json").write_text(json.dumps(LENS))
+    assert "auto" not in {camera.calibration for camera in load_job(path).capture.cameras}
+
+
 def options_without_comment_signs(text: str) -> dict[str, Any]:
     """Return the options after the last heading, without their comment signs."""
     lines = text.partition("change what you need, leave the rest.\n")[2].splitlines()
