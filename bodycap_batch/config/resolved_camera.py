@@ -74,7 +74,7 @@ def resolved_camera(index: int, capture: CaptureConfig, stated: CaptureConfig, b
     listed = stated.cameras[index] if index < len(stated.cameras) else None
     videos, sidecars = _chapters(camera, base)
     if camera.timestamps:
-        sidecars = tuple((base / path).resolve() for path in camera.timestamps)
+        sidecars = tuple(real_path(base / path) for path in camera.timestamps)
     if len(sidecars) not in (0, 1, len(videos)):
         raise CaptureError(
             f"camera {camera.name} has {len(sidecars)} timestamp files for {len(videos)} chapters",
@@ -86,12 +86,12 @@ def resolved_camera(index: int, capture: CaptureConfig, stated: CaptureConfig, b
     entry: CalibrationEntry | None = None
     file: Path | None = None
     if isinstance(calibration, Path):
-        file = (base / calibration).resolve()
+        file = real_path(base / calibration)
         entry = read_calibration(file, camera.name)
         calibration = entry.calibration
     update: dict[str, Any] = {"video": videos, "timestamps": sidecars, "calibration": calibration or "auto"}
     if camera.mask is not None:
-        update["mask"] = (base / camera.mask).resolve()
+        update["mask"] = real_path(base / camera.mask)
     if camera.offset_s is None:
         update["offset_s"] = entry.offset_s if entry else 0.0
     if camera.rolling_shutter_s is None:
@@ -200,4 +200,4 @@ def _first_beside(path: Path, *names: str) -> list[Path]:
     """Return the first existing file with one of the names beside a path, else beside its target."""
     places = (path, real_path(path))
     found = [place.with_name(name) for place in places for name in names if place.with_name(name).is_file()]
-    return [file.resolve() for file in found[:1]]
+    return [real_path(file) for file in found[:1]]

@@ -217,6 +217,10 @@ def test_paths_that_cannot_be_followed_and_names_that_are_no_text(tmp_path: Path
         else:
             with pytest.raises(JobError, match="cannot be a path"):
                 load_job(root)
+    (root / "loop.json").symlink_to("loop.json")
+    (root / "job.yaml").write_text(TORSO.replace("torso.mp4", "torso.mp4, calibration: loop.json"))
+    with pytest.raises(CaptureError, match="cannot read the calibration"):
+        load_job(root)
 
 
 def test_a_link_beside_a_job_file_that_leads_outside_is_refused_in_a_dropped_folder(tmp_path: Path) -> None:
