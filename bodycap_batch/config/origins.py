@@ -194,6 +194,8 @@ class LoadedJob:
         if name.endswith((".yaml", ".yml")):
             return f"a job file in a folder is called {JOB_FILES[0]}"
         if name == CALIBRATION_FILE:
+            if any(origins.calibration.source == "default" for origins in self.origins.values()):
+                return f"only a {JOB_FILES[0]} uses it without `calibration:`"
             return "the calibration of every camera comes from elsewhere"
         if name.endswith(".timestamps.txt"):
             return "no camera and no video has this name"

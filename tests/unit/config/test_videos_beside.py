@@ -84,7 +84,10 @@ def test_a_job_file_elsewhere_or_of_another_name_lists_exactly_its_cameras(tmp_p
         "calib.json is not used for torso: a job file that is not called job.yaml uses it only if it says "
         "`calibration: calib.json`",
     )
-    assert set(unused(root / "walk.yaml")) == {"left_palm.mp4", "calib.json"}
+    assert unused(root / "walk.yaml") == {
+        "calib.json": "only a job.yaml uses it without `calibration:`",
+        "left_palm.mp4": "not listed; only a job.yaml adds the videos beside it",
+    }
     assert unused(tmp_path / "any.yaml") == {}
     policy = PathPolicy(folder=None, roots=(root,))
     (root / "job.yaml").write_text(TORSO)
