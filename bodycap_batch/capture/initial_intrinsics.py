@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera, with_two_focal_lengths
+
+FovSource = Literal["job file", "video metadata", "default"]
 
 _GUESSED_FOV_DEG = 70.0
 """Field of view along the long side of the image. The program assumes this value if the true field of view is
@@ -78,6 +82,15 @@ def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Cam
 def _same_aspect(calibration: Calibration, width: int, height: int) -> bool:
     """Return True if a calibration has the same aspect ratio as an image of this width and height."""
     return abs(width * calibration.height / (height * calibration.width) - 1.0) <= _ASPECT_TOLERANCE
+
+
+def guessed_fov_deg(video: VideoFile, fov_deg: float | None) -> tuple[float, FovSource]:
+    """Return the field of view (degrees) along the long side of `guessed_camera`, and where it comes from."""
+    if fov_deg is not None:
+        return fov_deg, "job file"
+    if video.focal_35mm is not None:
+        return float(2.0 * np.degrees(np.arctan(0.5 * _FULL_FRAME_MM / video.focal_35mm))), "video metadata"
+    return _GUESSED_FOV_DEG, "default"
 
 
 def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Camera:

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from bodycap_batch.capture.kept import should_keep_all
-from bodycap_batch.config.models import Job
+from bodycap_batch.check.overview import unused_lines
+from bodycap_batch.config.models import NO_SKELETON, Job
+from bodycap_batch.config.origins import CameraOrigins, UnusedFile
 from bodycap_batch.core.errors import BodycapError
 
 _MAX_SHOWN_FILES = 3
@@ -39,6 +41,7 @@ class CameraSummary:
         lens: Description of the intrinsics for the user.
         notes: Notes for the user that are not errors.
         guessed_lens: True if the camera has no calibration.
+        origins: Where the settings of the camera come from; None if it is unknown.
     """
 
     name: str
@@ -56,6 +59,7 @@ class CameraSummary:
     lens: str
     notes: tuple[str, ...] = ()
     guessed_lens: bool = False
+    origins: CameraOrigins | None = None
 
     @property
     def large_frames(self) -> int:
@@ -83,6 +87,7 @@ class CameraSummary:
             f"{self.name}: {files} -> {self.role or 'no bone'}",
             f"  {size}, {rate}, {self.frames} frames{used}, {span}",
             f"  {self.lens}",
+            *(f"  {line}" for line in ([] if self.origins is None else self.origins.lines())),
             *(f"  note: {note}" for note in self.notes),
         ]
 
@@ -97,6 +102,7 @@ class CheckReport:
         notes: Notes for the user about the job as a whole.
         errors: Errors that prevent the job from running.
         advice: Sentences about what would improve the result; empty if there are errors.
+        unused_files: The files in the capture's folder that the job does not use.
     """
 
     job: Job | None = None
@@ -104,6 +110,7 @@ class CheckReport:
     notes: tuple[str, ...] = ()
     errors: tuple[BodycapError, ...] = ()
     advice: tuple[str, ...] = ()
+    unused_files: tuple[UnusedFile, ...] = ()
 
     @property
     def ready(self) -> bool:
@@ -118,6 +125,7 @@ class CheckReport:
     def lines(self) -> list[str]:
         """Return the report as text for the user."""
         out = [line for camera in self.cameras for line in camera.lines()]
+        out += unused_lines(self.unused_files)
         out += [f"note: {note}" for note in self.notes]
         out += [f"problem: {error}" for error in self.errors]
         for number, sentence in enumerate(self.advice, start=1):
@@ -130,7 +138,9 @@ class CheckReport:
                 break_on_hyphens=False,
             )
         if self.ready:
-            out.append("ready to run" if self.cameras else "no problems found")
+            no_body = self.job is not None and self.job.skeleton == NO_SKELETON
+            ready = "ready to run: map and camera paths, no body" if no_body else "ready to run"
+            out.append(ready if self.cameras else "no problems found")
         else:
             count = len(self.errors)
             out.append(f"not ready: {count} problem{'s' if count > 1 else ''}")
@@ -144,4 +154,5 @@ class CheckReport:
             "notes": list(self.notes),
             "errors": [error.to_dict() for error in self.errors],
             "advice": list(self.advice),
+            "unused_files": [dataclasses.asdict(file) for file in self.unused_files],
         }

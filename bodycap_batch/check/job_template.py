@@ -20,12 +20,11 @@ from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.config.folder import recordings_in
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
+from bodycap_batch.config.rules import UNKNOWN_MOUNT
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.atomic_files import write_text
 
 JOB_FILE = "job.yaml"
-UNKNOWN_MOUNT = "<where on the body?>"
-"""Placeholder for an unknown mount. The mount is unknown if the camera's file name does not contain it."""
 _STAGES = ("keyframes", "map", "registration", "merge", "export")
 _OPTION_WIDTH = 34
 """Number of characters in the column of options, before the column of their meanings."""
@@ -81,6 +80,8 @@ def job_template(folder: Path) -> str:
         "  # start_s: 12.0",
         "  # end_s: 95.5",
         *(_mount_lines() if any(mount_of(name) is None for name, _ in recordings) else ()),
+        "  # Videos in this folder that are not listed here become cameras, too.",
+        "  # cameras_only: true         # use the listed cameras only",
         "  cameras:",
     ]
     for safe, (name, files) in zip(_unique_names([name for name, _ in recordings]), recordings, strict=True):
@@ -114,7 +115,8 @@ def _calibration_lines(folder: Path) -> list[str]:
     return [
         "  # The lens is estimated together with the map. Better: film a board, then",
         "  #   bodycap calibrate board.mp4 --charuco 7x5 --out calib.json",
-        "  calibration: auto            # or calib.json",
+        "  # The file calib.json in this folder is used as soon as it exists.",
+        "  # calibration: auto          # always estimate the lens",
     ]
 
 

@@ -119,7 +119,7 @@ def _memory_finding() -> MachineFinding:
         return MachineFinding(
             what="memory", state="note", found="unknown", remedy=f"{_ENOUGH_MEMORY_MB / 1000:g} GB are enough"
         )
-    found = f"{total_mb / 1024:.1f} GB"
+    found = f"{total_mb / 1000:.1f} GB"
     if total_mb >= _ENOUGH_MEMORY_MB:
         return MachineFinding(what="memory", state="ok", found=found)
     remedy = (
@@ -130,8 +130,9 @@ def _memory_finding() -> MachineFinding:
 
 
 def _total_memory_mb() -> int | None:
+    """Return the memory of this machine in megabytes (1 MB = 10⁶ bytes); None if it is unknown."""
     try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 10**6
     except (ValueError, OSError, AttributeError):
         return None
 
@@ -188,8 +189,8 @@ def _video_finding() -> MachineFinding:
 
 def _disk_finding(folder: Path) -> MachineFinding:
     place = _nearest_existing(folder)
-    free_mb = shutil.disk_usage(place).free >> 20
-    found = f"{free_mb / 1024:.1f} GB free at {place}"
+    free_mb = shutil.disk_usage(place).free // 10**6
+    found = f"{free_mb / 1000:.1f} GB free at {place}"
     if free_mb >= _ENOUGH_DISK_MB:
         return MachineFinding(what="disk", state="ok", found=found)
     remedy = (

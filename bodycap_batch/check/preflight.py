@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +14,13 @@ from bodycap_batch.capture import CaptureCamera, open_camera
 from bodycap_batch.check.camera_settings import setting_notes
 from bodycap_batch.check.check_report import CameraSummary, CheckReport
 from bodycap_batch.check.file_mixups import require_distinct_videos
+from bodycap_batch.check.overview import with_first_guess
 from bodycap_batch.check.picture_quality import check_picture_quality
 from bodycap_batch.check.recording_advice import advise
-from bodycap_batch.config.folder import job_file_in
-from bodycap_batch.config.job import Overrides, load_job
+from bodycap_batch.config.job import Overrides, load_job_with_origins
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
+from bodycap_batch.config.mounts import TRUNK_ROLES
+from bodycap_batch.config.origins import CameraOrigins
 from bodycap_batch.config.rules import named_frames
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import BodycapError, CaptureError, JobError
@@ -41,22 +43,25 @@ _MIN_UNIX_TIME_S = 1e8
 
 A larger time is treated as a Unix time. This value as a Unix time is in 1973.
 """
-_TRUNK_ROLES = ("Hips", "Spine", "Spine1", "Neck", "Head")
-"""Roles of the bones of the trunk and the head."""
 
 
 def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
     """Check a job file or a folder of videos. Errors of the job are stored in the report and not raised."""
     try:
-        job = load_job(path, overrides)
+        loaded = load_job_with_origins(path, overrides)
     except (JobError, CaptureError) as error:
         if error.field == "capture.synthetic":
             note = f"this is a sample capture: `bodycap run {path.name}` renders its videos first"
             return CheckReport(notes=(note,))
         return CheckReport(errors=(error,))
-    report = check_job(job)
-    job_file = job_file_in(path) if path.is_dir() else None
-    return report if job_file is None else replace(report, notes=(f"settings from {job_file}", *report.notes))
+    report = check_job(loaded.job, loaded.origins)
+    settings = [f"settings from {loaded.job_file}"] if path.is_dir() and loaded.job_file is not None else []
+    no_body = [loaded.no_body] if loaded.no_body else []
+    return replace(
+        report,
+        notes=(*settings, *loaded.warnings, *no_body, *report.notes),
+        unused_files=loaded.unused_files(),
+    )
 
 
 def require_ready(job: Job, threads: int = 1) -> CheckReport:
@@ -74,26 +79,37 @@ def require_ready(job: Job, threads: int = 1) -> CheckReport:
     Raises:
         BodycapError: A check found an error.
     """
-    report = _run_checks(job, _CHECKS, threads)
+    report = _run_checks(job, _CHECKS, threads, {})
     if report.errors:
         raise report.errors[0]
     return report
 
 
-def check_job(job: Job) -> CheckReport:
-    """Run all checks of a resolved job, including disk space. If there are no errors, add advice."""
-    report = _run_checks(job, (*_CHECKS, _check_disk), os.cpu_count() or 1)
+def check_job(job: Job, origins: Mapping[str, CameraOrigins] | None = None) -> CheckReport:
+    """Run all checks of a resolved job, including disk space. If there are no errors, add advice.
+
+    Args:
+        job: The resolved job.
+        origins: Where the settings of each camera come from, by camera name; None if it is unknown.
+    """
+    report = _run_checks(job, (*_CHECKS, _check_disk), os.cpu_count() or 1, origins or {})
     return replace(report, advice=tuple(advise(job, report.cameras))) if report.ready else report
 
 
 def _run_checks(
-    job: Job, checks: Iterable[Callable[[Job, list[CameraSummary]], list[str]]], threads: int
+    job: Job,
+    checks: Iterable[Callable[[Job, list[CameraSummary]], list[str]]],
+    threads: int,
+    origins: Mapping[str, CameraOrigins],
 ) -> CheckReport:
     errors: list[BodycapError] = []
     summaries: list[CameraSummary] = []
     pool = ThreadPoolExecutor(max_workers=threads)
     try:
-        for look in [pool.submit(_check_camera, job.capture, config) for config in job.capture.cameras]:
+        for look in [
+            pool.submit(_check_camera, job.capture, config, origins.get(config.name))
+            for config in job.capture.cameras
+        ]:
             try:
                 summaries.append(look.result())
             except CaptureError as error:
@@ -109,9 +125,16 @@ def _run_checks(
     return CheckReport(job=job, cameras=tuple(summaries), notes=tuple(notes), errors=tuple(errors))
 
 
-def _check_camera(capture: CaptureConfig, config: CameraConfig) -> CameraSummary:
+def _check_camera(
+    capture: CaptureConfig, config: CameraConfig, origins: CameraOrigins | None
+) -> CameraSummary:
     camera = open_camera(capture, config)
-    return _summarise_camera(camera, config, check_picture_quality(camera))
+    summary = _summarise_camera(camera, config, check_picture_quality(camera))
+    return (
+        summary
+        if origins is None
+        else replace(summary, origins=with_first_guess(origins, config, camera.videos[0]))
+    )
 
 
 def _summarise_camera(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> CameraSummary:
@@ -164,11 +187,6 @@ def _intrinsics_notes(camera: CaptureCamera) -> list[str]:
     lens = camera.camera
     long_side = max(lens.width_px, lens.height_px)
     notes = []
-    if any(video.is_interlaced for video in camera.videos):
-        notes.append(
-            "the video is interlaced: convert it to full frames first "
-            "(ffmpeg -i in -vf bwdif=send_frame out.mp4)"
-        )
     if not 0.2 < lens.focal_px / long_side < 3.0:
         notes.append(
             f"a focal length of {lens.focal_px / long_side:.2f} image widths is unusual; is it the "
@@ -215,7 +233,7 @@ def _body_notes(job: Job) -> list[str]:
         return []
     roles = {camera.role for camera in job.capture.cameras}
     notes = []
-    if not roles & set(_TRUNK_ROLES):
+    if not roles & set(TRUNK_ROLES):
         notes.append(
             "no camera on the trunk or head: the body's position can only be inferred from the limbs"
         )

@@ -165,8 +165,8 @@ def _batch_results_folder(job: Job, folder: Path) -> Path:
     The `out` of a loaded job is the default folder if the job file does not give `out`. In this case, the
     results folder is a subfolder of `folder` (the batch's folder) with the job's name.
     """
-    busy_jobs = default_out() / job.name
-    return folder / job.name if job.out in (None, busy_jobs) else results_folder(job)
+    default_folder = default_out() / job.name
+    return folder / job.name if job.out in (None, default_folder) else results_folder(job)
 
 
 def _batch_jobs(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJob]:

@@ -21,8 +21,8 @@ def check(
 ) -> None:
     """Show what a job uses, and its problems.
 
-    Opens every video and prints which file belongs to which camera. Checks calibration, mounts, clocks and
-    disk space. Nothing is computed or written.
+    Opens every video and prints which file belongs to which camera, where each setting comes from, and which
+    files are not used. Checks calibration, mounts, clocks and disk space. Nothing is computed or written.
 
     \b
     Example:

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.core.errors import CaptureError, JobError
 
 
 @app.command()
@@ -26,11 +27,18 @@ def init(
       bodycap init my_walk/
       bodycap check my_walk/job.yaml
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.check.job_template import UNKNOWN_MOUNT, write_job_template
+    from bodycap_batch.check.job_template import write_job_template
+    from bodycap_batch.check.overview import overview_lines
+    from bodycap_batch.config.rules import UNKNOWN_MOUNT
 
     path = write_job_template(folder, replace=force)
     text = path.read_text(encoding="utf-8")
     typer.echo(f"wrote {path}")
+    try:
+        for line in overview_lines(path):
+            typer.echo(line)
+    except (JobError, CaptureError) as error:
+        typer.echo(f"problem: {error}")
     missing = text.count(UNKNOWN_MOUNT)
     if missing:
         typer.echo(

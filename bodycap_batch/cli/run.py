@@ -71,7 +71,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap run my_walk/ --from merge
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.folder import job_file_in
-    from bodycap_batch.config.job import Overrides, load_job
+    from bodycap_batch.config.job import Overrides, load_job_with_origins
     from bodycap_batch.pipeline import Settings, prepare_capture, run_job
     from bodycap_batch.store.artefacts import Store
 
@@ -105,7 +105,10 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
 
         if job.is_dir() and (job_file := job_file_in(job)) is not None:
             display(Event(kind="note", stage="", what=f"as {job_file} says"))
-        resolved = load_job(job, overrides, prepare=prepare)
+        loaded = load_job_with_origins(job, overrides, prepare=prepare)
+        for text in loaded.warnings_of_run():
+            display(Event(kind="note", stage="", what=text))
+        resolved = loaded.job
         out_dir = results_folder(resolved)
         summary = run_job(resolved, out_dir=out_dir, settings=settings(default_store(out_dir)))
     _print_summary(summary, resolved, display, verbose=verbose)

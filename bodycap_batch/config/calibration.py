@@ -86,13 +86,15 @@ class CalibrationEntry:
 
     Attributes:
         calibration: Intrinsics of the camera.
-        offset_s: Clock offset (seconds): common time = camera time + offset.
+        offset_s: Clock offset (seconds): common time = camera time + offset; 0 if the file does not give it.
+        has_offset: True if the file gives the clock offset.
         rolling_shutter_s: Time (seconds) from the exposure of the first row to the exposure of the last row;
             None if the file does not give it.
     """
 
     calibration: Calibration
     offset_s: float
+    has_offset: bool
     rolling_shutter_s: float | None
 
 
@@ -133,10 +135,14 @@ def read_calibration(path: Path, camera: str) -> CalibrationEntry:
             hint='{"model": "PINHOLE", "params": [fx, fy, cx, cy], "width": 1920, "height": 1080}',
         ) from error
     offsets = data.get("offsets_s", {})
-    offset = data.get("offset_s", offsets.get(camera, 0.0) if isinstance(offsets, dict) else offsets)
+    if "offset_s" in data or not isinstance(offsets, dict):
+        has_offset, offset = True, data.get("offset_s", offsets)
+    else:
+        has_offset, offset = camera in offsets, offsets.get(camera, 0.0)
     return CalibrationEntry(
         calibration=calibration,
         offset_s=_seconds(offset, path, f"{field}offsets_s"),
+        has_offset=has_offset,
         rolling_shutter_s=None
         if data.get("rolling_shutter_s") is None
         else _seconds(data["rolling_shutter_s"], path, f"{field}rolling_shutter_s"),

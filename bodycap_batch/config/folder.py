@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
@@ -28,9 +29,13 @@ VIDEO_SUFFIXES = frozenset(
 )
 JOB_FILES = ("job.yaml", "job.yml")
 """File names that the job file of a folder may have."""
+CALIBRATION_FILE = "calib.json"
+"""Name of the file with the calibration of the cameras in a folder of videos."""
 RUN_FILE = "run.json"
 """Name of the file that records a run. A folder with this file holds results. A ``job.yaml`` in such a folder
 belongs to the results; it is not a job to run."""
+Recording = tuple[str, tuple[Path, ...]]
+"""The name of a recording, and its videos in order."""
 _GOPRO = re.compile(r"^(G[HXPSLOT])(PR|[0-9]{2})([0-9]{4})$", re.IGNORECASE)
 
 
@@ -81,7 +86,7 @@ def videos_in(folder: Path) -> list[Path]:
         CaptureError: The folder holds no video, or it cannot be read.
     """
     try:
-        entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+        entries = visible_entries(folder)
         videos = [path for path in entries if is_video(path) or (path.is_dir() and _has_chapters(path))]
     except OSError as error:
         raise CaptureError(f"cannot read the folder ({error})", path=folder, hint="check the path") from error
@@ -94,24 +99,62 @@ def videos_in(folder: Path) -> list[Path]:
     return videos
 
 
+def real_path(path: Path) -> Path:
+    """Return the absolute path without symbolic links; for a path that cannot be followed, with them."""
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError, ValueError):  # a loop of links, a name that is too long, a null character
+        return path.absolute()
+
+
+def shown_name(path: Path) -> str:
+    """Return a path as text for the user. Bytes that are not UTF-8 are replaced."""
+    return path.as_posix().encode(errors="backslashreplace").decode()
+
+
+def visible_entries(folder: Path) -> list[Path]:
+    """Return the files and folders in a folder that are not hidden, sorted by name."""
+    return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+
+
 def _has_chapters(folder: Path) -> bool:
     return any(map(is_video, folder.iterdir())) and not (folder / RUN_FILE).is_file()
 
 
-def recordings_in(folder: Path) -> list[tuple[str, tuple[Path, ...]]]:
+def recordings_in(folder: Path) -> list[Recording]:
     """Return the recordings in a folder: the name of each recording, and its videos in order.
-
-    A recording is a video file, a folder of chapters, or all chapters of one GoPro video.
 
     Raises:
         CaptureError: The folder holds no video, or a folder cannot be read.
     """
-    found: dict[str, list[Path]] = {}
-    for path in videos_in(folder):
-        gopro = None if path.is_dir() else _GOPRO.match(path.stem)
-        name = f"{gopro.group(1)}-{gopro.group(3)}" if gopro else path.name if path.is_dir() else path.stem
-        found.setdefault(name.replace("GP-", "GO-"), []).append(path)
-    return [(name, tuple(sorted(paths, key=natural_key))) for name, paths in found.items()]
+    return grouped_recordings(videos_in(folder))
+
+
+def grouped_recordings(videos: Sequence[Path]) -> list[Recording]:
+    """Group videos to recordings: a video file, a folder of chapters, or all chapters of one GoPro video.
+
+    Several recordings can have the same name: ``torso.mp4`` and ``torso.mov``.
+    """
+    found: dict[tuple[str, str], list[Path]] = {}
+    for path in videos:
+        gopro = _gopro_name(path)
+        key = (gopro, "chapters") if gopro else (recording_name(path), path.name)
+        found.setdefault(key, []).append(path)
+    return [(name, tuple(sorted(paths, key=natural_key))) for (name, _), paths in found.items()]
+
+
+def _gopro_name(path: Path) -> str | None:
+    """Return the name that all chapters of one GoPro video share; None for any other file or folder."""
+    gopro = None if path.is_dir() else _GOPRO.match(path.stem)
+    if gopro is None:
+        return None
+    kind = gopro.group(1).upper()
+    return f"{'GO' if kind == 'GP' else kind}-{gopro.group(3)}"
+
+
+def recording_name(path: Path) -> str:
+    """Return the name of a video file or of a folder of chapters."""
+    return path.name if path.is_dir() else path.stem
 
 
 def job_file_in(folder: Path) -> Path | None:
@@ -131,29 +174,31 @@ def folder_capture(folder: Path) -> dict[str, object]:
     """
     videos = videos_in(folder)
     _refuse_missing_videos(folder)
-    named = [(path.name if path.is_dir() else path.stem, path) for path in videos]
+    named = [(recording_name(path), path) for path in videos]
     _refuse_equal_names(named)
     if len(named) > 1:
         _refuse_unknown_mounts(named)
-    cameras = [_camera_block(folder, name, path) for name, path in named]
-    calibration = folder / "calib.json"
-    block: dict[str, object] = {"cameras": cameras}
-    block["calibration"] = str(calibration) if calibration.is_file() else "auto"
-    return block
+    return {"cameras": [camera_block(name, path) for name, path in named]}
 
 
-def _camera_block(folder: Path, name: str, path: Path) -> dict[str, object]:
-    block: dict[str, object] = {
+def camera_block(name: str, path: Path) -> dict[str, object]:
+    """Return the raw block of a camera for a video or a folder of chapters."""
+    return {
         "name": re.sub(r"[^A-Za-z0-9_\-]+", "_", name).strip("_-") or "camera",
         "video": str(path),
     }
-    sidecar = folder / f"{name}.timestamps.txt"
-    if sidecar.is_file():
-        block["timestamps"] = str(sidecar)
-    own = path / "calib.json"
-    if path.is_dir() and own.is_file():
-        block["calibration"] = str(own)
-    return block
+
+
+def calibration_in(folder: Path) -> Path | None:
+    """Return the calibration file in a folder; None if there is none.
+
+    Raises:
+        CaptureError: The file is a symbolic link that leads nowhere.
+    """
+    path = folder / CALIBRATION_FILE
+    if path.is_symlink() and not path.exists():
+        raise CaptureError("a link that leads nowhere", path=path, hint="link it again, or remove the link")
+    return path if path.is_file() else None
 
 
 def _refuse_missing_videos(folder: Path) -> None:

@@ -4,28 +4,31 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from bodycap_batch.config.calibration import CalibrationEntry, read_calibration
 from bodycap_batch.config.explain import Problem, job_error, problems_of
 from bodycap_batch.config.folder import (
+    CALIBRATION_FILE,
     JOB_FILES,
     RUN_FILE,
     VIDEO_SUFFIXES,
-    chapters_in,
     folder_capture,
     job_file_in,
     videos_in,
 )
 from bodycap_batch.config.limits import Limits
-from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
+from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CaptureConfig, Job
+from bodycap_batch.config.mounts import TRUNK_ROLES
+from bodycap_batch.config.origins import LoadedJob
+from bodycap_batch.config.resolved_camera import ResolvedCamera, resolved_camera, with_found_calibrations
 from bodycap_batch.config.rules import problems_in, skeleton_of
 from bodycap_batch.config.trust import PathPolicy
+from bodycap_batch.config.videos_beside import VideosBeside, find_videos_beside
 from bodycap_batch.config.yaml_source import YamlSource, read_yaml
 from bodycap_batch.core.errors import CaptureError, JobError
 
@@ -60,7 +63,20 @@ def load_job(
     policy: PathPolicy | None = None,
     limits: Limits | None = None,
 ) -> Job:
-    """Load a job and resolve it.
+    """Load a job and resolve it. Arguments and errors are those of `load_job_with_origins`."""
+    return load_job_with_origins(path, overrides, prepare=prepare, policy=policy, limits=limits).job
+
+
+def load_job_with_origins(
+    path: Path,
+    overrides: Overrides | None = None,
+    *,
+    prepare: Prepare | None = None,
+    policy: PathPolicy | None = None,
+    limits: Limits | None = None,
+    is_draft: bool = False,
+) -> LoadedJob:
+    """Load a job and resolve it, and record where its settings come from.
 
     The resolved job holds absolute paths, all chapters and sidecar files, and the calibrations that were
     read.
@@ -68,15 +84,19 @@ def load_job(
     Args:
         path: Path of a YAML file or of a folder of videos. If the folder holds a ``job.yaml``, this file is
             loaded. Paths in a YAML file are relative to the folder of the file; if the file is a symbolic
-            link, they are relative to the folder of the link's target.
+            link, they are relative to the folder of the link's target. A ``job.yaml`` (or ``job.yml``)
+            belongs to its folder: videos that it does not list become cameras, and ``calib.json`` is used as
+            in a folder without a job file.
         overrides: Values of the command line.
         prepare: Function that renders the videos of a job with `capture.synthetic`. It is called before the
             videos are opened.
         policy: The rules for the files that the job may name. None allows any file, for the user's own job.
         limits: Maximum size and depth of the YAML file; None for the default limits.
+        is_draft: True to skip the rules for the values, for a job file with blanks to fill in.
 
     Returns:
-        The resolved job. `Job.model_validate(job.model_dump(mode="json"))` returns an equal job.
+        The resolved job and its origins. `Job.model_validate(job.model_dump(mode="json"))` returns an equal
+        job.
 
     Raises:
         JobError: The file is not a valid job. The error names the file, line and field, and gives advice.
@@ -89,7 +109,8 @@ def load_job(
     try:
         full = _job_source(full, policy)
         source = _read_source(full, limits or Limits())
-        return _load(full, source, overrides or Overrides(), prepare, policy, alone=alone)
+        stated = _stated_job(full, source, alone=alone)
+        return _resolved_job(stated, overrides or Overrides(), prepare, policy, is_draft=is_draft)
     except PermissionError as error:
         kind = JobError if error.filename == str(full) else CaptureError
         raise kind(
@@ -120,37 +141,168 @@ def _read_source(full: Path, limits: Limits) -> YamlSource | None:
     return read_yaml(full, max_bytes=int(1024 * limits.yaml_kb), max_depth=int(limits.yaml_depth))
 
 
-def _load(
-    full: Path,
-    source: YamlSource | None,
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _StatedJob:
+    """A job with the values of its file, before it is resolved.
+
+    Attributes:
+        path: The job file, or the folder of videos.
+        source: The parsed job file; None for a folder of videos.
+        job: The job as stated, with the cameras that were found in its folder.
+        stated: The capture as the job file states it; without cameras if it lists none.
+        uses_folder: True if the job uses the videos and the calibration in its folder.
+        is_alone: True for a job file that another user submitted without a folder.
+        beside: The videos in the folder that the job file does not list.
+    """
+
+    path: Path
+    source: YamlSource | None
+    job: Job
+    stated: CaptureConfig
+    uses_folder: bool
+    is_alone: bool = False
+    beside: VideosBeside = field(default_factory=VideosBeside)
+
+    @property
+    def folder(self) -> Path:
+        """Folder to which the paths of the job are relative."""
+        return self.path if self.source is None else self.path.parent
+
+    @property
+    def name(self) -> str:
+        """Name of the job if the job file gives none."""
+        return self.folder.name if self.source is None or self.path.name in JOB_FILES else self.path.stem
+
+
+def _stated_job(full: Path, source: YamlSource | None, *, alone: bool) -> _StatedJob:
+    if source is None:
+        data: dict[str, Any] = {"capture": folder_capture(full)}
+        job = _validated(data, full, source)
+        stated = _without_cameras(job.capture)
+        return _StatedJob(path=full, source=None, job=job, stated=stated, uses_folder=True)
+    stated_data = _top_mapping(source)
+    data = stated_data if alone else _with_folder_capture(stated_data, full.parent)
+    job = _validated(data, full, source)
+    if data is not stated_data:
+        stated = _without_cameras(job.capture)
+        return _StatedJob(path=full, source=source, job=job, stated=stated, uses_folder=True)
+    uses_folder = not alone and full.name in JOB_FILES and not (full.parent / RUN_FILE).is_file()
+    stated, beside = job.capture, VideosBeside()
+    # The videos of a synthetic capture exist only after they have been rendered, so they are not looked for.
+    if uses_folder and not stated.cameras_only and stated.synthetic is None:
+        beside = find_videos_beside(full, stated.cameras)
+        if beside.cameras:
+            listed = _with_lists(data)["capture"]
+            capture = {**listed, "cameras": [*listed["cameras"], *beside.cameras]}
+            job = _validated({**data, "capture": capture}, full, source)
+    return _StatedJob(
+        path=full,
+        source=source,
+        job=job,
+        stated=stated,
+        uses_folder=uses_folder,
+        is_alone=alone,
+        beside=beside,
+    )
+
+
+def _without_cameras(capture: CaptureConfig) -> CaptureConfig:
+    return capture.model_copy(update={"cameras": ()})
+
+
+def _resolved_job(
+    stated: _StatedJob,
     overrides: Overrides,
     prepare: Prepare | None,
     policy: PathPolicy | None,
     *,
-    alone: bool,
-) -> Job:
-    if source is None:
-        data, base, name = {"capture": folder_capture(full)}, full, full.name
-    else:
-        base = full.parent
-        data = _top_mapping(source)
-        if not alone:
-            data = _with_videos_beside(data, base)
-        name = base.name if full.name in JOB_FILES else full.stem
-    job = _with_overrides(_validated(data, full, source), overrides)
-    problems = problems_in(job)
+    is_draft: bool,
+) -> LoadedJob:
+    full, base, source = stated.path, stated.folder, stated.source
+    job = _with_overrides(stated.job, overrides)
+    problems = [] if is_draft else problems_in(job)
     if problems:
         raise job_error(problems, full, source)
     if policy is not None:
         policy.require_named(job, base)
     if job.capture.synthetic is not None:
         _prepare_synthetic(job, base, full, prepare)
-    resolved = _resolved(job, base, safe_name(name), full, source)
+    if stated.uses_folder:
+        job = job.model_copy(update={"capture": with_found_calibrations(job.capture, base)})
+        if policy is not None:  # before a calibration is read
+            policy.require_named(job, base)
+    cameras = [
+        resolved_camera(index, job.capture, stated.stated, base) for index in range(len(job.capture.cameras))
+    ]
+    resolved = _with_resolved(job, cameras, stated)
     if policy is None:
         _require_apart(resolved, full)
     else:  # the folder of the results is not checked, because the operator chooses it
         policy.require_resolved(resolved)
-    return resolved
+    return LoadedJob(
+        job=resolved,
+        origins={camera.config.name: camera.origins for camera in cameras},
+        folder=_capture_folder(stated, resolved),
+        job_file=None if source is None else full,
+        calibration_files=frozenset(
+            camera.calibration_file for camera in cameras if camera.calibration_file is not None
+        ),
+        reasons=stated.beside.reasons,
+        unlisted=_reason_of_unlisted(stated),
+        warnings=(*stated.beside.warnings, *_calibration_warnings(stated, cameras)),
+        no_body=_no_body(job, resolved),
+    )
+
+
+def _capture_folder(stated: _StatedJob, resolved: Job) -> Path | None:
+    """Return the folder of the videos; None if the job file lies elsewhere."""
+    videos = [video for camera in resolved.capture.cameras for video in camera.video]
+    if stated.uses_folder or any(video.parent == stated.folder for video in videos):
+        return stated.folder
+    return None
+
+
+def _reason_of_unlisted(stated: _StatedJob) -> str:
+    """Return the reason why a video in the capture's folder is not used although nothing is wrong with it."""
+    if stated.stated.cameras_only:
+        return "not listed, and the job file says `cameras_only: true`"
+    if stated.uses_folder:
+        return "not listed"
+    return f"not listed; only a {JOB_FILES[0]} adds the videos beside it"
+
+
+def _calibration_warnings(stated: _StatedJob, cameras: Sequence[ResolvedCamera]) -> list[str]:
+    """Return a warning if a calibration beside the job file is ignored although a camera has none."""
+    path = stated.folder / CALIBRATION_FILE
+    if stated.uses_folder or stated.is_alone or not path.is_file():
+        return []
+    unstated = [camera.config.name for camera in cameras if camera.origins.calibration.source == "default"]
+    if not unstated:
+        return []
+    return [
+        f"{path.name} is not used for {', '.join(unstated)}: a job file that is not called {JOB_FILES[0]} "
+        f"uses it only if it says `calibration: {path.name}`"
+    ]
+
+
+def _no_body(job: Job, resolved: Job) -> str:
+    """Return why the job computes no body although it does not say so; "" if there is no reason to say it."""
+    if resolved.skeleton != NO_SKELETON or job.skeleton is not None:
+        return ""
+    cameras = job.capture.cameras
+    names = ", ".join(camera.name for camera in cameras)
+    places = " and ".join(sorted({camera.role or "an unknown place" for camera in cameras}))
+    roles = {camera.role for camera in cameras}
+    if None in roles:
+        add = "name each video after its place on the body, for example torso.mp4, and add left_palm.mp4"
+    elif roles & set(TRUNK_ROLES):
+        add = "add a camera on a limb, for example left_palm.mp4 and right_palm.mp4"
+    else:
+        add = "add a camera on the trunk or the head, for example torso.mp4"
+    return (
+        "no body is computed: a body takes two cameras or more on different bones, and this job has only "
+        f"{names} (on {places}); {add}"
+    )
 
 
 def synthetic_folder(job: Job, base: Path) -> Path:
@@ -179,14 +331,14 @@ def _top_mapping(source: YamlSource) -> dict[str, Any]:
     return source.data
 
 
-def _with_videos_beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the data of a job file. If no cameras are named, add the videos in the job file's folder.
+def _with_folder_capture(data: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the data of a job file. If no cameras are listed, add the videos in the job file's folder.
 
     The cameras are named after these videos, as for a folder without a job file. Data with an unknown key are
     returned unchanged, because the unknown key may be a misspelt ``cameras``.
     """
     capture = data.get("capture", {})
-    if not isinstance(capture, dict) or "cameras" in capture:
+    if not isinstance(capture, dict) or "cameras" in capture or capture.get("cameras_only") is True:
         return data
     if not (data.keys() <= Job.model_fields.keys() and capture.keys() <= CaptureConfig.model_fields.keys()):
         return data
@@ -258,19 +410,19 @@ def _prepare_synthetic(job: Job, base: Path, path: Path, prepare: Prepare | None
         )
 
 
-def _resolved(job: Job, base: Path, name: str, path: Path, source: YamlSource | None) -> Job:
-    cameras = tuple(
-        _resolved_camera(camera, index, job.capture, base) for index, camera in enumerate(job.capture.cameras)
-    )
-    skeleton = skeleton_of(job)
+def _with_resolved(job: Job, cameras: Sequence[ResolvedCamera], stated: _StatedJob) -> Job:
+    skeleton, base = skeleton_of(job), stated.folder
     if skeleton not in SKELETON_PRESETS:
         skeleton = str((base / skeleton).resolve())
         if not Path(skeleton).is_file():
             raise job_error(
-                [Problem(("skeleton",), f"no such file: {skeleton}", "check the path")], path, source
+                [Problem(("skeleton",), f"no such file: {skeleton}", "check the path")],
+                stated.path,
+                stated.source,
             )
-    capture = job.capture.model_copy(update={"cameras": cameras, "calibration": None})
-    name = job.name or name
+    configs = tuple(camera.config for camera in cameras)
+    capture = job.capture.model_copy(update={"cameras": configs, "cameras_only": True, "calibration": None})
+    name = job.name or safe_name(stated.name)
     out = (base / job.out if job.out is not None else Path("out") / name).resolve()
     return job.model_copy(update={"capture": capture, "name": name, "skeleton": skeleton, "out": out})
 
@@ -290,62 +442,6 @@ def _require_apart(job: Job, full: Path) -> None:
             field="out",
             hint=f"use a separate folder for the results, for example {Path(str(job.out)) / 'results'}",
         )
-
-
-def _resolved_camera(camera: CameraConfig, index: int, capture: CaptureConfig, base: Path) -> CameraConfig:
-    videos, sidecars = _chapters(camera, base)
-    if camera.timestamps:
-        sidecars = tuple((base / path).resolve() for path in camera.timestamps)
-    if len(sidecars) not in (0, 1, len(videos)):
-        raise CaptureError(
-            f"camera {camera.name} has {len(sidecars)} timestamp files for {len(videos)} chapters",
-            path=sidecars[0],
-            field=f"capture.cameras.{index}.timestamps",
-            hint="one for the whole camera, or one beside every chapter",
-        )
-    calibration = camera.calibration if camera.calibration is not None else capture.calibration
-    entry: CalibrationEntry | None = None
-    if isinstance(calibration, Path):
-        entry = read_calibration((base / calibration).resolve(), camera.name)
-        calibration = entry.calibration
-    update: dict[str, Any] = {"video": videos, "timestamps": sidecars, "calibration": calibration or "auto"}
-    if camera.mask is not None:
-        update["mask"] = (base / camera.mask).resolve()
-    if camera.offset_s is None:
-        update["offset_s"] = entry.offset_s if entry else 0.0
-    if camera.rolling_shutter_s is None:
-        update["rolling_shutter_s"] = entry.rolling_shutter_s if entry else None
-    return camera.model_copy(update=update)
-
-
-def _chapters(camera: CameraConfig, base: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """Return the video files of a camera in order, and the sidecar files with the videos' timestamps.
-
-    The first of these that exists is used: the sidecar of a folder of chapters, the sidecars of the chapters
-    (``<video>.timestamps.txt``), the file ``<camera>.timestamps.txt``.
-    """
-    videos: list[Path] = []
-    beside: list[Path] = []
-    places = [(base / video).resolve() for video in camera.video]
-    for place in places:
-        chapters = chapters_in(place) if place.is_dir() else (place,)
-        whole = sidecars_of(place) if place.is_dir() and len(places) == 1 else []
-        videos.extend(chapters)
-        beside.extend(whole or [sidecar for chapter in chapters for sidecar in sidecars_of(chapter)])
-    return tuple(videos), tuple(beside or _existing(places[0].with_name(f"{camera.name}.timestamps.txt")))
-
-
-def sidecars_of(video: Path) -> list[Path]:
-    """Return the sidecar file of a video or folder: a list with one path, or an empty list.
-
-    Its name is ``torso.timestamps.txt`` or ``torso.mp4.timestamps.txt``; the first name is preferred.
-    """
-    names = (f"{video.stem}.timestamps.txt", f"{video.name}.timestamps.txt")
-    return [found for name in names for found in _existing(video.with_name(name))][:1]
-
-
-def _existing(path: Path) -> list[Path]:
-    return [path] if path.is_file() else []
 
 
 def safe_name(text: str) -> str:

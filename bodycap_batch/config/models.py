@@ -128,8 +128,13 @@ class CaptureConfig(_Block):
     cameras: tuple[CameraConfig, ...] = Field(
         min_length=1, max_length=64, description="a list of blocks: - {name: torso, video: torso.mp4}"
     )
+    cameras_only: bool = Field(
+        False, description="true: no other cameras; default: videos beside a job.yaml become cameras, too"
+    )
     calibration: AnyCalibration | None = Field(
-        None, description="calibration of every camera that does not give a calibration itself"
+        None,
+        description="calibration of every camera that does not give a calibration itself; "
+        "default: the calib.json beside a job.yaml, else auto",
     )
     rig: Literal["free", "synced"] = Field(
         "free",

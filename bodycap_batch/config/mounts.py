@@ -54,6 +54,9 @@ ROLES = tuple(dict.fromkeys(role for _, role in _MOUNT_BY_SPELLING.values()))
 MOUNT_NAMES = tuple(dict.fromkeys(mount for mount, _ in _MOUNT_BY_SPELLING.values()))
 """The preferred name of each place on the body where a camera can be mounted, for messages and help texts."""
 
+TRUNK_ROLES = ("Hips", "Spine", "Spine1", "Neck", "Head")
+"""Roles of the bones of the trunk and the head."""
+
 _QUALIFIER = re.compile(r"[_\- ]?(back|front|top|bottom|upper|lower|inner|outer|[0-9]+|[a-c])$")
 
 

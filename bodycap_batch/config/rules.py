@@ -22,7 +22,11 @@ _FREE_LIMB = {"Arm": "arm", "ForeArm": "arm", "Hand": "arm", "Leg": "leg", "Foot
 """Limb (arm or leg) that a bone belongs to, by the bone's role without its side. Only bones that move freely
 relative to the trunk are listed."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._\-]*")
-_UNFILLED = re.compile(r"<[^<>]*>")
+_NAME_CHARACTERS = "letters, digits, ., _ and - only, first a letter or a digit"
+UNKNOWN_MOUNT = "<where on the body?>"
+"""Placeholder that `bodycap init` writes for a mount that the file name of the camera does not contain."""
+_UNKNOWN_VIDEO = "<path of your camera.mp4>"
+"""Placeholder for the video in the job file ``jobs/tum_rgbd.yaml``."""
 _MAX_NAME_BYTES = 255
 """Maximum length (bytes) of a file name on common file systems."""
 _ROTATION_TOLERANCE = 5e-3
@@ -57,7 +61,7 @@ def skeleton_of(job: Job) -> str:
 def _camera_names(job: Job, index: int) -> Iterator[Problem]:
     name = job.capture.cameras[index].name
     if not _NAME.fullmatch(name):
-        yield Problem(("name",), f"{name!r} cannot be a file's name", "letters, digits, _ and - only")
+        yield Problem(("name",), f"{name!r} cannot be a file's name", _NAME_CHARACTERS)
     for other in job.capture.cameras[:index]:
         if other.name.lower() == name.lower():
             yield Problem(
@@ -73,7 +77,7 @@ def _mount(job: Job, camera: CameraConfig) -> Iterator[Problem]:
     if camera.segment is not None and camera.role is None:
         known = (*ROLES, *MOUNT_NAMES)
         yield Problem(("segment",), f"unknown segment {camera.segment!r}", _nearest(camera.segment, known))
-    elif camera.mount is not None and _UNFILLED.search(camera.mount):
+    elif camera.mount == UNKNOWN_MOUNT:
         message = f"still to be filled in: where on the body was camera {camera.name!r}?"
         yield Problem(("mount",), message, f"one of {', '.join(MOUNT_NAMES)}")
     elif camera.segment is None and camera.mount is not None and camera.role is None:
@@ -106,7 +110,7 @@ def _pose(camera: CameraConfig) -> Iterator[Problem]:
 
 def _paths(camera: CameraConfig) -> Iterator[Problem]:
     for video in camera.video:
-        if _UNFILLED.search(str(video)):
+        if str(video) == _UNKNOWN_VIDEO:
             yield Problem(("video",), f"still to be filled in: {video}", "put the path of your video here")
         yield from _unusable("video", video)
     for path in camera.timestamps:
@@ -132,9 +136,7 @@ def _job_names(job: Job) -> Iterator[Problem]:
         for found in _unusable("calibration", job.capture.calibration):
             yield found._replace(location=("capture", *found.location))
     if job.name and not _NAME.fullmatch(job.name):
-        yield Problem(
-            ("name",), f"{job.name!r} cannot be a folder's name", "letters, digits, ., _ and - only"
-        )
+        yield Problem(("name",), f"{job.name!r} cannot be a folder's name", _NAME_CHARACTERS)
 
 
 def _skeleton(job: Job) -> Iterator[Problem]:

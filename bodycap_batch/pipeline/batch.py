@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.config.job import Overrides, load_job
+from bodycap_batch.config.job import Overrides, load_job_with_origins
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import EXIT_BUG, BodycapError, Cancelled, DiskAway, JobError
+from bodycap_batch.core.progress import Event
 from bodycap_batch.pipeline.run import RunSummary, run_job
 from bodycap_batch.pipeline.sample import prepare_capture
 from bodycap_batch.pipeline.settings import Settings
@@ -113,10 +114,12 @@ class Batch:
         def prepare(options: Mapping[str, Any], folder: Path) -> None:
             prepare_capture(options, folder, self._settings(job, None))
 
-        resolved = load_job(job.path, Overrides(), prepare=prepare)
-        out_dir = self._results(resolved)
+        loaded = load_job_with_origins(job.path, Overrides(), prepare=prepare)
+        out_dir = self._results(loaded.job)
         self._claim_folder(out_dir, job.path)
-        resolved = resolved.model_copy(update={"out": out_dir})
+        for text in loaded.warnings_of_run():
+            self._settings(job, out_dir).listener(Event(kind="note", stage="", what=text))
+        resolved = loaded.job.model_copy(update={"out": out_dir})
         return run_job(resolved, out_dir=out_dir, settings=self._settings(job, out_dir))
 
     def _claim_folder(self, out_dir: Path, path: Path) -> None:

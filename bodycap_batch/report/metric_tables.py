@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.percent import format_percent
+from bodycap_batch.report.metric_paths import metric_at, metric_path
 from bodycap_batch.report.report_inputs import ReportInputs
 from bodycap_batch.report.viewer_data import known_joint_sigma_m
 
@@ -19,7 +20,8 @@ class Cell:
 
     Attributes:
         text: The displayed text.
-        metric: Dotted path of the value in ``metrics.json``; "" if the cell shows no value of this file.
+        metric: Path (see `metric_path`) of the value in ``metrics.json``; "" if the cell shows no value of
+            this file.
         value: The value without rounding; None if the cell shows no number.
         share: Relative length of a bar behind the text, 0 to 1; None for no bar.
     """
@@ -38,20 +40,6 @@ class Table:
     heads: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
     note: str = ""
-
-
-def metric_at(metrics: Mapping[str, Any], dotted: str) -> Any:
-    """Return the value at a dotted path of nested mappings and lists, or None if the path does not exist.
-
-    The names in the path, such as camera names, must not contain a dot.
-    """
-    value: Any = metrics
-    for part in dotted.split("."):
-        if isinstance(value, list):
-            value = value[int(part)] if int(part) < len(value) else None
-        else:
-            value = value.get(part) if isinstance(value, Mapping) else None
-    return value
 
 
 def make_tables(inputs: ReportInputs) -> dict[str, Table]:
@@ -88,7 +76,7 @@ def metric_cell(
 
     Args:
         metrics: The content of ``metrics.json``.
-        dotted: Dotted path of the value.
+        dotted: Dotted path of the value, as `metric_path` returns it.
         form: Format string for the value, or function that converts the value to text.
         factor: Factor that converts the value to the displayed unit.
     """
@@ -106,8 +94,8 @@ def _percent(value: float) -> str:
 
 def _frames_table(metrics: Mapping[str, Any]) -> Table:
     rows = []
-    for path in (*(f"cameras.{name}" for name in metrics["cameras"]), "total"):
-        name = path.partition(".")[2] or "all cameras"
+    paths = {name: metric_path("cameras", name) for name in metrics["cameras"]}
+    for name, path in (*paths.items(), ("all cameras", "total")):
         rows.append(
             (
                 Cell(text=name),
@@ -125,12 +113,10 @@ def _frames_table(metrics: Mapping[str, Any]) -> Table:
 
 
 def _map_table(metrics: Mapping[str, Any]) -> Table:
-    paths = [f"cameras.{name}" for name in metrics["cameras"]]
-    paths += [f"models.{index}" for index in range(len(metrics["models"]))] + ["total"]
+    paths = [(name, metric_path("cameras", name)) for name in metrics["cameras"]]
+    paths += [(f"map {index}", metric_path("models", index)) for index in range(len(metrics["models"]))]
     rows = []
-    for path in paths:
-        kind, _, name = path.partition(".")
-        head = {"cameras": name, "models": f"map {name}", "total": "all"}[kind]
+    for head, path in (*paths, ("all", "total")):
         rows.append(
             (
                 Cell(text=head),
@@ -153,7 +139,7 @@ def _residuals_table(merge: Mapping[str, Any]) -> Table:
     largest = max((camera["residual_m"]["p95"] for camera in cameras.values()), default=0.0)
     rows = []
     for name, camera in cameras.items():
-        path = f"merge.cameras.{name}"
+        path = metric_path("merge", "cameras", name)
         p95 = metric_cell(metrics, f"{path}.residual_m.p95", "{:.2f} cm", 100.0)
         rows.append(
             (
@@ -194,12 +180,13 @@ def _joint_distance_table(merge: Mapping[str, Any], key: str, caption: str) -> T
     largest = max((distance["p95"] for distance in distances.values()), default=0.0)
     rows = []
     for role in distances:
-        p95 = metric_cell(metrics, f"merge.{key}.{role}.p95", "{:.2f} mm", 1000.0)
+        path = metric_path("merge", key, role)
+        p95 = metric_cell(metrics, f"{path}.p95", "{:.2f} mm", 1000.0)
         share = distances[role]["p95"] / largest if largest else 0.0
         rows.append(
             (
                 Cell(text=role),
-                metric_cell(metrics, f"merge.{key}.{role}.p50", "{:.2f} mm", 1000.0),
+                metric_cell(metrics, f"{path}.p50", "{:.2f} mm", 1000.0),
                 replace(p95, share=share),
             )
         )
@@ -210,7 +197,7 @@ def _mounts_table(merge: Mapping[str, Any]) -> Table:
     metrics = {"merge": merge}
     rows = []
     for name, mount in merge.get("mounts", {}).items():
-        path = f"merge.mounts.{name}"
+        path = metric_path("merge", "mounts", name)
         rows.append(
             (
                 Cell(text=name),
@@ -239,8 +226,10 @@ def _joined_cameras_table(merge: Mapping[str, Any]) -> Table:
     rows = tuple(
         (
             Cell(text=name),
-            metric_cell(metrics, f"merge.joined_cameras.{name}.sigma_deg", "± {:.1f}°"),
-            metric_cell(metrics, f"merge.joined_cameras.{name}.sigma_m", "± {:.1f} cm", 100.0),
+            metric_cell(metrics, metric_path("merge", "joined_cameras", name, "sigma_deg"), "± {:.1f}°"),
+            metric_cell(
+                metrics, metric_path("merge", "joined_cameras", name, "sigma_m"), "± {:.1f} cm", 100.0
+            ),
         )
         for name in merge.get("joined_cameras", {})
     )
@@ -311,9 +300,9 @@ def _soft_limits_table(merge: Mapping[str, Any]) -> Table:
     metrics, activity = {"merge": merge}, merge.get("activity", {})
     rows = []
     for name, share in activity.get("rules_active", {}).items():
-        active = metric_cell(metrics, f"merge.activity.rules_active.{name}", _percent)
+        active = metric_cell(metrics, metric_path("merge", "activity", "rules_active", name), _percent)
         has_excess = name in activity.get("rules_pressed_m", {})
-        path = f"merge.activity.rules_pressed_m.{name}"
+        path = metric_path("merge", "activity", "rules_pressed_m", name)
         excess = [metric_cell(metrics, f"{path}.{key}", "{:.1f} cm", 100.0) for key in ("p50", "p95")]
         rows.append(
             (
@@ -368,6 +357,6 @@ def headline_figures(metrics: Mapping[str, Any]) -> Iterable[tuple[str, Cell]]:
             default=None,
         )
         if worst is not None:
-            path = f"merge.cameras.{worst[0]}.longest_gap_s"
+            path = metric_path("merge", "cameras", worst[0], "longest_gap_s")
             yield "longest gap", metric_cell(metrics, path, "{:.2f} s")
         yield "metric scale", metric_cell(metrics, "merge.scale.relative_sigma", "± {:.1%}")

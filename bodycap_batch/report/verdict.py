@@ -10,6 +10,7 @@ from bodycap_batch.core.percent import format_percent
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.report.camera_pairs import distance_criteria, shared_segment_criteria
 from bodycap_batch.report.grades import Criterion, Grade, grade_value
+from bodycap_batch.report.metric_paths import metric_path
 
 _GOOD_ERROR_PX, _FAIR_ERROR_PX = 1.0, 2.0
 """Maximum mean reprojection error (pixels) for the grades "good" and "usable with care".
@@ -166,7 +167,7 @@ def _frame_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
             f"({format_percent(share, 1)})",
             rationale="An average over all cameras hides one bad camera. The motion of the limb with this "
             "camera is then bad as well.",
-            metric=f"cameras.{name}.coverage",
+            metric=metric_path("cameras", name, "coverage"),
             value=share,
         )
 
@@ -247,7 +248,7 @@ def _lens_criteria(misfits: Mapping[str, float], freed: Collection[str]) -> Iter
             rationale="A wrong lens bends the whole map although its error in pixels is small. On a walk of "
             "2 m, an error of 25 % in the focal length moved every camera by 9 cm; an image centre that was "
             "wrong by 9 % moved them by 16 cm.",
-            metric="" if "." in name else f"mapping.misfitting_lenses.{name}",
+            metric=metric_path("mapping", "misfitting_lenses", name),
             value=float(worst),
         )
 
@@ -328,7 +329,7 @@ def _gap_criteria(cameras: Mapping[str, Any]) -> Iterator[Criterion]:
         rationale="An arm swings forward and back in about a second. The smoothness of the motion bridges a "
         "fifth of a second well. In more than half a second a whole swing can be missing. The time before a "
         "camera's first measurement and after its last measurement also counts as a gap.",
-        metric=f"merge.cameras.{name}.longest_gap_s",
+        metric=metric_path("merge", "cameras", name, "longest_gap_s"),
         value=gap_s,
     )
 
@@ -358,7 +359,7 @@ def _mount_criteria(mounts: Mapping[str, Any]) -> Iterator[Criterion]:
         finding=f"the worst mount is known to {sigma:.1f}° and {100 * worst['sigma_m']:.1f} cm ({name})",
         rationale="An error of the mount is a constant error of the bone that carries the camera. An "
         "animator aims a hand by eye to about 4°. Above 12° a palm visibly faces the wrong way.",
-        metric=f"merge.mounts.{name}.sigma_deg",
+        metric=metric_path("merge", "mounts", name, "sigma_deg"),
         value=sigma,
     )
 
@@ -385,6 +386,6 @@ def _observed_time_criteria(joints: Mapping[str, Any]) -> Iterator[Criterion]:
             finding=f"{format_percent(share, 1)} of the motion at the joint that was measured least ({name})",
             rationale="If a camera starts late, ends early or is lost for a long time, its limb is inferred. "
             "An average over all joints would hide such a limb.",
-            metric="" if "." in name else f"motion.joints.{name}.observed_share",
+            metric=metric_path("motion", "joints", name, "observed_share"),
             value=share,
         )

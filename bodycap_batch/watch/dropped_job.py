@@ -10,7 +10,7 @@ from pathlib import Path
 import yaml
 
 from bodycap_batch.config.folder import job_file_in
-from bodycap_batch.config.job import load_job, safe_name
+from bodycap_batch.config.job import load_job, load_job_with_origins, safe_name
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, Job
 from bodycap_batch.config.trust import PathPolicy
@@ -33,7 +33,9 @@ class JobPermissions:
     limits: Limits = field(default_factory=Limits)
 
 
-def read_dropped_job(entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions) -> Job:
+def read_dropped_job(
+    entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
+) -> tuple[Job, tuple[str, ...]]:
     """Read and resolve a job in the inbox.
 
     Args:
@@ -42,7 +44,7 @@ def read_dropped_job(entry: InboxEntry, snapshot: EntrySnapshot, permissions: Jo
         permissions: Which folders the job may read, and the maximum size of the job.
 
     Returns:
-        The job. All its paths are absolute and permitted.
+        The job, and warnings for the user. All paths of the job are absolute and permitted.
 
     Raises:
         JobError: The job is not valid, holds a special file, or names a path that is not permitted.
@@ -69,13 +71,15 @@ def read_dropped_job(entry: InboxEntry, snapshot: EntrySnapshot, permissions: Jo
     decides = None if entry.is_file else job_file_in(entry.path)
     if decides is not None:
         policy.require(decides)
-    job = load_job(entry.path, policy=policy, limits=permissions.limits)
+    loaded = load_job_with_origins(entry.path, policy=policy, limits=permissions.limits)
+    job = loaded.job
     if decides is not None and job.name == safe_name(entry.path.resolve().name):
         # The name of the job comes from the real folder. The entry may be a link with another name, so use
         # the name of the entry.
         job = job.model_copy(update={"name": safe_name(entry.name)})
     _require_video_sizes(job, permissions.limits)
-    return job.model_copy(update={"capture": job.capture.model_copy(update={"synthetic": None})})
+    capture = job.capture.model_copy(update={"synthetic": None})
+    return job.model_copy(update={"capture": capture}), loaded.warnings_of_run()
 
 
 def path_policy(path: Path, roots: tuple[Path, ...], *, is_file: bool) -> PathPolicy:

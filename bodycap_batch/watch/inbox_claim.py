@@ -153,12 +153,14 @@ def _write_job_files(
     job_dir: JobDir, entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
 ) -> BodycapError | None:
     """Read the job, and write all its files except the input. Return the error of the job, or None."""
-    job, error = _read_job_or_error(entry, snapshot, permissions)
+    job, warnings, error = _read_job_or_error(entry, snapshot, permissions)
     if job is not None:
         write_job(job, job_dir, entry.path.parent / entry.path.name if not entry.is_file else job_dir.input)
     status = JobStatusFile(job_dir)
     for name in [] if entry.is_file else unread_job_files(entry.path):
         status.add_note(f"{name} was not read: a job file in a folder must be called job.yaml")
+    for warning in warnings:
+        status.add_note(warning)
     status.update(kind="file" if entry.is_file else "folder", dropped=entry.path.name)
     return error
 
@@ -192,8 +194,8 @@ def _move_entry(
 
 def _read_job_or_error(
     entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
-) -> tuple[Job | None, BodycapError | None]:
+) -> tuple[Job | None, tuple[str, ...], BodycapError | None]:
     try:
-        return read_dropped_job(entry, snapshot, permissions), None
+        return *read_dropped_job(entry, snapshot, permissions), None
     except BodycapError as error:
-        return None, error
+        return None, (), error

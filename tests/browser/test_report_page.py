@@ -10,7 +10,7 @@ import pytest
 
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.report import ReportInputs, write_report
-from bodycap_batch.report.metric_tables import metric_at
+from bodycap_batch.report.metric_paths import metric_at
 from tests.browser.conftest import NO_3D, Pages
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 import bodycap_batch
 from bodycap_batch.cli import main
@@ -66,6 +67,18 @@ class Bench:
 @pytest.fixture
 def bench(tmp_path: Path) -> Bench:
     return Bench(tmp_path)
+
+
+def test_a_video_that_is_not_used_is_a_note_of_the_run_and_of_the_batch(bench: Bench) -> None:
+    (bench.capture / "board.mp4").write_text("a calibration board")
+    (bench.capture / "job.yaml").write_text("capture: {cameras: [{name: torso, video: torso.mp4}]}\n")
+    for command in (["run", "--until", "check"], ["batch"]):
+        code, _, err = bench.run(*command, "my walk")
+        assert code == 0, err
+        assert "board.mp4 is not used: the name is not a known place on the body" in err
+    job = yaml.safe_load((bench.folder / "out" / "my_walk" / "job.yaml").read_text())
+    assert [camera["name"] for camera in job["capture"]["cameras"]] == ["torso", "left_palm"]
+    assert job["capture"]["cameras_only"] is True
 
 
 def gone(pid: int) -> bool:

@@ -27,7 +27,8 @@ from bodycap_batch.report.figures.camera_timeline import draw_camera_timeline
 from bodycap_batch.report.frame_losses import LossCause, find_frame_losses, likely_cause
 from bodycap_batch.report.frame_pictures import FrameAppearance, FramePicture
 from bodycap_batch.report.grades import Criterion, Grade
-from bodycap_batch.report.metric_tables import metric_at
+from bodycap_batch.report.metric_paths import metric_at
+from bodycap_batch.report.metric_tables import headline_figures, make_tables
 from bodycap_batch.report.packing import MISSING_CODE, PageBudget, pack_scaled
 from bodycap_batch.report.recommendations import count_shared_points, recommend_changes
 from bodycap_batch.report.verdict import judge
@@ -374,6 +375,30 @@ def test_the_verdict_shows_a_camera_that_ended_early(inputs: ReportInputs) -> No
     assert (least.grade, least.value) == (Grade.POOR, 0.6)
     assert metric_at(metrics, least.metric) == 0.6
     assert judge(metrics, None).body is Grade.POOR
+
+
+def test_figures_of_cameras_and_joints_with_a_dot_in_their_name(inputs: ReportInputs) -> None:
+    metrics = json.loads(
+        json.dumps(inputs.metrics).replace('"left_palm"', '"left.palm"').replace('"LeftHand"', '"Left.Hand"')
+    )
+    metrics["motion"]["joints"]["Left.Hand"]["observed_share"] = 0.6
+    metrics["cameras"]["left.palm"]["coverage"] = 0.3
+    metrics["merge"]["mounts"]["left.palm"]["sigma_deg"] = 40.0
+    metrics["merge"]["cameras"]["left.palm"]["longest_gap_s"] = 99.0
+    metrics["mapping"]["misfitting_lenses"] = {"left.palm": 1.2}
+    found = {each.metric: each.value for each in judge(metrics, None).criteria if each.metric}
+    assert {
+        r"cameras.left\.palm.coverage": 0.3,
+        r"merge.mounts.left\.palm.sigma_deg": 40.0,
+        r"merge.cameras.left\.palm.longest_gap_s": 99.0,
+        r"mapping.misfitting_lenses.left\.palm": 1.2,
+        r"motion.joints.Left\.Hand.observed_share": 0.6,
+    }.items() <= found.items()
+    tables = make_tables(replace(inputs, metrics=metrics)).values()
+    cells = [cell for table in tables for row in table.rows for cell in row if cell.metric]
+    assert sum(r"left\.palm" in cell.metric for cell in cells) > 10
+    found |= {cell.metric: cell.value for cell in (*cells, *(cell for _, cell in headline_figures(metrics)))}
+    assert {path: metric_at(metrics, path) for path in found} == found
 
 
 def test_the_page_shows_scale_hinges_soft_limits_and_joined_maps(

@@ -78,3 +78,15 @@ def test_a_missing_extra_says_how_to_install_it(tmp_path: Path, monkeypatch: pyt
     extra = finding("extra [formats]", tmp_path)
     assert extra.state == "note"
     assert "[formats]" in extra.remedy
+
+
+def test_memory_and_disk_are_compared_in_megabytes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    pages = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 4_100_000_000 // 4096}
+    monkeypatch.setattr(machine.os, "sysconf", pages.__getitem__)
+    assert (finding("memory", tmp_path).state, finding("memory", tmp_path).found) == ("ok", "4.1 GB")
+    pages["SC_PHYS_PAGES"] = 3_900_000_000 // 4096
+    assert finding("memory", tmp_path).state == "note"
+    usage = machine.shutil._ntuple_diskusage(0, 0, 5_100_000_000)  # type: ignore[attr-defined]
+    monkeypatch.setattr(machine.shutil, "disk_usage", lambda _: usage)
+    assert finding("disk", tmp_path).state == "ok"
+    assert "5.1 GB free" in finding("disk", tmp_path).found

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bodycap_batch.capture import open_capture
+from bodycap_batch.capture import CaptureCamera, open_camera, open_capture
 from bodycap_batch.check import check_job, check_path, preflight, require_ready
 from bodycap_batch.check.picture_quality import sample_indices
+from bodycap_batch.cli import main
 from bodycap_batch.config.job import Overrides, load_job
+from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.errors import Cancelled, JobError, StoreError
 from bodycap_batch.formats import optional_libraries
@@ -23,6 +26,8 @@ from tests.videos import textured_frame, write_video
 
 FRAMES = [textured_frame(index % 40) for index in range(75)]
 LENS = {"model": "PINHOLE", "params": [40, 40, 32, 24], "width": 64, "height": 48}
+
+FOCAL_KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 
 
 @pytest.fixture
@@ -72,6 +77,16 @@ def test_short_grey_and_partly_black_videos_are_reported(tmp_path: Path) -> None
     assert any("contrast" in note for note in torso.notes)
     assert any("hardly enough movement" in note for note in torso.notes)
     assert any("are black" in note for note in head.notes)
+
+
+def test_an_interlaced_video_is_reported_once(walk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def open_interlaced(spec: CaptureConfig, config: CameraConfig) -> CaptureCamera:
+        camera = open_camera(spec, config)
+        return replace(camera, videos=tuple(replace(video, is_interlaced=True) for video in camera.videos))
+
+    monkeypatch.setattr(preflight, "open_camera", open_interlaced)
+    for camera in check_path(walk).cameras:
+        assert sum("interlaced" in note for note in camera.notes) == 1
 
 
 def test_cameras_that_never_ran_together(walk: Path) -> None:
@@ -220,7 +235,7 @@ def test_a_stopped_check_does_not_wait_for_the_remaining_cameras(
     job = load_job(walk)
     checked: list[object] = []
 
-    def check_camera(_: object, config: object) -> None:
+    def check_camera(_: object, config: object, __: object) -> None:
         if config is job.capture.cameras[0]:
             raise Cancelled("stopped on request")
         checked.append(config)
@@ -232,3 +247,52 @@ def test_a_stopped_check_does_not_wait_for_the_remaining_cameras(
     with pytest.raises(Cancelled):
         require_ready(many, threads=1)
     assert len(checked) < 50
+
+
+def test_the_check_says_where_settings_come_from_and_what_is_not_used(
+    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_video(walk / "head.mkv", FRAMES[20:], metadata={FOCAL_KEY: "28"})
+    for name in ("board.mp4", "notes.txt", "left_palm.timestamps.txt"):
+        (walk / name).touch()
+    times = "".join(f"{index / 30:.6f}\n" for index in range(75))
+    (walk / "left_palm.timestamps.txt").write_text(times)
+    (walk / "job.yaml").write_text(
+        "height_m: 1.7\ncapture:\n  cameras:\n"
+        "    - {name: torso, video: torso.mp4, offset_s: 0.2}\n"
+        "    - {name: head, video: head.mkv, calibration: auto}\n"
+    )
+    assert main(["check", str(walk), "--out", str(tmp_path / "out")]) == 0
+    text = capsys.readouterr().out
+    for line in (
+        "  calibration: PINHOLE (from calib.json)",
+        "  calibration: auto (from the job file), starting at 65° (from the video metadata)",
+        "  timestamps: left_palm.timestamps.txt (from the sidecar file)",
+        "  clock: offset 0.2 s (from the job file); drift 0, not corrected (default)",
+        "  mount: Spine1 (from the camera name); pose on the bone: typical of the place (default)",
+        "  video: left_palm.mp4 (from the folder)",
+        "not used (the name is not a known place on the body): board.mp4",
+        "not used (not a video, and no setting names it): notes.txt",
+    ):
+        assert line in text.splitlines(), line
+    assert "note: board.mp4 is not used: the name is not a known place" in text
+    assert main(["check", str(walk), "--out", str(tmp_path / "out"), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    torso, head, palm = (camera["origins"] for camera in data["cameras"])
+    assert torso["clock_offset"] == {"source": "job file", "value": "0.2 s"}
+    assert head["first_guess"] == {"source": "video metadata", "value": "65°"}
+    assert palm["video"]["source"] == "folder"
+    assert [file["path"] for file in data["unused_files"]] == ["board.mp4", "notes.txt"]
+
+
+def test_one_camera_with_a_height_gets_no_body(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_video(tmp_path / "walk" / "torso.mp4", FRAMES)
+    command = ["check", str(tmp_path / "walk"), "--height", "1.7", "--out", str(tmp_path / "out")]
+    assert main(command) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "ready to run: map and camera paths, no body"
+    (note,) = (line for line in lines if "no body is computed" in line)
+    assert "two cameras or more on different bones" in note
+    assert "for example left_palm.mp4" in note
+    assert main([*command, "--skeleton", "none"]) == 0
+    assert "no body is computed" not in capsys.readouterr().out

@@ -9,10 +9,12 @@ from typing import Any
 import pytest
 import yaml
 
-from bodycap_batch.check.job_template import UNKNOWN_MOUNT, job_template, write_job_template
+from bodycap_batch.check.job_template import job_template, write_job_template
 from bodycap_batch.cli import main
+from bodycap_batch.config.folder import recordings_in
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import Job
+from bodycap_batch.config.rules import UNKNOWN_MOUNT
 from bodycap_batch.core.errors import CaptureError, JobError
 from tests.broken import BVH, FRAMES, LENS
 from tests.videos import write_video
@@ -87,6 +89,44 @@ def test_chapters_are_one_camera_with_an_unknown_mount(
     text = (folder / "job.yaml").read_text().replace(f'"{UNKNOWN_MOUNT}"', "head")
     (folder / "job.yaml").write_text(text)
     assert len(load_job(folder / "job.yaml").capture.cameras) == 3
+
+
+def test_chapters_of_a_gopro_are_one_recording_in_any_case(tmp_path: Path) -> None:
+    for name in ("gp010123.mp4", "GOPR0123.MP4", "MYGP-1.mp4", "torso.mov", "torso.mp4"):
+        (tmp_path / name).write_bytes(b"not opened")
+    found = [(name, [path.name for path in paths]) for name, paths in recordings_in(tmp_path)]
+    assert found == [
+        ("GO-0123", ["GOPR0123.MP4", "gp010123.mp4"]),
+        ("MYGP-1", ["MYGP-1.mp4"]),
+        ("torso", ["torso.mov"]),
+        ("torso", ["torso.mp4"]),
+    ]
+
+
+def test_init_prints_where_settings_come_from_and_what_is_not_used(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_video(folder / "GX010042.mp4", FRAMES[:10])
+    (folder / "notes.txt").touch()
+    assert main(["init", str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "  calibration: auto (default), starting at 70° (default)" in lines
+    assert "  timestamps: frame times (from the video metadata)" in lines
+    assert (
+        f"  mount: {UNKNOWN_MOUNT} (from the job file); pose on the bone: typical of the place (default)"
+        in lines
+    )
+    assert "not used (not a video, and no setting names it): notes.txt" in lines
+    (folder / "calib.json").write_text("{}")
+    assert main(["init", str(folder), "--force"]) == 0
+    assert "problem: " in capsys.readouterr().out
+
+
+def test_a_calibration_that_is_made_after_init_is_used(folder: Path) -> None:
+    path = write_job_template(folder)
+    assert {camera.calibration for camera in load_job(path).capture.cameras} == {"auto"}
+    (folder / "calib.json").write_text(json.dumps(LENS))
+    assert "auto" not in {camera.calibration for camera in load_job(path).capture.cameras}
 
 
 def options_without_comment_signs(text: str) -> dict[str, Any]:

@@ -93,7 +93,8 @@ def test_a_folder_is_a_job(tmp_path: Path) -> None:
 
 def test_the_job_file_of_a_folder_decides(tmp_path: Path) -> None:
     root = folder(tmp_path / "kitchen walk", "torso.mp4", "left_palm.mp4", "right_palm.mp4")
-    (root / "job.yaml").write_text("height_m: 1.8\ncapture: {cameras: [{name: head, video: torso.mp4}]}\n")
+    listed = "cameras_only: true, cameras: [{name: head, video: torso.mp4}]"
+    (root / "job.yaml").write_text(f"height_m: 1.8\ncapture: {{{listed}}}\n")
     job = load_job(root)
     assert (job.name, job.height_m) == ("kitchen_walk", 1.8)
     assert [camera.name for camera in job.capture.cameras] == ["head"]

@@ -87,6 +87,22 @@ def test_yaml_words_are_not_turned_into_other_things(tmp_path: Path) -> None:
     assert job.name == "2026-03-01"
 
 
+def test_a_placeholder_is_a_whole_value_and_not_part_of_a_path(tmp_path: Path) -> None:
+    walk = tmp_path / "walk <3>"
+    walk.mkdir()
+    for name in ("torso.mp4", "<left>.mp4"):
+        (walk / name).touch()
+    text = "capture: {cameras: [{name: torso, video: torso.mp4}, {name: left.palm, video: <left>.mp4}]}"
+    assert [camera.video for camera in load(walk, text).capture.cameras] == [
+        (walk / "torso.mp4",),
+        (walk / "<left>.mp4",),
+    ]
+    (walk / "<left>.mp4").rename(walk / "left_palm.mp4")
+    assert len(load_job(walk).capture.cameras) == 2
+    text = 'capture: {cameras: [{name: torso, video: torso.mp4}, {name: a, mount: "<left>", video: b.mp4}]}'
+    assert "unknown mount '<left>'" in refused(walk, text).message
+
+
 @pytest.mark.parametrize(
     ("text", "line", "field", "message", "hint"),
     [
@@ -113,7 +129,7 @@ def test_yaml_words_are_not_turned_into_other_things(tmp_path: Path) -> None:
         (MINIMAL.replace("left/b", "left/a"), 6, "capture.cameras.1.video", "listed twice", "once"),
         (MINIMAL.replace("[left/a.mp4, left/b.mp4]", "torso.mp4"), 6, "capture.cameras.1.video", "same", ""),
         (MINIMAL.replace("torso.mp4", "17"), 4, "capture.cameras.0.video", "should be a list", None),
-        (MINIMAL.replace("torso.mp4", '"<yours>.mp4"'), 4, "capture.cameras.0.video", "filled in", "path"),
+        (MINIMAL.replace("left_palm", "left palm"), 5, "capture.cameras.1.name", "a file's", "digits, ., _"),
         (MINIMAL.replace("      video: torso.mp4\n", ""), 3, "capture.cameras.0.video", "missing", "video"),
         (MINIMAL + "  start_s: 5\n  end_s: 5\n", 8, "capture.end_s", "not after", None),
         (MINIMAL.replace("torso.mp4", '"a\\0.mp4"'), 4, "capture.cameras.0.video", "be a path", "check"),

@@ -15,7 +15,8 @@ import pytest
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.watch.change_notifier import ChangeNotifier, is_on_network_disk
 from bodycap_batch.watch.claim import HeartbeatMonitor, create_claim, take_over_job
-from bodycap_batch.watch.dropped_job import JobPermissions, read_dropped_job
+from bodycap_batch.watch.dropped_job import JobPermissions, read_dropped_job, read_job
+from bodycap_batch.watch.inbox_claim import claim_entry
 from bodycap_batch.watch.inbox_entries import CompletionTracker, InboxEntry, entries_in, take_snapshot
 from bodycap_batch.watch.spool import JobDir, Spool, folder_name_from_text, move_to_free_name, spool_from_path
 from bodycap_batch.watch.watch_options import WatchOptions
@@ -205,10 +206,30 @@ def test_a_linked_entry_uses_the_videos_beside_its_job_file(tmp_path: Path) -> N
     (footage / "job.yaml").write_text("height_m: 1.75\n")
     (tmp_path / "tuesday").symlink_to(footage)
     entry = InboxEntry(tmp_path / "tuesday")
-    job = read_dropped_job(entry, take_snapshot(entry, 100), JobPermissions(roots=(footage,)))
+    job, _ = read_dropped_job(entry, take_snapshot(entry, 100), JobPermissions(roots=(footage,)))
     assert (job.name, [camera.name for camera in job.capture.cameras]) == ("tuesday", ["torso"])
     with pytest.raises(JobError, match="outside"):
         read_dropped_job(entry, take_snapshot(entry, 100), JobPermissions())
+
+
+def test_a_video_that_is_not_used_is_a_note_of_a_dropped_job(tmp_path: Path) -> None:
+    walk = tmp_path / "inbox" / "walk"
+    walk.mkdir(parents=True)
+    for name in ("torso.mp4", "left_palm.mp4", "board.mp4"):
+        (walk / name).touch()
+    (walk / "job.yaml").write_text("capture: {cameras: [{name: torso, video: torso.mp4}]}\n")
+    spool = Spool(inbox=tmp_path / "inbox", root=tmp_path)
+    for folder in (spool.running, spool.done, spool.failed):
+        folder.mkdir()
+    entry = InboxEntry(walk)
+    claimed = claim_entry(spool, entry, take_snapshot(entry, 100), JobPermissions())
+    assert claimed is not None
+    job_dir = claimed[0].job
+    job = read_job(job_dir, JobPermissions())
+    assert [camera.name for camera in job.capture.cameras] == ["torso", "left_palm"]
+    assert job.capture.cameras_only
+    (note,) = json.loads(job_dir.status.read_text())["notes"]
+    assert note.startswith("board.mp4 is not used")
 
 
 def test_an_unknown_folder_is_the_parent_of_the_inbox(tmp_path: Path) -> None:
