@@ -41,7 +41,7 @@ TokenOption = Annotated[
     str,
     typer.Option(
         metavar="TOKEN",
-        help="Token that a browser must send (?token=…); required if --web is not a loopback address.",
+        help="Token that a browser must send (/?token=TOKEN); required if --web is not a loopback address.",
         envvar="BODYCAP_WEB_TOKEN",
         show_envvar=True,
         show_default=False,
@@ -149,7 +149,7 @@ def _live_page(watcher: Watcher, options: WatchOptions, address: str | None, tok
 
     access, limits = access_from_address(address, token), options.permissions.limits
     with LivePage(watcher.spool, access, limits, lambda: watcher.access_failures.text) as page:
-        _write_line(f"live page: {page.access.url}{'?token=…' if page.access.token else ''}")
+        _write_line(f"live page: {page.access.url}{'?token=TOKEN' if page.access.token else ''}")
         yield
 
 

@@ -7,16 +7,20 @@ import http.client
 import json
 import os
 import shutil
+import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
+from urllib.parse import quote, unquote
 
 import pytest
 
+from bodycap_batch.cli.watch import _live_page
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.watch.web import Access, LivePage
+from bodycap_batch.watch.web import Access, LivePage, connections
 from bodycap_batch.watch.web.job_list import JobList
 from tests.pipeline.spools import SpoolFixture, wait_for
 
@@ -115,6 +119,81 @@ def test_nothing_but_results_is_served(bench: SpoolFixture, client: Client) -> N
         assert client.ask("GET", path)[0] == 404, path
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "%00",
+        "a%00b",
+        "x" * 5000,
+        "%FF%FE",
+        "%ED%A0%80",
+        "%C3",
+        "..",
+        "%2e%2e",
+        "..%2f..",
+        "%0a",
+        "%",
+        "küche",
+    ],
+    ids=lambda value: ascii(value)[:12],
+)
+def test_no_name_causes_a_failure_of_the_server(bench: SpoolFixture, client: Client, name: str) -> None:
+    (bench.spool.done / "walk" / "result" / "trajectories").mkdir(parents=True)
+    key = client.begin("next")
+    name = name if name.isascii() else quote(name)
+    for path in (f"/results/walk/{name}", f"/results/walk/trajectories/{name}", f"/results/{name}/a"):
+        assert client.ask("GET", path)[0] == 404, path
+    requests = [
+        *(("GET", f"/api/jobs/{name}/{part}") for part in ("log", "files")),
+        *(("POST", f"/api/jobs/{name}/{part}") for part in ("retry", "cancel")),
+        *(("PUT", f"/api/uploads/{part}") for part in (f"{name}/torso.mp4", f"{key}/{name}")),
+        *(("PUT", f"/api/uploads/{key}/{part}") for part in (f"{name}/torso.mp4", f"a/{name}.mp4")),
+        ("POST", f"/api/uploads/{name}/finish"),
+        ("DELETE", f"/api/uploads/{name}"),
+        ("GET", f"/?token={name}"),
+        ("GET", f"/{name}"),
+        ("GET", f"/{name}/{name}"),
+    ]
+    for method, path in requests:
+        assert client.ask(method, path, b"x" if method == "PUT" else b"")[0] < 500, path
+    assert client.ask("POST", "/api/uploads", {"name": unquote(name)})[0] in (200, 400)
+
+
+@pytest.mark.parametrize("host", ["[", "127.0.0.1:" + "9" * 5000, "a]b", "\xff", "127.0.0.1:x"])
+def test_a_wrong_host_header_is_refused(client: Client, host: str) -> None:
+    assert client.ask("GET", "/", host=host)[0] in (400, 421)
+
+
+def test_a_result_that_cannot_be_read_is_an_error_of_the_disk(
+    bench: SpoolFixture, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (bench.spool.done / "walk").mkdir()
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr("bodycap_batch.watch.web.app._result_file", fail)
+    code, data, _ = client.ask("GET", "/results/walk/metrics.json")
+    assert (code, json.loads(data)["message"]) == (507, "Input/output error")
+
+
+def test_connections_without_a_complete_header_are_closed(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(connections.TIME_LIMITS_S, "header", 0.0)
+    monkeypatch.setattr(
+        connections, "connection_limits", lambda: connections.ConnectionLimits(total=9, per_address=4)
+    )
+    with LivePage(bench.spool, Access(host="127.0.0.1", port=0), Limits()) as page:
+        address = ("127.0.0.1", page.access.port)
+        idle = [socket.create_connection(address, timeout=30) for _ in range(20)]
+        for connection in idle:  # 4 are open until the time limit ends, the others are closed at once
+            with suppress(ConnectionResetError):
+                assert connection.recv(1) == b""
+            connection.close()
+        assert Client(page).ask("GET", "/api/jobs")[0] == 200
+
+
 def test_requests_of_other_pages_are_refused(bench: SpoolFixture, client: Client) -> None:
     bench.drop("walk")
     for headers in (
@@ -148,6 +227,18 @@ def test_a_token_is_required_and_stored_in_a_cookie(bench: SpoolFixture) -> None
         assert client.ask("GET", "/", cookie=headers["set-cookie"].split(";")[0])[0] == 200
 
 
+def test_the_printed_address_and_the_refusal_agree(
+    bench: SpoolFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    token = "0123456789abcdef0123"  # noqa: S105
+    with _live_page(bench.watcher(), bench.options(), "127.0.0.1:0", token):
+        line = capsys.readouterr().err.strip()
+    refusal = Access(host="127.0.0.1", port=80, token=token).refusal("GET", {"host": "127.0.0.1"}, "")
+    assert refusal is not None
+    assert line.endswith("/?token=TOKEN")
+    assert refusal[1].endswith("/?token=TOKEN")
+
+
 def test_an_uploaded_folder_becomes_a_job(bench: SpoolFixture, client: Client) -> None:
     key = client.begin("kitchen walk")
     client.json("PUT", f"/api/uploads/{key}/torso.mp4", b"frames of torso")
@@ -169,6 +260,8 @@ def test_an_uploaded_folder_becomes_a_job(bench: SpoolFixture, client: Client) -
         ("a/b/torso.mp4", b"x", (400,)),
         (".torso.mp4", b"x", (400,)),
         ("%00.mp4", b"x", (400,)),
+        ("x" * 250 + ".mp4", b"x", (400,)),
+        ("job.yaml/torso.mp4", b"x", (400,)),
         ("torso.exe", b"x", (400,)),
         ("torso.mp4", b"", (413,)),
         ("torso.mp4", b"x" * 20_000, (413,)),

@@ -25,8 +25,8 @@ _READING_METHODS = ("GET", "HEAD")
 _MIN_TOKEN_LENGTH = 16
 """Minimum number of characters of a token. There are 64 permitted characters, so 16 characters hold up to 96
 bits. A random token of this length cannot be guessed."""
-_PORT = re.compile(r":[0-9]+$")
-"""Pattern of the port in a Host header. Browsers omit the default port."""
+_PORT = re.compile(r":[0-9]{1,5}$")
+"""Pattern of the port in a Host header. Browsers omit the default port. A port has at most five digits."""
 _TOKEN = re.compile(rf"[A-Za-z0-9_\-]{{{_MIN_TOKEN_LENGTH},200}}")
 _TOKEN_HINT = "python3 -c 'import secrets; print(secrets.token_urlsafe())' makes one"  # noqa: S105 - a hint
 

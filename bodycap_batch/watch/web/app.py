@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import errno
+import functools
 import json
 import threading
 from collections.abc import AsyncIterator
@@ -23,8 +25,9 @@ from starlette.responses import (
 from starlette.routing import Route
 
 from bodycap_batch.core.errors import BodycapError, CaptureError, StoreError
+from bodycap_batch.store.artefacts import store_error
 from bodycap_batch.watch.commands import cancel_job, retry_job
-from bodycap_batch.watch.spool import JobDir
+from bodycap_batch.watch.spool import JobDir, Spool
 from bodycap_batch.watch.web.access import COOKIE, Access
 from bodycap_batch.watch.web.job_list import JobList, list_result_files, read_log_end
 from bodycap_batch.watch.web.uploads import Uploads
@@ -41,6 +44,8 @@ _KEEP_ALIVE_S = 15.0
 keeps the connection open. Evidence: none."""
 _MAX_JSON_BYTES = 4096
 """Maximum size (bytes) of a request's JSON document. The document holds only a name. Evidence: none."""
+_NO_SUCH_PATH = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP)
+"""Error numbers (errno) that mean that a path does not exist or cannot exist."""
 _PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
     "form-action 'none'; frame-ancestors 'none'; base-uri 'none'"
@@ -80,8 +85,11 @@ def make_app(job_list: JobList, access: Access, uploads: Uploads, stopped: threa
         Route("/api/uploads/{key}/{name:path}", page.write_upload, methods=["PUT"]),
         Route("/results/{name}/{file:path}", page.result),
     ]
-    app = Starlette(routes=routes, exception_handlers={BodycapError: _error_response})
-    return _AccessControl(app, access)
+    handlers: dict[Any, Any] = {
+        BodycapError: _error_response,
+        OSError: functools.partial(_os_error_response, job_list.spool),
+    }
+    return _AccessControl(Starlette(routes=routes, exception_handlers=handlers), access)
 
 
 class _AccessControl:
@@ -158,10 +166,15 @@ class _Routes:
         job = await run_in_threadpool(self._job, request)
         if job is None:
             return _not_found()
-        path = (job.result / request.path_params["file"]).resolve()
-        if not path.is_relative_to(job.result.resolve()) or not path.is_file():
+        path = await run_in_threadpool(_result_file, job, request.path_params["file"])
+        if path is None:
             return _not_found()
-        return FileResponse(path, headers={**_COMMON_HEADERS, "content-security-policy": _RESULT_POLICY})
+        return FileResponse(
+            path,
+            headers={**_COMMON_HEADERS, "content-security-policy": _RESULT_POLICY},
+            # With the state of the file, the response raises `FileNotFoundError` if the job moves meanwhile.
+            stat_result=await run_in_threadpool(path.stat),
+        )
 
     async def retry(self, request: Request) -> Response:
         path = await run_in_threadpool(retry_job, self._spool, request.path_params["name"])
@@ -218,6 +231,15 @@ class _Routes:
             silent_s += _UPDATE_PERIOD_S
 
 
+def _result_file(job: JobDir, name: str) -> Path | None:
+    """Return the path of a file in a job's folder of results; None if there is no such file."""
+    try:
+        path = (job.result / name).resolve()
+    except (ValueError, RuntimeError):  # the name holds a NUL character, or links form a circle
+        return None
+    return path if path.is_relative_to(job.result.resolve()) and path.is_file() else None
+
+
 async def _read_small_json(request: Request) -> dict[str, Any]:
     body = b""
     async for chunk in request.stream():
@@ -236,6 +258,14 @@ async def _error_response(_: Request, error: Exception) -> Response:
     assert isinstance(error, BodycapError)
     code = 507 if isinstance(error, StoreError) else 413 if isinstance(error, CaptureError) else 400
     return JSONResponse({"message": error.message, "hint": error.hint}, code, headers=_COMMON_HEADERS)
+
+
+async def _os_error_response(spool: Spool, request: Request, error: Exception) -> Response:
+    """Return 404 if a path does not exist or cannot exist, and otherwise the error of the disk."""
+    assert isinstance(error, OSError)
+    if error.errno in _NO_SUCH_PATH:
+        return _not_found()
+    return await _error_response(request, store_error(error, spool.root))
 
 
 def _not_found() -> Response:

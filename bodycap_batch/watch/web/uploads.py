@@ -8,7 +8,7 @@ import shutil
 import threading
 import time
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -22,17 +22,25 @@ from bodycap_batch.watch.spool import Spool, folder_name_from_text, move_to_free
 
 _PREFIX = ".upload-"
 _OTHER_FILES = ("calib.json", *JOB_FILES)
+_RESERVED_NAMES = frozenset(name.lower() for name in (*_OTHER_FILES, READY))
+"""Names, in lower case, that a folder must not have, because the watcher expects a file."""
 _OTHER_SUFFIXES = (".timestamps.txt", ".bvh", ".png")
 _MAX_OTHER_BYTES = 64 << 20
 """Maximum size (bytes) of a file that is not a video: job, calibration, timestamps, mask, skeleton. Evidence:
 none."""
-_NAME = re.compile(r"[^/\\\x00-\x1f\x7f.][^/\\\x00-\x1f\x7f]{0,199}")
+_NAME = re.compile(r"[^/\\\x00-\x1f\x7f.][^/\\\x00-\x1f\x7f]*")
+_MAX_NAME_BYTES = 200
+"""Maximum length (bytes) of a name. File systems usually permit 255 bytes. The remaining bytes are for the
+suffixes of temporary files."""
 _MIN_FREE_BYTES = 1 << 30
 """Minimum free space (bytes) on the disk after an upload. Evidence: none."""
 _MAX_OPEN_UPLOADS = 8
 """Maximum number of folders that are uploaded at the same time. Evidence: none."""
-_MAX_SILENCE_S = 86_400.0
-"""Maximum time (seconds) without data before an upload is removed: one day. Evidence: none."""
+_MAX_IDLE_S = 900.0
+"""Maximum time (seconds) without data before an upload is removed: 15 minutes. Evidence: none."""
+_MAX_UNCHANGED_S = 86_400.0
+"""Maximum time (seconds) without a new file before an upload of another machine is removed: one day. The time
+is long because the folder's time does not change while a long file is received. Evidence: none."""
 
 
 @dataclass(slots=True)
@@ -62,11 +70,13 @@ class Uploads:
     Args:
         spool: The folders of the watcher. Complete uploads are moved to the inbox.
         limits: Maximum size and number of files.
+        clock: Function that returns the time (seconds) of this process's monotonic clock.
     """
 
-    def __init__(self, spool: Spool, limits: Limits) -> None:
+    def __init__(self, spool: Spool, limits: Limits, clock: Callable[[], float] = time.monotonic) -> None:
         self._spool = spool
         self._limits = limits
+        self._clock = clock
         self._open: dict[str, _Upload] = {}
         self._lock = threading.Lock()
 
@@ -76,22 +86,22 @@ class Uploads:
         Raises:
             JobError: The name cannot be used, or too many folders are being uploaded.
         """
+        _require_short(name.strip())
         if not _NAME.fullmatch(name.strip()):
             hint = "letters, digits, spaces; no / and no leading dot"
             raise JobError(f"{name[:40]!r} cannot be the name of a job", hint=hint)
+        self.remove_idle()
         with self._lock:
-            self._forget_stale()
             if len(self._open) >= _MAX_OPEN_UPLOADS:
                 raise JobError(
-                    f"{_MAX_OPEN_UPLOADS} folders are being sent already", hint="wait until one is complete"
+                    f"{_MAX_OPEN_UPLOADS} folders are being sent already",
+                    hint="wait until one is complete; an upload without new data ends after 15 minutes",
                 )
             key = uuid.uuid4().hex
             folder = self._spool.inbox / f"{_PREFIX}{process_tag()}-{key}"
             with disk_errors(folder):
                 folder.mkdir()
-            self._open[key] = _Upload(
-                name=folder_name_from_text(name), folder=folder, touched=time.monotonic()
-            )
+            self._open[key] = _Upload(name=folder_name_from_text(name), folder=folder, touched=self._clock())
             return key
 
     async def write(self, key: str, name: str, size: int, chunks: AsyncIterator[bytes]) -> None:
@@ -110,18 +120,21 @@ class Uploads:
         """
         upload, path = self._reserve(key, name, size)
         target = upload.folder / path
+        is_complete = False
         try:
             with disk_errors(target):
-                await _receive_file(target, size, chunks, upload)
+                await _receive_file(target, size, self._touching(upload, chunks))
+            is_complete = True
         except (CaptureError, StoreError):
             self._require_not_discarded(upload)
             raise
         finally:
             with self._lock:
                 del upload.coming[name]
+                if is_complete:
+                    upload.files.add(name)
                 if upload.discarded:
                     shutil.rmtree(upload.folder, ignore_errors=True)
-        upload.files.add(name)
 
     def finish(self, key: str) -> str:
         """Move a complete upload into the inbox, and return the name of the folder in the inbox.
@@ -149,6 +162,13 @@ class Uploads:
         with self._lock:
             if (upload := self._open.pop(key, None)) is not None:
                 self._remove(upload)
+
+    def remove_idle(self) -> None:
+        """Remove the uploads that have received no data for `_MAX_IDLE_S` seconds."""
+        with self._lock:
+            now = self._clock()
+            for key in [key for key, upload in self._open.items() if now - upload.touched > _MAX_IDLE_S]:
+                self._remove(self._open.pop(key))
 
     def clear(self) -> None:
         """Remove all incomplete uploads, because they cannot be continued after the page ends."""
@@ -189,9 +209,15 @@ class Uploads:
 
     def _checked_path(self, upload: _Upload, name: str, size: int) -> PurePosixPath:
         path = PurePosixPath(name)
+        for part in path.parts:
+            _require_short(part)
         if not 1 <= len(path.parts) <= 2 or not all(map(_NAME.fullmatch, name.split("/"))):
             raise JobError(
                 f"{name[:80]!r} cannot be the name of a file", hint="send files at most one folder deep"
+            )
+        if len(path.parts) == 2 and path.parts[0].lower() in _RESERVED_NAMES:
+            raise JobError(
+                f"{path.parts[0]} is a folder, but only a file may have this name", hint="rename the folder"
             )
         video = path.suffix.lower() in VIDEO_SUFFIXES
         if not video and path.name not in _OTHER_FILES and not path.name.lower().endswith(_OTHER_SUFFIXES):
@@ -206,7 +232,9 @@ class Uploads:
         if len(sent) >= self._limits.files:
             raise CaptureError(f"more than {self._limits.files:g} files", hint="send one recording only")
         most = 1e9 * self._limits.video_gb if video else _MAX_OTHER_BYTES
-        if not 0 < size <= most:
+        if size == 0:
+            raise CaptureError("the file is empty", path=name, hint="copy it again from the camera")
+        if size > most:
             hint = "cut the recording, or ask the operator to raise --limit video_gb"
             raise CaptureError(f"{size / 1e9:.3g} GB, the limit is {most / 1e9:.3g}", path=name, hint=hint)
         # Subtract the bytes that are still to be received, so that several uploads do not fill the disk.
@@ -217,10 +245,21 @@ class Uploads:
             )
         return path
 
-    def _forget_stale(self) -> None:
-        now = time.monotonic()
-        for key in [key for key, upload in self._open.items() if now - upload.touched > _MAX_SILENCE_S]:
-            self._remove(self._open.pop(key))
+    async def _touching(self, upload: _Upload, chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+        """Yield the chunks, and record for the upload when the last data arrived."""
+        async for chunk in chunks:
+            if chunk:
+                upload.touched = self._clock()
+            yield chunk
+
+
+def _require_short(name: str) -> None:
+    """Raise `JobError` if a name is too long for a file or folder."""
+    if (length := len(name.encode(errors="replace"))) > _MAX_NAME_BYTES:
+        raise JobError(
+            f"the name {name[:40]!r} is too long: {length} bytes",
+            hint=f"use at most {_MAX_NAME_BYTES} bytes, that is, as many letters without accents",
+        )
 
 
 def _unknown_upload() -> JobError:
@@ -243,15 +282,15 @@ def _is_abandoned(folder: Path) -> bool:
     tag = folder.name.removeprefix(_PREFIX)
     if is_from_this_machine(tag):
         return not is_process_running(tag)
-    return time.time() - folder.stat().st_mtime > _MAX_SILENCE_S
+    return time.time() - folder.stat().st_mtime > _MAX_UNCHANGED_S
 
 
-async def _receive_file(target: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> None:
+async def _receive_file(target: Path, size: int, chunks: AsyncIterator[bytes]) -> None:
     """Write a file with a temporary name, and rename the file once it is complete."""
     target.parent.mkdir(exist_ok=True)
     partial = target.with_name(f"{target.name}.part")
     try:
-        written = await _write_chunks(partial, size, chunks, upload)
+        written = await _write_chunks(partial, size, chunks)
         if written != size:
             message = f"received {written} bytes, the browser stated {size}"
             raise CaptureError(message, path=target.name, hint="send it again")
@@ -260,7 +299,7 @@ async def _receive_file(target: Path, size: int, chunks: AsyncIterator[bytes], u
         partial.unlink(missing_ok=True)
 
 
-async def _write_chunks(path: Path, size: int, chunks: AsyncIterator[bytes], upload: _Upload) -> int:
+async def _write_chunks(path: Path, size: int, chunks: AsyncIterator[bytes]) -> int:
     """Write the content of a file, and return the number of bytes received.
 
     Stop if more than `size` bytes arrive.
@@ -272,5 +311,4 @@ async def _write_chunks(path: Path, size: int, chunks: AsyncIterator[bytes], upl
             if written > size:
                 break
             stream.write(chunk)
-            upload.touched = time.monotonic()
     return written
