@@ -11,7 +11,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from bodycap_batch.config.calibration import CalibrationEntry, read_calibration
+from bodycap_batch.config.calibration import (
+    Calibration,
+    CalibrationEntry,
+    implausible_calibration,
+    read_calibration,
+)
 from bodycap_batch.config.explain import Problem, job_error, problems_of
 from bodycap_batch.config.folder import (
     JOB_FILES,
@@ -26,7 +31,7 @@ from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
 from bodycap_batch.config.rules import problems_in, skeleton_of
 from bodycap_batch.config.trust import PathPolicy
-from bodycap_batch.config.yaml_source import YamlSource, read_yaml
+from bodycap_batch.config.yaml_source import Location, YamlSource, dotted, read_yaml
 from bodycap_batch.core.errors import CaptureError, JobError
 
 _HEIGHT_M = (0.4, 2.6)
@@ -258,7 +263,26 @@ def _prepare_synthetic(job: Job, base: Path, path: Path, prepare: Prepare | None
         )
 
 
+def _require_plausible_calibrations(job: Job, path: Path, source: YamlSource | None) -> None:
+    """Refuse a job that contains a calibration with a parameter that no camera has.
+
+    Raises:
+        CaptureError: A parameter is not plausible.
+    """
+    places: list[tuple[Location, object]] = [(("capture", "calibration"), job.capture.calibration)]
+    for index, camera in enumerate(job.capture.cameras):
+        places.append((("capture", "cameras", index, "calibration"), camera.calibration))
+    for place, calibration in places:
+        if not isinstance(calibration, Calibration):
+            continue
+        if (found := calibration.implausible_parameter()) is not None:
+            location = (*place, "params")
+            line = None if source is None else source.line_of(location)
+            raise implausible_calibration(found, path, dotted(location), line)
+
+
 def _resolved(job: Job, base: Path, name: str, path: Path, source: YamlSource | None) -> Job:
+    _require_plausible_calibrations(job, path, source)
     cameras = tuple(
         _resolved_camera(camera, index, job.capture, base) for index, camera in enumerate(job.capture.cameras)
     )
