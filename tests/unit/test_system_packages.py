@@ -45,7 +45,8 @@ def debian(machine: Path, python: str = GOOD_PYTHON) -> Path:
         machine,
         "apt-get",
         f'echo "$*" >>{asked}\n'
-        f"case \"$*\" in *' python3 '*) printf '%s' '{bring}' >{machine}/python3; chmod +x {machine}/python3;; "
+        f"case \"$*\" in *' python3 '*) printf '%s' '{bring}' >{machine}/python3; "
+        f"chmod +x {machine}/python3;; "
         "esac",
     )
     return asked
