@@ -114,14 +114,24 @@ def black(root: Path) -> None:
     write_video(root / "torso.mp4", [rng.integers(0, 8, (48, 64)).astype(np.uint8) for _ in range(20)])
 
 
-def corrupt_in_the_middle(root: Path) -> None:
-    """Overwrite whole access units with zeroes, so that no frame can be decoded from them."""
-    path = root / "torso.mp4"
+def overwrite(path: Path, first: float, last: float) -> None:
+    """Overwrite whole access units of a video with zeroes, so that no frame can be decoded from them.
+
+    Args:
+        path: Path of the video.
+        first: Start of the zeroes, as a fraction of the video's data.
+        last: End of the zeroes, as a fraction of the video's data.
+    """
     data = bytearray(path.read_bytes())
     start = data.index(b"mdat") + 4
     length = struct.unpack(">I", data[start - 8 : start - 4])[0] - 8
-    data[start + length // 3 : start + length] = bytes(length - length // 3)
+    low, high = start + int(first * length), start + int(last * length)
+    data[low:high] = bytes(high - low)
     path.write_bytes(bytes(data))
+
+
+def damaged_from_the_start(root: Path) -> None:
+    overwrite(root / "torso.mp4", 0.0, 1.0)
 
 
 def wrong_aspect(root: Path) -> None:
@@ -232,7 +242,7 @@ CASES = (
     Case("zero frames", zero_frames, 3, VIDEO, "no frame"),
     Case("sound only", audio_only, 3, VIDEO, "sound only"),
     Case("lens covered", black, 3, VIDEO, "only black pictures"),
-    Case("damaged in the middle", corrupt_in_the_middle, 3, VIDEO, "decod"),
+    Case("damaged from the start", damaged_from_the_start, 3, VIDEO, "decod"),
     Case("unknown codec", unknown_codec, 3, VIDEO, "no decoder for this kind"),
     Case("one frame", one_frame, 3, VIDEO, "single frame"),
     Case("a photo", a_photo, 3, VIDEO, "single frame"),

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera, open_camera
+from bodycap_batch.capture.damage import damage_notes, find_damaged_frames
 from bodycap_batch.check.camera_settings import setting_notes
 from bodycap_batch.check.check_report import CameraSummary, CheckReport
 from bodycap_batch.check.file_mixups import require_distinct_videos
@@ -62,7 +63,8 @@ def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
 def require_ready(job: Job, threads: int = 1) -> CheckReport:
     """Check a resolved job before hours of computation, and raise the first error.
 
-    Disk space is not checked, because it changes while the job runs.
+    Disk space is not checked, because it changes while the job runs. Damaged frames are not searched: the
+    selection of keyframes decodes all frames and finds them.
 
     Args:
         job: The resolved job.
@@ -81,19 +83,29 @@ def require_ready(job: Job, threads: int = 1) -> CheckReport:
 
 
 def check_job(job: Job) -> CheckReport:
-    """Run all checks of a resolved job, including disk space. If there are no errors, add advice."""
-    report = _run_checks(job, (*_CHECKS, _check_disk), os.cpu_count() or 1)
+    """Run all checks of a resolved job, including disk space. If there are no errors, add advice.
+
+    All frames are decoded once, to find damaged frames.
+    """
+    report = _run_checks(job, (*_CHECKS, _check_disk), os.cpu_count() or 1, decode_all=True)
     return replace(report, advice=tuple(advise(job, report.cameras))) if report.ready else report
 
 
 def _run_checks(
-    job: Job, checks: Iterable[Callable[[Job, list[CameraSummary]], list[str]]], threads: int
+    job: Job,
+    checks: Iterable[Callable[[Job, list[CameraSummary]], list[str]]],
+    threads: int,
+    *,
+    decode_all: bool = False,
 ) -> CheckReport:
     errors: list[BodycapError] = []
     summaries: list[CameraSummary] = []
     pool = ThreadPoolExecutor(max_workers=threads)
     try:
-        for look in [pool.submit(_check_camera, job.capture, config) for config in job.capture.cameras]:
+        for look in [
+            pool.submit(_check_camera, job.capture, config, decode_all=decode_all)
+            for config in job.capture.cameras
+        ]:
             try:
                 summaries.append(look.result())
             except CaptureError as error:
@@ -109,9 +121,12 @@ def _run_checks(
     return CheckReport(job=job, cameras=tuple(summaries), notes=tuple(notes), errors=tuple(errors))
 
 
-def _check_camera(capture: CaptureConfig, config: CameraConfig) -> CameraSummary:
+def _check_camera(capture: CaptureConfig, config: CameraConfig, *, decode_all: bool) -> CameraSummary:
     camera = open_camera(capture, config)
-    return _summarise_camera(camera, config, check_picture_quality(camera))
+    notes = check_picture_quality(camera)
+    if decode_all:
+        notes += damage_notes(camera, find_damaged_frames(camera))
+    return _summarise_camera(camera, config, notes)
 
 
 def _summarise_camera(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> CameraSummary:

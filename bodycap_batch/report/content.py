@@ -88,7 +88,9 @@ _CAUSE_CRITERIA = {
     LossCause.SHALLOW: "the visible points did not determine the position",
     LossCause.UNKNOWN_PLACE: "the frame is sharp and textured, but it does not match the map",
     LossCause.NO_MAP: "there is no map for this camera",
+    LossCause.DAMAGED: "the decoder reports damaged data, or gives no picture for the frame",
 }
+"""Rule by which each cause of a loss is found. The limits are those of `frame_losses`."""
 
 
 def _progress_at_failure(inputs: ReportInputs) -> str:

@@ -216,11 +216,12 @@ def _read_pictures(camera: CaptureCamera, indices: IntArray, context: StageConte
 def _decode_frames(camera: CaptureCamera, indices: IntArray, context: StageContext) -> list[tuple[int, Any]]:
     """Return the index and the colour image of each frame before the first frame that cannot be decoded.
 
-    If a frame cannot be decoded, all later frames are missing on the page, but the report does not fail.
+    Frames that are known to be damaged are omitted. If another frame cannot be decoded, all later frames are
+    missing on the page, but the report does not fail.
     """
     frames = []
     try:
-        for index, image in camera.read(indices, colour=True):
+        for index, image in camera.read(np.setdiff1d(indices, camera.damaged), colour=True):
             context.check_cancelled()
             frames.append((index, image))
     except CaptureError:

@@ -62,6 +62,8 @@ _ACTIONS = {
     "picture.",
     LossCause.UNKNOWN_PLACE: "Turn the camera so that it sees less of the wearer's body, keep other people "
     "out of the picture, and walk past each place more than once.",
+    LossCause.DAMAGED: "Copy the video again from the camera's card. If it is damaged there, too, use "
+    "another card.",
     LossCause.NO_MAP: "Let every camera see the same places as the others: walk a loop and look around "
     "in each place.",
 }
@@ -75,7 +77,9 @@ _OBSERVATIONS = {
     LossCause.SHALLOW: "the visible points did not determine the position (too far away, or close together)",
     LossCause.UNKNOWN_PLACE: "the picture was sharp and textured, but its content is not in the map",
     LossCause.NO_MAP: "the camera has no map",
+    LossCause.DAMAGED: "the video file is damaged there",
 }
+"""Observation that explains each cause of a loss. The limits are those of `frame_losses`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
