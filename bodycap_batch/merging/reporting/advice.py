@@ -112,8 +112,8 @@ def describe_unknown_way_up(camera: str) -> str:
         A part of a sentence for the report.
     """
     return (
-        f"; {camera} is assumed to be mounted upright: no cameras on both arms or both legs hang below it, so "
-        "a mount that is upside down, and a body that is then upside down, cannot be noticed"
+        f"; {camera} is assumed to be mounted upright: no cameras on both arms or both legs hang below it, "
+        "so a mount that is upside down, and a body that is then upside down, cannot be noticed"
     )
 
 
