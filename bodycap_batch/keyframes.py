@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera, FrameCandidate, FrameKeeper
+from bodycap_batch.capture.video import COPY_AGAIN
 from bodycap_batch.config import KeyframeOptions
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
@@ -182,10 +183,11 @@ def select_keyframes(
             copies are written.
 
     Returns:
-        The frame indices of the keyframes, the sharpness of every frame and the tracking noise.
+        The frame indices of the keyframes, the sharpness of every frame, the tracking noise and the damaged
+        frames. Damaged frames are not selected.
 
     Raises:
-        CaptureError: The camera has no frames.
+        CaptureError: The camera has no frames, or all its frames are damaged.
     """
     times_s = (camera.times_ns - camera.times_ns[:1]) * 1e-9
     count = len(times_s)
@@ -198,9 +200,11 @@ def select_keyframes(
     tracker = _KeyframeTracker(camera.camera, _coarse_mask(camera))
     recent: deque[_Candidate] = deque(maxlen=options.window)
     see, keep = (_ignore, _ignore) if keeper is None else (keeper.add_frame, keeper.add_keyframe)
+    is_damaged = np.ones(count, dtype=bool)
     for shot in camera.frame_candidates():
         context.check_cancelled()
         index = shot.index
+        is_damaged[index] = False
         sharp[index] = sharpness(shot.grey)
         image = make_coarse_image(shot.grey)
         see(shot)
@@ -220,8 +224,14 @@ def select_keyframes(
                 keep(best.shot)
         if index % 30 == 0:
             context.progress(index, count, "frames")
-    if selected[-1] != count - 1:
-        selected.append(count - 1)
+    if is_damaged.all():
+        raise CaptureError(
+            f"none of the {count} frames can be decoded without errors",
+            path=camera.chapters[0],
+            hint=COPY_AGAIN,
+        )
+    if selected[-1] != shot.index:
+        selected.append(shot.index)
         keep(shot)
         novelty.append(0.0)
     context.progress(count, count, "frames")
@@ -234,6 +244,7 @@ def select_keyframes(
         frame_count=count,
         sharpness=sharp,
         noise_px=tracker.noise_px(),
+        damaged=np.flatnonzero(is_damaged),
     )
 
 

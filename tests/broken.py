@@ -114,14 +114,24 @@ def black(root: Path) -> None:
     write_video(root / "torso.mp4", [rng.integers(0, 8, (48, 64)).astype(np.uint8) for _ in range(20)])
 
 
-def corrupt_in_the_middle(root: Path) -> None:
-    """Overwrite whole access units with zeroes, so that no frame can be decoded from them."""
-    path = root / "torso.mp4"
+def overwrite(path: Path, first: float, last: float) -> None:
+    """Overwrite whole access units of a video with zeroes, so that no frame can be decoded from them.
+
+    Args:
+        path: Path of the video.
+        first: Start of the zeroes, as a fraction of the video's data.
+        last: End of the zeroes, as a fraction of the video's data.
+    """
     data = bytearray(path.read_bytes())
     start = data.index(b"mdat") + 4
     length = struct.unpack(">I", data[start - 8 : start - 4])[0] - 8
-    data[start + length // 3 : start + length] = bytes(length - length // 3)
+    low, high = start + int(first * length), start + int(last * length)
+    data[low:high] = bytes(high - low)
     path.write_bytes(bytes(data))
+
+
+def damaged_from_the_start(root: Path) -> None:
+    overwrite(root / "torso.mp4", 0.0, 1.0)
 
 
 def wrong_aspect(root: Path) -> None:
@@ -232,7 +242,7 @@ CASES = (
     Case("zero frames", zero_frames, 3, VIDEO, "no frame"),
     Case("sound only", audio_only, 3, VIDEO, "sound only"),
     Case("lens covered", black, 3, VIDEO, "only black pictures"),
-    Case("damaged in the middle", corrupt_in_the_middle, 3, VIDEO, "decod"),
+    Case("damaged from the start", damaged_from_the_start, 3, VIDEO, "decod"),
     Case("unknown codec", unknown_codec, 3, VIDEO, "no decoder for this kind"),
     Case("one frame", one_frame, 3, VIDEO, "single frame"),
     Case("a photo", a_photo, 3, VIDEO, "single frame"),
@@ -241,8 +251,30 @@ CASES = (
     Case("calibrated sideways", calibrated(width=48, height=64), 3, VIDEO, "another aspect"),
     Case("calibration missing", lambda root: (root / CALIB).unlink(), 3, CALIB, "cannot read"),
     Case("calibration cut off", replace_text(CALIB, '{"model": "PINHO'), 3, CALIB, "JSON"),
-    Case("NaN in the calibration", calibrated(params=[float("nan"), 40, 32, 24]), 3, CALIB, "finite number"),
-    Case("negative focal length", calibrated(params=[-40, 40, 32, 24]), 3, CALIB, "must be positive"),
+    Case("NaN in the calibration", calibrated(params=[float("nan"), 40, 32, 24]), 3, CALIB, "fx is nan px"),
+    Case("infinity in the calibration", calibrated(params=[40, float("inf"), 32, 24]), 3, CALIB, "fy is inf"),
+    Case("focal length 1e300", calibrated(params=[1e300, 40, 32, 24]), 3, CALIB, "plausible is 1.28 to 3200"),
+    Case("focal length zero", calibrated(params=[40, 0, 32, 24]), 3, CALIB, "fy is 0 px"),
+    Case("principal point far away", calibrated(params=[40, 40, 32, 1e6]), 3, CALIB, "cy is 1e+06 px"),
+    Case(
+        "absurd distortion",
+        calibrated(model="OPENCV", params=[40, 40, 32, 24, 0, 1e9, 0, 0]),
+        *(3, CALIB, "the distortion k2 is 1e+09"),
+    ),
+    Case(
+        "absurd angle of the FOV model",
+        calibrated(model="FOV", params=[40, 40, 32, 24, 7]),
+        *(3, CALIB, "the distortion omega is 7"),
+    ),
+    Case(
+        "focal length 1e300 in the job",
+        edit(
+            "calibration: calib.json",
+            "calibration: {model: PINHOLE, width: 64, height: 48, params: [1.0e+300, 40, 32, 24]}",
+        ),
+        *(3, JOB, "the focal length fx is 1e+300 px"),
+    ),
+    Case("negative focal length", calibrated(params=[-40, 40, 32, 24]), 3, CALIB, "fx is -40 px"),
     Case("too few parameters", calibrated(params=[40, 32, 24]), 3, CALIB, "takes 4 params, got 3"),
     Case("unknown lens model", calibrated(model="PINHOLLE"), 3, CALIB, "did you mean PINHOLE"),
     Case("calibration of other cameras", replace_text(CALIB, '{"cameras": {"left": {}}}'), 3, CALIB, "torso"),

@@ -60,6 +60,8 @@ class CaptureCamera:
         videos: Video file of each chapter, with the list of its frames.
         mask: (H,W) mask at the work size, True where the room is visible; None if the room is visible
             everywhere.
+        damaged: (D,) indices into `frame_numbers` of frames that are damaged in the video. They are not read.
+            Empty if the video was not yet searched for damage.
         kept: Stored copies of frames at the work size. They are read instead of the video. None if there are
             no copies.
         threads: Number of threads of the decoder. For 0, the number is taken from the environment variable
@@ -80,6 +82,7 @@ class CaptureCamera:
     notes: tuple[str, ...] = ()
     videos: tuple[VideoFile, ...] = field(default=(), repr=False)
     mask: BoolArray | None = field(default=None, repr=False)
+    damaged: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64), repr=False)
     kept: KeptFrames | None = field(default=None, repr=False)
     threads: int = 0
 
@@ -87,6 +90,7 @@ class CaptureCamera:
         count = len(self.frame_numbers)
         set_array(self, "frame_numbers", (count,), np.int64)
         set_array(self, "times_ns", (count,), np.int64)
+        set_array(self, "damaged", (None,), np.int64)
         if count and ((np.diff(self.frame_numbers) <= 0).any() or (np.diff(self.times_ns) <= 0).any()):
             raise ValueError("frame numbers and times must increase")
 
@@ -130,13 +134,35 @@ class CaptureCamera:
             stop: Index after the last index; None for the end of the video.
 
         Yields:
-            The index into `frame_numbers`, and the image (H,W) uint8.
+            The index into `frame_numbers`, and the image (H,W) uint8. Damaged frames are omitted.
 
         Raises:
-            CaptureError: A frame cannot be decoded.
+            CaptureError: A frame that is not listed as damaged cannot be decoded.
         """
-        indices = range(*slice(start, stop).indices(len(self.frame_numbers)))
-        return self.read(np.array(indices, dtype=np.int64))
+        indices = np.arange(*slice(start, stop).indices(len(self.frame_numbers)), dtype=np.int64)
+        return self.read(np.setdiff1d(indices, self.damaged))
+
+    def read_decodable(self, indices: IntArray) -> Generator[tuple[int, Image], None, None]:
+        """Decode selected frames as grey images at the work size. Frames that cannot be decoded are omitted.
+
+        Args:
+            indices: (K,) increasing indices into `frame_numbers`.
+
+        Yields:
+            The index into `frame_numbers`, and the image (H,W) uint8.
+        """
+        size = (self.camera.width_px, self.camera.height_px)
+        for index, frame, video in self._frames(indices, skip_lost=True):
+            yield index, work_image(frame, video.orientation, size, colour=False)
+
+    def decodable_frames(self) -> Generator[tuple[int, VideoFrame, VideoFile], None, None]:
+        """Decode all frames from the videos. Frames that cannot be decoded are omitted.
+
+        Yields:
+            The index into `frame_numbers`, the decoded frame, and the video file of its chapter. The frame's
+            `is_corrupt` is True if the decoder found damaged data in the frame.
+        """
+        return self._frames(np.arange(len(self.frame_numbers), dtype=np.int64), skip_lost=True)
 
     def read(
         self, indices: Sequence[int] | IntArray, *, colour: bool = False
@@ -164,10 +190,10 @@ class CaptureCamera:
     def frame_candidates(self) -> Generator[FrameCandidate, None, None]:
         """Decode all frames at the work size, in a form that can be stored as a copy.
 
-        A thread decodes the next frames ahead.
+        Damaged frames are omitted. A thread decodes the next frames ahead.
 
         Raises:
-            CaptureError: A frame cannot be decoded.
+            CaptureError: A video cannot be read.
         """
         return prefetch(self._frame_candidates(), self.threads)
 
@@ -180,8 +206,9 @@ class CaptureCamera:
     def _frame_candidates(self) -> Generator[FrameCandidate, None, None]:
         size = (self.camera.width_px, self.camera.height_px)
         keep_all = self.should_keep_all
-        indices = np.arange(len(self.frame_numbers), dtype=np.int64)
-        for index, frame, video in self._frames(indices):
+        for index, frame, video in self.decodable_frames():
+            if frame.is_corrupt:
+                continue
             if keep_all:
                 # Only the planes at the work size are held in memory. They are far smaller than the frame.
                 planes = work_planes(frame, video.orientation, size)
@@ -213,11 +240,14 @@ class CaptureCamera:
                 _, frame, video = next(others)
                 yield index, work_image(frame, video.orientation, size, colour=colour)
 
-    def _frames(self, indices: IntArray) -> Generator[tuple[int, VideoFrame, VideoFile], None, None]:
+    def _frames(
+        self, indices: IntArray, *, skip_lost: bool = False
+    ) -> Generator[tuple[int, VideoFrame, VideoFile], None, None]:
         """Decode the requested frames from the videos.
 
         Args:
             indices: (K,) increasing indices into `frame_numbers`.
+            skip_lost: Whether frames that cannot be decoded are omitted, instead of raising an error.
 
         Yields:
             The index into `frame_numbers`, the decoded frame, and the video file of its chapter.
@@ -226,11 +256,9 @@ class CaptureCamera:
         for video in self.videos:
             numbers = self.frame_numbers[indices] - first
             inside = (numbers >= 0) & (numbers < len(video.pts))
-            own = indices[inside]
-            for index, (_, frame) in zip(
-                own, decode_frames(video, numbers[inside], self.threads), strict=True
-            ):
-                yield int(index), frame, video
+            own = dict(zip(numbers[inside].tolist(), indices[inside].tolist(), strict=True))
+            for number, frame in decode_frames(video, numbers[inside], self.threads, skip_lost=skip_lost):
+                yield own[number], frame, video
             first += len(video.pts)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -18,22 +19,25 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 
-def decode_frames(video: VideoFile, indices: IntArray, threads: int = 0) -> Iterator[tuple[int, VideoFrame]]:
+def decode_frames(
+    video: VideoFile, indices: IntArray, threads: int = 0, *, skip_lost: bool = False
+) -> Iterator[tuple[int, VideoFrame]]:
     """Decode the frames with the given indices.
 
     A frame between the requested frames is skipped if no other frame depends on the skipped frame. In H.264,
-    most B-frames can be skipped.
+    most B-frames can be skipped. Damaged data between the requested frames are passed over.
 
     Args:
         video: The video.
         indices: (N,) increasing frame indices.
         threads: Number of threads of the decoder, as in `open_stream`.
+        skip_lost: Whether a requested frame that cannot be decoded is omitted, instead of raising an error.
 
     Yields:
         The index and the decoded frame.
 
     Raises:
-        CaptureError: A frame cannot be decoded.
+        CaptureError: A requested frame cannot be decoded, or the file cannot be read.
     """
     import av
 
@@ -47,9 +51,10 @@ def decode_frames(video: VideoFile, indices: IntArray, threads: int = 0) -> Iter
                 frame_decoder.close()
                 frame_decoder = _ForwardDecoder(video, None, threads)
                 frame = frame_decoder.advance(index)
-            if frame is None:
+            if frame is not None:
+                yield index, frame
+            elif not skip_lost:
                 raise _undecodable_frame(video, index)
-            yield index, frame
     except av.error.FFmpegError as error:
         raise CaptureError(
             f"decoding fails after frame {frame_decoder.position} ({error_reason(error)})",
@@ -75,8 +80,10 @@ def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
     with open_container(video.path) as container:
         stream = open_stream(container, video, threads)
         try:
-            for frame in container.decode(stream):
-                return frame, bool(stream.codec_context.has_b_frames)
+            for packet in container.demux(stream):
+                with contextlib.suppress(av.error.InvalidDataError):
+                    for frame in stream.decode(packet):
+                        return frame, bool(stream.codec_context.has_b_frames)
         except av.error.FFmpegError as error:
             raise CaptureError(
                 f"none of its frames can be decoded ({error_reason(error)})", path=video.path, hint=COPY_AGAIN
@@ -126,6 +133,7 @@ class _ForwardDecoder:
         self._needed_pts = frozenset(video.pts[indices].tolist()) if may_skip else None
         self._frames = self._decoded()
         self._key_index = np.searchsorted(video.pts, video.key_pts)
+        self._newest: VideoFrame | None = None
 
     def close(self) -> None:
         """Close the file."""
@@ -141,33 +149,43 @@ class _ForwardDecoder:
             key_frames = self._key_index[: int(np.searchsorted(self._key_index, index, side="right"))]
             if len(key_frames) and key_frames[-1] > self.position + 1:
                 self._seek(int(key_frames[-1]))
-        for frame in self._frames:
+        while self._newest is None or self.position < index:
+            # If a frame is missing, the frame after it is held until its index is requested.
+            self._newest = next(self._frames, None)
+            if self._newest is None:
+                return None
             if self._video.is_counted:
                 self.position += 1
-            else:
-                if frame.pts is None:
-                    continue
-                self.position = int(np.searchsorted(self._video.pts, frame.pts))
-            if self.position >= index:
-                is_exact = self._video.is_counted or frame.pts == self._video.pts[index]
-                return frame if is_exact and self.position == index else None
-        return None
+            elif self._newest.pts is not None:
+                self.position = int(np.searchsorted(self._video.pts, self._newest.pts))
+        is_exact = self._video.is_counted or self._newest.pts == self._video.pts[index]
+        return self._newest if is_exact and self.position == index else None
 
     def _seek(self, index: int) -> None:
         """Seek to the key frame with this index. Some containers seek to an earlier key frame instead."""
+        self._newest = None
         self._container.seek(int(self._video.pts[index]), stream=self._stream, backward=True)
         self._frames = self._decoded()
 
     def _decoded(self) -> Iterator[VideoFrame]:
         """Yield the decoded frames from the current position on, in the order of presentation.
 
-        Frames that may be skipped can be missing.
+        Frames that may be skipped can be missing, and so can frames of packets with damaged data. If frames
+        are identified by counting, damaged data are an error, because the count would be wrong.
         """
+        import av
+
         for packet in self._container.demux(self._stream):
             if self._needed_pts is not None:
                 needed = packet.pts is None or packet.pts in self._needed_pts
                 self._stream.codec_context.skip_frame = "DEFAULT" if needed else "NONREF"
-            yield from self._stream.decode(packet)
+            try:
+                frames = self._stream.decode(packet)
+            except av.error.InvalidDataError:
+                if self._video.is_counted:
+                    raise
+                continue
+            yield from frames
 
 
 def _undecodable_frame(video: VideoFile, index: int) -> CaptureError:

@@ -9,6 +9,7 @@ import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.images import Image
+from bodycap_batch.capture.video import COPY_AGAIN
 from bodycap_batch.check.static_pictures import reduced_picture, static_notes
 from bodycap_batch.core.arrays import IntArray, evenly_spaced
 from bodycap_batch.core.errors import CaptureError
@@ -55,8 +56,8 @@ def check_picture_quality(camera: CaptureCamera) -> list[str]:
         Notes about pictures that are hard to track.
 
     Raises:
-        CaptureError: A frame cannot be decoded, the video has fewer than two frames, or all inspected frames
-            are black.
+        CaptureError: No inspected frame can be decoded, the video has fewer than two frames, or all inspected
+            frames are black.
     """
     if sum(len(video.pts) for video in camera.videos) < 2:
         raise CaptureError(
@@ -67,7 +68,7 @@ def check_picture_quality(camera: CaptureCamera) -> list[str]:
     dark, bright = [], []
     grey, corners = [], []
     indices, reduced_pictures = [], []
-    for index, image in camera.read(sample_indices(camera, _SAMPLES)):
+    for index, image in camera.read_decodable(sample_indices(camera, _SAMPLES)):
         low, high = np.percentile(image, (1, 99))
         dark.append(float(low))
         bright.append(float(high))
@@ -75,6 +76,12 @@ def check_picture_quality(camera: CaptureCamera) -> list[str]:
         reduced_pictures.append(reduced_picture(image))
         grey.append(float(np.median(image)))
         corners.append(_corner_count(image))
+    if not indices:
+        raise CaptureError(
+            f"none of the inspected frames of camera {camera.name} can be decoded",
+            path=camera.chapters[0],
+            hint=COPY_AGAIN,
+        )
     black = int(np.sum(np.array(bright) < _MAX_BLACK_GREY))
     if black == len(bright):
         raise CaptureError(

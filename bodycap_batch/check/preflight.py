@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera, open_camera
+from bodycap_batch.capture.damage import damage_notes, find_damaged_frames
 from bodycap_batch.check.camera_settings import setting_notes
 from bodycap_batch.check.check_report import CameraSummary, CheckReport
 from bodycap_batch.check.file_mixups import require_distinct_videos
@@ -67,7 +68,8 @@ def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
 def require_ready(job: Job, threads: int = 1) -> CheckReport:
     """Check a resolved job before hours of computation, and raise the first error.
 
-    Disk space is not checked, because it changes while the job runs.
+    Disk space is not checked, because it changes while the job runs. Damaged frames are not searched: the
+    selection of keyframes decodes all frames and finds them.
 
     Args:
         job: The resolved job.
@@ -88,11 +90,14 @@ def require_ready(job: Job, threads: int = 1) -> CheckReport:
 def check_job(job: Job, origins: Mapping[str, CameraOrigins] | None = None) -> CheckReport:
     """Run all checks of a resolved job, including disk space. If there are no errors, add advice.
 
+    All frames are decoded once, to find damaged frames.
+
     Args:
         job: The resolved job.
         origins: Where the settings of each camera come from, by camera name; None if it is unknown.
     """
-    report = _run_checks(job, (*_CHECKS, _check_disk), os.cpu_count() or 1, origins or {})
+    checks = (*_CHECKS, _check_disk)
+    report = _run_checks(job, checks, os.cpu_count() or 1, origins or {}, decode_all=True)
     return replace(report, advice=tuple(advise(job, report.cameras))) if report.ready else report
 
 
@@ -101,13 +106,15 @@ def _run_checks(
     checks: Iterable[Callable[[Job, list[CameraSummary]], list[str]]],
     threads: int,
     origins: Mapping[str, CameraOrigins],
+    *,
+    decode_all: bool = False,
 ) -> CheckReport:
     errors: list[BodycapError] = []
     summaries: list[CameraSummary] = []
     pool = ThreadPoolExecutor(max_workers=threads)
     try:
         for look in [
-            pool.submit(_check_camera, job.capture, config, origins.get(config.name))
+            pool.submit(_check_camera, job.capture, config, origins.get(config.name), decode_all=decode_all)
             for config in job.capture.cameras
         ]:
             try:
@@ -126,15 +133,16 @@ def _run_checks(
 
 
 def _check_camera(
-    capture: CaptureConfig, config: CameraConfig, origins: CameraOrigins | None
+    capture: CaptureConfig, config: CameraConfig, origins: CameraOrigins | None, *, decode_all: bool
 ) -> CameraSummary:
     camera = open_camera(capture, config)
-    summary = _summarise_camera(camera, config, check_picture_quality(camera))
-    return (
-        summary
-        if origins is None
-        else replace(summary, origins=with_first_guess(origins, config, camera.videos[0]))
-    )
+    notes = check_picture_quality(camera)
+    if decode_all:
+        notes += damage_notes(camera, find_damaged_frames(camera))
+    summary = _summarise_camera(camera, config, notes)
+    if origins is None:
+        return summary
+    return replace(summary, origins=with_first_guess(origins, config, camera.videos[0]))
 
 
 def _summarise_camera(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> CameraSummary:

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AllowInfNan,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camera, parameter_count
@@ -27,6 +36,54 @@ _CENTRE_INDEX = {
 }
 """Index, in a camera model's parameters, of the x coordinate of the principal point. The table lists the
 models with one focal length. For all other models the index is 2."""
+_FOCAL_RANGE = (0.02, 50.0)
+"""Minimum and maximum plausible focal length, as a ratio to the long side of the image. Derivation: a fisheye
+lens that shows 180° has about 0.3; a telephoto lens of 1000 mm on a 35 mm camera has 28. Values outside the
+range are errors of unit or of typing."""
+_MAX_CENTRE_DISTANCE = 1.0
+"""Maximum distance of the principal point from the centre of the image, along each axis, as a ratio to the
+image size. At 0.5 the principal point is on the edge of the image; more occurs only in images that are cut
+out of a larger image. Evidence: none."""
+_MAX_DISTORTION = 10.0
+"""Maximum size of one distortion term at half the distance from the centre to the edge of the image, as a
+ratio to this distance. Real lenses are below 1 there. Evidence: none."""
+_MAX_RATIONAL_DISTORTION = 1000.0
+"""As `_MAX_DISTORTION`, for FULL_OPENCV. Its terms in the numerator and in the denominator are often large
+and cancel each other. Evidence: none."""
+_MAX_FOV_OMEGA = math.pi
+"""Maximum absolute value (radians) of the parameter omega of the camera model FOV. Omega is the angle of view
+of the lens; the model is not defined beyond 180°."""
+_DISTORTION = {
+    "SIMPLE_RADIAL": (("k", 2),),
+    "RADIAL": (("k1", 2), ("k2", 4)),
+    "OPENCV": (("k1", 2), ("k2", 4), ("p1", 1), ("p2", 1)),
+    "OPENCV_FISHEYE": (("k1", 2), ("k2", 4), ("k3", 6), ("k4", 8)),
+    "FULL_OPENCV": (
+        *(("k1", 2), ("k2", 4), ("p1", 1), ("p2", 1)),
+        *(("k3", 6), ("k4", 2), ("k5", 4), ("k6", 6)),
+    ),
+    "FOV": (("omega", 0),),
+    "SIMPLE_RADIAL_FISHEYE": (("k", 2),),
+    "RADIAL_FISHEYE": (("k1", 2), ("k2", 4)),
+    "THIN_PRISM_FISHEYE": (
+        *(("k1", 2), ("k2", 4), ("p1", 1), ("p2", 1)),
+        *(("k3", 6), ("k4", 8), ("sx1", 1), ("sy1", 1)),
+    ),
+}
+"""By camera model: name of each distortion parameter, and the power of the image radius that it is multiplied
+with, relative to the radius. Omega has a range of its own. Source: COLMAP, sensor/models.h."""
+
+
+class ImplausibleParameter(NamedTuple):
+    """A parameter of a calibration that no camera has.
+
+    Attributes:
+        position: Index of the parameter in `Calibration.params`.
+        message: The parameter, its value and the plausible values.
+    """
+
+    position: int
+    message: str
 
 
 class Calibration(BaseModel):
@@ -38,7 +95,9 @@ class Calibration(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     model: str = Field(description="COLMAP camera model")
-    params: tuple[float, ...] = Field(description="the model's parameters in COLMAP's order, pixels")
+    params: tuple[Annotated[float, AllowInfNan()], ...] = Field(
+        description="the model's parameters in COLMAP's order, pixels"
+    )
     width: int = Field(gt=0, le=65536, description="image width of the calibration, pixels")
     height: int = Field(gt=0, le=65536, description="image height of the calibration, pixels")
     pixel_origin: Literal["colmap", "opencv"] = Field(
@@ -66,9 +125,41 @@ class Calibration(BaseModel):
         count = parameter_count(self.model)
         if len(self.params) != count:
             raise ValueError(f"{self.model} takes {count} params, got {len(self.params)}")
-        if self.params[0] <= 0 or (self.model not in _CENTRE_INDEX and self.params[1] <= 0):
-            raise ValueError("the focal length must be positive")
         return self
+
+    def implausible_parameter(self) -> ImplausibleParameter | None:
+        """Return the first parameter that no camera has; None if all parameters are plausible."""
+        centre = _CENTRE_INDEX.get(self.model, 2)
+        names = [*(("f",) if centre == 1 else ("fx", "fy")), "cx", "cy"]
+        names += [name for name, _ in _DISTORTION.get(self.model, ())]
+        for index, (name, value) in enumerate(zip(names, self.params, strict=True)):
+            low, high, what, unit = self._plausible_range(index, centre)
+            if not (math.isfinite(value) and low <= value <= high):
+                message = f"{what} {name} is {value:g}{unit}; plausible is {low:.6g} to {high:.6g}{unit}"
+                return ImplausibleParameter(index, message)
+        return None
+
+    def _plausible_range(self, index: int, centre: int) -> tuple[float, float, str, str]:
+        """Return the smallest and the largest plausible value, the meaning and the unit of a parameter.
+
+        Args:
+            index: Index of the parameter.
+            centre: Index of the x coordinate of the principal point.
+        """
+        long_side = max(self.width, self.height)
+        if index < centre:
+            low, high = (ratio * long_side for ratio in _FOCAL_RANGE)
+            return low, high, "the focal length", " px"
+        if index < centre + 2:
+            side = self.width if index == centre else self.height
+            reach = _MAX_CENTRE_DISTANCE * side
+            return 0.5 * side - reach, 0.5 * side + reach, "the principal point", " px"
+        _, power = _DISTORTION[self.model][index - centre - 2]
+        limit = _MAX_FOV_OMEGA
+        if power:
+            ratio = _MAX_RATIONAL_DISTORTION if self.model == "FULL_OPENCV" else _MAX_DISTORTION
+            limit = ratio / (0.25 * long_side / max(self.params[:centre])) ** power
+        return -limit, limit, "the distortion", ""
 
     def camera(self) -> Camera:
         """Return the camera model at the image size of the calibration, with COLMAP's pixel origin."""
@@ -134,6 +225,8 @@ def read_calibration(path: Path, camera: str) -> CalibrationEntry:
             field=name or None,
             hint='{"model": "PINHOLE", "params": [fx, fy, cx, cy], "width": 1920, "height": 1080}',
         ) from error
+    if (implausible := calibration.implausible_parameter()) is not None:
+        raise implausible_calibration(implausible, path, f"{field}params")
     offsets = data.get("offsets_s", {})
     if "offset_s" in data or not isinstance(offsets, dict):
         has_offset, offset = True, data.get("offset_s", offsets)
@@ -146,6 +239,26 @@ def read_calibration(path: Path, camera: str) -> CalibrationEntry:
         rolling_shutter_s=None
         if data.get("rolling_shutter_s") is None
         else _seconds(data["rolling_shutter_s"], path, f"{field}rolling_shutter_s"),
+    )
+
+
+def implausible_calibration(
+    found: ImplausibleParameter, path: Path, field: str, line: int | None = None
+) -> CaptureError:
+    """Return the error for a calibration with a parameter that no camera has.
+
+    Args:
+        found: The parameter.
+        path: Path of the calibration file or of the job.
+        field: Name of the field that holds the parameters.
+        line: Number of the field's line in the file; None if it is not known.
+    """
+    return CaptureError(
+        f"the calibration is not plausible: {found.message}",
+        path=path,
+        line=line,
+        field=f"{field}.{found.position}",
+        hint="calibrate this camera again (`bodycap calibrate`), or use calibration: auto",
     )
 
 

@@ -18,6 +18,7 @@ _MAX_FURTHER = 5
 """Maximum number of problems that a message lists after the first problem. Evidence: none."""
 _MISSING = "this is missing"
 _DID_YOU_MEAN = "did you mean "
+_EXAMPLES = "the folder jobs/ has a commented example"
 _EXPECTED = {
     "string_type": "text",
     "int_type": "a whole number",
@@ -47,13 +48,15 @@ class Problem(typing.NamedTuple):
     hint: str | None = None
 
 
-def job_error(problems: Sequence[Problem], path: Path, source: YamlSource | None = None) -> JobError:
+def job_error(
+    problems: Sequence[Problem], path: Path | None = None, source: YamlSource | None = None
+) -> JobError:
     """Return one error for all problems: the first problem in full, further problems briefly.
 
     Args:
         problems: The problems, at least one.
-        path: Path of the job.
-        source: The YAML file of the job, for line numbers; None for a folder of videos.
+        path: Path of the job; None if the values come from the command line.
+        source: The YAML file of the job, for line numbers; None if there is no such file.
     """
     ordered = sorted(problems, key=lambda p: (source.line_of(p.location) or 0) if source else 0)
     first, further = ordered[0], ordered[1 : 1 + _MAX_FURTHER]
@@ -72,20 +75,23 @@ def _place(problem: Problem, source: YamlSource | None) -> str:
     return " ".join(part for part in (f"line {line}" if line else "", dotted(problem.location)) if part)
 
 
-def problems_of(error: ValidationError, model: type[BaseModel], data: object) -> list[Problem]:
+def problems_of(
+    error: ValidationError, model: type[BaseModel], data: object, *, hint: str = _EXAMPLES
+) -> list[Problem]:
     """Convert pydantic's errors to problems.
 
     Args:
         error: The errors of pydantic.
         model: The pydantic model that refused the data.
         data: The refused data.
+        hint: Advice for a problem that concerns no single field.
     """
     errors = error.errors(include_url=False)
     # If all items of a list are wrong, pydantic also reports that the list is too short. This second report
     # is omitted.
     reported = [e for e in errors if e["type"] != "too_short" or not _has_deeper(e, errors)]
     problems = _without_misspelt([_problem_of(details, model, data) for details in reported])
-    return [p if p.hint else p._replace(hint=_description(p.location, model)) for p in problems]
+    return [p if p.hint else p._replace(hint=_description(p.location, model) or hint) for p in problems]
 
 
 def _without_misspelt(problems: list[Problem]) -> list[Problem]:
@@ -118,6 +124,10 @@ def _problem_of(details: Any, model: type[BaseModel], data: object) -> Problem:
         return Problem(location, "this is an empty list", None)
     text = str(details["msg"]).removeprefix("Value error, ").replace("Input should be", "should be")
     if kind == "value_error":
+        # The text of a rule for several fields starts with the name of the field that is wrong.
+        name, colon, rest = text.partition(": ")
+        if colon and name in known_keys(model, location):
+            return Problem((*location, name), rest, None)
         return Problem(location, text, None)
     return Problem(location, f"{_short(details['input'])}: {text[0].lower()}{text[1:]}", None)
 
@@ -137,10 +147,11 @@ def _location_in(loc: Sequence[str | int], data: object, *, missing: bool) -> Lo
     return tuple(kept)
 
 
-def _description(location: Location, model: type[BaseModel]) -> str:
+def _description(location: Location, model: type[BaseModel]) -> str | None:
     """Return the description of the field at a location, for the hint of a message.
 
-    If the field has no description, the description of the nearest enclosing field is returned.
+    If the field has no description, the description of the nearest enclosing field is returned. None if there
+    is no description at all.
     """
     while location:
         fields = _fields_at(location[:-1], model)
@@ -148,7 +159,7 @@ def _description(location: Location, model: type[BaseModel]) -> str:
         if text:
             return f"{location[-1]}: {text}"
         location = location[:-1]
-    return "the folder jobs/ has a commented example"
+    return None
 
 
 def _unknown_key(location: Location, model: type[BaseModel]) -> Problem:

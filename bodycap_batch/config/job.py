@@ -11,6 +11,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from bodycap_batch.config.calibration import Calibration, implausible_calibration
 from bodycap_batch.config.explain import Problem, job_error, problems_of
 from bodycap_batch.config.folder import (
     CALIBRATION_FILE,
@@ -29,7 +30,7 @@ from bodycap_batch.config.resolved_camera import ResolvedCamera, resolved_camera
 from bodycap_batch.config.rules import problems_in, skeleton_of
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.config.videos_beside import VideosBeside, find_videos_beside
-from bodycap_batch.config.yaml_source import YamlSource, read_yaml
+from bodycap_batch.config.yaml_source import Location, YamlSource, dotted, read_yaml
 from bodycap_batch.core.errors import CaptureError, JobError
 
 _HEIGHT_M = (0.4, 2.6)
@@ -227,6 +228,7 @@ def _resolved_job(
         policy.require_named(job, base)
     if job.capture.synthetic is not None:
         _prepare_synthetic(job, base, full, prepare)
+    _require_plausible_calibrations(job, full, source)
     if stated.uses_folder:
         job = job.model_copy(update={"capture": with_found_calibrations(job.capture, base)})
         if policy is not None:  # before a calibration is read
@@ -408,6 +410,24 @@ def _prepare_synthetic(job: Job, base: Path, path: Path, prepare: Prepare | None
             field="capture.synthetic",
             hint=f"`bodycap run {path.name}` renders it on first use",
         )
+
+
+def _require_plausible_calibrations(job: Job, path: Path, source: YamlSource | None) -> None:
+    """Refuse a job that contains a calibration with a parameter that no camera has.
+
+    Raises:
+        CaptureError: A parameter is not plausible.
+    """
+    places: list[tuple[Location, object]] = [(("capture", "calibration"), job.capture.calibration)]
+    for index, camera in enumerate(job.capture.cameras):
+        places.append((("capture", "cameras", index, "calibration"), camera.calibration))
+    for place, calibration in places:
+        if not isinstance(calibration, Calibration):
+            continue
+        if (found := calibration.implausible_parameter()) is not None:
+            location = (*place, "params")
+            line = None if source is None else source.line_of(location)
+            raise implausible_calibration(found, path, dotted(location), line)
 
 
 def _with_resolved(job: Job, cameras: Sequence[ResolvedCamera], stated: _StatedJob) -> Job:

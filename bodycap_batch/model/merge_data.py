@@ -24,6 +24,12 @@ The sigma is not zero, because the shin rolls over the standing foot and moves t
 """
 _STANDING_RATE_HZ = 30.0
 """Rate, Hz, of the timeline for which `_STANDING_SPEED_M_PER_S` holds."""
+SLIP_HUBER_SIGMAS = 2.0
+"""Threshold of the Huber loss for the movement of a standing foot, in sigmas.
+
+A larger movement is treated as slipping. The motion graph and the projection to a rigid skeleton use the same
+threshold. Evidence: none.
+"""
 
 
 def standing_sigma_m(fps: float) -> float:

@@ -262,6 +262,20 @@ class SwappedSidesReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class InvertedCamerasReport:
+    """The cameras that are mounted upside down, although the job does not say so.
+
+    Attributes:
+        rolls_deg: By camera name, the roll of the solved mount relative to the usual mount, degrees. It is
+            between −180 and 180.
+        says: Sentence about these cameras for the user.
+    """
+
+    rolls_deg: Mapping[str, float]
+    says: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AlignedCameraReport:
     """The sigmas of the pose of a map that was aligned with another map: degrees and metres, per axis."""
 
@@ -330,6 +344,7 @@ class MergeReport:
         cameras: By camera name, the measurements of the camera.
         doubted_clocks: By camera name, the clock of a camera whose clock seems wrong.
         exchanged_sides: Cameras that seem to be on the wrong side of the body; None if there are none.
+        inverted_cameras: Cameras that are mounted upside down; None if there are none.
         unused_cameras: By camera name, the reason why the camera's map could not be linked to the body. Only
             cameras with such a map have an entry.
         joined_cameras: By name of a camera in an aligned map, the uncertainty of the map's pose.
@@ -354,6 +369,7 @@ class MergeReport:
     cameras: Mapping[str, CameraReport]
     doubted_clocks: Mapping[str, ClockReport]
     exchanged_sides: SwappedSidesReport | None = field(metadata=_EMPTY_IF_NONE)
+    inverted_cameras: InvertedCamerasReport | None = field(default=None, metadata=_OMIT_NONE)
     unused_cameras: Mapping[str, str]
     joined_cameras: Mapping[str, AlignedCameraReport]
     joint_gap_m: Mapping[str, Percentiles]

@@ -38,6 +38,7 @@ class FrameStatus(StrEnum):
     POSE_JUMP: Lost; the estimated pose was rejected as an outlier of the trajectory.
     UNCONFIRMED: Lost; few observations support the estimated pose, and no neighbouring frame confirms it.
     NO_MAP: Lost; no map contains this camera.
+    DAMAGED: Lost; the frame cannot be decoded, or the decoder reports that its data are damaged.
     """
 
     KEYFRAME = "KEYFRAME"
@@ -50,6 +51,7 @@ class FrameStatus(StrEnum):
     POSE_JUMP = "POSE_JUMP"
     UNCONFIRMED = "UNCONFIRMED"
     NO_MAP = "NO_MAP"
+    DAMAGED = "DAMAGED"
 
     @property
     def localised(self) -> bool:
@@ -68,6 +70,7 @@ class KeyframeSelection:
         sharpness: (N,) sharpness of each frame in an arbitrary unit; a larger value means a sharper frame.
         noise_px: Standard deviation, pixels, of the error of tracked positions. It is measured by tracking
             points forwards and back.
+        damaged: (D,) indices of the frames that cannot be decoded, or whose data are damaged. They are lost.
     """
 
     camera: str
@@ -75,9 +78,11 @@ class KeyframeSelection:
     frame_count: int
     sharpness: FloatArray
     noise_px: float
+    damaged: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
         set_array(self, "frames", (None,), np.int64)
+        set_array(self, "damaged", (None,), np.int64)
         set_array(self, "sharpness", (self.frame_count,))
         if len(self.frames) and (
             self.frames[0] < 0 or self.frames[-1] >= self.frame_count or (np.diff(self.frames) <= 0).any()

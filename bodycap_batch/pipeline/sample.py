@@ -38,7 +38,7 @@ def prepare_capture(options: Mapping[str, Any], folder: Path, settings: Settings
     Raises:
         BodycapError: The options are wrong, rendering failed, or the folder cannot be written.
     """
-    task = _synth_task(options, folder, settings)
+    task = _synth_task(options, settings)
     if _is_complete(folder, task.key):
         return
     logs = folder / "logs"
@@ -56,12 +56,11 @@ def prepare_capture(options: Mapping[str, Any], folder: Path, settings: Settings
     shutil.rmtree(logs, ignore_errors=True)
 
 
-def _synth_task(options: Mapping[str, Any], folder: Path, settings: Settings) -> Task:
+def _synth_task(options: Mapping[str, Any], settings: Settings) -> Task:
     try:
         checked = SynthOptions.model_validate(dict(options))
     except ValidationError as error:
-        refused = job_error(problems_of(error, SynthOptions, dict(options)), folder)
-        refused.path = None
+        refused = job_error(problems_of(error, SynthOptions, dict(options)))
         refused.field = ".".join(part for part in ("capture.synthetic", refused.field) if part)
         raise refused from error
     task = SynthTask(

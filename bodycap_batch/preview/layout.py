@@ -44,8 +44,8 @@ def lay_out_videos(aspects: Sequence[float]) -> list[tuple[Box, Box]]:
         aspects: Ratio of width to height of each video.
 
     Returns:
-        For each video, a box for the video and a box for the line of text below it. For up to ten videos, no
-        row has fewer videos than the row above it.
+        For each video, a box for the video and a box for the line of text below it. No row has fewer
+        videos than the row above it.
     """
     layouts = [_place_rows(aspects, ends) for ends in _partitions(len(aspects))]
     # The square roots of the areas are summed. If areas were summed, a large video could compensate for many
@@ -59,13 +59,13 @@ def _partitions(count: int) -> list[tuple[int, ...]]:
     A partition lists, for each row, the number of videos up to the end of this row. For example, (2, 5) means
     two videos in the first row and three videos in the second row.
 
-    For many videos, only partitions into rows of equal length are returned. Their last row may be shorter.
+    No row has fewer videos than the row above it: the first videos are then the largest. For many videos,
+    only partitions into rows of equal length are returned. Their first row may be shorter.
     """
     if count > _MAX_SEARCHED:
-        return [tuple(sorted({*range(row, count, row), count})) for row in range(2, count + 1)]
+        return [tuple(range(count % row or row, count + 1, row)) for row in range(2, count + 1)]
     inner = range(1, count)
     partitions = [(*cuts, count) for size in range(count) for cuts in combinations(inner, size)]
-    # No row may have fewer videos than the row above it: the first videos are then the largest.
     return [ends for ends in partitions if _row_lengths(ends) == sorted(_row_lengths(ends))]
 
 

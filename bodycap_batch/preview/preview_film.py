@@ -75,7 +75,7 @@ class PreviewInputs:
 def render_preview(inputs: PreviewInputs, context: StageContext) -> Path:
     """Write the preview, 1280×720, and return its path.
 
-    The preview has at most `MAX_FRAMES` frames. A long capture is shown with evenly spaced frames. If
+    The preview is at most `MAX_SECONDS` long. A long capture is shown with evenly spaced frames. If
     necessary, the preview is played faster than the capture was filmed.
 
     Raises:

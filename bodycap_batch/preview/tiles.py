@@ -32,6 +32,7 @@ _LOSS_REASONS = {
     FrameStatus.POSE_JUMP: "the pose jumped",
     FrameStatus.UNCONFIRMED: "no neighbour confirms it",
     FrameStatus.NO_MAP: "not in the map",
+    FrameStatus.DAMAGED: "damaged in the video",
 }
 _LOST_BRIGHTNESS = 0.45
 """Factor on the brightness of lost frames. Evidence: none."""
@@ -64,14 +65,16 @@ class VideoTile:
     def images(self) -> Generator[RgbImage | None, None, None]:
         """Yield the video's image for each frame of the preview.
 
-        The image (H,W,3) has the size of the tile. None is yielded if there is no video frame at this time.
+        The image (H,W,3) has the size of the tile. None is yielded if there is no video frame at this time. A
+        damaged frame is replaced by the frame that was shown before.
         """
         size = (self.video_box.width, self.video_box.height)
-        shown = np.unique(self.frames[self.frames >= 0])
+        is_shown = (self.frames >= 0) & ~np.isin(self.frames, self.camera.damaged)
+        shown = np.unique(self.frames[is_shown])
         index, image = -1, None
         with closing(self.camera.read(shown, colour=True)) as stream:
-            for frame in self.frames.tolist():
-                while index < frame:
+            for frame, is_readable in zip(self.frames.tolist(), is_shown.tolist(), strict=True):
+                while is_readable and index < frame:
                     index, full_image = next(stream)
                     image = resize_image(full_image, size)
                 yield image if frame >= 0 else None

@@ -77,6 +77,7 @@ def register_frames(
     trajectory = smooth_if_final(build_trajectory(camera, scene_map.gauge, poses, selection.sharpness))
     already_requested = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes
     requested = request_keyframes(trajectory.localised, selection.sharpness, offered)
+    requested = np.setdiff1d(requested, selection.damaged)
     return Registration(
         trajectory=trajectory,
         obs_frame=tracks.frame,

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.report.drawn_scene import DrawnScene, common_times_s
 from bodycap_batch.report.figures.before_after import draw_before_and_after, find_unoptimised_bones
 from bodycap_batch.report.figures.camera_landmark_matrix import draw_camera_landmark_matrix
 from bodycap_batch.report.figures.camera_timeline import MAX_COLUMNS, column_count, draw_camera_timeline
 from bodycap_batch.report.figures.shared_landmarks import draw_shared_landmarks
-from bodycap_batch.report.frame_losses import LossCause
+from bodycap_batch.report.frame_losses import FAST_DEG, PLAIN_RATIO, LossCause
+from bodycap_batch.report.frame_pictures import DARK_BRIGHTNESS
 from bodycap_batch.report.grades import Grade
 from bodycap_batch.report.loss_diagnosis import DiagnosedLoss, count_frames_by_cause
 from bodycap_batch.report.metric_tables import headline_figures, make_tables
@@ -77,14 +79,18 @@ def page_content(
 
 
 _CAUSE_CRITERIA = {
-    LossCause.DARK: "the mean brightness of the lost frame is below 30 of 255",
-    LossCause.FAST: "the camera turned more than 8° per frame next to the gap",
-    LossCause.BLUR: "the sharpness is below 60 % of the sharpness of the registered frames",
-    LossCause.PLAIN: "the frame has under 30 % of the corners of the camera's registered frames",
+    LossCause.DARK: f"the mean brightness of the lost frame is below {DARK_BRIGHTNESS:.0f} of 255",
+    LossCause.FAST: f"the camera turned more than {FAST_DEG:.0f}° per frame next to the gap",
+    LossCause.BLUR: f"the sharpness is below {BLUR_SHARPNESS_RATIO * 100:.0f} % of the sharpness of the "
+    "registered frames",
+    LossCause.PLAIN: f"the frame has under {PLAIN_RATIO * 100:.0f} % of the corners of the camera's "
+    "registered frames",
     LossCause.SHALLOW: "the visible points did not determine the position",
     LossCause.UNKNOWN_PLACE: "the frame is sharp and textured, but it does not match the map",
     LossCause.NO_MAP: "there is no map for this camera",
+    LossCause.DAMAGED: "the decoder reports damaged data, or gives no picture for the frame",
 }
+"""Rule by which each cause of a loss is found. The limits are those of `frame_losses`."""
 
 
 def _progress_at_failure(inputs: ReportInputs) -> str:

@@ -17,12 +17,12 @@ from bodycap_batch.report.drawn_scene import common_times_s
 from bodycap_batch.report.frame_pictures import FrameAppearance
 from bodycap_batch.report.report_inputs import ReportInputs
 
-_FAST_DEG = 8.0
+FAST_DEG = 8.0
 """Maximum rotation (degrees) between successive frames that is not treated as a fast turn.
 
 Optical flow loses most tracks above 20 degrees. Motion blur starts at much smaller angles.
 """
-_PLAIN_RATIO = 0.3
+PLAIN_RATIO = 0.3
 """Minimum ratio of a lost frame's number of corners to the usual number in the camera's registered frames.
 
 A frame with fewer corners shows plain surfaces. Evidence: none.
@@ -44,6 +44,7 @@ class LossCause(StrEnum):
     SHALLOW = "points too far away or too close together"
     UNKNOWN_PLACE = "place not in the map"
     NO_MAP = "no map for this camera"
+    DAMAGED = "damaged video"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,15 +105,17 @@ def likely_cause(
     """
     if loss.reason is FrameStatus.NO_MAP:
         return LossCause.NO_MAP
+    if loss.reason is FrameStatus.DAMAGED:
+        return LossCause.DAMAGED
     if appearance is not None and appearance.is_dark:
         return LossCause.DARK
-    if loss.turn_deg > _FAST_DEG:
+    if loss.turn_deg > FAST_DEG:
         return LossCause.FAST
     if loss.reason is FrameStatus.BLUR:
         return LossCause.BLUR
     if loss.reason is FrameStatus.UNCONSTRAINED:
         return LossCause.SHALLOW
-    if appearance is not None and usual_corners and appearance.corners < _PLAIN_RATIO * usual_corners:
+    if appearance is not None and usual_corners and appearance.corners < PLAIN_RATIO * usual_corners:
         return LossCause.PLAIN
     return LossCause.BLUR if loss.sharpness < BLUR_SHARPNESS_RATIO else LossCause.UNKNOWN_PLACE
 

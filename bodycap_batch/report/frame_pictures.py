@@ -46,7 +46,7 @@ _MAX_SHIFT_S = 1.0
 If half the time between two pictures is longer than this value, half the time between two pictures is the
 maximum. Keyframes are at most half a second apart.
 """
-_DARK_BRIGHTNESS = 30.0
+DARK_BRIGHTNESS = 30.0
 """Minimum mean brightness (grey levels, 0 to 255) of a frame that is not dark.
 
 If a frame is darker, hardly any light reached the camera. Evidence: none.
@@ -99,7 +99,7 @@ class FrameAppearance:
     @property
     def is_dark(self) -> bool:
         """True if hardly any light reached the camera."""
-        return self.brightness < _DARK_BRIGHTNESS
+        return self.brightness < DARK_BRIGHTNESS
 
 
 def picture_series(
@@ -216,11 +216,12 @@ def _read_pictures(camera: CaptureCamera, indices: IntArray, context: StageConte
 def _decode_frames(camera: CaptureCamera, indices: IntArray, context: StageContext) -> list[tuple[int, Any]]:
     """Return the index and the colour image of each frame before the first frame that cannot be decoded.
 
-    If a frame cannot be decoded, all later frames are missing on the page, but the report does not fail.
+    Frames that are known to be damaged are omitted. If another frame cannot be decoded, all later frames are
+    missing on the page, but the report does not fail.
     """
     frames = []
     try:
-        for index, image in camera.read(indices, colour=True):
+        for index, image in camera.read(np.setdiff1d(indices, camera.damaged), colour=True):
             context.check_cancelled()
             frames.append((index, image))
     except CaptureError:

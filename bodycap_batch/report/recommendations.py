@@ -13,9 +13,10 @@ from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.percent import format_percent
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.merge_report import ScaleReport
+from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.scene import Map
 from bodycap_batch.report.drawn_scene import common_times_s
-from bodycap_batch.report.frame_losses import LossCause
+from bodycap_batch.report.frame_losses import FAST_DEG, PLAIN_RATIO, LossCause
 from bodycap_batch.report.report_inputs import ReportInputs
 from bodycap_batch.report.verdict import FAIR_GAP_S, GOOD_MOUNT_DEG, describe_lens_misfit
 
@@ -61,18 +62,24 @@ _ACTIONS = {
     "picture.",
     LossCause.UNKNOWN_PLACE: "Turn the camera so that it sees less of the wearer's body, keep other people "
     "out of the picture, and walk past each place more than once.",
+    LossCause.DAMAGED: "Copy the video again from the camera's card. If it is damaged there, too, use "
+    "another card.",
     LossCause.NO_MAP: "Let every camera see the same places as the others: walk a loop and look around "
     "in each place.",
 }
 _OBSERVATIONS = {
     LossCause.DARK: "hardly any light reached the camera",
-    LossCause.FAST: "the camera turned more than 8° from one frame to the next",
-    LossCause.BLUR: "the picture was blurred (sharpness below 60 % of the frames near it)",
-    LossCause.PLAIN: "the camera looked at plain surfaces (under 30 % of its usual corners)",
+    LossCause.FAST: f"the camera turned more than {FAST_DEG:.0f}° from one frame to the next",
+    LossCause.BLUR: f"the picture was blurred (sharpness below {BLUR_SHARPNESS_RATIO * 100:.0f} % of the "
+    "frames near it)",
+    LossCause.PLAIN: f"the camera looked at plain surfaces (under {PLAIN_RATIO * 100:.0f} % of its "
+    "usual corners)",
     LossCause.SHALLOW: "the visible points did not determine the position (too far away, or close together)",
     LossCause.UNKNOWN_PLACE: "the picture was sharp and textured, but its content is not in the map",
     LossCause.NO_MAP: "the camera has no map",
+    LossCause.DAMAGED: "the video file is damaged there",
 }
+"""Observation that explains each cause of a loss. The limits are those of `frame_losses`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

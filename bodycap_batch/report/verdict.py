@@ -312,6 +312,15 @@ def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
             rationale="No body fits arms with exchanged sides: on one such walk the metric scale was wrong "
             "by 62 %.",
         )
+    if merge.get("inverted_cameras"):
+        yield Criterion(
+            subject="body",
+            name="Cameras upside down",
+            grade=Grade.FAIR,
+            finding=str(merge["inverted_cameras"]["says"]),
+            rationale="The body was solved with the cameras upside down. If they were mounted upright, its "
+            "poses are wrong.",
+        )
     yield from _mount_criteria(merge.get("mounts", {}))
     yield from _unused_camera_criteria(merge.get("unused_cameras", {}))
 

@@ -27,6 +27,7 @@ class KeyframesTask:
 
 def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> None:
     """Select the keyframes; store them with copies of decoded frames."""
+    from bodycap_batch.capture.damage import damage_notes
     from bodycap_batch.capture.kept import KEPT_NAME, FrameKeeper
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.keyframes import select_keyframes
@@ -38,7 +39,12 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     if (kept := keeper.kept_frames()) is not None:
         write_dataclass(kept, files, KEPT_NAME)
     write_dataclass(selection, files, "keyframes")
-    write_summary(files, frames=selection.frame_count, keyframes=len(selection.frames))
+    write_summary(
+        files,
+        frames=selection.frame_count,
+        keyframes=len(selection.frames),
+        notes=[f"{camera.name}: {note}" for note in damage_notes(camera, selection.damaged)],
+    )
 
 
 KEYFRAMES = Stage(

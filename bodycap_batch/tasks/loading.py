@@ -21,16 +21,20 @@ def load_capture(
 
     Args:
         capture: The cameras and their videos.
-        keyframes: The artefact with the keyframes of each camera, by camera name. If an artefact holds copies
-            of decoded frames, the copies are read instead of the video. None to read all frames from the
-            videos.
+        keyframes: The artefact with the keyframes of each camera, by camera name. It lists the damaged
+            frames. If an artefact holds copies of decoded frames, the copies are read instead of the video.
+            None to read all frames from the videos.
         threads: Number of threads of each video decoder; 0 lets the decoder choose.
     """
     from bodycap_batch.capture import open_capture
 
     opened = open_capture(capture.config, threads)
     stored = keyframes or {}
-    cameras = (replace(camera, kept=_kept_frames(stored.get(camera.name))) for camera in opened.cameras)
+    cameras = []
+    for camera in opened.cameras:
+        artefact = stored.get(camera.name)
+        damaged = camera.damaged if artefact is None else load_keyframes(artefact.path).damaged
+        cameras.append(replace(camera, kept=_kept_frames(artefact), damaged=damaged))
     return replace(opened, cameras=tuple(cameras))
 
 

@@ -12,7 +12,7 @@ from bodycap_batch.check import check_path, require_ready
 from bodycap_batch.cli import main
 from bodycap_batch.config.job import load_job
 from bodycap_batch.core.errors import BodycapError
-from tests.broken import CASES, FRAMES, MIRRORED, Case, black, edit
+from tests.broken import CASES, FRAMES, MIRRORED, Case, black, edit, overwrite
 from tests.videos import textured_frame, write_video
 
 
@@ -46,6 +46,10 @@ def test_bad_input(capture: Path, case: Case) -> None:
             require_ready(load_job(capture / "job.yaml"))
 
 
+def damaged_in_the_middle(root: Path) -> None:
+    overwrite(root / "torso.mp4", 0.5, 0.6)
+
+
 def shorter(root: Path) -> None:
     write_video(root / "head.mp4", MIRRORED[:20])
 
@@ -77,6 +81,7 @@ def partly_black(root: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
+        (damaged_in_the_middle, "of 40 frames are damaged in the video"),
         (shorter, "all cameras run together for 0.6 s"),
         (upside_down, "ready to run"),
         (variable_rate, "variable rate"),

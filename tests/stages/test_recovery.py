@@ -222,6 +222,21 @@ def test_frames_that_show_no_part_of_the_map_stay_lost(
     assert all(path.status[frame] is FrameStatus.FEW_TRACKS for frame in LOST)
 
 
+def test_a_registration_without_a_map_stays_as_it_is(
+    pictures: list[np.ndarray], context: StageContext
+) -> None:
+    found = _tracked()
+    lost = replace(found, trajectory=replace(found.trajectory, gauge="none"))
+    inputs = recover.RecoveryInputs(
+        capture=Capture(cameras=()),
+        registrations=(),
+        maps=(_map(pictures),),
+        selection=_selection(),
+        in_rig=False,
+    )
+    assert recover.recover_lost_frames(lost, inputs, RegistrationOptions(), context) is lost
+
+
 def test_masked_pixels_give_no_pose(pictures: list[np.ndarray], context: StageContext) -> None:
     mask = np.ones((240, 320), dtype=bool)
     mask[10:, :] = False

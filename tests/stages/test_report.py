@@ -14,18 +14,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodycap_batch.capture import open_capture
+from bodycap_batch.capture import Capture, CaptureCamera, open_capture
 from bodycap_batch.config.models import CaptureConfig, Job
 from bodycap_batch.model.geometry import interpolate_pose
 from bodycap_batch.model.merge_report import MergeReport
-from bodycap_batch.model.scene import FrameStatus, Trajectory
+from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
+from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Trajectory
 from bodycap_batch.pipeline.stage_results import StageResults, report_task
 from bodycap_batch.report import ReportInputs
+from bodycap_batch.report.content import _CAUSE_CRITERIA
 from bodycap_batch.report.drawn_scene import common_times_s, make_drawn_scene
 from bodycap_batch.report.figures.before_after import find_unoptimised_bones
-from bodycap_batch.report.figures.camera_timeline import draw_camera_timeline
-from bodycap_batch.report.frame_losses import LossCause, find_frame_losses, likely_cause
-from bodycap_batch.report.frame_pictures import FrameAppearance, FramePicture
+from bodycap_batch.report.figures.camera_timeline import draw_camera_timeline, x_from_time
+from bodycap_batch.report.frame_losses import (
+    FAST_DEG,
+    PLAIN_RATIO,
+    LossCause,
+    find_frame_losses,
+    likely_cause,
+)
+from bodycap_batch.report.frame_pictures import DARK_BRIGHTNESS, FrameAppearance, FramePicture
 from bodycap_batch.report.grades import Criterion, Grade
 from bodycap_batch.report.metric_paths import metric_at
 from bodycap_batch.report.metric_tables import headline_figures, make_tables
@@ -460,6 +468,48 @@ def test_a_camera_timeline_of_any_length_stays_small(inputs: ReportInputs) -> No
     drawn = draw_camera_timeline(long, path.camera, (0.0, count / 30.0), losses, 0.0)
     assert len(drawn) < 150_000
     assert f"{count // 2} frames lost: BLUR" in drawn
+
+
+def test_the_sharpness_of_a_camera_without_a_trajectory_is_drawn_at_its_own_times(
+    inputs: ReportInputs,
+) -> None:
+    path = inputs.registrations[0].trajectory
+    camera = CaptureCamera(
+        name=path.camera,
+        chapters=(),
+        camera=inputs.maps[0].cameras[path.camera],
+        calibrated=True,
+        frame_numbers=path.frame_numbers,
+        times_ns=path.times_ns,
+        nominal_fps=30.0,
+        offset_s=0.5,
+        rolling_shutter_s=0.0,
+    )
+    times = camera.common_times_ns() * 1e-9
+    count = len(times)
+    selection = KeyframeSelection(
+        camera=path.camera,
+        frames=np.zeros(1, np.int64),
+        frame_count=count,
+        sharpness=np.ones(count),
+        noise_px=0.1,
+    )
+    lost = ReportInputs(
+        name="lost", cameras=(path.camera,), selections=(selection,), capture=Capture(cameras=(camera,))
+    )
+    # The camera ran in the first quarter of the time axis only.
+    span = (float(times[0]), float(times[0] + 4.0 * (times[-1] - times[0])))
+    drawn = draw_camera_timeline(lost, camera.name, span, [], 0.0)
+    x = [float(value) for value in re.findall(r"[ML]([\d.]+)", drawn)]
+    assert x
+    assert max(x) < x_from_time(span[0] + 0.3 * (span[1] - span[0]), span)
+
+
+def test_the_causes_of_losses_are_explained_with_the_limits_that_are_used() -> None:
+    assert f"{FAST_DEG:.0f}°" in _CAUSE_CRITERIA[LossCause.FAST]
+    assert f"below {DARK_BRIGHTNESS:.0f} of 255" in _CAUSE_CRITERIA[LossCause.DARK]
+    assert f"{PLAIN_RATIO:.0%}".replace("%", " %") in _CAUSE_CRITERIA[LossCause.PLAIN]
+    assert f"{BLUR_SHARPNESS_RATIO:.0%}".replace("%", " %") in _CAUSE_CRITERIA[LossCause.BLUR]
 
 
 def test_unoptimised_bones_of_a_camera_half_a_frame_late_are_the_same(inputs: ReportInputs) -> None:

@@ -71,10 +71,12 @@ def register_images(
     mapper = _open_mapper(workspace, settings)
     mapper.begin_reconstruction(model)
     run = _MapperRun(mapper, settings, adjust_globally=adjust_globally)
-    if not model.num_reg_frames() and not run.initialise():
-        mapper.end_reconstruction(True)
-        return False
-    count_one()
+    if not model.num_reg_frames():
+        if not run.initialise():
+            mapper.end_reconstruction(True)
+            return False
+        for _ in range(model.num_reg_images()):
+            count_one()
     run.register_all(count_one)
     model.update_point_3d_errors()
     mapper.end_reconstruction(False)
@@ -105,7 +107,7 @@ def with_new_images(
     """
     settings.fix_existing_frames = True
     extended = copy.deepcopy(model)
-    count_one = progress_counter(context, total, context.check_cancelled)
+    count_one = progress_counter(context, total, context.check_cancelled, extended.num_reg_images())
     register_images(workspace, settings, extended, count_one, adjust_globally=adjust_globally)
     return extended
 

@@ -141,7 +141,8 @@ def _with_registered_images(
     Return the copy if it is at least as large as the model, else the model.
     """
     extended = copy.deepcopy(model)
-    register_images(workspace, settings, extended, progress_counter(context, total, context.check_cancelled))
+    count_one = progress_counter(context, total, context.check_cancelled, extended.num_reg_images())
+    register_images(workspace, settings, extended, count_one)
     return min([extended, model], key=model_order)
 
 

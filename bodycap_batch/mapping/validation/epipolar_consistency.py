@@ -12,14 +12,15 @@ import numpy as np
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.matching.database import DATABASE_NAME
+from bodycap_batch.model.optical_flow import pixel_scale
 
 if TYPE_CHECKING:
     import pycolmap
 
 _MAX_ERROR_PX = 8.0
-"""Maximum epipolar error (px of the keyframe) of a match that the map's poses explain. For an image with a
-long side of 640 px, this is twice the maximum error in the verification of pairs. The error may be larger
-than in verification because a map is slightly deformed."""
+"""Maximum epipolar error, in px of an image with a long side of 640 px, of a match that the map's poses
+explain. This is twice the maximum error in the verification of pairs. The error may be larger than in
+verification because a map is slightly deformed."""
 _MIN_PAIR_MATCHES = 30
 """Minimum number of matches of an evaluated pair. Some verified pairs with fewer matches are wrong.
 Evidence: none."""
@@ -67,7 +68,7 @@ def evaluate_pairs(workspace: Path, model: pycolmap.Reconstruction) -> list[Pair
     import pycolmap
 
     poses = {int(i): model.image(i).cam_from_world() for i in model.reg_image_ids()}
-    rays, focal_px = {}, {}
+    rays, focal_px, max_error_px = {}, {}, {}
     out = []
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         for image in database.read_all_images():
@@ -77,6 +78,7 @@ def evaluate_pairs(workspace: Path, model: pycolmap.Reconstruction) -> list[Pair
                 pixels = np.asarray(database.read_keypoints(number), dtype=np.float64)[:, :2]
                 rays[number] = np.asarray(camera.cam_from_img(pixels))
                 focal_px[number] = camera.mean_focal_length()
+                max_error_px[number] = _MAX_ERROR_PX * pixel_scale(camera.width, camera.height)
         for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
             a, b = map(int, pycolmap.pair_id_to_image_pair(pair))
             matches = np.asarray(geometry.inlier_matches)
@@ -86,7 +88,7 @@ def evaluate_pairs(workspace: Path, model: pycolmap.Reconstruction) -> list[Pair
                     rays[a][matches[:, 0]], rays[b][matches[:, 1]], essential
                 )
                 error_px = focal_px[a] * np.sqrt(squared)
-                ratio = float((error_px < _MAX_ERROR_PX).mean())
+                ratio = float((error_px < max_error_px[a]).mean())
                 out.append(PairConsistency(a, b, len(matches), ratio))
     return out
 

@@ -130,6 +130,15 @@ def has_unknown_roll(mount: Mount) -> bool:
     return mount.by_name
 
 
+def roll_deg(prior: Mount, solved: Mount) -> float:
+    """Return the roll of a solved mount relative to its prior: degrees about the optical axis.
+
+    The result is between −180 and 180.
+    """
+    rotation = prior.joint_from_cam[:3, :3].T @ solved.joint_from_cam[:3, :3]
+    return float(np.degrees(np.arctan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])))
+
+
 def search_rolls(
     skeleton: SkeletonModel,
     mounts: Mapping[str, Mount],
@@ -209,7 +218,7 @@ def reference_roll(
         The roll and the vertical. The roll is 0 if the job gives the orientation of the reference camera, if
         no limbs hang below the camera, or if no other roll is clearly better.
     """
-    reference, limbs, usual = tracks[0], _hanging_tracks(mounts, tracks), vertical_of(0.0)
+    reference, limbs, usual = tracks[0], hanging_tracks(mounts, tracks), vertical_of(0.0)
     usual_cosine = 0.0 if usual is None else mean_down_cosine(reference, limbs, usual)
     is_decided = usual_cosine > _MIN_DOWN_COSINE
     if not has_unknown_roll(mounts[reference.camera]) or not limbs or is_decided:
@@ -250,7 +259,7 @@ def mean_down_cosine(reference: CameraTrack, limbs: Sequence[CameraTrack], verti
     return float(together.mean()) if len(together) else 0.0
 
 
-def _hanging_tracks(mounts: Mapping[str, Mount], tracks: Sequence[CameraTrack]) -> list[CameraTrack]:
+def hanging_tracks(mounts: Mapping[str, Mount], tracks: Sequence[CameraTrack]) -> list[CameraTrack]:
     """Return the tracks of the cameras on limbs that hang below the reference camera.
 
     The list is empty if only one side of the body has such cameras. Seen from the chest, the hand of one side

@@ -14,7 +14,7 @@ from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
 from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.model.geometry import invert, make_transform
-from bodycap_batch.model.merge_data import standing_sigma_m
+from bodycap_batch.model.merge_data import SLIP_HUBER_SIGMAS, standing_sigma_m
 from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions
 
@@ -63,7 +63,8 @@ class FootContact:
             adjoint @ np.diag(np.repeat([_FREE_ROTATION_SIGMA_RAD, self.sigma_m], 3) ** 2) @ adjoint.T
         )
         noise = gtsam.noiseModel.Robust.Create(
-            gtsam.noiseModel.mEstimator.Huber.Create(2.0), gtsam.noiseModel.Gaussian.Covariance(covariance)
+            gtsam.noiseModel.mEstimator.Huber.Create(SLIP_HUBER_SIGMAS),
+            gtsam.noiseModel.Gaussian.Covariance(covariance),
         )
         keys = bone_key(tick, self.bone), bone_key(tick + 1, self.bone)
         graph.add(gtsam.BetweenFactorPose3(*keys, gtsam.Pose3(), noise))

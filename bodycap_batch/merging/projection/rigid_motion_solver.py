@@ -20,6 +20,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 from bodycap_batch.model.geometry import skew, so3_exp, so3_log
+from bodycap_batch.model.merge_data import SLIP_HUBER_SIGMAS
 from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
 
 _CAMERA_SIGMA = np.repeat([np.deg2rad(0.5), 0.005], 3)
@@ -52,12 +53,6 @@ _INDEPENDENT_HZ = 30.0
 The errors of successive ticks are correlated. More ticks per second therefore do not add information, and the
 weight of a tick is proportional to its duration.
 Evidence: docs/decisions/export.md for the weight; none for the value.
-"""
-
-_SLIP_HUBER_SIGMAS = 2.0
-"""Threshold of the Huber loss for the movement of a standing foot, in sigmas.
-
-A larger movement is treated as slipping. The motion graph uses the same threshold.
 """
 
 _GEMAN_MCCLURE_SQUARED = 100.0
@@ -366,8 +361,8 @@ def cost(problem: ProjectionProblem, motion: RigidMotion) -> float:
     out += float((np.diff(_scaled_correction(problem, motion, graph_error), axis=0) ** 2).sum())
     for joint in problem.standing:
         size = np.linalg.norm(_slip(joint, world), axis=1)
-        linear = _SLIP_HUBER_SIGMAS * (2.0 * size - _SLIP_HUBER_SIGMAS)
-        out += float(np.where(size < _SLIP_HUBER_SIGMAS, size**2, linear).sum())
+        linear = SLIP_HUBER_SIGMAS * (2.0 * size - SLIP_HUBER_SIGMAS)
+        out += float(np.where(size < SLIP_HUBER_SIGMAS, size**2, linear).sum())
     return out
 
 
@@ -442,8 +437,8 @@ def _add_standing_joints(
     for standing in problem.standing:
         (held,) = np.nonzero(standing.held)
         slip = _slip(standing, world)[held]
-        size = np.maximum(np.linalg.norm(slip, axis=1), _SLIP_HUBER_SIGMAS)
-        sqrt_weight = np.sqrt(_SLIP_HUBER_SIGMAS / size)
+        size = np.maximum(np.linalg.norm(slip, axis=1), SLIP_HUBER_SIGMAS)
+        sqrt_weight = np.sqrt(SLIP_HUBER_SIGMAS / size)
         jacobians = []
         for ticks in (held, held + 1):
             centres = world[ticks][:, problem.solved][..., :3, 3]

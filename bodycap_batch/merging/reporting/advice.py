@@ -82,6 +82,41 @@ def describe_swapped_sides(swapped: Mapping[str, float]) -> str:
     )
 
 
+def describe_inverted_cameras(rolls_deg: Mapping[str, float], cameras: int) -> str:
+    """Describe cameras that are mounted upside down.
+
+    Args:
+        rolls_deg: By camera, the roll of the solved mount relative to the usual mount, degrees.
+        cameras: Number of all cameras of the body.
+
+    Returns:
+        A sentence for the report, with the measured rolls.
+    """
+    names = sorted(rolls_deg)
+    measured = ", ".join(f"{abs(rolls_deg[name]):.0f}°" for name in names)
+    every = " (all cameras)" if len(names) == cameras > 1 else ""
+    return (
+        f"mounted upside down, as it seems: {' and '.join(names)}{every}; from the motion and from the "
+        f"position of the limbs, the roll from the usual mount is {measured}; the body is solved with this, "
+        "so if they are mounted upright, give their mounts (joint_from_cam)"
+    )
+
+
+def describe_unknown_way_up(camera: str) -> str:
+    """Describe that no measurement shows which way up the reference camera is mounted.
+
+    Args:
+        camera: Name of the reference camera.
+
+    Returns:
+        A part of a sentence for the report.
+    """
+    return (
+        f"; {camera} is assumed to be mounted upright: no cameras on both arms or both legs hang below it, "
+        "so a mount that is upside down, and a body that is then upside down, cannot be noticed"
+    )
+
+
 def describe_mount(mount: Mount, *, t_pose: bool) -> str:
     """Describe how well the pose of a camera on its bone is known.
 
@@ -148,16 +183,18 @@ def describe_scale(calibration: BodyCalibration) -> str:
     return f"{text}; to know it better, {' or '.join(ways)}"
 
 
-def describe_vertical(vertical: Vertical) -> str:
+def describe_vertical(vertical: Vertical, way_up: str = "") -> str:
     """Describe how well the vertical is known.
 
     Args:
         vertical: The estimated vertical.
+        way_up: Text from `describe_unknown_way_up`; empty if it is known which way up the reference camera is
+            mounted.
 
     Returns:
         A sentence for the report. If the vertical is not well known, the sentence contains advice.
     """
-    text = f"the vertical is known to {vertical.sigma_deg:.1f}° (1 sigma), from the {vertical.source}"
+    text = f"the vertical is known to {vertical.sigma_deg:.1f}° (1 sigma), from the {vertical.source}{way_up}"
     if vertical.rests_on_lean_only():
         text = (
             f"{text}, but it is not certain: only the posture shows it, and a constant lean of the trunk "

@@ -9,6 +9,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body_calibration.calibrate_body import BodyCalibration
+from bodycap_batch.merging.body_calibration.camera_roll import hanging_tracks, has_unknown_roll, roll_deg
 from bodycap_batch.merging.body_calibration.scale import ScaleSource, chi_square
 from bodycap_batch.merging.cameras.clock_check import suspicious_clocks
 from bodycap_batch.merging.cameras.side_check import swapped_sides
@@ -17,9 +18,11 @@ from bodycap_batch.merging.graph.motion_graph import MotionSolution
 from bodycap_batch.merging.reporting.advice import (
     describe_clock,
     describe_hinge,
+    describe_inverted_cameras,
     describe_mount,
     describe_scale,
     describe_swapped_sides,
+    describe_unknown_way_up,
     describe_vertical,
 )
 from bodycap_batch.merging.world.floor import Floor
@@ -34,6 +37,7 @@ from bodycap_batch.model.merge_report import (
     ClockReport,
     FloorReport,
     HingeReport,
+    InvertedCamerasReport,
     LimbScalesReport,
     MergeReport,
     MountReport,
@@ -54,6 +58,9 @@ _DOWN_WEIGHTED = 0.25
 
 The report gives the number of down-weighted measurements.
 """
+_MIN_INVERTED_ROLL_DEG = 135.0
+"""Minimum roll (degrees) from the usual mount of a camera that is mounted upside down. Derivation: half-way
+between a camera that lies on its side (90°) and one that is upside down (180°)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +120,7 @@ def build_report(
     return MergeReport(
         scale=_scale_report(calibration),
         t_pose=_t_pose_report(calibration, facts.start_ns),
-        up=_vertical_report(calibration),
+        up=_vertical_report(inputs.mounts, calibration, main_tracks),
         floor=FloorReport(source=facts.floor.source, points=facts.floor.support),
         mounts={
             mount.camera: _mount_report(inputs.mount_of(mount.camera), mount, calibration)
@@ -122,6 +129,7 @@ def build_report(
         cameras={track.camera: _camera_report(track, solution, facts) for track in tracks},
         doubted_clocks=_clock_reports(inputs.clocks, main_tracks),
         exchanged_sides=_sides_report(inputs.mounts, calibration, main_tracks),
+        inverted_cameras=_inverted_cameras_report(inputs.mounts, calibration),
         unused_cameras=dict(facts.unused),
         joined_cameras=dict(facts.aligned),
         joint_gap_m=_percentiles_by_name(facts.joint_gap_m),
@@ -185,6 +193,26 @@ def _sides_report(
     return SwappedSidesReport(cameras=wrong, says=describe_swapped_sides(wrong)) if wrong else None
 
 
+def _inverted_cameras_report(
+    priors: Collection[Mount], calibration: BodyCalibration
+) -> InvertedCamerasReport | None:
+    """Report the cameras whose solved mount is upside down relative to the usual mount.
+
+    Cameras whose orientation is given in the job are not reported.
+    """
+    by_camera = {mount.camera: mount for mount in priors}
+    rolls_deg = {
+        solved.camera: round(roll_deg(by_camera[solved.camera], solved), 1)
+        for solved in calibration.mounts
+        if has_unknown_roll(by_camera[solved.camera])
+    }
+    inverted = {name: roll for name, roll in rolls_deg.items() if abs(roll) > _MIN_INVERTED_ROLL_DEG}
+    if not inverted:
+        return None
+    says = describe_inverted_cameras(inverted, len(calibration.mounts))
+    return InvertedCamerasReport(rolls_deg=inverted, says=says)
+
+
 def _scale_report(calibration: BodyCalibration) -> ScaleReport:
     scale = calibration.scale
     chi2, freedom = chi_square(scale.sources)
@@ -230,8 +258,13 @@ def _source_reports(sources: Sequence[ScaleSource], scale: float) -> tuple[Scale
     )
 
 
-def _vertical_report(calibration: BodyCalibration) -> VerticalReport:
+def _vertical_report(
+    priors: Collection[Mount], calibration: BodyCalibration, tracks: Sequence[CameraTrack]
+) -> VerticalReport:
     up = calibration.vertical
+    mounts = {mount.camera: mount for mount in priors}
+    reference = tracks[0].camera
+    is_shown = not has_unknown_roll(mounts[reference]) or bool(hanging_tracks(mounts, tracks))
     return VerticalReport(
         source=up.source,
         sigma_deg=round(up.sigma_deg, 2),
@@ -246,7 +279,7 @@ def _vertical_report(calibration: BodyCalibration) -> VerticalReport:
             )
             for other in up.alternatives
         ),
-        known_to=describe_vertical(up),
+        known_to=describe_vertical(up, "" if is_shown else describe_unknown_way_up(reference)),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -224,21 +224,26 @@ def build_trajectory(
         covariance=np.array(
             [missing if pose.covariance is None else pose.covariance for pose in poses]
         ).reshape(-1, 6, 6),
-        status=tuple(_frame_statuses(poses, sharpness)),
+        status=tuple(_frame_statuses(poses, sharpness, frozenset(camera.damaged.tolist()))),
         inliers=np.array([pose.inliers for pose in poses], dtype=np.int64),
         error_px=np.array([pose.error_px for pose in poses]),
     )
 
 
-def _frame_statuses(poses: Sequence[FramePose], sharpness: FloatArray) -> list[FrameStatus]:
+def _frame_statuses(
+    poses: Sequence[FramePose], sharpness: FloatArray, damaged: Collection[int]
+) -> list[FrameStatus]:
     """Return the status of each frame.
 
-    The status is BLUR if a frame has too few tracks and is much less sharp than the frames around it.
+    The status is DAMAGED if a frame without a pose is damaged. It is BLUR if a frame has too few tracks and
+    is much less sharp than the frames around it.
     """
     statuses = []
     for index, pose in enumerate(poses):
         status = pose.status
-        if status is FrameStatus.FEW_TRACKS:
+        if index in damaged and not status.localised:
+            status = FrameStatus.DAMAGED
+        elif status is FrameStatus.FEW_TRACKS:
             nearby = sharpness[max(0, index - _BLUR_WINDOW_FRAMES) : index + _BLUR_WINDOW_FRAMES + 1]
             if sharpness[index] < BLUR_SHARPNESS_RATIO * np.median(nearby):
                 status = FrameStatus.BLUR

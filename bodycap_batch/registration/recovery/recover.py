@@ -86,10 +86,12 @@ def recover_lost_frames(
 
     Returns:
         The registration with more poses and a smoothed trajectory. It contains no observations of the
-        recovered frames.
+        recovered frames. A registration without a map is returned unchanged.
     """
     gauge = registration.trajectory.gauge
-    scene_map = next(scene for scene in inputs.maps if scene.gauge == gauge)
+    own_map = next((scene for scene in inputs.maps if scene.gauge == gauge), None)
+    if own_map is None:
+        return registration
     trajectories: list[Trajectory] = []
 
     def cameras() -> Iterable[RegisteredCamera]:
@@ -97,7 +99,7 @@ def recover_lost_frames(
             trajectories.append(camera.registration.trajectory)
             yield camera
 
-    scene_map = remove_misplaced_keyframes(scene_map, cameras(), inputs.selection, options)
+    scene_map = remove_misplaced_keyframes(own_map, cameras(), inputs.selection, options)
     if not inputs.in_rig:
         own = RegisteredCamera(camera=inputs.capture.cameras[0], registration=registration)
         scene_map, registration = prepare_recovery(

@@ -95,9 +95,10 @@ def read_pyramids(
         max_frames: Maximum number of frames. The frames nearest to an end or a seed are selected.
 
     Returns:
-        Image pyramids, by frame index.
+        Image pyramids, by frame index. Damaged frames are missing.
     """
     frames = np.arange(max(0, start - 1), min(len(camera.times_ns), stop + 1))
+    frames = np.setdiff1d(frames, camera.damaged)
     reference_frames = np.array([start, stop - 1, *seed_frames])
     distance = np.abs(frames[:, None] - reference_frames).min(axis=1)
     nearest = np.argsort(distance, kind="stable")[:max_frames]

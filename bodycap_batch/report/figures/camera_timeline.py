@@ -103,7 +103,7 @@ def draw_camera_timeline(
         usual = float(np.median(selection.sharpness)) if len(selection.sharpness) else 0.0
         curves.insert(2 if curves else 0, _Curve("sharpness", selection.sharpness / max(usual, 1e-12)))
         if path is None:
-            times = np.linspace(*span_s, len(selection.sharpness)) if len(selection.sharpness) else times
+            times = _times_without_path(inputs, camera, span_s, len(selection.sharpness))
     if len(times) == 0:
         return ""
     parts, top = [], 4.0
@@ -127,6 +127,27 @@ def draw_camera_timeline(
         data_start=f"{span_s[0]:.6f}",
         data_end=f"{span_s[1]:.6f}",
     )
+
+
+def _times_without_path(
+    inputs: ReportInputs, camera: str, span_s: tuple[float, float], count: int
+) -> FloatArray:
+    """Return the common times (seconds) of the frames of a camera that has no trajectory.
+
+    The times are those of the camera's video. If the video cannot be opened, the frames are spread evenly
+    over the time axis.
+
+    Args:
+        inputs: The results of the job.
+        camera: Camera name.
+        span_s: First and last common time of the time axis, seconds.
+        count: Number of frames of the camera.
+    """
+    if inputs.capture is not None:
+        times_ns = inputs.capture.camera(camera).times_ns
+        if len(times_ns) == count:
+            return common_times_s(inputs, camera, times_ns)
+    return np.linspace(*span_s, count)
 
 
 def column_count(detail: float) -> int:

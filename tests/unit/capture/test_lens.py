@@ -170,7 +170,7 @@ def test_one_calibration_for_all_and_one_for_each(tmp_path: Path) -> None:
     ("change", "field"),
     [
         ({"params": [420, 420, 320]}, None),
-        ({"params": [0, 420, 320, 240]}, None),
+        ({"params": [0, 420, 320, 240]}, "params.0"),
         ({"model": "PINHOL"}, "model"),
         ({"width": 0}, "width"),
         ({"width": None}, "width"),

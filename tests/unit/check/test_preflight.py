@@ -235,7 +235,7 @@ def test_a_stopped_check_does_not_wait_for_the_remaining_cameras(
     job = load_job(walk)
     checked: list[object] = []
 
-    def check_camera(_: object, config: object, __: object) -> None:
+    def check_camera(_: object, config: object, *_args: object, **_options: object) -> None:
         if config is job.capture.cameras[0]:
             raise Cancelled("stopped on request")
         checked.append(config)

@@ -249,6 +249,50 @@ def test_keyframes_are_registered_again_against_the_rest(
     assert _rms(placed, poses) < 0.01
 
 
+def test_progress_counts_the_keyframes_that_the_map_has_already(
+    built: tuple[Any, FloatArray, MappingContext, set[Any]],
+) -> None:
+    model, _, mapping, _ = built
+    reported: list[int] = []
+    watching = replace(mapping.stage, progress=lambda done, _total, _what: reported.append(done))
+    wrong = _with_moved_block(model, {ref.frame: number for ref, number in _ids(mapping).items()})
+    moved = {number for ref, number in _ids(mapping).items() if ref.frame in _MOVED}
+    re_register_images(wrong, moved, replace(mapping, stage=watching), _KEYFRAMES)
+    assert reported == [_KEYFRAMES - 2, _KEYFRAMES - 1, _KEYFRAMES]
+
+
+@pytest.mark.parametrize(("width", "error_px", "explained"), [(640, 7.0, 1), (640, 9.0, 0), (1280, 14.0, 1)])
+def test_the_limit_of_the_epipolar_error_is_scaled_with_the_image(
+    width: int, error_px: float, explained: float, tmp_path: Path
+) -> None:
+    lens = _CAMERA.scaled(width, 3 * width // 4)
+    camera = pycolmap.Camera(
+        model=lens.model, width=lens.width_px, height=lens.height_px, params=lens.params, camera_id=1
+    )
+    rng = np.random.default_rng(1)
+    points = rng.uniform((-1, -1, 3), (1, 1, 5), (50, 3))
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    with pycolmap.Database.open(str(tmp_path / DATABASE_NAME)) as database:
+        database.write_camera(camera, use_camera_id=True)
+        for number, shift in ((1, 0.0), (2, 0.5)):
+            # The second image is displaced along x. An error along y is then the distance to the epipolar
+            # line. The Sampson error divides it between both images.
+            px = lens.project(points - (shift, 0.0, 0.0))
+            px[:, 1] += np.sqrt(2) * error_px * (number - 1)
+            image = pycolmap.Image(name=f"cam/{number}", keypoints=px, camera_id=1, image_id=number)
+            database.write_image(image, use_image_id=True)
+            database.write_keypoints(number, px.astype(np.float32))
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-shift, 0.0, 0.0]))
+            model.add_image_with_trivial_frame(image, pose)
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+        geometry.inlier_matches = np.column_stack([np.arange(50), np.arange(50)]).astype(np.uint32)
+        database.write_two_view_geometry(1, 2, geometry)
+    (pair,) = evaluate_pairs(tmp_path, model)
+    assert pair.inlier_ratio == explained
+
+
 def test_transient_points_are_removed_if_enough_others_remain(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:

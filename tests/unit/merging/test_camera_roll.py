@@ -1,6 +1,7 @@
 """Cameras that are mounted sideways or upside down: selection among four rolls."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,16 @@ from bodycap_batch.merging.body_calibration.camera_roll import (
     RollSearch,
     has_unknown_roll,
     reference_roll,
+    roll_deg,
     search_rolls,
     with_roll,
 )
 from bodycap_batch.merging.body_calibration.samples import PostureHints
 from bodycap_batch.merging.cameras.track import make_track
+from bodycap_batch.merging.reporting.advice import describe_unknown_way_up, describe_vertical
+from bodycap_batch.merging.reporting.report import _inverted_cameras_report
+from bodycap_batch.merging.world.vertical import Vertical
+from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.nominal_mounts import STATED_SIGMA_RAD, nominal_mount
 from bodycap_batch.model.skeleton_presets import load_skeleton
 from tests.stages.walker import ROLES, Walk, make_inputs, make_walk, record
@@ -44,6 +50,38 @@ def _searched(inputs, tracks):
     """Search the rolls of all cameras but the reference camera, with a known vertical."""
     hints = PostureHints(vertical=UP)
     return search_rolls(inputs.skeleton, inputs.mount_by_camera(), tracks, 1.0, hints, lambda: None)
+
+
+@pytest.mark.parametrize("given", [False, True])
+@pytest.mark.parametrize("upside_down", [("torso", "left_palm", "right_palm"), ("right_palm",), ()])
+def test_cameras_upside_down_are_named_with_the_measured_roll(upside_down, given):
+    inputs, _ = _with_rolls({})
+    priors = [replace(mount, by_name=not given) for mount in inputs.mounts]
+    tilt = make_transform(so3_exp(np.array([0.1, -0.05, 0.02])), np.zeros(3))
+    solved = [
+        replace(turned, joint_from_cam=turned.joint_from_cam @ tilt)
+        for mount in inputs.mounts
+        for turned in [with_roll(mount, 180.0) if mount.camera in upside_down else mount]
+    ]
+    for prior, mount in zip(priors, solved, strict=True):
+        expected = 180.0 if mount.camera in upside_down else 0.0
+        assert abs(roll_deg(prior, mount)) == pytest.approx(expected, abs=3.0)
+    report = _inverted_cameras_report(priors, SimpleNamespace(mounts=solved))
+    if given or not upside_down:
+        assert report is None
+        return
+    assert sorted(report.rolls_deg) == sorted(upside_down)
+    assert ("(all cameras)" in report.says) == (len(upside_down) == len(priors))
+    assert "the roll from the usual mount is 179°" in report.says
+    assert all(name in report.says for name in upside_down)
+
+
+def test_it_is_said_if_nothing_shows_which_way_up_a_camera_is_mounted():
+    vertical = Vertical(UP, "map", 3.0, 0.9, sigma_deg=1.0)
+    assert describe_vertical(vertical).endswith("from the map")
+    text = describe_vertical(vertical, describe_unknown_way_up("torso"))
+    assert "torso is assumed to be mounted upright" in text
+    assert "cannot be noticed" in text
 
 
 @pytest.mark.parametrize(("camera", "roll"), [("left_palm", 90.0), ("right_palm", 180.0)])

@@ -41,6 +41,9 @@ SECOND = 1_000_000_000
         (10.0, 120.0, 15.0, 1.0),
         (40.0, 30.0, 15.0, 1.0),
         (59.0, 29.97, 12.0, 1.2),  # every third frame: 9.99 per second, played at 12
+        (59.0, 10.0, 10.0, 1.0),
+        (70.0, 10.0, 10.0, 2.0),  # 701 frames would take 70 s: every second of them
+        (600.0, 1.0, 1.0, 11.0),  # 601 frames, every eleventh of them
         (3600.0, 60.0, 12.0, 60.2),  # 216,001 frames, every 301st of them
     ],
 )
@@ -99,6 +102,8 @@ def test_of_three_videos_one_is_large_above_two_small_ones() -> None:
     first, second, third = (picture for picture, _ in lay_out_videos([4 / 3] * 3))
     assert first.width > 1.9 * second.width
     assert second.y == third.y > first.y + first.height
+    eleven = [picture for picture, _ in lay_out_videos([4 / 3] * 11)]
+    assert eleven[0].width >= max(picture.width for picture in eleven), "the first is the largest"
     five = [picture for picture, _ in lay_out_videos([4 / 3] * 5)]
     assert min(picture.width for picture in five) > 200, "none is too small to read"
     assert five[0].width > 1.9 * five[1].width, "the first is the largest"
