@@ -61,7 +61,9 @@ def decode_frames(video: VideoFile, indices: IntArray, threads: int = 0) -> Iter
 
 
 def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
-    """Decode the first frame that can be decoded.
+    """Decode the first frame that can be decoded and that has a timestamp.
+
+    If no frame has a timestamp, the first frame that can be decoded is returned.
 
     Returns:
         The frame, and a flag: True if the codec stores the frames in an order different from the order in
@@ -74,14 +76,23 @@ def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
 
     with open_container(video.path) as container:
         stream = open_stream(container, video, threads)
+        first: VideoFrame | None = None
         try:
             for frame in container.decode(stream):
-                return frame, bool(stream.codec_context.has_b_frames)
+                first = frame if first is None or frame.pts is not None else first
+                if frame.pts is not None:
+                    break
         except av.error.FFmpegError as error:
-            raise CaptureError(
-                f"none of its frames can be decoded ({error_reason(error)})", path=video.path, hint=COPY_AGAIN
-            ) from error
-    raise CaptureError("none of its frames can be decoded", path=video.path, hint=COPY_AGAIN)
+            if first is None:
+                raise CaptureError(
+                    f"none of its frames can be decoded ({error_reason(error)})",
+                    path=video.path,
+                    hint=COPY_AGAIN,
+                ) from error
+        is_reordered = bool(stream.codec_context.has_b_frames)
+    if first is None:
+        raise CaptureError("none of its frames can be decoded", path=video.path, hint=COPY_AGAIN)
+    return first, is_reordered
 
 
 def open_stream(container: InputContainer, video: VideoFile, threads: int = 0) -> VideoStream:

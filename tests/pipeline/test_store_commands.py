@@ -15,6 +15,8 @@ import pytest
 
 from bodycap_batch.core.errors import Cancelled, StoreError
 from bodycap_batch.pipeline import Settings, explain_job, run_job
+from bodycap_batch.pipeline.why import _reason
+from bodycap_batch.runner import Task
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 from bodycap_batch.store.garbage_collection import collect_garbage
 from bodycap_batch.store.references import References, in_use, moving
@@ -136,6 +138,40 @@ def test_why_names_the_change_and_what_follows(
     if later is not None:
         assert [name for name, why in found.items() if why.startswith("after ")] == later
     assert done.executed() == [], "asking computes nothing"
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "expected"),
+    [
+        (
+            {"body": {"height_m": 1.7, "mounts": []}},
+            {"body": None},
+            "the body was used before, but is not used now",
+        ),
+        (
+            {"body": None},
+            {"body": {"height_m": 1.7, "mounts": []}},
+            "the body is used now, but was not used before",
+        ),
+        ({"merge": None}, {"merge": "a"}, "the motion is used now, but was not used before"),
+        ({"body": {"height_m": 1.7}}, {"body": {"height_m": 1.8}}, "the body: height_m changed"),
+        ({"map": "a"}, {"map": "b"}, "the map changed"),
+        ({"previous": "a"}, {"previous": "b"}, "the result of the previous round changed"),
+        ({"keyframes": {"torso": "a"}}, {"keyframes": {"torso": "b"}}, "the keyframes of torso changed"),
+        ({"keyframes": {}}, {"keyframes": {"torso": "b"}}, "the keyframes of torso changed"),
+    ],
+)
+def test_why_describes_a_changed_input(
+    tmp_path: Path, before: dict[str, Any], now: dict[str, Any], expected: str
+) -> None:
+    store = Store(tmp_path)
+    keys = [
+        ArtefactKey(stage="export", algorithm="1", options={}, inputs=inputs, libraries={})
+        for inputs in (before, now)
+    ]
+    with store.draft(keys[0]) as draft:
+        store.commit(draft, keys[0], {})
+    assert _reason(Task(key=keys[1]), store) == expected
 
 
 def test_why_lists_the_preview_that_runs_beside_the_export(done: Bench) -> None:
