@@ -119,7 +119,7 @@ class CheckReport:
         """Return the report as text for the user."""
         out = [line for camera in self.cameras for line in camera.lines()]
         out += [f"note: {note}" for note in self.notes]
-        out += [f"problem: {error}" for error in self.errors]
+        out += [line for error in self.errors for line in f"problem: {error}".split("\n")]
         for number, sentence in enumerate(self.advice, start=1):
             mark = f"advice {number}: "
             out += textwrap.wrap(

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.terminal import print_line
 
 
 @app.command()
@@ -30,10 +31,10 @@ def init(
 
     path = write_job_template(folder, replace=force)
     text = path.read_text(encoding="utf-8")
-    typer.echo(f"wrote {path}")
+    print_line(f"wrote {path}")
     missing = text.count(UNKNOWN_MOUNT)
     if missing:
-        typer.echo(
+        print_line(
             f"fill in `mount:`, the place on the body, of {missing} camera{'s' if missing > 1 else ''}, then"
         )
-    typer.echo(f"next: bodycap check {shlex.quote(str(path))}")
+    print_line(f"next: bodycap check {shlex.quote(str(path))}")

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bodycap_batch.core.errors import BodycapError, Cancelled, JobError, error_from_dict
+from bodycap_batch.core.errors import BodycapError, Cancelled, JobError, StoreError, error_from_dict
 from bodycap_batch.runner import CHILD_COMMAND, Task, TaskEnvironment
 from bodycap_batch.runner.child_pool import STOPPED
 from bodycap_batch.runner.remote import remote_order, run_order
@@ -301,9 +301,9 @@ def _dask_error(failure: BaseException, task: Task, environment: TaskEnvironment
     return BodycapError(f"{task.label}: {type(failure).__name__}: {failure}", path=log, hint=hint)
 
 
-def _lost(task: Task) -> BodycapError:
+def _lost(task: Task) -> StoreError:
     """Return the error of a task for the case that the scheduler can no longer be reached."""
-    return BodycapError(
+    return StoreError(
         f"{task.label}: the scheduler was lost",
         hint="start the scheduler and the same batch again; finished stages are kept",
     )

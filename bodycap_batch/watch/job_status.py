@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import threading
 import time
@@ -15,6 +14,7 @@ from typing import Any, Literal
 from bodycap_batch.core.errors import BodycapError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import disk_errors
+from bodycap_batch.store.checked_json import checked_json, parse_checked_json
 from bodycap_batch.watch.spool import JobDir
 
 State = Literal["claimed", "running", "stopped", "done", "failed", "cancelled"]
@@ -152,7 +152,7 @@ class JobStatusFile:
             return
         temporary = self._job.path / f".status.{os.getpid()}.{threading.get_ident()}.part"
         with disk_errors(self._job.path):
-            temporary.write_text(json.dumps(self.document, indent=1) + "\n", encoding="utf-8")
+            temporary.write_text(checked_json(self.document), encoding="utf-8")
             os.replace(temporary, self._job.status)
 
     def _log(self, event: Event) -> None:
@@ -181,14 +181,12 @@ def read_status(job: JobDir, *, strict: bool = False) -> dict[str, Any]:
             this case.
     """
     try:
-        found = json.loads(job.status.read_text(encoding="utf-8"))
+        found = parse_checked_json(job.status.read_bytes())
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return {}
     except OSError:
         if strict:
             raise
-        return {}
-    if not isinstance(found, dict):
         return {}
     return {
         name: value for name, value in found.items() if isinstance(value, _FIELD_TYPES.get(name, (object,)))

@@ -18,6 +18,7 @@ from bodycap_batch.pipeline import Settings, explain_job, run_job
 from bodycap_batch.pipeline.why import _reason
 from bodycap_batch.runner import Task
 from bodycap_batch.store.artefacts import ArtefactKey, Store
+from bodycap_batch.store.digests import _entry_text
 from bodycap_batch.store.garbage_collection import collect_garbage
 from bodycap_batch.store.references import References, in_use, moving
 from bodycap_batch.tasks.order import StageName, stages_from
@@ -303,7 +304,7 @@ def test_damage_that_the_file_system_does_not_tell_is_found_when_the_artefact_is
     identity = (stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
     name = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
     (store.root / "digests").mkdir(exist_ok=True)
-    (store.root / "digests" / name).write_text(manifest["files"]["made_of.txt"])
+    (store.root / "digests" / name).write_bytes(_entry_text(name, manifest["files"]["made_of.txt"]))
     assert done.executed() == [], "looked up, it seems sound"
     with pytest.raises(StoreError, match="damaged") as caught:
         done.run(merge={"max_gap_s": 0.5})
