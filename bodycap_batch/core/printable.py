@@ -6,7 +6,8 @@ import unicodedata
 
 _ESCAPED_CATEGORIES = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 """Unicode categories of the characters that are escaped: control characters (ESC, newline, BEL), invisible
-format characters (changes of the text direction), unpaired surrogates, and separators of lines and paragraphs."""
+format characters (changes of the text direction), unpaired surrogates, and separators of lines and
+paragraphs."""
 _JOINERS = "\u200c\u200d"
 """Format characters that are not escaped, because some scripts need them: ZERO WIDTH NON-JOINER and ZERO
 WIDTH JOINER."""

@@ -92,6 +92,22 @@ def test_a_scheduler_lost_during_a_request_is_reported(
         make(client, tmp_path, [])
 
 
+@pytest.mark.parametrize("what", ["run_on_scheduler", "subscribe_topic", "submit"])
+def test_a_scheduler_lost_at_any_request_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError("the connection is closed")
+
+    client = Client()
+    monkeypatch.setattr(client, what, fail)
+    monkeypatch.setattr(dask_cluster, "_connect", lambda _: client)
+    with pytest.raises(StoreError, match="the scheduler was lost") as caught:
+        make(client, tmp_path, [])
+    assert caught.value.exit_code == 5
+    assert "start the scheduler" in str(caught.value.hint)
+
+
 def test_a_scheduler_lost_before_the_answer_is_read_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
