@@ -12,6 +12,7 @@ from types import NoneType
 from typing import Any, Literal
 
 from bodycap_batch.core.errors import BodycapError
+from bodycap_batch.core.printable import printable
 from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import disk_errors
 from bodycap_batch.store.checked_json import checked_json, parse_checked_json
@@ -164,12 +165,13 @@ class JobStatusFile:
 
 
 def append_log(job: JobDir, text: str) -> None:
-    """Add a line to the job's log."""
+    """Add a line, or several lines, to the job's log. Special characters are escaped."""
+    lines = "\n".join(map(printable, text.split("\n")))
     if job.path.is_dir():
         with disk_errors(job.path):
             job.log.parent.mkdir(parents=True, exist_ok=True)
             with job.log.open("a", encoding="utf-8", errors="backslashreplace") as stream:
-                stream.write(f"{utc_text()} {text}\n")
+                stream.write(f"{utc_text()} {lines}\n")
 
 
 def read_status(job: JobDir, *, strict: bool = False) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from bodycap_batch.core.printable import printable
 from bodycap_batch.core.progress import Event
 from bodycap_batch.pipeline.batch import BatchJob, Outcome, _outcome
 from bodycap_batch.store import Store
-from bodycap_batch.watch.job_status import JobStatusFile
+from bodycap_batch.watch.job_status import JobStatusFile, append_log
 from bodycap_batch.watch.spool import JobDir
 from tests.pipeline.spools import SpoolFixture
 
@@ -90,6 +90,15 @@ def test_no_name_in_the_spool_reaches_the_terminal_as_it_is(
         captured = capfd.readouterr()
         assert is_clean(captured.out + captured.err)
         assert SHOWN in captured.err or command[0] == "fly"
+
+
+def test_names_in_the_log_of_a_job_are_escaped(tmp_path: Path) -> None:
+    job = JobDir(tmp_path / "walk")
+    job.path.mkdir()
+    append_log(job, f"failed: {JobError('wrong', path=BAD, hint=BAD)}")
+    text = job.log.read_text(encoding="utf-8")
+    assert is_clean(text)
+    assert len(text.splitlines()) == 2
 
 
 def test_names_in_the_lines_of_a_watcher_are_escaped(
