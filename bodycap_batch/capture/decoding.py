@@ -66,7 +66,9 @@ def decode_frames(
 
 
 def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
-    """Decode the first frame that can be decoded.
+    """Decode the first frame that can be decoded and that has a timestamp.
+
+    If no frame has a timestamp, the first frame that can be decoded is returned.
 
     Returns:
         The frame, and a flag: True if the codec stores the frames in an order different from the order in
@@ -79,16 +81,27 @@ def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
 
     with open_container(video.path) as container:
         stream = open_stream(container, video, threads)
+        first: VideoFrame | None = None
         try:
             for packet in container.demux(stream):
                 with contextlib.suppress(av.error.InvalidDataError):
                     for frame in stream.decode(packet):
-                        return frame, bool(stream.codec_context.has_b_frames)
+                        first = frame if first is None or frame.pts is not None else first
+                        if frame.pts is not None:
+                            break
+                if first is not None and first.pts is not None:
+                    break
         except av.error.FFmpegError as error:
-            raise CaptureError(
-                f"none of its frames can be decoded ({error_reason(error)})", path=video.path, hint=COPY_AGAIN
-            ) from error
-    raise CaptureError("none of its frames can be decoded", path=video.path, hint=COPY_AGAIN)
+            if first is None:
+                raise CaptureError(
+                    f"none of its frames can be decoded ({error_reason(error)})",
+                    path=video.path,
+                    hint=COPY_AGAIN,
+                ) from error
+        is_reordered = bool(stream.codec_context.has_b_frames)
+    if first is None:
+        raise CaptureError("none of its frames can be decoded", path=video.path, hint=COPY_AGAIN)
+    return first, is_reordered
 
 
 def open_stream(container: InputContainer, video: VideoFile, threads: int = 0) -> VideoStream:

@@ -171,7 +171,8 @@ def _with_first_frame(video: VideoFile, container_format: str, threads: int) -> 
     """Return the video with size and orientation taken from a decoded frame.
 
     The values in the container may be wrong. Frames before the first frame that can be decoded are removed
-    from the list. Such frames exist if the stream was cut between two key frames.
+    from the list. Such frames exist if the stream was cut between two key frames. If no decoded frame has a
+    timestamp, no frame is removed.
     """
     frame, reordered = first_frame(video, threads)
     video = replace(
@@ -182,5 +183,5 @@ def _with_first_frame(video: VideoFile, container_format: str, threads: int) -> 
     )
     if container_format == "avi" and reordered:
         return replace(video, is_counted=True, key_pts=video.pts[:1])
-    first = int(np.searchsorted(video.pts, frame.pts or 0))
+    first = 0 if frame.pts is None else int(np.searchsorted(video.pts, frame.pts))
     return replace(video, pts=video.pts[first:], key_pts=video.key_pts[video.key_pts >= video.pts[first]])

@@ -127,7 +127,7 @@ class CheckReport:
         out = [line for camera in self.cameras for line in camera.lines()]
         out += unused_lines(self.unused_files)
         out += [f"note: {note}" for note in self.notes]
-        out += [f"problem: {error}" for error in self.errors]
+        out += [line for error in self.errors for line in f"problem: {error}".split("\n")]
         for number, sentence in enumerate(self.advice, start=1):
             mark = f"advice {number}: "
             out += textwrap.wrap(

@@ -67,10 +67,10 @@ class MachineFinding:
     found: str
     remedy: str = ""
 
-    def line(self) -> str:
+    def lines(self) -> list[str]:
         """Return the finding as text for the user."""
         text = f"{self.state:8} {self.what}: {self.found}"
-        return f"{text}\n         -> {self.remedy}" if self.remedy else text
+        return [text, f"         -> {self.remedy}"] if self.remedy else [text]
 
 
 def examine_machine(folder: Path) -> Iterator[MachineFinding]:

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 import bodycap_batch
+from bodycap_batch.cli.terminal import print_line
 
 # The help is plain text: formatting it with rich would double the time of `--help`.
 app = typer.Typer(
@@ -21,7 +22,7 @@ app = typer.Typer(
 
 def _print_version(is_requested: bool) -> None:
     if is_requested:
-        typer.echo(f"bodycap {bodycap_batch.__version__}")
+        print_line(f"bodycap {bodycap_batch.__version__}")
         raise typer.Exit
 
 
@@ -46,5 +47,5 @@ def _options(
       0 done            3 unusable video or calibration    70 a bug
       2 wrong job or    4 the videos are not sufficient    130 or 143 stopped; run it
         command line      for a result                       again to continue
-                        5 disk or store
+                        5 disk, store or cluster
     """  # noqa: D301 - \b keeps lines as they are

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import re
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +23,9 @@ from bodycap_batch.cli.shared_options import (
     results_folder,
 )
 from bodycap_batch.cli.signals import event_on_signal
+from bodycap_batch.cli.terminal import print_json, print_line, print_message, print_messages
 from bodycap_batch.core.errors import Cancelled, JobError
+from bodycap_batch.core.printable import printable
 from bodycap_batch.core.progress import Event
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def _with_worker_note(cluster: Cluster) -> Cluster:
     the failure itself.
     """
     if not cluster.workers():
-        sys.stderr.write("no worker is connected yet; the batch starts when one connects\n")
+        print_message("no worker is connected yet; the batch starts when one connects")
     for name in ("distributed", "distributed.client", "distributed.core"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # after the import of Dask, which sets the levels
     return cluster
@@ -199,7 +199,7 @@ class _BatchReporter:
             if self._as_json:
                 self._write_json({"job": str(job), **event.to_dict()})
             elif event.kind != "progress":
-                self._write_line(f"{_shown_name(job)}: {text_from_event(event)}")
+                self._write(printable(f"{_shown_name(job)}: {text_from_event(event)}"))
 
         return listen
 
@@ -208,9 +208,10 @@ class _BatchReporter:
         if self._as_json:
             self._write_json({"kind": "job", **outcome.to_dict()})
         elif outcome.error is not None:
-            self._write_line(f"{_shown_name(outcome.job.path)}: {outcome.error}")
+            name = printable(_shown_name(outcome.job.path))
+            self._write(f"{name}: {outcome.error}")
             for note in getattr(outcome.error, "__notes__", []):
-                self._write_line(note)
+                self._write(note)
         return outcome
 
     def print_summary(self, jobs: Sequence[BatchJob], outcomes: Sequence[Outcome]) -> None:
@@ -218,21 +219,19 @@ class _BatchReporter:
         if self._as_json:
             return
         found = {outcome.job: outcome for outcome in outcomes}
-        width = max(len(_shown_name(job.path)) for job in jobs)
+        width = max(len(printable(_shown_name(job.path))) for job in jobs)
         for job in jobs:
-            typer.echo(f"{_shown_name(job.path):{width}}  {_outcome_text(found[job])}")
+            print_line(f"{printable(_shown_name(job.path)):{width}}  {_outcome_text(found[job])}")
         failed = sum(outcome.exit_code != 0 for outcome in outcomes)
-        typer.echo(f"{len(jobs) - failed} of {len(jobs)} jobs done")
+        print_line(f"{len(jobs) - failed} of {len(jobs)} jobs done")
 
-    def _write_line(self, text: str) -> None:
+    def _write(self, text: str) -> None:
         with self._lock:
-            sys.stderr.write(f"{time.strftime('%H:%M:%S')} {text}\n")
-            sys.stderr.flush()
+            print_messages(f"{time.strftime('%H:%M:%S')} {text}")
 
     def _write_json(self, values: dict[str, Any]) -> None:
         with self._lock:
-            sys.stdout.write(json.dumps(values) + "\n")
-            sys.stdout.flush()
+            print_json(values)
 
 
 def _shown_name(job: Path) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 import tempfile
 from enum import StrEnum
 from pathlib import Path
@@ -14,6 +13,7 @@ import typer
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.progress_display import make_progress_display
 from bodycap_batch.cli.signals import event_on_signal
+from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.progress import Event
 
@@ -98,7 +98,8 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
     write_preview(result, preview)
     if not json_progress:
         lines = [*result.lines(), f"calibration: {target.resolve()}", f"preview: {preview.resolve()}"]
-        sys.stdout.write("\n".join(lines) + "\n")
+        for line in lines:
+            print_line(line)
 
 
 def _board_size(

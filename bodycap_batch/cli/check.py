@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated
 
 import typer
 
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.shared_options import HeightOption, JobArgument, OutOption, SkeletonOption
+from bodycap_batch.cli.terminal import print_json, print_line
 
 
 @app.command()
@@ -33,8 +33,8 @@ def check(
 
     report = check_path(job, Overrides(out=out, skeleton=skeleton, height_m=height))
     if as_json:
-        typer.echo(json.dumps(report.to_dict(), indent=1))
+        print_json(report.to_dict(), indent=1)
     else:
         for line in report.lines():
-            typer.echo(line)
+            print_line(line)
     raise typer.Exit(report.exit_code)

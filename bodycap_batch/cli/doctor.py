@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.terminal import print_json, print_line
 from bodycap_batch.core.errors import StoreError
 
 
@@ -34,11 +34,12 @@ def doctor(
     for finding in examine_machine(out):
         findings.append(finding)
         if not as_json:
-            typer.echo(finding.line())
+            for line in finding.lines():
+                print_line(line)
     problems = [finding.what for finding in findings if finding.state == "problem"]
     if as_json:
-        typer.echo(json.dumps([dataclasses.asdict(finding) for finding in findings], indent=1))
+        print_json([dataclasses.asdict(finding) for finding in findings], indent=1)
     else:
-        typer.echo(f"problems: {', '.join(problems)}" if problems else "this machine can run jobs")
+        print_line(f"problems: {', '.join(problems)}" if problems else "this machine can run jobs")
     if problems:
         raise typer.Exit(StoreError.exit_code)

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.terminal import print_json, print_line
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.percent import format_percent
 
@@ -77,7 +78,11 @@ def evaluate(
             hint="name two .tum files, two .bvh files, or two folders with .tum files of the same names",
         )
     values = {name: report.to_dict() for name, report in reports.items()}
-    typer.echo(json.dumps(values, indent=1) if as_json else "\n".join(_table_lines(values)))
+    if as_json:
+        print_json(values, indent=1)
+        return
+    for line in _table_lines(values):
+        print_line(line)
 
 
 def _evaluate_trajectories(

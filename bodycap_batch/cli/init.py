@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.core.errors import CaptureError, JobError
 
 
@@ -33,15 +34,15 @@ def init(
 
     path = write_job_template(folder, replace=force)
     text = path.read_text(encoding="utf-8")
-    typer.echo(f"wrote {path}")
+    print_line(f"wrote {path}")
     try:
         for line in overview_lines(path):
-            typer.echo(line)
+            print_line(line)
     except (JobError, CaptureError) as error:
-        typer.echo(f"problem: {error}")
+        print_line(f"problem: {error}")
     missing = text.count(UNKNOWN_MOUNT)
     if missing:
-        typer.echo(
+        print_line(
             f"fill in `mount:`, the place on the body, of {missing} camera{'s' if missing > 1 else ''}, then"
         )
-    typer.echo(f"next: bodycap check {shlex.quote(str(path))}")
+    print_line(f"next: bodycap check {shlex.quote(str(path))}")

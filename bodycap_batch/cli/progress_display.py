@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import threading
 import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
 
+from bodycap_batch.cli.terminal import print_json, print_timed_message
 from bodycap_batch.core.percent import format_percent
+from bodycap_batch.core.printable import printable
 from bodycap_batch.core.progress import Event
 
 if TYPE_CHECKING:
@@ -59,8 +60,7 @@ class JsonLines:
     def __call__(self, event: Event) -> None:
         """Print one event."""
         with self._lock:
-            sys.stdout.write(json.dumps(event.to_dict()) + "\n")
-            sys.stdout.flush()
+            print_json(event.to_dict())
 
 
 class ProgressLines:
@@ -82,13 +82,9 @@ class ProgressLines:
             if event.kind == "progress":
                 pace = self._pace.setdefault(f"{event.label} {event.what}", _LinePacer())
                 if (text := pace.line(event)) is not None:
-                    self._write(text)
+                    print_timed_message(text)
             else:
-                self._write(text_from_event(event))
-
-    def _write(self, text: str) -> None:
-        sys.stderr.write(f"{time.strftime('%H:%M:%S')} {text}\n")
-        sys.stderr.flush()
+                print_timed_message(text_from_event(event))
 
 
 class _LinePacer:
@@ -143,14 +139,16 @@ class ProgressBars:
         """Update the bar of the event's stage and camera."""
         with self._lock:
             if event.kind == "note":
-                self._progress.console.print(event.what, highlight=False)
+                self._progress.console.print(printable(event.what), highlight=False, markup=False)
                 return
             bar = self._bars.get(event.label)
             if bar is None:
-                bar = self._progress.add_task(event.label, total=None, what="")
+                bar = self._progress.add_task(printable(event.label), total=None, what="")
                 self._bars[event.label] = bar
             if event.kind == "progress":
-                self._progress.update(bar, completed=event.done, total=event.total or None, what=event.what)
+                self._progress.update(
+                    bar, completed=event.done, total=event.total or None, what=printable(event.what)
+                )
             elif event.kind != "started":
                 self._close(bar, event)
 
@@ -190,10 +188,10 @@ def _make_rich_progress() -> Progress:
             return Text(f"{int(task.completed)}/{int(task.total or 0)}" if known else "")
 
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=30),
         Count(),
-        TextColumn("{task.fields[what]}"),
+        TextColumn("{task.fields[what]}", markup=False),
         Rate(),
         TimeRemainingColumn(compact=True, elapsed_when_finished=False),
         console=Console(stderr=True),

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import typer
-
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.progress_display import make_progress_display
 from bodycap_batch.cli.shared_options import (
@@ -20,6 +18,7 @@ from bodycap_batch.cli.shared_options import (
     results_folder,
 )
 from bodycap_batch.cli.signals import event_on_signal
+from bodycap_batch.cli.terminal import print_line
 
 
 @app.command()
@@ -57,7 +56,7 @@ def report(
             cancelled=stop.is_set,
         )
         path = remake_report(resolved, out_dir=out_dir, settings=settings)
-    typer.echo(f"report: {path}")
+    print_line(f"report: {path}")
 
 
 def job_from_path(path_argument: Path) -> tuple[Path, Path | None]:

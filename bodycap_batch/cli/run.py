@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +24,7 @@ from bodycap_batch.cli.shared_options import (
     results_folder,
 )
 from bodycap_batch.cli.signals import event_on_signal
+from bodycap_batch.cli.terminal import print_json, print_line
 from bodycap_batch.core.errors import BodycapError, JobError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.tasks.order import STAGE_ORDER, StageName, stages_from
@@ -121,25 +120,25 @@ def _report_errors_as_json(display: ProgressDisplay) -> Iterator[None]:
         yield
     except BodycapError as error:
         if isinstance(display, JsonLines):
-            sys.stdout.write(json.dumps({"kind": "error", **error.to_dict()}) + "\n")
+            print_json({"kind": "error", **error.to_dict()})
         raise
 
 
 def _print_summary(summary: RunSummary, job: Job, display: ProgressDisplay, *, verbose: bool) -> None:
     if isinstance(display, JsonLines):
         last = {"kind": "done", "out_dir": str(summary.out_dir), "files": list(summary.files)}
-        sys.stdout.write(json.dumps({**last, "executed": summary.executed}) + "\n")
+        print_json({**last, "executed": summary.executed})
         return
     if verbose:
         for stage in summary.stages:
             cost = f"{stage.seconds:8.1f} s {stage.peak_memory_mb:7.0f} MB"
-            typer.echo(f"{cost}  {stage.stage} {stage.camera}{' (kept)' if stage.reused else ''}".rstrip())
+            print_line(f"{cost}  {stage.stage} {stage.camera}{' (kept)' if stage.reused else ''}".rstrip())
     if not summary.files:
         # Report the last stage with a name that the user knows. Stages such as rig and recover belong to
         # registration.
         reached = next(stage.stage for stage in reversed(summary.stages) if stage.stage in STAGE_ORDER)
-        typer.echo(f"{job.name}: stopped after {reached}, as requested; run it again for the rest")
+        print_line(f"{job.name}: stopped after {reached}, as requested; run it again for the rest")
         return
     if summary.executed == 0:
-        typer.echo(f"{job.name}: nothing to do, all {len(summary.stages)} stages were finished before")
-    typer.echo(f"results: {summary.out_dir}")
+        print_line(f"{job.name}: nothing to do, all {len(summary.stages)} stages were finished before")
+    print_line(f"results: {summary.out_dir}")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.terminal import print_json, print_line
 from bodycap_batch.core.errors import JobError
 
 if TYPE_CHECKING:
@@ -54,9 +55,7 @@ def skeleton(
     rig, motion = read_rig(file, options)
     if as_json:
         joints = [dataclasses.asdict(line) for line in describe_joints(rig)]
-        typer.echo(
-            json.dumps({"joints": joints, "missing": missing_roles(rig)}, indent=1, ensure_ascii=False)
-        )
+        print_json({"joints": joints, "missing": missing_roles(rig)}, indent=1)
         return
     for line in (
         *_heading_lines(file, rig, motion, tpose_frame),
@@ -65,7 +64,7 @@ def skeleton(
         "",
         *_closing_lines(rig, options),
     ):
-        typer.echo(line)
+        print_line(line)
 
 
 def _parse_roles(words: list[str]) -> dict[str, str]:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.terminal import print_json, print_line
 from bodycap_batch.core.percent import format_percent
+from bodycap_batch.core.printable import printable
 
 if TYPE_CHECKING:
     from bodycap_batch.watch import JobRow, Spool
@@ -54,14 +54,14 @@ def status(
             "jobs": [row.to_dict() for row in rows],
             "watchers": [watcher.to_dict() for watcher in watchers],
         }
-        _print(json.dumps(found, indent=1))
+        print_json(found, indent=1)
         return
     for line in _job_table(rows):
-        _print(line)
+        print_line(line)
     for watcher in watchers:
-        _print(str(watcher))
+        print_line(str(watcher))
     if not watchers and any(row.state in ("waiting", "interrupted", "stopped") for row in rows):
-        _print(f"no watcher runs here: `bodycap watch {watched.inbox}` starts one")
+        print_line(f"no watcher runs here: `bodycap watch {watched.inbox}` starts one")
 
 
 @app.command()
@@ -76,7 +76,7 @@ def retry(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.watch import retry_job
 
-    _print(f"back in the inbox: {retry_job(_find_spool(spool), name)}")
+    print_line(f"back in the inbox: {retry_job(_find_spool(spool), name)}")
 
 
 @app.command()
@@ -91,11 +91,11 @@ def cancel(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
 
     place = cancel_job(_find_spool(spool), name)
     if place is None:
-        _print(f"{name}: no watcher has stopped the job yet; the next active watcher cancels the job")
+        print_line(f"{name}: no watcher has stopped the job yet; the next active watcher cancels the job")
     elif (state := read_status(place).get("state")) != "cancelled":
-        _print(f"{name}: the job ended before it could be stopped: {state}, {place.path}")
+        print_line(f"{name}: the job ended before it could be stopped: {state}, {place.path}")
     else:
-        _print(f"cancelled: {place.path}")
+        print_line(f"cancelled: {place.path}")
 
 
 def _find_spool(path: Path) -> Spool:
@@ -115,9 +115,18 @@ def _job_table(rows: list[JobRow]) -> list[str]:
     cells = [("JOB", "STATE", "STAGE", "PROGRESS", "AGE", "")]
     for row in rows:
         progress = "" if row.progress is None else format_percent(row.progress)
-        cause = " ".join(row.cause.split())
+        cause = printable(" ".join(row.cause.split()))
         cause = cause if len(cause) <= _MAX_CAUSE_LENGTH else f"{cause[: _MAX_CAUSE_LENGTH - 1]}…"
-        cells.append((row.name, row.state, row.stage, progress, _age_text(row.age_s), cause))
+        cells.append(
+            (
+                printable(row.name),
+                printable(row.state),
+                printable(row.stage),
+                progress,
+                _age_text(row.age_s),
+                cause,
+            )
+        )
     widths = [max(len(line[column]) for line in cells) for column in range(5)]
     lines = [
         "  ".join(f"{part:{width}}" for part, width in zip(line, widths, strict=False)) for line in cells
@@ -132,8 +141,3 @@ def _age_text(seconds: float | None) -> str:
         if seconds >= size:
             return f"{seconds / size:.0f} {unit}"
     return f"{max(seconds, 0.0):.0f} s"
-
-
-def _print(text: str) -> None:
-    encoding = sys.stdout.encoding or "utf-8"
-    typer.echo(text.encode(encoding, "backslashreplace").decode(encoding))

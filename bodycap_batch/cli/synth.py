@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ from bodycap_batch.cli.application import app
 from bodycap_batch.cli.progress_display import make_progress_display
 from bodycap_batch.cli.shared_options import ThreadsOption, cores
 from bodycap_batch.cli.signals import event_on_signal
+from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.progress import Event
 
@@ -85,7 +85,7 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
         )
         synthesise(options, out, context)
     if not json_progress:
-        sys.stdout.write(f"capture: {out.resolve()}\n")
+        print_line(f"capture: {out.resolve()}")
 
 
 def _parse_size(text: str | None) -> dict[str, int]:

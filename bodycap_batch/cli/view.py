@@ -18,6 +18,7 @@ from bodycap_batch.cli.shared_options import (
     default_store,
     results_folder,
 )
+from bodycap_batch.cli.terminal import print_line, print_message
 from bodycap_batch.core.errors import BodycapError, JobError
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def view(
     store = store or default_store(out_dir)
     if rerun is not None:
         write_recording(_stored_inputs(resolved, out_dir, store), rerun)
-        typer.echo(f"recording: {rerun}")
+        print_line(f"recording: {rerun}")
         return
     page = next((out_dir / name for name in _REPORT_FILES if (out_dir / name).is_file()), None)
     if page is None:
@@ -79,7 +80,7 @@ def view(
         port,
     )
     address = f"http://{LOOPBACK}:{server.server_port}/report.html?videos"
-    typer.echo(f"{address}  (Ctrl-C ends the server)")
+    print_line(f"{address}  (Ctrl-C ends the server)")
     if browser:
         webbrowser.open(address)
     with server:
@@ -129,5 +130,5 @@ class _StoredMarks:
             if inputs.registrations:
                 return FrameOverlays(inputs)
             reason = "the store no longer holds this job's camera paths (run it again)"
-        typer.echo(f"points and skeleton are drawn over the stored pictures only: {reason}", err=True)
+        print_message(f"points and skeleton are drawn over the stored pictures only: {reason}")
         return None

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +13,7 @@ import typer
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.shared_options import ThreadsOption, WatchStoreOption, cores
 from bodycap_batch.cli.signals import event_on_signal, signal_exit_code
+from bodycap_batch.cli.terminal import print_timed_message
 
 if TYPE_CHECKING:
     from bodycap_batch.watch import Watcher, WatchOptions
@@ -118,12 +117,12 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
         once=once,
     )
     with event_on_signal() as stop:
-        watcher = Watcher(spool, options, _write_line)
-        _write_line(f"watching {spool.inbox}; results go to {spool.done}")
+        watcher = Watcher(spool, options, print_timed_message)
+        print_timed_message(f"watching {spool.inbox}; results go to {spool.done}")
         with _live_page(watcher, options, web, web_token):
             worst = _run(watcher, stop)
     if stop.is_set():
-        _write_line("stopped; running jobs continue at the next start")
+        print_timed_message("stopped; running jobs continue at the next start")
         raise typer.Exit(signal_exit_code())
     raise typer.Exit(worst)
 
@@ -149,7 +148,7 @@ def _live_page(watcher: Watcher, options: WatchOptions, address: str | None, tok
 
     access, limits = access_from_address(address, token), options.permissions.limits
     with LivePage(watcher.spool, access, limits, lambda: watcher.access_failures.text) as page:
-        _write_line(f"live page: {page.access.url}{'?token=TOKEN' if page.access.token else ''}")
+        print_timed_message(f"live page: {page.access.url}{'?token=TOKEN' if page.access.token else ''}")
         yield
 
 
@@ -159,9 +158,3 @@ def _existing_folder(path: Path) -> Path:
     if not path.is_dir():
         raise JobError("there is no such folder", path=path, field="--root", hint="name an existing folder")
     return path.resolve()
-
-
-def _write_line(text: str) -> None:
-    line = f"{time.strftime('%H:%M:%S')} {text}\n"
-    sys.stderr.write(line.encode(errors="backslashreplace").decode())
-    sys.stderr.flush()

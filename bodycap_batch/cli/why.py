@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import asdict
 from pathlib import Path
@@ -23,6 +22,7 @@ from bodycap_batch.cli.shared_options import (
     default_store,
     results_folder,
 )
+from bodycap_batch.cli.terminal import print_json, print_line
 from bodycap_batch.core.errors import StoreError
 
 
@@ -58,13 +58,13 @@ def why(
     )
     steps = explain_job(resolved, out_dir=out_dir, settings=settings)
     if as_json:
-        typer.echo(json.dumps([step.to_dict() for step in steps], indent=1))
+        print_json([step.to_dict() for step in steps], indent=1)
         return
     width = max(len(step.stage) for step in steps)
     for step in steps:
-        typer.echo(f"{step.stage:{width}}  {'stored' if step.stored else f'would run: {step.reason}'}")
+        print_line(f"{step.stage:{width}}  {'stored' if step.stored else f'would run: {step.reason}'}")
     if all(step.stored for step in steps):
-        typer.echo("nothing to do")
+        print_line("nothing to do")
 
 
 @app.command()
@@ -95,14 +95,14 @@ def gc(
         raise StoreError("there is no store", path=store_dir, hint="name its folder: bodycap gc FOLDER")
     garbage = collect_garbage(Store(store_dir), delete=delete)
     if as_json:
-        typer.echo(json.dumps({**asdict(garbage), "deleted": delete}, indent=1))
+        print_json({**asdict(garbage), "deleted": delete}, indent=1)
         return
     for name in (*garbage.artefacts, *(f"corrupt/{name}" for name in garbage.corrupt)):
-        typer.echo(name)
+        print_line(name)
     for owner in garbage.gone:
-        typer.echo(f"results that no longer exist: {owner or 'an unreadable list'}")
+        print_line(f"results that no longer exist: {owner}")
     count, size = len(garbage.artefacts) + len(garbage.corrupt), f"{garbage.freed_bytes / 1e6:.1f} MB"
     verb = "removed" if delete else "would remove"
-    typer.echo(
+    print_line(
         f"{verb} {count} of {count + garbage.kept}, {size}{'' if delete else ' (--delete removes them)'}"
     )

@@ -60,7 +60,7 @@ def job_error(
     """
     ordered = sorted(problems, key=lambda p: (source.line_of(p.location) or 0) if source else 0)
     first, further = ordered[0], ordered[1 : 1 + _MAX_FURTHER]
-    also = "".join(f"\n  also {_place(p, source)}: {p.message}" for p in further)
+    also = "".join(f"; also {_place(p, source)}: {p.message}" for p in further)
     return JobError(
         first.message + also,
         path=path,

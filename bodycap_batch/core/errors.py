@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from bodycap_batch.core.printable import printable
+
 EXIT_OK = 0
 """Exit code after success."""
 EXIT_BUG = 70
@@ -46,10 +48,17 @@ class BodycapError(Exception):
         self.hint = hint
 
     def __str__(self) -> str:
+        """Return the error as text for the user: one line, and a second line if there is a hint."""
+        return f"{self._first_line()}\n  hint: {printable(self.hint)}" if self.hint else self._first_line()
+
+    @property
+    def one_line(self) -> str:
+        """The error as one line: place, message, and the hint in brackets."""
+        return f"{self._first_line()} ({printable(self.hint)})" if self.hint else self._first_line()
+
+    def _first_line(self) -> str:
         where = ":".join(str(part) for part in (self.path, self.line) if part is not None)
-        parts = [part for part in (where, self.field, self.message) if part]
-        text = ": ".join(parts)
-        return f"{text}\n  hint: {self.hint}" if self.hint else text
+        return printable(": ".join(part for part in (where, self.field, self.message) if part))
 
     def to_dict(self) -> dict[str, str | int | None]:
         """Return the error as plain JSON values. `error_from_dict` restores the error in another process."""
@@ -83,7 +92,7 @@ class EstimationError(BodycapError):
 
 
 class StoreError(BodycapError):
-    """A file cannot be written, or a stored artefact is damaged."""
+    """A file cannot be written, a stored artefact is damaged, or the cluster's scheduler was lost."""
 
     exit_code = 5
 
@@ -96,6 +105,11 @@ class Cancelled(BodycapError):
     """The user stopped the work."""
 
     exit_code = EXIT_CANCELLED
+
+
+def one_line(error: Exception) -> str:
+    """Return an error as one line for the user."""
+    return error.one_line if isinstance(error, BodycapError) else printable(str(error))
 
 
 _ERROR_TYPES = {

@@ -13,12 +13,12 @@ from typing import Any
 
 from bodycap_batch.config.job import Overrides, load_job_with_origins
 from bodycap_batch.config.models import Job
-from bodycap_batch.core.errors import EXIT_BUG, BodycapError, Cancelled, DiskAway, JobError
+from bodycap_batch.core.errors import EXIT_BUG, BodycapError, Cancelled, JobError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.pipeline.run import RunSummary, run_job
 from bodycap_batch.pipeline.sample import prepare_capture
 from bodycap_batch.pipeline.settings import Settings
-from bodycap_batch.store.artefacts import store_error
+from bodycap_batch.store.artefacts import disk_error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,9 +142,9 @@ def _outcome(job: BatchJob, future: Future[RunSummary], seconds: float) -> Outco
         return Outcome(job=job, seconds=seconds, summary=future.result())
     if isinstance(failure, BodycapError):
         return Outcome(job=job, seconds=seconds, error=failure)
-    away = store_error(failure, job.path) if isinstance(failure, OSError) else None
-    if isinstance(away, DiskAway):
-        return Outcome(job=job, seconds=seconds, error=away)
+    disk = disk_error(failure, job.path) if isinstance(failure, OSError) else None
+    if disk is not None:
+        return Outcome(job=job, seconds=seconds, error=disk)
     bug = BodycapError(f"{type(failure).__name__}: {failure}", path=job.path, hint="this is a bug")
     bug.exit_code = EXIT_BUG
     bug.add_note("".join(traceback.format_exception(failure)))

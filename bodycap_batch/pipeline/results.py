@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Iterable, Mapping
@@ -11,6 +10,7 @@ from typing import Any
 
 from bodycap_batch.config.folder import RUN_FILE
 from bodycap_batch.store.artefacts import disk_errors, sync_folder
+from bodycap_batch.store.checked_json import parse_checked_json
 from bodycap_batch.store.digests import remove_abandoned, temporary_beside, write_atomically
 
 PARTIAL = "partial"
@@ -91,7 +91,7 @@ def _link_or_copy(source: Path, target: Path) -> None:
 
 def _files_of_last_run(folder: Path) -> list[str]:
     try:
-        last: Any = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+        last: Any = parse_checked_json((folder / RUN_FILE).read_bytes())
         return [str(name) for name in last["files"]]
     except (OSError, ValueError, KeyError, TypeError):
         return []

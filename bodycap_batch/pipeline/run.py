@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -26,6 +25,7 @@ from bodycap_batch.pipeline.results import (
 from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.pipeline.stage_results import StageResults
 from bodycap_batch.store.artefacts import Artefact
+from bodycap_batch.store.checked_json import checked_json
 from bodycap_batch.tasks.order import STAGE_ORDER
 from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
@@ -248,7 +248,7 @@ def _write_results(job: Job, results: StageResults, summary: RunSummary, setting
         "stages": [asdict(stage) for stage in summary.stages],
         "files": list(summary.files),
     }
-    write_results_file(out_dir, RUN_FILE, json.dumps(record, indent=1) + "\n")
+    write_results_file(out_dir, RUN_FILE, checked_json(record))
 
 
 def _versions(flow: Flow) -> dict[str, str]:

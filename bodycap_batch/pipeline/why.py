@@ -27,8 +27,16 @@ _INPUTS = {
     "body": "the body: {}",
     "extra": "the extra keyframes of {}",
 }
-"""Description of a changed input of a task, by the name of the input's field in the task's dataclass. ``{}``
-is replaced by the names of the changed parts."""
+"""Description of a changed part of an input, by the name of the input's field in the task's dataclass. ``{}``
+is replaced by the name of the part."""
+_WHOLE_INPUTS = {
+    "footage": "the search for the marker board",
+    "merge": "the motion",
+    "previous": "the result of the previous round",
+    "reach": "the distances between the cameras",
+}
+"""Description of an input as a whole, by the name of the input's field. Every other input is described by the
+name of its field."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,8 +172,27 @@ def _describe_change(name: str, before: Mapping[str, Any], now: Mapping[str, Any
         return "the program has changed"
     if kind == "libraries":
         return f"{rest} {_value_text(before, name)} -> {_value_text(now, name)}"
-    field, _, part = rest.partition(".")
-    return f"{_INPUTS.get(field, f'the {field}').format(part or 'a camera')} changed"
+    return _describe_input(*rest.partition(".")[::2], before, now)
+
+
+def _describe_input(field: str, part: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Describe a changed input.
+
+    An optional input that a task does not use is stored as one leaf with the value None.
+
+    Args:
+        field: Name of the input's field in the task's dataclass.
+        part: Dotted name of the part that changed; "" if the input has no parts.
+        before: The leaves of the stored key.
+        now: The leaves of the task's key.
+    """
+    whole = f"inputs.{field}"
+    text = _WHOLE_INPUTS.get(field, f"the {field}")
+    if whole in before and before[whole] is None:
+        return f"{text} is used now, but was not used before"
+    if whole in now and now[whole] is None:
+        return f"{text} was used before, but is not used now"
+    return f"{_INPUTS[field].format(part) if part and field in _INPUTS else text} changed"
 
 
 def _value_text(values: Mapping[str, Any], name: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -91,7 +92,7 @@ def make_server(content: ServedContent, port: int = 0) -> ThreadingHTTPServer:
         served = content
 
     try:
-        return ThreadingHTTPServer((LOOPBACK, port), Handler)
+        return _Server((LOOPBACK, port), Handler)
     except OSError as error:
         raise StoreError(
             f"port {port} cannot be used: {error.strerror}", hint="name another port with --port"
@@ -124,6 +125,18 @@ def _chapters(camera: CaptureCamera) -> list[dict[str, Any]]:
     return chapters
 
 
+class _Server(ThreadingHTTPServer):
+    """A server that reports no closed connection as an error."""
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print a traceback, except if the browser has closed the connection.
+
+        Browsers close connections when a page is left, and video players close them whenever they seek.
+        """
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
+
+
 class _Handler(BaseHTTPRequestHandler):
     """Answers GET and HEAD requests for known addresses.
 
@@ -135,21 +148,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer with headers and content."""
-        self._answer_until_closed(with_body=True)
+        self._answer(with_body=True)
 
     def do_HEAD(self) -> None:
         """Answer with headers only."""
-        self._answer_until_closed(with_body=False)
+        self._answer(with_body=False)
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the base class's name
         """Log nothing."""
-
-    def _answer_until_closed(self, *, with_body: bool) -> None:
-        # Video players close the connection whenever they seek, so a closed connection is not an error.
-        try:
-            self._answer(with_body=with_body)
-        except ConnectionError:
-            self.close_connection = True
 
     def _answer(self, *, with_body: bool) -> None:
         # A web page from the internet can send requests to this server if the page's own host name is

@@ -13,11 +13,12 @@ import os
 import threading
 import time
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bodycap_batch.core.errors import BodycapError, Cancelled, JobError, error_from_dict
+from bodycap_batch.core.errors import BodycapError, Cancelled, JobError, StoreError, error_from_dict
 from bodycap_batch.runner import CHILD_COMMAND, Task, TaskEnvironment
 from bodycap_batch.runner.child_pool import STOPPED
 from bodycap_batch.runner.remote import remote_order, run_order
@@ -70,8 +71,9 @@ class Cluster:
         self._asking = threading.Lock()
         self._largest_memory: float | None = None
         self._last_asked = -math.inf
-        self._client.subscribe_topic(self._topic, self._receive_progress)
-        self._client.run_on_scheduler(_allow_failures, _ALLOWED_FAILURES)
+        with _lost_connection():
+            self._client.subscribe_topic(self._topic, self._receive_progress)
+            self._client.run_on_scheduler(_allow_failures, _ALLOWED_FAILURES)
 
     def __enter__(self) -> Cluster:
         """Return the cluster itself."""
@@ -82,7 +84,8 @@ class Cluster:
 
     def workers(self) -> dict[str, Mapping[str, float]]:
         """Return the resources that each worker declares, by the worker's address."""
-        workers = self._client.scheduler_info()["workers"]
+        with _lost_connection():
+            workers = self._client.scheduler_info()["workers"]
         return {str(name): dict(info.get("resources") or {}) for name, info in workers.items()}
 
     def execute(self, task: Task, environment: TaskEnvironment) -> None:
@@ -102,15 +105,17 @@ class Cluster:
         with self._lock:
             self._progress[key] = environment.progress
         try:
-            future = self._client.submit(
-                _on_worker,
-                remote_order(task, environment, self._command),
-                self._topic,
-                key=key,
-                pure=False,
-                priority=task.priority,
-                resources=self._resources(task, environment),
-            )
+            resources = self._resources(task, environment)
+            with _lost_connection():
+                future = self._client.submit(
+                    _on_worker,
+                    remote_order(task, environment, self._command),
+                    self._topic,
+                    key=key,
+                    pure=False,
+                    priority=task.priority,
+                    resources=resources,
+                )
             _raise_error_in(self._wait(future, task, environment))
         finally:
             with self._lock:
@@ -126,14 +131,14 @@ class Cluster:
         Without this reservation, the task could run at the same time as other large tasks. The largest memory
         is known only after a worker has connected, so this method waits for the first worker.
         """
-        while (largest := self._largest_worker(task)) is None:
+        while (largest := self._largest_worker()) is None:
             if environment.cancelled():
                 raise Cancelled(STOPPED, hint="run it again to go on")
             environment.progress(0, 0, "waiting for a worker")
             time.sleep(_POLL_S)
         return {MEMORY: min(float(task.memory_mb), largest)} if largest else None
 
-    def _largest_worker(self, task: Task) -> float | None:
+    def _largest_worker(self) -> float | None:
         """Return the largest memory (MB) that a worker declares.
 
         Returns:
@@ -142,11 +147,8 @@ class Cluster:
         with self._asking:
             if self._largest_memory is None or time.monotonic() - self._last_asked > _WORKERS_PERIOD_S:
                 if self._client.status in _CLIENT_LEFT:
-                    raise _lost(task)
-                try:
-                    workers = self.workers().values()
-                except OSError as error:
-                    raise _lost(task) from error
+                    raise _lost()
+                workers = self.workers().values()
                 memories = (resources.get(MEMORY, 0.0) for resources in workers)
                 self._largest_memory = max(memories, default=None)
                 self._last_asked = time.monotonic()
@@ -160,15 +162,13 @@ class Cluster:
                 future.cancel()
                 raise Cancelled(STOPPED, hint="run it again to go on")
             if self._client.status in _CLIENT_LEFT:
-                raise _lost(task)
+                raise _lost()
         if future.status == "finished":
-            try:
+            with _lost_connection():  # errors of the task are in the answer
                 return dict(future.result())
-            except OSError as error:  # the connection failed: errors of the task are in the answer
-                raise _lost(task) from error
         if future.status == "error":
             raise _dask_error(future.exception(), task, environment)
-        raise _lost(task)
+        raise _lost()
 
     def _receive_progress(self, event: Any) -> None:
         message = event[1]
@@ -301,9 +301,18 @@ def _dask_error(failure: BaseException, task: Task, environment: TaskEnvironment
     return BodycapError(f"{task.label}: {type(failure).__name__}: {failure}", path=log, hint=hint)
 
 
-def _lost(task: Task) -> BodycapError:
-    """Return the error of a task for the case that the scheduler can no longer be reached."""
-    return BodycapError(
-        f"{task.label}: the scheduler was lost",
+@contextmanager
+def _lost_connection() -> Iterator[None]:
+    """Convert errors of the connection to the scheduler into `StoreError`."""
+    try:
+        yield
+    except OSError as error:
+        raise _lost() from error
+
+
+def _lost() -> StoreError:
+    """Return the error for the case that the scheduler can no longer be reached."""
+    return StoreError(
+        "the scheduler was lost",
         hint="start the scheduler and the same batch again; finished stages are kept",
     )

@@ -348,11 +348,19 @@ def store_error(error: OSError, path: Path) -> StoreError:
     return StoreError(reason, path=where, hint=hint)
 
 
+def disk_error(error: OSError, path: Path | str) -> StoreError | None:
+    """Return the `StoreError` for an operating system error that a disk caused; None for another cause."""
+    return store_error(error, Path(path)) if error.errno in DISK_ERRORS else None
+
+
 def _is_sound(path: Path) -> bool:
     """Return True if every file of an artefact has the digest given in the manifest."""
     try:
-        files = json.loads((path / MANIFEST).read_text(encoding="utf-8"))["files"]
-        return all(file_sha256(path / name) == expected for name, expected in files.items())
+        manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+        files, seal = manifest["files"], manifest.pop("seal")
+        return seal == json_digest(manifest) and all(
+            file_sha256(path / name) == expected for name, expected in files.items()
+        )
     except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
         return False
 

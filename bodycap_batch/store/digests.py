@@ -16,7 +16,8 @@ from bodycap_batch.core.errors import CaptureError
 
 _BLOCK_BYTES = 1 << 20
 """Size (bytes) of the blocks in which a file is read and hashed. Evidence: none."""
-_SHA256 = re.compile(r"[0-9a-f]{64}")
+_SHA256_DIGITS = 64
+"""Number of hexadecimal digits of a SHA-256. Origin: 256 bits, four bits per digit."""
 _TEMPORARY = re.compile(r"\.([0-9a-f]{8})\.(\d+)\.\d+\.part$")
 """Pattern of the name of a temporary file. The name ends with a code of the machine, the process id and a
 time. The code of the machine is needed because several machines may share a folder."""
@@ -92,7 +93,8 @@ class FileDigests:
     """Stores digests of large files. Device, inode, size, mtime and ctime identify the state of a file.
 
     If the bytes of a file change, its ctime changes too, and no program can set the ctime back. A stored
-    digest is therefore correct, and a finished job does not read its videos again.
+    digest is therefore correct, and a finished job does not read its videos again. Each stored digest has a
+    checksum. If the checksum does not match, the digest is computed again.
 
     Args:
         folder: Folder of the stored digests; each digest is one small file.
@@ -113,9 +115,10 @@ class FileDigests:
         """
         before = _identity(path)
         entry = self._folder / hashlib.sha256(json.dumps(before).encode()).hexdigest()
-        stored = entry.read_text() if entry.is_file() else ""
-        if _SHA256.fullmatch(stored):
-            return stored
+        stored = entry.read_bytes() if entry.is_file() else b""
+        digest = stored[:_SHA256_DIGITS].decode("ascii", "replace")
+        if stored == _entry_text(entry.name, digest):
+            return digest
         digest = file_sha256(path, on_bytes)
         if _identity(path) != before:
             raise CaptureError(
@@ -123,8 +126,13 @@ class FileDigests:
             )
         if time.time() - max(before[3], before[4]) / 1e9 > _MIN_AGE_S:
             self._folder.mkdir(parents=True, exist_ok=True)
-            write_atomically(entry, digest.encode())
+            write_atomically(entry, _entry_text(entry.name, digest))
         return digest
+
+
+def _entry_text(name: str, digest: str) -> bytes:
+    """Return the content of the file `name` of a stored digest: the digest, and a checksum of both."""
+    return f"{digest} {hashlib.sha256(f'{name} {digest}'.encode()).hexdigest()}\n".encode()
 
 
 def _identity(path: Path) -> tuple[int, int, int, int, int]:

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from bodycap_batch.core.errors import StoreError
 from bodycap_batch.store.artefacts import Store, disk_errors
 from bodycap_batch.store.references import REFERENCES_FOLDER, locked, read_references
 
@@ -37,13 +38,11 @@ def collect_garbage(store: Store, *, delete: bool) -> Garbage:
     """Find the artefacts that no job refers to, and remove them if `delete` is True.
 
     Raises:
-        StoreError: A job is using the store, or the disk fails.
+        StoreError: A job is using the store, a list of used artefacts is damaged, or the disk fails.
     """
     busy = "a job is running on this store", "wait until it has ended"
     with locked(store, fcntl.LOCK_EX | fcntl.LOCK_NB, *busy), disk_errors(store.root):
-        lists = {
-            path: read_references(path) for path in sorted((store.root / REFERENCES_FOLDER).glob("*.json"))
-        }
+        lists = {path: _read_list(path) for path in sorted((store.root / REFERENCES_FOLDER).glob("*.json"))}
         gone = {path: places[0] for path, (places, _) in lists.items() if not any(map(_exists, places))}
         used = {name for path, (_, names) in lists.items() if path not in gone for name in names}
         found = [path for path in sorted((store.root / "artefacts").glob("*/*")) if path.is_dir()]
@@ -62,6 +61,17 @@ def collect_garbage(store: Store, *, delete: bool) -> Garbage:
                 path.unlink()
             store.sweep()
     return garbage
+
+
+def _read_list(path: Path) -> tuple[list[str], list[str]]:
+    """Return the paths and the artefacts of one folder of results. Raise `StoreError` if they are unknown."""
+    if (found := read_references(path)) is None:
+        raise StoreError(
+            "a list of used artefacts is damaged, so nothing can be removed",
+            path=path,
+            hint="run the jobs of this store again, or remove the file; its job is then computed again",
+        )
+    return found
 
 
 def _exists(place: str) -> bool:

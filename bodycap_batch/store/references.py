@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import json
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -12,6 +11,7 @@ from pathlib import Path
 
 from bodycap_batch.core.errors import StoreError
 from bodycap_batch.store.artefacts import Store, disk_errors
+from bodycap_batch.store.checked_json import checked_json, parse_checked_json
 from bodycap_batch.store.digests import json_digest, write_atomically
 
 REFERENCES_FOLDER = "references"
@@ -41,7 +41,7 @@ class References:
         self._root = store.root
         self._places = [str(place) for place in dict.fromkeys((owner.resolve(), *also))]
         self._lock = threading.Lock()
-        self.named = set(read_references(self._path)[1])
+        self.named = set((read_references(self._path) or ([], []))[1])
 
     @property
     def _path(self) -> Path:
@@ -77,7 +77,7 @@ class References:
         content = {"owner": self._places[0], "also": self._places[1:], "artefacts": sorted(self.named)}
         with disk_errors(self._root):
             self._path.parent.mkdir(exist_ok=True)
-            write_atomically(self._path, json.dumps(content, indent=1).encode())
+            write_atomically(self._path, checked_json(content).encode())
 
 
 @contextlib.contextmanager
@@ -149,14 +149,11 @@ def locked(store: Store, kind: int, refusal: str, hint: str) -> Iterator[None]:
         os.close(handle)
 
 
-def read_references(path: Path) -> tuple[list[str], list[str]]:
-    """Read the paths and the artefacts of one folder of results.
-
-    If the list is missing or damaged, return one empty path and no artefacts.
-    """
+def read_references(path: Path) -> tuple[list[str], list[str]] | None:
+    """Return the paths and the artefacts of one folder of results; None if the list is missing or damaged."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_checked_json(path.read_bytes())
         places = [content["owner"], *content.get("also", ())]
         return [str(place) for place in places], [str(name) for name in content["artefacts"]]
-    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
-        return [""], []
+    except (FileNotFoundError, ValueError, KeyError, TypeError):
+        return None

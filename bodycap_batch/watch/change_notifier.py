@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 _NETWORK_FILE_SYSTEMS = (
@@ -40,11 +40,20 @@ class ChangeNotifier:
         woken: Event that is set on every change.
         poll: True: poll the folder. False: wait for change reports of the system. None: poll the folder only
             if the folder is on a network disk, because such a disk does not report all changes.
+        write_line: Function that is called with each line for the operator.
     """
 
-    def __init__(self, folder: Path, woken: threading.Event, *, poll: bool | None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        woken: threading.Event,
+        *,
+        poll: bool | None,
+        write_line: Callable[[str], None],
+    ) -> None:
         self._folder = folder
         self._woken = woken
+        self._write_line = write_line
         self.polling = is_on_network_disk(folder) if poll is None else poll
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="changes", daemon=True)
@@ -77,7 +86,7 @@ class ChangeNotifier:
             except (OSError, RuntimeError) as error:
                 # The system has no free inotify watches, or the folder is gone. Poll the folder instead.
                 if not self.polling:
-                    sys.stderr.write(f"note: {self._folder} is polled from now on, because: {error}\n")
+                    self._write_line(f"{self._folder} is polled from now on, because: {error}")
                 self.polling = True
                 self._stop.wait(_STOP_CHECK_MS / 1000)
 

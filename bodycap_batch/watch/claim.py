@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from bodycap_batch.store.checked_json import checked_json
 from bodycap_batch.store.digests import write_atomically
 from bodycap_batch.watch.ownership import MARKER_PREFIX, Ownership, generation_marker, read_owner
 from bodycap_batch.watch.process_identity import machine_id, process_start
@@ -105,7 +106,7 @@ def write_owner(job: JobDir, token: str, generation: int, *, beat: int = 0, rele
         "machine": machine_id(),
         "process": process_start(os.getpid()),
     }
-    write_atomically(job.owner, (json.dumps(document, indent=1) + "\n").encode())
+    write_atomically(job.owner, checked_json(document).encode())
 
 
 def create_claim(job: JobDir) -> Claim:

@@ -18,12 +18,19 @@ from bodycap_batch.core.errors import Cancelled, JobError
 from bodycap_batch.store.artefacts import Store, disk_errors
 from bodycap_batch.store.references import moving
 from bodycap_batch.watch.claim import create_claim, remove_claim_files
-from bodycap_batch.watch.inbox_claim import input_path, move_to_running, path_exists, return_to_inbox
+from bodycap_batch.watch.inbox_claim import (
+    dropped_name,
+    input_path,
+    move_to_running,
+    path_exists,
+    return_to_inbox,
+)
 from bodycap_batch.watch.inbox_entries import (
     NOT_A_JOB,
     InboxEntry,
     entries_in,
     ignored_paths_in,
+    missing_content,
     take_snapshot,
 )
 from bodycap_batch.watch.job_status import FINAL, JobStatusFile, read_status, utc_text
@@ -31,6 +38,8 @@ from bodycap_batch.watch.ownership import read_owner
 from bodycap_batch.watch.process_identity import machine_id, process_start, process_tag
 from bodycap_batch.watch.spool import (
     CLAIM_PREFIX,
+    DONE,
+    FAILED,
     RETRY_PREFIX,
     JobDir,
     Spool,
@@ -41,6 +50,8 @@ from bodycap_batch.watch.spool import (
 
 _MAX_SNAPSHOT_FILES = 1000
 """Maximum number of files of a waiting entry that are inspected for the list of jobs. Evidence: none."""
+_STATE_BY_FOLDER = {DONE: "done", FAILED: "failed"}
+"""State of a job with a damaged status file, by the name of the folder that holds the job."""
 _POLL_S = 0.1
 """Time (seconds) between two checks of a job that is being cancelled. Evidence: none."""
 
@@ -120,7 +131,7 @@ def retry_job(spool: Spool, name: str) -> Path:
     with disk_errors(job.path):
         if not path_exists(input_path(job)):
             raise JobError("the job's input is gone", path=job.path, hint="drop the videos again")
-        dropped = str(read_status(job).get("dropped") or job.name)
+        dropped = dropped_name(job)
         hidden = JobDir(spool.failed / f"{RETRY_PREFIX}{process_tag()}-{uuid.uuid4().hex}")
         with _keep_artefacts(job, hidden, spool) as keep_for:
             keep_for(spool.inbox / dropped)
@@ -243,7 +254,10 @@ def _cancel_waiting(spool: Spool, entry: InboxEntry) -> JobDir:
 def _waiting_row(entry: InboxEntry) -> JobRow:
     """Return the row of a waiting entry of the inbox."""
     try:
-        waits_for = take_snapshot(entry, _MAX_SNAPSHOT_FILES).incomplete_reason
+        snapshot = take_snapshot(entry, _MAX_SNAPSHOT_FILES)
+        waits_for = snapshot.incomplete_reason
+        if not waits_for and not snapshot.ready:
+            waits_for = missing_content(entry, _MAX_SNAPSHOT_FILES)
         changed = entry.path.stat().st_mtime
     except OSError as error:
         return JobRow(name=entry.name, state="waiting", cause=str(error), path=str(entry.path))
@@ -260,7 +274,7 @@ def _waiting_row(entry: InboxEntry) -> JobRow:
 def job_row(job: JobDir) -> JobRow:
     """Return the row of a claimed job. The row is read from the job's files."""
     status = read_status(job)
-    state = str(status.get("state", "claimed"))
+    state = str(status.get("state") or _STATE_BY_FOLDER.get(job.path.parent.name, "claimed"))
     if state == "running" and _is_watcher_gone(job):
         state = "interrupted"
     error = status.get("error") or {}

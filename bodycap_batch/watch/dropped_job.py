@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,10 +15,13 @@ from bodycap_batch.config.job import load_job, load_job_with_origins, safe_name
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, Job
 from bodycap_batch.config.trust import PathPolicy
-from bodycap_batch.core.errors import CaptureError, JobError
+from bodycap_batch.core.errors import CaptureError, JobError, StoreError
 from bodycap_batch.pipeline.results import write_results_file
 from bodycap_batch.watch.inbox_entries import YAML_SUFFIXES, EntrySnapshot, InboxEntry
 from bodycap_batch.watch.spool import JobDir, visible_entries
+
+_CHECKSUM_LINE = "# SHA-256 of the lines below: "
+"""Start of the first line of a job's resolved file in the spool. The SHA-256 follows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,10 +115,8 @@ def write_job(job: Job, job_dir: JobDir, dropped: Path) -> None:
         dropped: Current path of the job's input.
     """
     here = dropped.resolve()
-    job_dir.job.write_text(
-        yaml_from_job(with_changed_paths(job, lambda path: _relocated(path, here, Path("input")))),
-        encoding="utf-8",
-    )
+    text = yaml_from_job(with_changed_paths(job, lambda path: _relocated(path, here, Path("input"))))
+    job_dir.job.write_text(f"{_CHECKSUM_LINE}{_checksum(text)}\n{text}", encoding="utf-8")
 
 
 def read_job(job_dir: JobDir, permissions: JobPermissions) -> Job:
@@ -123,11 +125,32 @@ def read_job(job_dir: JobDir, permissions: JobPermissions) -> Job:
     Raises:
         JobError: The job cannot be read, or names a path that is not permitted.
         CaptureError: A video is too large.
+        StoreError: The file is damaged.
     """
+    _require_undamaged(job_dir.job)
     policy = path_policy(job_dir.input, permissions.roots, is_file=False)
     job = load_job(job_dir.job, policy=policy, limits=Limits())
     _require_video_sizes(job, permissions.limits)
     return job.model_copy(update={"out": job_dir.result})
+
+
+def _require_undamaged(path: Path) -> None:
+    """Raise `StoreError` if a job's file was written with a checksum that does not match."""
+    first, _, text = path.read_bytes().partition(b"\n")
+    start = _CHECKSUM_LINE.encode()
+    # The start of the line may be damaged, too. Files of earlier program versions have no such line.
+    half = len(start) // 2
+    has_line = first[:half] == start[:half] or first[half : len(start)] == start[half:]
+    if has_line and first != start + _checksum(text).encode():
+        raise StoreError(
+            "the stored job is damaged",
+            path=path,
+            hint="check the disk; `bodycap retry` reads the job again",
+        )
+
+
+def _checksum(text: str | bytes) -> str:
+    return hashlib.sha256(text.encode() if isinstance(text, str) else text).hexdigest()
 
 
 def make_result_paths_relative(job_dir: JobDir, job: Job) -> None:

@@ -9,12 +9,13 @@ import uuid
 from collections.abc import Callable
 from pathlib import Path
 
+from bodycap_batch.config.folder import JOB_FILES
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import BodycapError, StoreError
 from bodycap_batch.store.artefacts import store_error
 from bodycap_batch.watch.claim import Claim, create_claim
 from bodycap_batch.watch.dropped_job import JobPermissions, read_dropped_job, unread_job_files, write_job
-from bodycap_batch.watch.inbox_entries import EntrySnapshot, InboxEntry, take_snapshot
+from bodycap_batch.watch.inbox_entries import YAML_SUFFIXES, EntrySnapshot, InboxEntry, take_snapshot
 from bodycap_batch.watch.job_status import JobStatusFile, read_status
 from bodycap_batch.watch.process_identity import is_process_running
 from bodycap_batch.watch.spool import (
@@ -25,6 +26,9 @@ from bodycap_batch.watch.spool import (
     folder_name_from_text,
     move_to_free_name,
 )
+
+_UNKNOWN_NAME = "job"
+"""Name of a job whose own name is unknown."""
 
 
 def claim_entry(
@@ -70,8 +74,9 @@ def move_to_running(spool: Spool, claim: Claim) -> None:
     """Give a claimed hidden folder its visible name in `running`."""
     previous = read_status(claim.job, strict=True)
     status = JobStatusFile(claim.job, previous)
-    dropped = str(previous.get("dropped") or "job")
-    wanted = folder_name_from_text(Path(dropped).stem if previous.get("kind") == "file" else dropped)
+    dropped = dropped_name(claim.job)
+    is_file = input_path(claim.job) != claim.job.input
+    wanted = folder_name_from_text(Path(dropped).stem if is_file else dropped)
 
     def rename(target: Path) -> None:
         status.update(name=target.name)
@@ -111,7 +116,32 @@ def path_exists(path: Path) -> bool:
 def input_path(job_dir: JobDir) -> Path:
     """Return the current path of the dropped folder, or of the job file that was dropped without a folder."""
     document = read_status(job_dir, strict=True)
-    return job_dir.input / str(document.get("dropped")) if document.get("kind") == "file" else job_dir.input
+    if document.get("kind") == "file":
+        return job_dir.input / str(document.get("dropped"))
+    return (None if document else _only_job_file(job_dir.input)) or job_dir.input
+
+
+def dropped_name(job_dir: JobDir) -> str:
+    """Return the name that a job had in the inbox.
+
+    If `status.json` is damaged, return the name of the job file, else the job's name.
+    """
+    if stated := read_status(job_dir, strict=True).get("dropped"):
+        return str(stated)
+    path = input_path(job_dir)
+    if path != job_dir.input:
+        return path.name
+    return _UNKNOWN_NAME if job_dir.name.startswith(".") else job_dir.name
+
+
+def _only_job_file(folder: Path) -> Path | None:
+    """Return the only file in a folder if it is a YAML file. Such an input was dropped without a folder."""
+    try:
+        found = list(folder.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    is_job_file = len(found) == 1 and found[0].suffix.lower() in YAML_SUFFIXES
+    return found[0] if is_job_file and found[0].name not in JOB_FILES else None
 
 
 def return_to_inbox(
@@ -130,7 +160,7 @@ def return_to_inbox(
     """
     dropped, target = input_path(job_dir), None
     if path_exists(dropped):
-        name = str(read_status(job_dir, strict=True).get("dropped") or job_dir.name)
+        name = dropped_name(job_dir)
         suffix = dropped.suffix if dropped != job_dir.input else ""
         try:
             target = move_to_free_name(dropped, spool.inbox, name, before_move, suffix=suffix)

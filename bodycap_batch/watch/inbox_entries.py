@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import stat
 import time
@@ -10,6 +11,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from bodycap_batch.config.folder import VIDEO_SUFFIXES
+from bodycap_batch.formats.file_completeness import missing_part
 from bodycap_batch.watch.spool import visible_entries
 
 READY = "READY"
@@ -17,6 +20,10 @@ NOT_A_JOB = "not a job: neither a folder nor a YAML file"
 """Text that explains why a path in the inbox is ignored."""
 YAML_SUFFIXES = (".yaml", ".yml")
 _PARTIAL_SUFFIX = ".part"
+_MAX_STALL_S = 1800.0
+"""Time (seconds) without a change after which an entry with an incomplete file is processed anyway. Origin:
+Linux closes a connection that does not answer after 13 to 30 minutes (tcp_retries2 in the manual page
+tcp(7)). A copy over the network that has stopped for longer does not continue."""
 _FILE_MANAGER_FILES = (
     ".DS_Store",
     ".localized",
@@ -125,8 +132,29 @@ def take_snapshot(entry: InboxEntry, max_files: int) -> EntrySnapshot:
     )
 
 
+def missing_content(entry: InboxEntry, max_files: int) -> str:
+    """Return which file of an entry is not complete according to its own content.
+
+    Args:
+        entry: Entry to inspect. Its videos are opened, but no frame is decoded.
+        max_files: Maximum number of files that are inspected.
+
+    Returns:
+        Text for the user; "" if no file is known to be incomplete.
+    """
+    for path, name in itertools.islice(_files_below(entry.path), max_files):
+        if missing := missing_part(path, VIDEO_SUFFIXES):
+            limit = f"it is processed after {_MAX_STALL_S / 60:.0f} minutes without a change"
+            return f"{name} is not complete: {missing} ({limit})"
+    return ""
+
+
 class CompletionTracker:
     """Find out which entries of the inbox users have copied completely.
+
+    An entry is complete if it has not changed for some time, and if the content of its files agrees with
+    their lengths. An entry with a damaged file never agrees. It is treated as complete after `_MAX_STALL_S`
+    seconds without a change, so that its error is reported.
 
     Args:
         unchanged_s: Time (seconds) for which the names, sizes and times of an entry's files must not change
@@ -148,6 +176,7 @@ class CompletionTracker:
         self._most = max_files
         self._clock = clock
         self._seen: dict[Path, tuple[str, float]] = {}
+        self._missing: dict[Path, tuple[str, str]] = {}
         self.incomplete: dict[Path, str] = {}
         self.unreadable: dict[Path, str] = {}
 
@@ -166,15 +195,34 @@ class CompletionTracker:
             last_state, since = previous.get(entry.path, ("", now))
             since = since if last_state == state else now
             self._seen[entry.path] = (state, since)
-            still = now - since >= self._unchanged_s
-            if snapshot is not None and (snapshot.ready or (still and not snapshot.incomplete_reason)):
+            is_still = now - since >= self._unchanged_s
+            if snapshot is None:
+                if is_still and error:
+                    self.incomplete[entry.path] = self.unreadable[entry.path] = error
+            elif snapshot.ready:
                 found.append((since, entry, snapshot))
-            elif still and (reason := error or (snapshot.incomplete_reason if snapshot is not None else "")):
-                self.incomplete[entry.path] = reason
-                if error:
-                    self.unreadable[entry.path] = error
+            elif is_still:
+                reason = snapshot.incomplete_reason
+                if not reason and now - since < _MAX_STALL_S:
+                    reason = self._missing_content(entry, snapshot)
+                if reason:
+                    self.incomplete[entry.path] = reason
+                else:
+                    found.append((since, entry, snapshot))
+        self._missing = {path: value for path, value in self._missing.items() if path in self._seen}
         found.sort(key=lambda item: (item[0], item[1].path))
         return [(entry, snapshot) for _, entry, snapshot in found]
+
+    def _missing_content(self, entry: InboxEntry, snapshot: EntrySnapshot) -> str:
+        """Return which file of an entry is not complete. An unchanged entry is inspected only once."""
+        digest, reason = self._missing.get(entry.path, ("", ""))
+        if digest != snapshot.digest:
+            try:
+                reason = missing_content(entry, self._most)
+            except OSError:  # a copying program renames a file at this moment
+                return "it is changing"
+            self._missing[entry.path] = (snapshot.digest, reason)
+        return reason
 
     @property
     def is_tracking(self) -> bool:

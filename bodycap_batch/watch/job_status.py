@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import threading
 import time
@@ -13,8 +12,10 @@ from types import NoneType
 from typing import Any, Literal
 
 from bodycap_batch.core.errors import BodycapError
+from bodycap_batch.core.printable import printable
 from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import disk_errors
+from bodycap_batch.store.checked_json import checked_json, parse_checked_json
 from bodycap_batch.watch.spool import JobDir
 
 State = Literal["claimed", "running", "stopped", "done", "failed", "cancelled"]
@@ -152,7 +153,7 @@ class JobStatusFile:
             return
         temporary = self._job.path / f".status.{os.getpid()}.{threading.get_ident()}.part"
         with disk_errors(self._job.path):
-            temporary.write_text(json.dumps(self.document, indent=1) + "\n", encoding="utf-8")
+            temporary.write_text(checked_json(self.document), encoding="utf-8")
             os.replace(temporary, self._job.status)
 
     def _log(self, event: Event) -> None:
@@ -164,12 +165,13 @@ class JobStatusFile:
 
 
 def append_log(job: JobDir, text: str) -> None:
-    """Add a line to the job's log."""
+    """Add a line, or several lines, to the job's log. Special characters are escaped."""
+    lines = "\n".join(map(printable, text.split("\n")))
     if job.path.is_dir():
         with disk_errors(job.path):
             job.log.parent.mkdir(parents=True, exist_ok=True)
             with job.log.open("a", encoding="utf-8", errors="backslashreplace") as stream:
-                stream.write(f"{utc_text()} {text}\n")
+                stream.write(f"{utc_text()} {lines}\n")
 
 
 def read_status(job: JobDir, *, strict: bool = False) -> dict[str, Any]:
@@ -181,14 +183,12 @@ def read_status(job: JobDir, *, strict: bool = False) -> dict[str, Any]:
             this case.
     """
     try:
-        found = json.loads(job.status.read_text(encoding="utf-8"))
+        found = parse_checked_json(job.status.read_bytes())
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return {}
     except OSError:
         if strict:
             raise
-        return {}
-    if not isinstance(found, dict):
         return {}
     return {
         name: value for name, value in found.items() if isinstance(value, _FIELD_TYPES.get(name, (object,)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import threading
 import traceback
@@ -10,15 +11,23 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from bodycap_batch.core.errors import BodycapError, Cancelled, DiskAway, JobError, StoreError, error_from_dict
+from bodycap_batch.core.errors import (
+    BodycapError,
+    Cancelled,
+    DiskAway,
+    JobError,
+    StoreError,
+    error_from_dict,
+    one_line,
+)
 from bodycap_batch.pipeline import Settings, run_job
 from bodycap_batch.runner.turns import Turns
-from bodycap_batch.store.artefacts import Store, store_error
+from bodycap_batch.store.artefacts import Store, disk_error, store_error
 from bodycap_batch.store.references import StoreBusy, moving
 from bodycap_batch.watch.claim import Claim, remove_claim_files
 from bodycap_batch.watch.dropped_job import make_result_paths_relative, read_job
 from bodycap_batch.watch.job_status import FINAL, JobStatusFile, State, append_log, read_status, utc_text
-from bodycap_batch.watch.spool import JobDir, Spool, move_to_free_name
+from bodycap_batch.watch.spool import RUNNING, JobDir, Spool, move_to_free_name
 from bodycap_batch.watch.watch_options import WatchOptions
 
 _MAX_DISK_FAILURES = 5
@@ -33,8 +42,8 @@ class JobOutcome:
 
     Attributes:
         name: Name of the job.
-        state: State as in `status.json`; "lost" if another watcher has taken the job over; "stuck" if a disk
-            failed.
+        state: State as in `status.json`; "lost" if another watcher has taken the job over; "deleted" if the
+            job's folder was deleted; "stuck" if a disk failed.
         exit_code: Exit code of the error; 0 if there is no error. A bug of the program has the code 70.
         message: One line for the operator.
         path: The job's final folder; None if the job was not moved there.
@@ -74,7 +83,7 @@ class JobWorker:
         try:
             return self._process(claim, read_error)
         except (BodycapError, OSError) as error:
-            return self._stuck(claim, error)
+            return self._give_up(claim) if self._is_deleted(claim) else self._stuck(claim, error)
 
     def _process(self, claim: Claim, read_error: BodycapError | None) -> JobOutcome:
         previous = read_status(claim.job, strict=True)
@@ -95,13 +104,10 @@ class JobWorker:
         except BodycapError as error:
             return self._end(claim, status, "failed", error)
         except Exception as error:  # noqa: BLE001 - the only place that catches program bugs
-            away = store_error(error, claim.job.path) if isinstance(error, OSError) else None
-            if isinstance(away, DiskAway):
-                return self._postpone(claim, status, away)
-            append_log(claim.job, traceback.format_exc())
-            hint = "this is a bug in bodycap; please report it with this log and the job"
-            bug = BodycapError(f"{type(error).__name__}: {error}", path=claim.job.log, hint=hint)
-            return self._end(claim, status, "failed", bug)
+            disk = disk_error(error, claim.job.path) if isinstance(error, OSError) else None
+            if isinstance(disk, DiskAway):
+                return self._postpone(claim, status, disk)
+            return self._end(claim, status, "failed", disk or _log_bug(claim, error))
         return self._end(claim, status, "done", None)
 
     def _run(self, claim: Claim, status: JobStatusFile) -> None:
@@ -145,14 +151,34 @@ class JobWorker:
         """Handle a stop: a user cancelled the job, this watcher ends, or another watcher has the job."""
         name = claim.job.name
         if not claim.ownership.is_held():
-            claim.lost.set()
-            return JobOutcome(name=name, state="lost", message="another watcher has taken it over")
+            return self._give_up(claim)
         if claim.job.cancel.exists():
             error = Cancelled(
                 "cancelled; finished stages are kept", hint=f"`bodycap retry {name}` continues the job"
             )
             return self._end(claim, status, "cancelled", error)
         return self._leave(claim, status, error)
+
+    def _give_up(self, claim: Claim) -> JobOutcome:
+        """Stop working on a job that this watcher no longer owns, and return an outcome with the reason."""
+        claim.lost.set()
+        name = claim.job.name
+        if not self._is_deleted(claim):
+            return JobOutcome(name=name, state="lost", message="another watcher has taken it over")
+        if not claim.job.input.exists():  # remove log files that were written after the deletion
+            shutil.rmtree(claim.job.path, ignore_errors=True)
+        return JobOutcome(name=name, state="deleted", message=f"its folder was deleted from {RUNNING}/")
+
+    def _is_deleted(self, claim: Claim) -> bool:
+        """Return True if someone deleted the folder of a running job.
+
+        If another watcher has taken the job over, the files of the claims still exist. If it has also filed
+        the job, the job is in another folder of the spool. If the disk is gone, `running` does not exist.
+        """
+        if claim.ownership.has_claim() or not self._spool.running.is_dir():
+            return False
+        found = self._spool.find(claim.job.name)
+        return found is None or found.path == claim.job.path
 
     def _postpone(self, claim: Claim, status: JobStatusFile, error: DiskAway) -> JobOutcome:
         """Postpone a job after a disk failure, or end it after too many disk failures.
@@ -179,7 +205,8 @@ class JobWorker:
         """
         claim.stop_heartbeat()
         code, name = StoreError.exit_code, claim.job.name
-        return JobOutcome(name=name, state="stuck", exit_code=code, message=f"continues later: {error}")
+        message = f"continues later: {one_line(error)}"
+        return JobOutcome(name=name, state="stuck", exit_code=code, message=message)
 
     def _leave(self, claim: Claim, status: JobStatusFile, error: BodycapError) -> JobOutcome:
         """Leave the job in `running`, so that this or another watcher can run the job again later."""
@@ -228,9 +255,7 @@ class JobWorker:
         with moving(self._store, claim.job.result, wait=False) as keep_for:
             claim.stop_heartbeat()
             if not claim.ownership.is_held():
-                return JobOutcome(
-                    name=claim.job.name, state="lost", message="another watcher has taken it over"
-                )
+                return self._give_up(claim)
 
             def write_final_status(target: Path) -> None:
                 keep_for(JobDir(target).result)
@@ -247,6 +272,13 @@ class JobWorker:
             message="" if error is None else error.message,
             path=target,
         )
+
+
+def _log_bug(claim: Claim, error: Exception) -> BodycapError:
+    """Write the traceback of a program bug to the job's log, and return the error for the user."""
+    append_log(claim.job, "".join(traceback.format_exception(error)))
+    hint = "this is a bug in bodycap; please report it with this log and the job"
+    return BodycapError(f"{type(error).__name__}: {error}", path=claim.job.log, hint=hint)
 
 
 def _is_disk_readable(path: Path) -> bool:

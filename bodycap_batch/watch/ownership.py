@@ -6,13 +6,12 @@ of a job before each step that other processes can see: a commit to the store, a
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.core.errors import Cancelled
+from bodycap_batch.store.checked_json import parse_checked_json
 
 MARKER_PREFIX = ".generation-"
 _FIELD_TYPES: Mapping[str, type] = {
@@ -56,14 +55,11 @@ class Ownership:
         outdated = int(found.get("generation", 0)) < self.generation
         return outdated or (found.get("token"), found.get("generation")) == (self.token, self.generation)
 
-    def require(self) -> None:
-        """Raise `Cancelled` if another watcher has taken the job over."""
-        if not self.is_held():
-            raise Cancelled(
-                "another watcher has taken this job over",
-                path=self.owner,
-                hint="nothing to do: the other watcher continues the job after its finished stages",
-            )
+    def has_claim(self) -> bool:
+        """Return True if the job's folder holds a file of this claim or of the next claim."""
+        folder = self.owner.parent
+        numbers = (self.generation, self.generation + 1)
+        return any(generation_marker(folder, number).exists() for number in numbers)
 
 
 def generation_marker(folder: Path, generation: int) -> Path:
@@ -72,11 +68,9 @@ def generation_marker(folder: Path, generation: int) -> Path:
 
 
 def read_owner(path: Path) -> dict[str, Any]:
-    """Return the content of `owner.json`; empty if the file is missing or cannot be read."""
+    """Return the content of `owner.json`; empty if the file is missing, damaged or cannot be read."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = parse_checked_json(path.read_bytes())
     except (OSError, ValueError):
-        return {}
-    if not isinstance(found, dict):
         return {}
     return {name: value for name, value in found.items() if isinstance(value, _FIELD_TYPES.get(name, object))}

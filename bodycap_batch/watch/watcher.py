@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from bodycap_batch.core.errors import BodycapError, StoreError
+from bodycap_batch.core.errors import BodycapError, StoreError, one_line
 from bodycap_batch.watch.access_failures import AccessFailures
 from bodycap_batch.watch.change_notifier import ChangeNotifier
 from bodycap_batch.watch.claim import Claim, HeartbeatMonitor, take_over_job
@@ -104,7 +104,9 @@ class Watcher:
         """
         heartbeat = threading.Thread(target=self._write_heartbeats, name="heartbeat")
         with (
-            ChangeNotifier(self.spool.inbox, self._woken, poll=self._options.poll),
+            ChangeNotifier(
+                self.spool.inbox, self._woken, poll=self._options.poll, write_line=self._write_line
+            ),
             ThreadPoolExecutor(max_workers=self._options.jobs, thread_name_prefix="job") as pool,
         ):
             heartbeat.start()
@@ -147,7 +149,8 @@ class Watcher:
             finish_interrupted_retries(self.spool)
         except (OSError, StoreError) as error:
             if not self._retry_failure_reported:
-                self._write_line(f"an interrupted retry in {self.spool.failed} cannot be completed: {error}")
+                where = f"an interrupted retry in {self.spool.failed}"
+                self._write_line(f"{where} cannot be completed: {one_line(error)}")
             self._retry_failure_reported = True
 
     def _report_left_entries(self) -> None:
@@ -251,7 +254,7 @@ class Watcher:
             self._unmovable[str(entry.path)] = (snapshot.digest, time.monotonic() + self._options.stale_s)
             self._worst_exit_code = max(self._worst_exit_code, error.exit_code)
             if digest != snapshot.digest:
-                self._write_line(f"{entry.name}: cannot be moved out of the inbox: {error}")
+                self._write_line(f"{entry.name}: cannot be moved out of the inbox: {error.one_line}")
             return None
 
     def _take_over_abandoned(self, max_jobs: int) -> list[Claim]:
@@ -289,6 +292,6 @@ class Watcher:
             move_to_running(self.spool, claim)
         except (StoreError, OSError) as error:
             self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
-            self._write_line(f"{job.name}: cannot be taken over: {error}")
+            self._write_line(f"{job.name}: cannot be taken over: {one_line(error)}")
             return None
         return claim

@@ -6,7 +6,6 @@ Each watcher writes a small file in `running`. `bodycap status` reads these file
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import socket
 import time
@@ -14,6 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from bodycap_batch.store.checked_json import checked_json, parse_checked_json
 from bodycap_batch.store.digests import write_atomically
 from bodycap_batch.watch.job_status import utc_text
 from bodycap_batch.watch.process_identity import is_from_this_machine, is_process_running, process_tag
@@ -77,7 +77,7 @@ class WatcherStatusFile:
             "trouble": trouble,
         }
         with contextlib.suppress(OSError):
-            write_atomically(self._path, (json.dumps(document, indent=1) + "\n").encode())
+            write_atomically(self._path, checked_json(document).encode())
 
     def remove(self) -> None:
         """Remove the file of this watcher, and the files of watchers that are no longer active."""
@@ -111,17 +111,27 @@ def _is_abandoned(path: Path) -> bool:
 
 
 def _read_watcher_status(path: Path) -> WatcherStatus | None:
-    """Return the content of a watcher's file; None if the file cannot be read."""
+    """Return the content of a watcher's file.
+
+    If the file is damaged, return what the file's name tells. Return None if the file cannot be read, or if
+    its name is not that of a watcher's file.
+    """
+    here = is_from_this_machine(path.name.removeprefix(_PREFIX))
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        here = is_from_this_machine(path.name.removeprefix(_PREFIX))
-        seen = "" if here else str(found["seen"])
+        data = path.read_bytes()
+    except OSError:
+        return None
+    try:
+        found = parse_checked_json(data)
         return WatcherStatus(
             host=str(found["host"]),
             pid=int(found["pid"]),
             since=str(found["since"]),
-            seen=seen,
+            seen="" if here else str(found["seen"]),
             trouble=str(found["trouble"]),
         )
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+    except (ValueError, KeyError, TypeError):
+        process = "".join(path.name.removeprefix(_PREFIX).split("-")[1:2])
+        host = socket.gethostname() if here else "another machine"
+        known = process.isdecimal()
+        return WatcherStatus(host=host, pid=int(process), since="an unknown time") if known else None

@@ -15,7 +15,10 @@ import pytest
 
 from bodycap_batch.core.errors import Cancelled, StoreError
 from bodycap_batch.pipeline import Settings, explain_job, run_job
+from bodycap_batch.pipeline.why import _reason
+from bodycap_batch.runner import Task
 from bodycap_batch.store.artefacts import ArtefactKey, Store
+from bodycap_batch.store.digests import _entry_text
 from bodycap_batch.store.garbage_collection import collect_garbage
 from bodycap_batch.store.references import References, in_use, moving
 from bodycap_batch.tasks.order import StageName, stages_from
@@ -136,6 +139,40 @@ def test_why_names_the_change_and_what_follows(
     if later is not None:
         assert [name for name, why in found.items() if why.startswith("after ")] == later
     assert done.executed() == [], "asking computes nothing"
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "expected"),
+    [
+        (
+            {"body": {"height_m": 1.7, "mounts": []}},
+            {"body": None},
+            "the body was used before, but is not used now",
+        ),
+        (
+            {"body": None},
+            {"body": {"height_m": 1.7, "mounts": []}},
+            "the body is used now, but was not used before",
+        ),
+        ({"merge": None}, {"merge": "a"}, "the motion is used now, but was not used before"),
+        ({"body": {"height_m": 1.7}}, {"body": {"height_m": 1.8}}, "the body: height_m changed"),
+        ({"map": "a"}, {"map": "b"}, "the map changed"),
+        ({"previous": "a"}, {"previous": "b"}, "the result of the previous round changed"),
+        ({"keyframes": {"torso": "a"}}, {"keyframes": {"torso": "b"}}, "the keyframes of torso changed"),
+        ({"keyframes": {}}, {"keyframes": {"torso": "b"}}, "the keyframes of torso changed"),
+    ],
+)
+def test_why_describes_a_changed_input(
+    tmp_path: Path, before: dict[str, Any], now: dict[str, Any], expected: str
+) -> None:
+    store = Store(tmp_path)
+    keys = [
+        ArtefactKey(stage="export", algorithm="1", options={}, inputs=inputs, libraries={})
+        for inputs in (before, now)
+    ]
+    with store.draft(keys[0]) as draft:
+        store.commit(draft, keys[0], {})
+    assert _reason(Task(key=keys[1]), store) == expected
 
 
 def test_why_lists_the_preview_that_runs_beside_the_export(done: Bench) -> None:
@@ -267,7 +304,7 @@ def test_damage_that_the_file_system_does_not_tell_is_found_when_the_artefact_is
     identity = (stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
     name = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
     (store.root / "digests").mkdir(exist_ok=True)
-    (store.root / "digests" / name).write_text(manifest["files"]["made_of.txt"])
+    (store.root / "digests" / name).write_bytes(_entry_text(name, manifest["files"]["made_of.txt"]))
     assert done.executed() == [], "looked up, it seems sound"
     with pytest.raises(StoreError, match="damaged") as caught:
         done.run(merge={"max_gap_s": 0.5})

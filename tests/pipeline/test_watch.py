@@ -17,7 +17,7 @@ import yaml
 
 from bodycap_batch.cli import main
 from bodycap_batch.config.limits import Limits
-from bodycap_batch.core.errors import JobError, StoreError
+from bodycap_batch.core.errors import CaptureError, JobError, StoreError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.garbage_collection import collect_garbage
@@ -26,9 +26,12 @@ from bodycap_batch.watch.claim import Claim, create_claim, take_over_job
 from bodycap_batch.watch.commands import job_row
 from bodycap_batch.watch.inbox_entries import EntrySnapshot, InboxEntry, take_snapshot
 from bodycap_batch.watch.job_status import JobStatusFile
+from bodycap_batch.watch.ownership import read_owner
 from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir
 from tests.pipeline.spools import SpoolFixture, wait_for
 from tests.pipeline.test_cli import gone
+from tests.pipeline.test_watch_disk import running
+from tests.videos import textured_frame, write_video
 
 
 def leftovers(bench: SpoolFixture) -> list[str]:
@@ -417,7 +420,7 @@ def test_a_bug_fails_only_its_job(bench: SpoolFixture) -> None:
 
 def test_a_copy_in_progress_stays_in_the_inbox_until_it_is_complete(bench: SpoolFixture) -> None:
     dropped = bench.drop("walk", ready=False)
-    (dropped / "head.mp4.part").write_text("half")
+    (dropped / "head.mp4.part").write_text("frames of the head")
     watcher = bench.watcher(once=False)
     thread = threading.Thread(target=watcher.run)
     thread.start()
@@ -431,6 +434,23 @@ def test_a_copy_in_progress_stays_in_the_inbox_until_it_is_complete(bench: Spool
         watcher.stop()
         thread.join(30)
     assert not thread.is_alive()
+
+
+def test_a_stalled_copy_is_left_with_its_reason(
+    bench: SpoolFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    dropped = bench.drop("walk", ready=False)
+    video = write_video(dropped / "head.mp4", [textured_frame(0)] * 9)
+    whole = video.read_bytes()
+    video.write_bytes(whole[:-100])
+    assert bench.run_once() == 0
+    assert any("walk: left in the inbox: head.mp4 is not complete" in line for line in bench.lines)
+    assert main(["status", str(bench.spool.root)]) == 0
+    count = f"{len(whole) - 100:,} of {len(whole):,} bytes are there"
+    assert f"head.mp4 is not complete: {count}" in capfd.readouterr().out
+    video.write_bytes(whole)
+    assert bench.run_once() == 0
+    assert bench.status("walk")["state"] == "done"
 
 
 @pytest.mark.parametrize(
@@ -548,7 +568,7 @@ def test_a_suspended_watcher_gives_up_a_lost_job_when_it_resumes(bench: SpoolFix
     try:
         # As seen from another machine, which sees only that the heartbeat has stopped.
         owner = bench.job("walk").owner
-        owner.write_text(json.dumps({**json.loads(owner.read_text()), "machine": "elsewhere"}))
+        owner.write_text(json.dumps({**read_owner(owner), "machine": "elsewhere"}))
         watcher = bench.watcher(stale_s=1.0, once=False)
         thread = threading.Thread(target=watcher.run)
         thread.start()
@@ -565,6 +585,52 @@ def test_a_suspended_watcher_gives_up_a_lost_job_when_it_resumes(bench: SpoolFix
     assert "another watcher has taken it over" in err
     assert {path: path.stat().st_mtime_ns for path in bench.spool.done.rglob("*")} == before
     assert leftovers(bench) == []
+
+
+@pytest.mark.parametrize("how", ["all", "all but the logs"])
+def test_a_deleted_running_job_is_reported_as_deleted(bench: SpoolFixture, how: str) -> None:
+    bench.drop("walk")
+    bench.order(hang="map")
+    with running(bench.watcher(once=False, stale_s=1.0)):
+        bench.wait_until_hanging()
+        shutil.rmtree(bench.spool.running / "walk")
+        if how == "all but the logs":  # as the start of the next stage does
+            (bench.spool.running / "walk" / "result" / "logs").mkdir(parents=True)
+        wait_for(lambda: any("walk: deleted" in line for line in bench.lines))
+    assert bench.lines.count("walk: deleted: its folder was deleted from running/") == 1
+    assert not any("another watcher" in line for line in bench.lines)
+    assert leftovers(bench) == []
+    assert [row.name for row in job_rows(bench.spool)] == []
+
+
+@pytest.mark.parametrize("when", ["videos", "error"])
+def test_a_job_that_fails_because_it_was_deleted_is_deleted(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    def run(job: object, *, out_dir: Path, settings: object) -> None:
+        shutil.rmtree(out_dir.parent)
+        if when == "videos":
+            raise CaptureError("no such video", path=out_dir)
+        raise FileNotFoundError(errno.ENOENT, "gone", str(out_dir))
+
+    monkeypatch.setattr("bodycap_batch.watch.job_worker.run_job", run)
+    bench.drop("walk")
+    assert bench.run_once() == 0
+    assert "walk: deleted: its folder was deleted from running/" in bench.lines
+
+
+def test_a_job_on_a_missing_disk_is_not_taken_for_deleted(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(job: object, *, out_dir: Path, settings: object) -> None:
+        bench.spool.running.rename(bench.folder / "away")
+        raise FileNotFoundError(errno.ENOENT, "gone", str(out_dir))
+
+    monkeypatch.setattr("bodycap_batch.watch.job_worker.run_job", run)
+    bench.drop("walk")
+    bench.run_once()
+    assert not any("deleted" in line for line in bench.lines)
+    assert (bench.folder / "away" / "walk" / "input" / "torso.mp4").is_file()
 
 
 def test_a_replaced_owner_writes_nothing_more(bench: SpoolFixture) -> None:

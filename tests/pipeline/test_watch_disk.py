@@ -286,7 +286,7 @@ def test_videos_are_never_removed_because_the_disk_did_not_answer(
     with pytest.raises(OSError, match="Input/output"):
         inbox_claim.return_to_inbox(bench.spool, job_dir)
     assert (job_dir.input / "torso.mp4").is_file()
-    assert inbox_claim.return_to_inbox(bench.spool, job_dir) == bench.spool.inbox / ".claim-1"
+    assert inbox_claim.return_to_inbox(bench.spool, job_dir) == bench.spool.inbox / "job"
 
 
 def test_paths_left_in_the_inbox_are_reported_when_a_watcher_ends(bench: SpoolFixture) -> None:

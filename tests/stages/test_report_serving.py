@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import http.client
 import json
+import socket
+import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -90,6 +92,46 @@ def test_a_player_that_closes_the_connection_causes_no_error(
     thread.join()
     server.server_close()  # waits for the thread that answers
     assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("when", ["waiting", "in a request", "answered"])
+def test_a_browser_that_leaves_causes_no_traceback(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], when: str
+) -> None:
+    page = tmp_path / "report.html"
+    page.write_text("<p>the report</p>")
+    server = make_server(ServedContent(files={"/report.html": page}, videos={}))
+    server.daemon_threads = False
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    with socket.create_connection((LOOPBACK, server.server_port), timeout=10) as connection:
+        if when == "in a request":
+            connection.sendall(b"GET /report.html HTTP/1.1\r\n")
+        if when == "answered":
+            connection.sendall(b"GET /report.html HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            connection.recv(1000)
+        # Close with a reset instead of a normal end.
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    server.shutdown()
+    thread.join()
+    server.server_close()
+    assert capsys.readouterr().err == ""
+
+
+def test_a_bug_of_the_server_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail(*_: object) -> list[dict[str, object]]:
+        raise ZeroDivisionError
+
+    server = make_server(ServedContent(files={}, videos={"torso": []}, overlays=fail))
+    server.daemon_threads = False
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    with pytest.raises(http.client.HTTPException):
+        get(server.server_port, "/marks/0/0.json")
+    server.shutdown()
+    thread.join()
+    server.server_close()
+    assert "ZeroDivisionError" in capsys.readouterr().err
 
 
 def test_times_of_both_chapters_are_common_times(port: int) -> None:

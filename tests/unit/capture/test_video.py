@@ -8,13 +8,14 @@ from collections.abc import Generator, Iterator
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
 import pytest
 from av.video.frame import VideoFrame
 
-from bodycap_batch.capture import CaptureCamera, decoding, open_camera
+from bodycap_batch.capture import CaptureCamera, decoding, frame_index, open_camera
 from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.capture.images import turn_upright
 from bodycap_batch.capture.prefetch import prefetch
@@ -44,6 +45,34 @@ def test_times_are_the_containers_exact_timestamps(tmp_path: Path) -> None:
     assert np.abs(video.times_ns() - np.array(pts) / 300 * 1e9).max() <= 0.5e6 + 1
     exact = index_video(write_video(tmp_path / "a.mp4", FRAMES[:10], pts=pts))
     assert exact.times_ns().tolist() == [round(Fraction(p, 300) * 10**9) for p in pts]
+
+
+@pytest.mark.parametrize("shift", [-200, -95])
+@pytest.mark.parametrize("unknown", [1, 10])
+def test_a_missing_timestamp_of_the_first_decoded_frame_removes_no_later_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shift: int, unknown: int
+) -> None:
+    path = write_video(tmp_path / "a.mkv", FRAMES[:10], bframes=False)
+    video = index_video(path)
+    negative = replace(video, pts=video.pts + shift, key_pts=video.key_pts + shift)
+
+    class Container:
+        def __enter__(self) -> Container:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def decode(self, _: object) -> Iterator[VideoFrame]:
+            with av.open(str(path)) as container:
+                for index, frame in enumerate(container.decode(video=0)):
+                    frame.pts = None if index < unknown else frame.pts + shift
+                    yield frame
+
+    monkeypatch.setattr(decoding, "open_container", lambda _: Container())
+    codec = SimpleNamespace(codec_context=SimpleNamespace(has_b_frames=0))
+    monkeypatch.setattr(decoding, "open_stream", lambda *_: codec)
+    found = frame_index._with_first_frame(negative, "matroska", 0)
+    assert found.pts.tolist() == negative.pts[unknown % 10 :].tolist()
 
 
 def test_b_frames_come_in_display_order(tmp_path: Path) -> None:

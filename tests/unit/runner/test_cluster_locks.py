@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from bodycap_batch.core.errors import BodycapError, Cancelled
+from bodycap_batch.core.errors import Cancelled, StoreError
 from bodycap_batch.runner import Task, TaskEnvironment, dask_cluster
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 
@@ -88,8 +88,24 @@ def test_a_scheduler_lost_during_a_request_is_reported(
         client.status = "closed"
     else:
         monkeypatch.setattr(client, "scheduler_info", fail)
-    with pytest.raises(BodycapError, match="the scheduler was lost"):
+    with pytest.raises(StoreError, match="the scheduler was lost"):
         make(client, tmp_path, [])
+
+
+@pytest.mark.parametrize("what", ["run_on_scheduler", "subscribe_topic", "submit"])
+def test_a_scheduler_lost_at_any_request_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError("the connection is closed")
+
+    client = Client()
+    monkeypatch.setattr(client, what, fail)
+    monkeypatch.setattr(dask_cluster, "_connect", lambda _: client)
+    with pytest.raises(StoreError, match="the scheduler was lost") as caught:
+        make(client, tmp_path, [])
+    assert caught.value.exit_code == 5
+    assert "start the scheduler" in str(caught.value.hint)
 
 
 def test_a_scheduler_lost_before_the_answer_is_read_is_reported(
@@ -104,7 +120,7 @@ def test_a_scheduler_lost_before_the_answer_is_read_is_reported(
     client = Client()
     monkeypatch.setattr(client, "submit", lambda *_, **__: future)
     monkeypatch.setattr(dask_cluster, "_connect", lambda _: client)
-    with pytest.raises(BodycapError, match="the scheduler was lost"):
+    with pytest.raises(StoreError, match="the scheduler was lost"):
         make(client, tmp_path, [])
 
 

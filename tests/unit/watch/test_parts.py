@@ -17,9 +17,17 @@ from bodycap_batch.watch.change_notifier import ChangeNotifier, is_on_network_di
 from bodycap_batch.watch.claim import HeartbeatMonitor, create_claim, take_over_job
 from bodycap_batch.watch.dropped_job import JobPermissions, read_dropped_job, read_job
 from bodycap_batch.watch.inbox_claim import claim_entry
-from bodycap_batch.watch.inbox_entries import CompletionTracker, InboxEntry, entries_in, take_snapshot
+from bodycap_batch.watch.inbox_entries import (
+    CompletionTracker,
+    InboxEntry,
+    entries_in,
+    missing_content,
+    take_snapshot,
+)
+from bodycap_batch.watch.ownership import read_owner
 from bodycap_batch.watch.spool import JobDir, Spool, folder_name_from_text, move_to_free_name, spool_from_path
 from bodycap_batch.watch.watch_options import WatchOptions
+from tests.videos import textured_frame, write_video
 
 ROOT = Path(__file__).parents[3]
 
@@ -46,7 +54,7 @@ def test_a_folder_is_complete_when_it_is_unchanged_for_long_enough(tmp_path: Pat
     assert completed(tracker, tmp_path) == []  # the folder is empty
     video = folder / "torso.mp4"
     for size in (100, 200):
-        video.write_bytes(bytes(size))
+        video.write_bytes(b"x" * size)
         assert completed(tracker, tmp_path) == []
         clock.now += 9.9
         assert completed(tracker, tmp_path) == []
@@ -54,6 +62,62 @@ def test_a_folder_is_complete_when_it_is_unchanged_for_long_enough(tmp_path: Pat
     assert completed(tracker, tmp_path) == []
     clock.now += 10
     assert completed(tracker, tmp_path) == ["walk"]
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".avi"])
+def test_a_copy_that_stalls_is_never_processed_in_parts(tmp_path: Path, suffix: str) -> None:
+    clock = Clock()
+    tracker = CompletionTracker(10.0, 100, clock)
+    whole = write_video(tmp_path / "outside" / f"torso{suffix}", [textured_frame(0)] * 9).read_bytes()
+    shutil.rmtree(tmp_path / "outside")
+    video = tmp_path / "walk" / "head" / f"torso{suffix}"
+    video.parent.mkdir(parents=True)
+    for length in (0, len(whole) // 3, len(whole) // 2, len(whole) - 20):
+        video.write_bytes(whole[:length])
+        assert completed(tracker, tmp_path) == []
+        clock.now += 600
+        assert completed(tracker, tmp_path) == []
+        assert f"head/torso{suffix} is not complete" in tracker.incomplete[tmp_path / "walk"]
+        assert "after 30 minutes" in missing_content(InboxEntry(tmp_path / "walk"), 100)
+    video.write_bytes(whole)
+    assert completed(tracker, tmp_path) == []
+    clock.now += 10
+    assert completed(tracker, tmp_path) == ["walk"]
+    assert tracker.incomplete == {}
+
+
+def test_a_damaged_video_does_not_wait_for_ever(tmp_path: Path) -> None:
+    clock = Clock()
+    tracker = CompletionTracker(10.0, 100, clock)
+    video = tmp_path / "walk" / "torso.mp4"
+    write_video(video, [textured_frame(0)] * 9)
+    video.write_bytes(video.read_bytes()[:-9])
+    completed(tracker, tmp_path)
+    clock.now += 1799
+    assert completed(tracker, tmp_path) == []
+    clock.now += 1
+    assert completed(tracker, tmp_path) == ["walk"]
+    video.write_bytes(video.read_bytes()[:-1])
+    assert completed(tracker, tmp_path) == [], "a change starts the time anew"
+    (tmp_path / "walk" / "READY").touch()
+    assert completed(tracker, tmp_path) == ["walk"], "the user says that it is complete"
+
+
+def test_an_unchanged_entry_is_opened_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, opened = Clock(), []
+    tracker = CompletionTracker(10.0, 100, clock)
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "walk" / "torso.mp4").touch()
+
+    def look(path: Path, _: object) -> str:
+        opened.append(path)
+        return "something"
+
+    monkeypatch.setattr("bodycap_batch.watch.inbox_entries.missing_part", look)
+    for _ in range(5):
+        assert completed(tracker, tmp_path) == []
+        clock.now += 20
+    assert len(opened) == 1
 
 
 @pytest.mark.parametrize(
@@ -76,7 +140,7 @@ def test_files_of_a_copying_program_delay_a_folder_until_ready(tmp_path: Path, l
 def test_files_of_file_managers_delay_nothing(tmp_path: Path) -> None:
     (tmp_path / "walk").mkdir()
     for name in ("torso.mp4", ".DS_Store", "._torso.mp4"):
-        (tmp_path / "walk" / name).touch()
+        (tmp_path / "walk" / name).write_text("frames of no known format")
     assert completed(CompletionTracker(0.0, 100), tmp_path) == ["walk"]
 
 
@@ -88,7 +152,7 @@ def test_the_entry_that_is_complete_for_longest_comes_first(tmp_path: Path) -> N
         completed(tracker, tmp_path)
         clock.now += 1
     (tmp_path / "z").mkdir()
-    (tmp_path / "z" / "torso.mp4").touch()
+    (tmp_path / "z" / "torso.mp4").write_text("frames of no known format")
     clock.now += 20
     completed(tracker, tmp_path)
     clock.now += 20
@@ -103,7 +167,7 @@ def test_a_stopped_heartbeat_is_detected_with_the_own_clock_alone(tmp_path: Path
     monitor = HeartbeatMonitor(60.0, clock)
 
     def elsewhere() -> None:
-        owner = json.loads(job.owner.read_text())
+        owner = read_owner(job.owner)
         job.owner.write_text(json.dumps({**owner, "machine": "another", "pid": 1}))
 
     for _ in range(5):
@@ -128,7 +192,7 @@ def test_there_is_no_wait_for_an_owner_that_released_the_job_or_ended(tmp_path: 
     claim = create_claim(job)
     monitor = HeartbeatMonitor(1e9)
     assert monitor.find_abandoned([job]) == []
-    owner = json.loads(job.owner.read_text())
+    owner = read_owner(job.owner)
     if owner["machine"]:
         job.owner.write_text(json.dumps({**owner, "process": "1"}))
         # the process number belongs to another process now
@@ -150,7 +214,7 @@ def test_a_late_heartbeat_of_an_earlier_owner_does_not_regain_the_job(tmp_path: 
     assert second.ownership.is_held()
     assert not first.ownership.is_held()
     second.write_heartbeat()
-    assert json.loads(job.owner.read_text())["generation"] == 2
+    assert read_owner(job.owner)["generation"] == 2
     shutil.rmtree(job.path)
     assert not second.ownership.is_held()
 
@@ -258,7 +322,7 @@ def test_the_folders_that_jobs_are_moved_to_are_not_watched(tmp_path: Path) -> N
 @pytest.mark.parametrize("poll", [False, True])
 def test_a_change_wakes_the_watcher(tmp_path: Path, poll: bool) -> None:
     woken = threading.Event()
-    with ChangeNotifier(tmp_path, woken, poll=poll):
+    with ChangeNotifier(tmp_path, woken, poll=poll, write_line=lambda _: None):
         end = time.monotonic() + 20
         number = 0
         while not woken.is_set() and time.monotonic() < end:
