@@ -116,13 +116,13 @@ def _parse_settings(settings: list[str]) -> dict[str, Any]:
 def _synth_options(values: Mapping[str, Any]) -> Any:
     from pydantic import ValidationError
 
+    from bodycap_batch.config.explain import job_error, problems_of
     from bodycap_batch.synthetic import SynthOptions
 
+    given = {key: value for key, value in values.items() if value is not None}
     try:
-        return SynthOptions.model_validate({key: value for key, value in values.items() if value is not None})
+        return SynthOptions.model_validate(given)
     except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
-        known = ", ".join(SynthOptions.model_fields)
-        hint = f"known: {known}" if first["type"] == "extra_forbidden" else None
-        raise JobError(first["msg"], field=field or None, hint=hint) from error
+        refused = job_error(problems_of(error, SynthOptions, given), Path())
+        refused.path = None
+        raise refused from error

@@ -139,7 +139,7 @@ def _value(node: yaml.Node, location: Location, lines: dict[Location, int], path
         return _mapping(node, location, lines, path)
     if isinstance(node, yaml.SequenceNode):
         return [_value(item, (*location, index), lines, path) for index, item in enumerate(node.value)]
-    return _scalar(node, path)
+    return _scalar(node, location, path)
 
 
 def _mapping(
@@ -165,7 +165,7 @@ def _mapping(
     return out
 
 
-def _scalar(node: yaml.Node, path: Path) -> object:
+def _scalar(node: yaml.Node, location: Location, path: Path) -> object:
     """Return the value of a scalar according to the core schema of YAML 1.2; quoted text stays text."""
     text = str(node.value)
     if getattr(node, "style", None) is not None:
@@ -184,6 +184,7 @@ def _scalar(node: yaml.Node, path: Path) -> object:
             f"number out of range: {text[:40]}",
             path=path,
             line=node.start_mark.line + 1,
+            field=dotted(location) or None,
             hint="check the digits",
         )
     return number

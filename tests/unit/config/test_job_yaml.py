@@ -100,7 +100,7 @@ def test_yaml_words_are_not_turned_into_other_things(tmp_path: Path) -> None:
         (MINIMAL + "height_m: 17.5\n", 7, "height_m", "less than or equal to 2.6", None),
         (MINIMAL + "  work_px: 640.5\n", 7, "capture.work_px", "640.5", None),
         (MINIMAL + "  start_s: .nan\n", 7, "capture.start_s", "should be a number", None),
-        (MINIMAL + "  start_s: 1e999\n", 7, None, "out of range", "digits"),
+        (MINIMAL + "  start_s: 1e999\n", 7, "capture.start_s", "out of range", "digits"),
         (MINIMAL + "activity: wlak\n", 7, "activity", "not one of walk, generic", "'walk'"),
         (MINIMAL + "skeleton: uper_body\n", 7, "skeleton", "unknown skeleton", "'upper_body'"),
         (MINIMAL + "skeleton: body.bvh\n", 7, "skeleton", "no such file", "path"),
