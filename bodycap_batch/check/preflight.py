@@ -18,6 +18,7 @@ from bodycap_batch.check.file_mixups import require_distinct_videos
 from bodycap_batch.check.overview import with_first_guess
 from bodycap_batch.check.picture_quality import check_picture_quality
 from bodycap_batch.check.recording_advice import advise
+from bodycap_batch.config.bounds import MAX_TICKS
 from bodycap_batch.config.job import Overrides, load_job_with_origins
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
 from bodycap_batch.config.mounts import TRUNK_ROLES
@@ -282,6 +283,21 @@ def _no_common_time_error(job: Job, camera: CameraSummary, others: list[CameraSu
     )
 
 
+def _check_rates(job: Job, summaries: list[CameraSummary]) -> list[str]:
+    """Check that the rates that the job gives do not need too many ticks for the duration of the capture."""
+    if job.skeleton == NO_SKELETON or not summaries:
+        return []
+    length_s = max(camera.end_s for camera in summaries) - min(camera.start_s for camera in summaries)
+    for field, fps in (("merge.fps", job.merge.fps), ("export.fps", job.export.fps)):
+        if fps is not None and length_s * fps > MAX_TICKS:
+            raise JobError(
+                f"{length_s:.0f} s at {fps:g} ticks per second are more than {MAX_TICKS} ticks",
+                field=field,
+                hint=f"at most {MAX_TICKS / length_s:.3g} for this capture, or cut it with start_s and end_s",
+            )
+    return []
+
+
 def _check_skeleton(job: Job, _findings: list[CameraSummary]) -> list[str]:
     """Check that a skeleton file can be read and contains the bones on which cameras are mounted."""
     if job.skeleton is None or job.skeleton in SKELETON_PRESETS:
@@ -359,4 +375,11 @@ def _check_disk(job: Job, summaries: list[CameraSummary]) -> list[str]:
     return require_room(job.out or Path("out").resolve(), frames, large)
 
 
-_CHECKS = (_check_files, _check_clocks, _check_named_frames, _check_skeleton, _check_formats)
+_CHECKS = (
+    _check_files,
+    _check_clocks,
+    _check_rates,
+    _check_named_frames,
+    _check_skeleton,
+    _check_formats,
+)

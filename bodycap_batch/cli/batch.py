@@ -18,6 +18,7 @@ from bodycap_batch.cli.progress_display import text_from_event
 from bodycap_batch.cli.shared_options import (
     BatchOutOption,
     BatchStoreOption,
+    MemoryOption,
     cores,
     default_out,
     results_folder,
@@ -57,6 +58,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
     executor: _ExecutorOption = "local",
     out: BatchOutOption = None,
     store: BatchStoreOption = None,
+    memory_mb: MemoryOption = None,
     max_jobs: Annotated[
         int | None, typer.Option(min=1, help="Maximum number of jobs at the same time.", show_default=False)
     ] = None,
@@ -105,6 +107,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
                 cancelled=stop.is_set,
                 executor=shared,
                 priority=job.priority,
+                memory_mb=memory_mb,
             )
 
         work = Batch(settings, lambda job: _batch_results_folder(job, folder), max_jobs or busy_jobs)

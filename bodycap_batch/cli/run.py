@@ -14,6 +14,7 @@ from bodycap_batch.cli.progress_display import JsonLines, ProgressDisplay, make_
 from bodycap_batch.cli.shared_options import (
     HeightOption,
     JobArgument,
+    MemoryOption,
     OutOption,
     SkeletonOption,
     StoreOption,
@@ -42,6 +43,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     height: HeightOption = None,
     threads: ThreadsOption = None,
     store: StoreOption = None,
+    memory_mb: MemoryOption = None,
     from_: Annotated[
         StageName | None, typer.Option("--from", help="Repeat this stage and all later ones.")
     ] = None,
@@ -93,6 +95,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
                 cancelled=stop.is_set,
                 redo=redo,
                 until=until or "",
+                memory_mb=memory_mb,
                 results_ready=announce_results,
             )
 

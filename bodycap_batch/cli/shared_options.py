@@ -51,6 +51,17 @@ ThreadsOption = Annotated[
     int | None,
     typer.Option(min=1, max=1024, help="Number of cores to use (default: all).", show_default=False),
 ]
+MemoryOption = Annotated[
+    int | None,
+    typer.Option(
+        "--memory-mb",
+        min=500,
+        max=1 << 24,
+        metavar="MB",
+        help="Memory limit of one task (default: four fifths of the machine's memory).",
+        show_default=False,
+    ),
+]
 StoreOption = Annotated[Path | None, _store(".store beside the results")]
 BatchStoreOption = Annotated[Path | None, _store(".store in the results folder")]
 WatchStoreOption = Annotated[Path | None, _store(".store beside INBOX")]

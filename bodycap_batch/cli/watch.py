@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.shared_options import ThreadsOption, WatchStoreOption, cores
+from bodycap_batch.cli.shared_options import MemoryOption, ThreadsOption, WatchStoreOption, cores
 from bodycap_batch.cli.signals import event_on_signal, signal_exit_code
 from bodycap_batch.cli.terminal import print_timed_message
 
@@ -57,6 +57,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Number of jobs at the same time.")] = 1,
     threads: ThreadsOption = None,
     store: WatchStoreOption = None,
+    memory_mb: MemoryOption = None,
     root: RootOption = None,
     limit: LimitOption = None,
     unchanged_s: Annotated[
@@ -111,6 +112,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
         store=store,
         jobs=jobs,
         threads=threads or cores(),
+        memory_mb=memory_mb,
         unchanged_s=unchanged_s,
         stale_s=stale,
         poll=poll,

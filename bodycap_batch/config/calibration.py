@@ -19,14 +19,12 @@ from pydantic import (
     model_validator,
 )
 
+from bodycap_batch.config.bounds import MAX_ROLLING_SHUTTER_S, MAX_TIME_S
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camera, parameter_count
 
 _MAX_BYTES = 1 << 20
 """Maximum size (bytes) of a calibration file. Real calibration files have a few kilobytes. Evidence: none."""
-_MAX_SECONDS = 1e10
-"""Maximum absolute value (seconds) of a time in a calibration file. Every Unix time is smaller.
-Evidence: none."""
 _CENTRE_INDEX = {
     "SIMPLE_PINHOLE": 1,
     "SIMPLE_RADIAL": 1,
@@ -86,6 +84,10 @@ class ImplausibleParameter(NamedTuple):
     message: str
 
 
+_MAX_PARAMETERS = 16
+"""Maximum number of parameters of a lens. COLMAP's largest model has 16 parameters."""
+
+
 class Calibration(BaseModel):
     """Intrinsics of a camera at the size of its calibration images.
 
@@ -96,7 +98,7 @@ class Calibration(BaseModel):
 
     model: str = Field(description="COLMAP camera model")
     params: tuple[Annotated[float, AllowInfNan()], ...] = Field(
-        description="the model's parameters in COLMAP's order, pixels"
+        max_length=_MAX_PARAMETERS, description="the model's parameters in COLMAP's order, pixels"
     )
     width: int = Field(gt=0, le=65536, description="image width of the calibration, pixels")
     height: int = Field(gt=0, le=65536, description="image height of the calibration, pixels")
@@ -234,11 +236,11 @@ def read_calibration(path: Path, camera: str) -> CalibrationEntry:
         has_offset, offset = camera in offsets, offsets.get(camera, 0.0)
     return CalibrationEntry(
         calibration=calibration,
-        offset_s=_seconds(offset, path, f"{field}offsets_s"),
+        offset_s=_seconds(offset, MAX_TIME_S, path, f"{field}offsets_s"),
         has_offset=has_offset,
         rolling_shutter_s=None
         if data.get("rolling_shutter_s") is None
-        else _seconds(data["rolling_shutter_s"], path, f"{field}rolling_shutter_s"),
+        else _seconds(data["rolling_shutter_s"], MAX_ROLLING_SHUTTER_S, path, f"{field}rolling_shutter_s"),
     )
 
 
@@ -298,9 +300,12 @@ def _no_such_camera(path: Path, camera: str, cameras: object) -> CaptureError:
     )
 
 
-def _seconds(value: object, path: Path, field: str) -> float:
-    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MAX_SECONDS:
+def _seconds(value: object, largest_s: float, path: Path, field: str) -> float:
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= largest_s:
         return float(value)
     raise CaptureError(
-        f"{value!r:.40} is not a time in seconds", path=path, field=field, hint="a number, e.g. 0.12"
+        f"{value!r:.40} is not a time in seconds",
+        path=path,
+        field=field,
+        hint=f"a number from {-largest_s:g} to {largest_s:g}, e.g. 0.12",
     )

@@ -8,6 +8,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
+from bodycap_batch.config.bounds import (
+    MAX_ANGLE_DEG,
+    MAX_REACH_M,
+    MAX_ROLLING_SHUTTER_S,
+    MAX_TIME_S,
+    MIN_SIGMA_DEG,
+    MIN_SIGMA_M,
+)
 from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.mounts import mount_of, role_of_segment
 from bodycap_batch.config.options import (
@@ -23,9 +31,11 @@ from bodycap_batch.model.geometry import make_transform, rotation_from_quat_xyzw
 NO_SKELETON = "none"
 """Value of ``skeleton`` for a job that computes the camera paths and the map, but no body."""
 SKELETON_PRESETS = (NO_SKELETON, "upper_body", "full_body")
-_MAX_SECONDS = 4e9
-"""Maximum absolute value (seconds) of a time in a job. Unix times are smaller than this maximum. The sum of
-two times of this size, in nanoseconds, fits into int64."""
+_MAX_ROTATION = 10.0
+"""Maximum absolute value (no unit) of a component of a rotation that the job gives, as a quaternion or as a
+matrix. The bound keeps products finite; `rules` checks that the components are a rotation. Evidence: none."""
+_MAX_FRAME = 10**8
+"""Maximum number of a frame of a skeleton file: a day of motion at the maximum rate has 86 million frames."""
 
 
 class _Block(BaseModel):
@@ -50,16 +60,18 @@ AnyCalibration = Annotated[
     | Annotated[Path, Tag("file")],
     Discriminator(_calibration_kind),
 ]
-Seconds = Annotated[float, Field(ge=-_MAX_SECONDS, le=_MAX_SECONDS)]
-Row = tuple[float, float, float, float]
+Seconds = Annotated[float, Field(ge=-MAX_TIME_S, le=MAX_TIME_S)]
+_Component = Annotated[float, Field(ge=-_MAX_ROTATION, le=_MAX_ROTATION)]
+_Metres = Annotated[float, Field(ge=-MAX_REACH_M, le=MAX_REACH_M)]
+Row = tuple[_Component, _Component, _Component, _Metres]
 Activity = Literal["walk", "generic"]
 
 
 class MountPose(_Block):
     """Pose of a camera relative to the joint of its bone: x_in_joint = rotation · x_in_cam + translation."""
 
-    translation_m: tuple[float, float, float]
-    quat_xyzw: Row
+    translation_m: tuple[_Metres, _Metres, _Metres]
+    quat_xyzw: tuple[_Component, _Component, _Component, _Component]
 
 
 AnyPose = Annotated[
@@ -80,8 +92,12 @@ class CameraConfig(_Block):
     joint_from_cam: AnyPose | None = Field(
         None, description="measured mount: 4x4 matrix, or translation_m and quat_xyzw"
     )
-    sigma_deg: float | None = Field(None, gt=0, le=180, description="uncertainty of the mount's rotation")
-    sigma_m: float | None = Field(None, gt=0, le=10, description="uncertainty of the mount's position")
+    sigma_deg: float | None = Field(
+        None, ge=MIN_SIGMA_DEG, le=MAX_ANGLE_DEG, description="uncertainty of the mount's rotation"
+    )
+    sigma_m: float | None = Field(
+        None, ge=MIN_SIGMA_M, le=MAX_REACH_M, description="uncertainty of the mount's position"
+    )
     calibration: AnyCalibration | None = Field(
         None, description="inline block, path of a calib.json, or auto; default: the capture's"
     )
@@ -97,8 +113,8 @@ class CameraConfig(_Block):
     offset_s: Seconds | None = Field(None, description="common time = camera time + offset_s")
     rolling_shutter_s: float | None = Field(
         None,
-        ge=-1,
-        le=1,
+        ge=-MAX_ROLLING_SHUTTER_S,
+        le=MAX_ROLLING_SHUTTER_S,
         description="time from the first row's exposure to the last's; default: found from the video",
     )
 
@@ -172,7 +188,10 @@ class Job(_Block):
         description="role by joint name of a skeleton file; replaces the role found from the joint's name",
     )
     tpose_frame: int | None = Field(
-        None, ge=0, description="frame of the skeleton file with the T-pose, if the zero pose is not a T-pose"
+        None,
+        ge=0,
+        le=_MAX_FRAME,
+        description="frame of the skeleton file with the T-pose, if the zero pose is not a T-pose",
     )
     height_m: float | None = Field(
         None, ge=0.4, le=2.6, description="the subject's height in metres, e.g. 1.75"

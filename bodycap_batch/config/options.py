@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
+from bodycap_batch.config.bounds import MAX_CAPTURE_S, MAX_FPS, MAX_MOTION_FPS, MAX_SEED, MIN_FPS
+
 FrameName = Annotated[str, StringConstraints(pattern=r"^.+:\d{1,9}$")]
 """Name of one frame: ``camera:frame``. Frame 0 is the first frame of the camera's first chapter; the count
 continues through all chapters. ``start_s`` does not change the count."""
@@ -15,10 +17,34 @@ NamePreset = Literal["hik", "mixamo", "biped", "unreal"]
 RootMode = Literal["hips", "ground", "in_place"]
 
 
-class Options(BaseModel):
-    """Base class of all blocks of options: immutable; unknown keys are refused."""
+_MAX_PARALLAX_PX = 640.0
+"""Maximum parallax (pixels) that causes a keyframe: the long side of the image in which it is measured."""
+_MAX_WINDOW = 60
+"""Maximum number of frames from which the sharpest one is selected: two seconds of usual video. All these
+frames are in memory. Evidence: none."""
+_MAX_FEATURES = 32_768
+"""Maximum number of features of a keyframe. It is four times the default of COLMAP. The matching of two
+keyframes needs a matrix with a row and a column for each feature: 4 GB for this number."""
+_MAX_ROUNDS = 100
+"""Maximum number of rounds that extend the map. A map that still gains frames after ten rounds was not
+observed. Evidence: none."""
+_MAX_INLIERS = 10_000
+"""Maximum of the smallest number of inliers of a frame. A frame has fewer tracks. Evidence: none."""
+_MAX_SQUARES = 100
+"""Maximum number of squares along a side of a marker board. A board that fills an image of 960 px then has
+squares of 10 px, and smaller markers cannot be read. Evidence: none."""
+_DISTANCE_M = (1e-3, 1e4)
+"""Minimum and maximum distance (metres) between two frames that sets the scale. A distance below 1 mm cannot
+be measured; a walk of 10 km takes two hours. Evidence: none."""
+_CUTOFF_HZ = (0.1, MAX_FPS / 2.0)
+"""Minimum and maximum cutoff frequency (Hz) of the low-pass filter. A body moves faster than the minimum; the
+maximum is the Nyquist frequency of the maximum rate."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+
+class Options(BaseModel):
+    """Base class of all blocks of options: immutable; unknown keys, NaN and infinity are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class KeyframeOptions(Options):
@@ -27,18 +53,25 @@ class KeyframeOptions(Options):
     parallax_px: float = Field(
         15.0,
         gt=0,
+        le=_MAX_PARALLAX_PX,
         description="a larger parallax causes a keyframe; pixels at a long side of 640 px, rotation removed",
     )
     min_survival: float = Field(
         0.5, gt=0, lt=1, description="a keyframe is selected if a smaller share of the tracks is left"
     )
-    max_gap_s: float = Field(0.5, gt=0, description="largest time between two keyframes")
-    min_gap_s: float = Field(0.05, ge=0, description="smallest time between two keyframes")
+    max_gap_s: float = Field(0.5, gt=0, le=MAX_CAPTURE_S, description="largest time between two keyframes")
+    min_gap_s: float = Field(0.05, ge=0, le=MAX_CAPTURE_S, description="smallest time between two keyframes")
     max_per_min: float | None = Field(
-        None, gt=0, description="most keyframes per minute; the keyframes that add least are left out"
+        None,
+        gt=0,
+        le=60.0 * MAX_FPS,
+        description="most keyframes per minute; the keyframes that add least are left out",
     )
     window: int = Field(
-        4, ge=1, description="number of last frames; the sharpest of these frames becomes the keyframe"
+        4,
+        ge=1,
+        le=_MAX_WINDOW,
+        description="number of last frames; the sharpest of these frames becomes the keyframe",
     )
 
 
@@ -46,7 +79,10 @@ class MapOptions(Options):
     """Options of stage 2, mapping."""
 
     features: int = Field(
-        512, ge=128, description="number of SIFT features per keyframe; the strongest features are used"
+        512,
+        ge=128,
+        le=_MAX_FEATURES,
+        description="number of SIFT features per keyframe; the strongest features are used",
     )
     pairs: Literal["retrieval", "exhaustive"] = Field(
         "retrieval", description="keyframe pairs to match: neighbours and similar keyframes, or all pairs"
@@ -54,7 +90,7 @@ class MapOptions(Options):
     init_frames: tuple[FrameName, FrameName] | None = Field(
         None, description="two frames to start from, each camera:frame; default: selected automatically"
     )
-    seed: int = Field(0, ge=0, description="seed of every random choice")
+    seed: int = Field(0, ge=0, le=MAX_SEED, description="seed of every random choice")
     min_coverage: float = Field(
         0.1, ge=0, le=1, description="smallest share of the keyframes that the map must contain"
     )
@@ -63,10 +99,14 @@ class MapOptions(Options):
 class RegistrationOptions(Options):
     """Options of stage 3, the registration of every frame."""
 
-    rounds: int = Field(3, ge=0, description="how often the map may be extended to localise lost frames")
-    min_inliers: int = Field(15, ge=4, description="smallest number of PnP inliers of a frame")
+    rounds: int = Field(
+        3, ge=0, le=_MAX_ROUNDS, description="how often the map may be extended to localise lost frames"
+    )
+    min_inliers: int = Field(
+        15, ge=4, le=_MAX_INLIERS, description="smallest number of PnP inliers of a frame"
+    )
     max_sigma_depth: float = Field(
-        0.015, gt=0, description="largest sigma of the camera centre, as a share of the median depth"
+        0.015, gt=0, le=1, description="largest sigma of the camera centre, as a share of the median depth"
     )
 
 
@@ -85,9 +125,15 @@ MARKER_COUNTS = {
 class MarkerBoard(Options):
     """A flat board in the room, with squares of known size."""
 
-    square_m: float = Field(gt=0, le=2, description="side of one square, metres, as measured on the print")
-    columns: int = Field(ge=3, description="chessboard: inner corners in a row; ChArUco: squares in a row")
-    rows: int = Field(ge=3, description="chessboard: inner corners in a column; ChArUco: squares in a column")
+    square_m: float = Field(ge=1e-3, le=2, description="side of one square, metres, as measured on the print")
+    columns: int = Field(
+        ge=3, le=_MAX_SQUARES, description="chessboard: inner corners in a row; ChArUco: squares in a row"
+    )
+    rows: int = Field(
+        ge=3,
+        le=_MAX_SQUARES,
+        description="chessboard: inner corners in a column; ChArUco: squares in a column",
+    )
     kind: Literal["charuco", "chessboard"] = Field("charuco", description="kind of board")
     dictionary: str = Field("4X4_50", description="ChArUco: family of its markers, as OpenCV names it")
     marker: float = Field(0.75, gt=0.1, lt=1, description="ChArUco: side of a marker / side of a square")
@@ -99,18 +145,28 @@ class MarkerBoard(Options):
     )
 
 
+_Distance = Annotated[float, Field(ge=_DISTANCE_M[0], le=_DISTANCE_M[1])]
+
+
 class MergeOptions(Options):
     """Options of stage 4, the motion of the skeleton."""
 
     fps: float | None = Field(
-        None, gt=0, description="rate of the motion; default: the rate of the torso camera"
+        None,
+        ge=MIN_FPS,
+        le=MAX_MOTION_FPS,
+        description="rate of the motion; default: the rate of the torso camera",
     )
     max_gap_s: float = Field(
-        1.0, gt=0, description="longest gap between the poses of a camera that is not marked as filled"
+        1.0,
+        gt=0,
+        le=MAX_CAPTURE_S,
+        description="longest gap between the poses of a camera that is not marked as filled",
     )
     t_pose_s: float | None = Field(
         None,
         ge=0,
+        le=MAX_CAPTURE_S,
         description="duration of the T-pose at the start; default: detected; 0: there is no T-pose",
     )
     camera_paths: Literal["joint", "measured"] = Field(
@@ -120,7 +176,7 @@ class MergeOptions(Options):
         True,
         description="keep standing feet from sliding, if cameras on shins or feet show that the feet stand",
     )
-    known_distance: tuple[FrameName, FrameName, Annotated[float, Field(gt=0)]] | None = Field(
+    known_distance: tuple[FrameName, FrameName, _Distance] | None = Field(
         None, description="two frames, each camera:frame, and the metres between their lenses; sets the scale"
     )
     marker_board: MarkerBoard | None = Field(
@@ -140,12 +196,16 @@ class ExportOptions(Options):
         "hips", description="joint that holds the travel: the hips, an extra root on the ground, or none"
     )
     fps: float | None = Field(
-        None, gt=0, le=1000, description="rate of the files for animation; default: the rate of the motion"
+        None,
+        ge=MIN_FPS,
+        le=MAX_FPS,
+        description="rate of the files for animation; default: the rate of the motion",
     )
     tpose: bool = Field(False, description="a T-pose as frame 0 of the files for animation")
     smoothing_hz: float | None = Field(
         None,
-        gt=0,
+        ge=_CUTOFF_HZ[0],
+        le=_CUTOFF_HZ[1],
         description="cutoff of a low-pass filter for the files for animation, usually 6; default: no filter",
     )
     euler_order: Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"] = Field(

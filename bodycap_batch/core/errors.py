@@ -101,6 +101,10 @@ class DiskAway(StoreError):
     """A disk does not respond, for example an unreachable network disk. A later attempt may succeed."""
 
 
+class OutOfMemory(BodycapError):
+    """A task needs more memory than it may use, or than the machine has."""
+
+
 class Cancelled(BodycapError):
     """The user stopped the work."""
 
@@ -113,7 +117,8 @@ def one_line(error: Exception) -> str:
 
 
 _ERROR_TYPES = {
-    cls.__name__: cls for cls in (JobError, CaptureError, EstimationError, StoreError, DiskAway, Cancelled)
+    cls.__name__: cls
+    for cls in (JobError, CaptureError, EstimationError, StoreError, DiskAway, OutOfMemory, Cancelled)
 }
 
 

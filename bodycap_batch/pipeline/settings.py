@@ -46,6 +46,7 @@ class Settings:
         results_ready: Called with the folder of the results if the results are published before their video
             is ready.
         limits: Maximum sizes of the videos; None (no limits) for a job that the user runs directly.
+        memory_mb: Memory limit (MB) of one task; None for four fifths of the machine's memory.
         turns: Object that lets only one job of this process compute an artefact at a time; None if the
             process runs only this job.
     """
@@ -63,6 +64,7 @@ class Settings:
     priority: int = 0
     results_ready: Callable[[Path], None] = _ignore
     limits: Limits | None = None
+    memory_mb: int | None = None
     turns: Turns | None = None
 
     def runner(
@@ -87,6 +89,7 @@ class Settings:
                 before=before,
                 compute=self.compute,
                 redo=self.redo,
+                memory_mb=self.memory_mb,
             ),
         )
 

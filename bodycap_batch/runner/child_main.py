@@ -30,6 +30,12 @@ from bodycap_batch.core.errors import (
     StoreError,
 )
 from bodycap_batch.core.memory import release_memory
+from bodycap_batch.runner.memory_limit import (
+    is_out_of_memory,
+    lift_own_limit,
+    limit_own_memory,
+    out_of_memory,
+)
 from bodycap_batch.runner.task import Task, TaskFunction, task_from_json
 from bodycap_batch.store.artefacts import DISK_ERRORS, Store, store_error
 
@@ -51,9 +57,10 @@ reported as the cause of the failure, because libraries hide the error ENOSPC. E
 def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
     """Run the task file given in `arguments`; without a file, follow orders until standard input closes.
 
-    An order is one JSON line. ``{"task": task, "log": file}`` runs a task and writes the task's printed
-    output to the log. ``{"import": [modules]}`` loads modules while the child has no task. If a task is
-    ordered while modules are loading, the task waits until the modules are loaded.
+    An order is one JSON line. ``{"task": task, "log": file, "memory_mb": limit, "limit_yourself": true}``
+    runs a task and writes the task's printed output to the log. If ``limit_yourself`` is false, the parent
+    limits the memory of the child. ``{"import": [modules]}`` loads modules while the child has no task. If a
+    task is ordered while modules are loading, the task waits until the modules are loaded.
 
     Args:
         arguments: The path of the task file; empty to follow orders.
@@ -73,7 +80,10 @@ def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
             continue
         _redirect_prints(Path(order["log"]))
         writer.send("started")
-        if _run_task(order["task"], stages, _Parent(writer, orders, asks=True)) == EXIT_BUG:
+        parent = _Parent(
+            writer, orders, asks=True, memory_mb=order["memory_mb"], limits_itself=order["limit_yourself"]
+        )
+        if _run_task(order["task"], stages, parent) == EXIT_BUG:
             return EXIT_BUG
     return 0
 
@@ -86,11 +96,15 @@ class _Parent:
         messages: Writer of the messages to the parent.
         orders: Reader of the parent's orders and answers.
         asks: True if the child asks the parent for permission before a commit.
+        memory_mb: Memory limit (MB) of the task; None for no limit.
+        limits_itself: True if the child limits its own memory, and not the parent.
     """
 
     messages: _MessageWriter
     orders: _OrderReader
     asks: bool
+    memory_mb: int | None = None
+    limits_itself: bool = False
 
     def before_commit(self) -> None:
         """Ask the parent whether the artefact may be committed; raise `Cancelled` if the parent refuses."""
@@ -107,11 +121,18 @@ def _run_task(document: Mapping[str, Any], stages: Mapping[str, TaskFunction], p
     task, root = task_from_json(document)
     try:
         store = Store(root)
+        if parent.memory_mb is not None and parent.limits_itself:
+            limit_own_memory(parent.memory_mb, task.threads)
         _run(task, store, stages[task.key.stage], parent)
-    except BodycapError as error:
-        parent.messages.send("error", error=error.to_dict())
-        return error.exit_code
     except Exception as error:  # noqa: BLE001 - the only place that catches the bugs of a task
+        lift_own_limit()
+        if is_out_of_memory(error):
+            full = out_of_memory(task.label, parent.memory_mb, peak_memory_mb())
+            parent.messages.send("error", error=full.to_dict(), ends=True)
+            return EXIT_BUG
+        if isinstance(error, BodycapError):
+            parent.messages.send("error", error=error.to_dict())
+            return error.exit_code
         return _report_unexpected(error, root, parent.messages)
     return 0
 
@@ -217,11 +238,7 @@ def disk_full(root: Path) -> StoreError:
 
 
 def _report_unexpected(error: Exception, root: Path, messages: _MessageWriter) -> int:
-    """Report a bug or a lack of memory to the parent; return the exit code with which the child must end."""
-    if isinstance(error, MemoryError):
-        full = BodycapError("out of memory", hint="close other programs, or lower work_px in the job")
-        messages.send("error", error=full.to_dict(), ends=True)
-        return EXIT_BUG
+    """Report a bug to the parent; return the exit code with which the child must end."""
     text = traceback.format_exc()
     sys.stderr.write(text)
     bug = BodycapError(f"{type(error).__name__}: {error}", path=root if isinstance(error, OSError) else None)

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from bodycap_batch.core.errors import BodycapError, Cancelled, error_from_dict
 from bodycap_batch.runner.child_main import FULL_DISK_BYTES, disk_full
 from bodycap_batch.runner.child_process import CHILD_COMMAND, Child, crash_hint, describe_end
+from bodycap_batch.runner.memory_limit import default_limit_mb, log_says_out_of_memory, out_of_memory
 from bodycap_batch.runner.task import Task
 from bodycap_batch.store.artefacts import Store, disk_errors
 from bodycap_batch.store.digests import write_atomically
@@ -34,6 +35,7 @@ class TaskEnvironment:
         cancelled: Called several times a second; True stops the task.
         may_commit: Called before the artefact is committed; False stops the task.
         preload: Modules that idle children load while the task runs: one list of module names for each child.
+        memory_mb: Memory limit (MB) of the task; None for four fifths of the machine's memory.
     """
 
     store: Store
@@ -42,6 +44,12 @@ class TaskEnvironment:
     cancelled: Callable[[], bool]
     may_commit: Callable[[], bool]
     preload: Sequence[Sequence[str]] = ()
+    memory_mb: int | None = None
+
+    @property
+    def memory_limit_mb(self) -> int:
+        """Memory limit (MB) of the task."""
+        return default_limit_mb() if self.memory_mb is None else self.memory_mb
 
 
 class Executor(Protocol):
@@ -122,7 +130,7 @@ class Children:
         if stopped:
             raise Cancelled(STOPPED, hint="run it again to go on")
         if last is None or last["event"] == "error":
-            raise _task_error(task, last, child.returncode, log, environment.store)
+            raise _task_error(task, last, child, log, environment)
 
     def _run_in_child(
         self, task: Task, environment: TaskEnvironment, order: Mapping[str, Any]
@@ -146,7 +154,9 @@ class Children:
             with ExitStack() as on_error:
                 on_error.callback(child.end, at_once=True)
                 self.prepare(environment.logs, preload)
-                child.order(order)
+                memory_mb = environment.memory_limit_mb
+                limit_yourself = child.limit_memory(memory_mb)
+                child.order({**order, "memory_mb": memory_mb, "limit_yourself": limit_yourself})
                 last = child.follow(environment.cancelled, receive)
                 on_error.pop_all()
             if is_new or events or last is not None or environment.cancelled():
@@ -183,9 +193,9 @@ def _answer(child: Child, message: dict[str, Any], environment: TaskEnvironment)
 
 
 def _task_error(
-    task: Task, last: dict[str, Any] | None, returncode: int, log: Path, store: Store
+    task: Task, last: dict[str, Any] | None, child: Child, log: Path, environment: TaskEnvironment
 ) -> BodycapError:
-    """Return the error of a failed task, from the child's last message or else from the child's exit code."""
+    """Return the error of a failed task, from the child's last message or else from the child's end."""
     if last is not None:
         error = error_from_dict(last["error"])
         if "traceback" in last:
@@ -193,6 +203,9 @@ def _task_error(
             error.hint = f"this is a bug; please report it with {log} and the job file"
             error.add_note(last["traceback"])
         return error
-    if store.free_bytes() < FULL_DISK_BYTES:
-        return disk_full(store.root)
-    return BodycapError(f"{task.label}: {describe_end(returncode)}", path=log, hint=crash_hint(returncode))
+    if child.ended_by_memory() or log_says_out_of_memory(log):
+        return out_of_memory(task.label, environment.memory_limit_mb, child.peak_mb)
+    if environment.store.free_bytes() < FULL_DISK_BYTES:
+        return disk_full(environment.store.root)
+    code = child.returncode
+    return BodycapError(f"{task.label}: {describe_end(code)}", path=log, hint=crash_hint(code))

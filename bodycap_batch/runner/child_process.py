@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import bodycap_batch
+from bodycap_batch.runner.memory_limit import MemoryGroup, kernel_kills, resident_mb
 
 CHILD_COMMAND = (sys.executable, "-P", "-m", "bodycap_batch.tasks")
 """Command line of a child, without the task file. The command names the package `tasks`, which belongs to a
@@ -35,6 +36,7 @@ class Child:
 
     Attributes:
         loaded: Names of the modules that the child was asked to load.
+        peak_mb: Largest resident memory (MB) that was seen during the current task.
     """
 
     def __init__(self, command: Sequence[str], log: BinaryIO) -> None:
@@ -48,11 +50,42 @@ class Child:
             start_new_session=True,
         )
         self._incomplete = b""
+        self.peak_mb = 0.0
+        self._memory_mb = 0
+        self._group = MemoryGroup.create(self._process.pid)
+        self._kills_before = self._kills_after = (0, 0)
+        self._exceeded = False
 
     @property
     def returncode(self) -> int:
         """Exit code of a child that has ended; the negative signal number if a signal ended it."""
         return self._process.returncode
+
+    def limit_memory(self, memory_mb: int) -> bool:
+        """Limit the resident memory of the next task; return True if the child must limit itself, too."""
+        self._memory_mb, self.peak_mb, self._exceeded = memory_mb, 0.0, False
+        if self._group is not None and not self._group.limit(memory_mb):
+            self._group = None
+        self._kills_before = self._kills()
+        return self._group is None
+
+    def ended_by_memory(self) -> bool:
+        """Return True if the limit or the kernel ended this child, because of its memory."""
+        killed = self.returncode == -signal.SIGKILL
+        return self._exceeded or (killed and self._kills_after != self._kills_before)
+
+    def _kills(self) -> tuple[int, int]:
+        return kernel_kills(), 0 if self._group is None else self._group.kills()
+
+    def _check_memory(self) -> bool:
+        """Note the resident memory. If it is above the limit, kill the child and return False."""
+        now = resident_mb(self._process.pid)
+        self.peak_mb = max(self.peak_mb, now)
+        if self._group is None and now > self._memory_mb > 0:
+            self._exceeded = True
+            self._signal(signal.SIGKILL)
+            return False
+        return True
 
     def order(self, order: Mapping[str, Any]) -> None:
         """Send one order to the child. If the child has ended, do nothing; `follow` then returns None."""
@@ -64,7 +97,7 @@ class Child:
     def follow(
         self, cancelled: Callable[[], bool], on_message: Callable[[dict[str, Any]], None]
     ) -> dict[str, Any] | None:
-        """Read the child's messages until its task ends.
+        """Read the child's messages until its task ends; kill the child if it exceeds its memory limit.
 
         Args:
             cancelled: Called several times a second; True ends the reading.
@@ -76,7 +109,10 @@ class Child:
         assert self._process.stdout is not None
         pipe = self._process.stdout.fileno()
         while not cancelled():
-            if not select.select([pipe], [], [], _POLL_S)[0]:
+            ready = select.select([pipe], [], [], _POLL_S)[0]
+            if not self._check_memory():
+                return None
+            if not ready:
                 continue
             if not (data := os.read(pipe, 1 << 16)):
                 return None
@@ -105,6 +141,9 @@ class Child:
             self._signal(signal.SIGKILL)
             self._process.wait()
         self._process.stdout.close()
+        self._kills_after = self._kills()
+        if self._group is not None:
+            self._group.remove()
 
     def kill(self) -> None:
         """Kill a child that has no task. No results can be lost."""

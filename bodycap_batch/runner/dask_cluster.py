@@ -274,7 +274,10 @@ def _on_worker(order: Mapping[str, Any], topic: str) -> dict[str, Any]:
 
     # All tasks of this worker together must not use more threads than the machine has cores.
     threads = min(order["task"]["threads"], max(1, (os.cpu_count() or 1) // worker.state.nthreads))
-    return run_order({**order, "task": {**order["task"], "threads": threads}}, progress, cancelled)
+    limits = (order["memory_mb"], worker.state.total_resources.get(MEMORY))
+    memory_mb = min((int(limit) for limit in limits if limit), default=None)
+    task = {**order["task"], "threads": threads}
+    return run_order({**order, "task": task, "memory_mb": memory_mb}, progress, cancelled)
 
 
 def _raise_error_in(answer: Mapping[str, Any]) -> None:

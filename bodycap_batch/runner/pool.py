@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import heapq
 import itertools
-import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from pathlib import Path
 from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.runner.child_pool import STOPPED, Children, TaskEnvironment
 from bodycap_batch.runner.child_process import CHILD_COMMAND
+from bodycap_batch.runner.memory_limit import default_limit_mb
 from bodycap_batch.runner.task import Task
 from bodycap_batch.runner.turns import Turns
 
@@ -88,7 +88,7 @@ class LocalPool:
     def __init__(
         self, cores: int, memory_mb: int | None = None, command: Sequence[str] = CHILD_COMMAND
     ) -> None:
-        self.slots = Slots(cores, memory_mb or machine_memory_mb() * 4 // 5)
+        self.slots = Slots(cores, memory_mb or default_limit_mb())
         self._children = Children(command)
         self._logs: set[Path] = set()
         self._turns = Turns()
@@ -109,8 +109,3 @@ class LocalPool:
         """End all child processes."""
         for logs in self._logs or {Path()}:
             self._children.close(logs)
-
-
-def machine_memory_mb() -> int:
-    """Return the physical memory of this machine, in MB."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20

@@ -23,6 +23,7 @@ def remote_order(task: Task, environment: TaskEnvironment, command: tuple[str, .
         "task": task.to_json(environment.store.root),
         "logs": str(environment.logs),
         "command": list(command),
+        "memory_mb": environment.memory_mb,
     }
 
 
@@ -53,6 +54,7 @@ def run_order(
             progress=progress,
             cancelled=cancelled,
             may_commit=lambda: not cancelled(),
+            memory_mb=order["memory_mb"],
         )
         _children_of(tuple(order["command"])).execute(task, environment)
     except BodycapError as error:

@@ -48,6 +48,7 @@ class Rules:
         before: Called before a task runs; may raise an error to forbid the task.
         compute: If False, only stored artefacts are returned; `NotStored` is raised for a missing artefact.
         redo: Names of the stages that are computed again even if their artefacts are stored.
+        memory_mb: Memory limit (MB) of one task; None for four fifths of the machine's memory.
     """
 
     cancelled: Callable[[], bool]
@@ -55,6 +56,7 @@ class Rules:
     before: Callable[[Task], None] = allow
     compute: bool = True
     redo: frozenset[str] = frozenset()
+    memory_mb: int | None = None
 
 
 class Runner:
@@ -126,6 +128,7 @@ class Runner:
             cancelled=self._rules.cancelled,
             may_commit=self._rules.may_commit,
             preload=preload,
+            memory_mb=self._rules.memory_mb,
         )
         self._executor.execute(replace(task, replaces=task.key.stage in self._rules.redo), environment)
         if (artefact := self.store.find(task.key)) is None:

@@ -127,6 +127,7 @@ class JobWorker:
         settings = Settings(
             store=self._store,
             threads=max(1, self._options.threads // self._options.jobs),
+            memory_mb=self._options.memory_mb,
             listener=status,
             cancelled=lambda: self._is_cancelled(claim),
             command=self._options.command,

@@ -25,6 +25,7 @@ class WatchOptions:
         store: Folder of the artefacts; None for the folder ``.store`` beside `running`.
         jobs: Maximum number of jobs that run at the same time.
         threads: Number of processor cores that all running jobs share.
+        memory_mb: Memory limit (MB) of one task; None for four fifths of the machine's memory.
         unchanged_s: Time (seconds) for which an entry must not change before it is treated as complete.
         stale_s: Time (seconds) without a heartbeat after which another watcher's job is taken over.
         poll: True: poll the inbox for changes (network disks need this). False: do not poll. None: poll only
@@ -37,6 +38,7 @@ class WatchOptions:
     store: Path | None = None
     jobs: int = 1
     threads: int = 1
+    memory_mb: int | None = None
     unchanged_s: float = 10.0
     stale_s: float = 60.0
     poll: bool | None = None

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.core.errors import CaptureError, EstimationError
 from bodycap_batch.runner.child_main import main
 
 Json = Mapping[str, Any]
@@ -83,9 +83,56 @@ def fill_and_die(arguments: Json, context: StageContext, files: Path) -> None:
         os.abort()
 
 
+def allocate(arguments: Json, context: StageContext, files: Path) -> None:
+    """Use memory step by step, and hold it until the parent has seen it."""
+    held = []
+    for _ in range(int(arguments["mb"])):
+        held.append(bytearray(b"x") * (1 << 20))
+    time.sleep(0.6)
+    (files / "result.txt").write_text(str(len(held)))
+
+
+def allocate_at_once(arguments: Json, context: StageContext, files: Path) -> None:
+    held = bytearray(int(arguments["mb"]) << 20)
+    (files / "result.txt").write_text(str(len(held)))
+
+
+def hide_memory_error(arguments: Json, context: StageContext, files: Path) -> None:
+    try:
+        raise MemoryError
+    except MemoryError as error:
+        raise CaptureError("cannot decode the video", path="torso.mp4", hint="copy it again") from error
+
+
+def native_memory_error(arguments: Json, context: StageContext, files: Path) -> None:
+    """End as a native thread does that cannot allocate memory."""
+    os.write(2, b"terminate called after throwing an instance of 'std::bad_alloc'\n")
+    os.abort()
+
+
+def killed(arguments: Json, context: StageContext, files: Path) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 TABLE = {
     function.__name__: function
-    for function in (work, noisy, refuse, bug, crash, hang, polite, fill, fill_quietly, fill_and_die)
+    for function in (
+        work,
+        noisy,
+        refuse,
+        bug,
+        crash,
+        hang,
+        polite,
+        fill,
+        fill_quietly,
+        fill_and_die,
+        allocate,
+        allocate_at_once,
+        hide_memory_error,
+        native_memory_error,
+        killed,
+    )
 }
 
 if __name__ == "__main__":

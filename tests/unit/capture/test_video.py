@@ -62,14 +62,15 @@ def test_a_missing_timestamp_of_the_first_decoded_frame_removes_no_later_frame(
 
         def __exit__(self, *_: object) -> None: ...
 
-        def decode(self, _: object) -> Iterator[VideoFrame]:
+        def demux(self, _: object) -> Iterator[VideoFrame]:
             with av.open(str(path)) as container:
                 for index, frame in enumerate(container.decode(video=0)):
                     frame.pts = None if index < unknown else frame.pts + shift
                     yield frame
 
     monkeypatch.setattr(decoding, "open_container", lambda _: Container())
-    codec = SimpleNamespace(codec_context=SimpleNamespace(has_b_frames=0))
+    context = SimpleNamespace(has_b_frames=0)
+    codec = SimpleNamespace(codec_context=context, decode=lambda packet: [packet])
     monkeypatch.setattr(decoding, "open_stream", lambda *_: codec)
     found = frame_index._with_first_frame(negative, "matroska", 0)
     assert found.pts.tolist() == negative.pts[unknown % 10 :].tolist()

@@ -56,6 +56,21 @@ def test_a_good_capture(walk: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(("block", "fps"), [("merge", 240), ("export", 1000)])
+def test_a_rate_that_gives_too_many_ticks_is_refused_before_any_work(
+    walk: Path, monkeypatch: pytest.MonkeyPatch, block: str, fps: int
+) -> None:
+    (walk / "job.yaml").write_text(
+        f"capture: {{calibration: calib.json}}\nout: out\nheight_m: 1.8\n{block}: {{fps: {fps}}}\n"
+    )
+    assert check_path(walk).ready
+    monkeypatch.setattr(preflight, "MAX_TICKS", 500)
+    (error,) = check_path(walk).errors
+    assert (error.exit_code, error.field) == (2, f"{block}.fps")
+    assert f"at {fps} ticks per second are more than 500 ticks" in error.message
+    assert "at most 20" in str(error.hint)
+
+
 def test_an_unlikely_calibration_and_dropped_frames_are_reported(walk: Path) -> None:
     lens = {**LENS, "params": [4, 4, 32, 24]}
     sharp = {**LENS, "params": [40, 40, 55, 24]}

@@ -129,14 +129,36 @@ def test_the_tasks_of_a_worker_share_its_cores(
     monkeypatch: pytest.MonkeyPatch, threads: int, tasks_at_once: int, want: int
 ) -> None:
     worker = SimpleNamespace(
-        get_current_task=lambda: "key", state=SimpleNamespace(nthreads=tasks_at_once, tasks={})
+        get_current_task=lambda: "key",
+        state=SimpleNamespace(nthreads=tasks_at_once, tasks={}, total_resources={}),
     )
     monkeypatch.setattr("distributed.get_worker", lambda: worker)
     monkeypatch.setattr(dask_cluster.os, "cpu_count", lambda: 8)
     monkeypatch.setattr(dask_cluster, "run_order", lambda order, *_: order["task"])
-    answer = dask_cluster._on_worker({"task": {"threads": threads}}, "topic")
+    answer = dask_cluster._on_worker({"task": {"threads": threads}, "memory_mb": None}, "topic")
     assert answer["threads"] == want
     assert answer["threads"] * tasks_at_once <= max(8, tasks_at_once)
+
+
+@pytest.mark.parametrize(
+    ("asked_mb", "declared", "want"),
+    [
+        (None, {}, None),
+        (None, {"memory": 4000.0}, 4000),
+        (3000, {}, 3000),
+        (3000, {"memory": 4000.0}, 3000),
+        (9000, {"memory": 4000.0}, 4000),
+    ],
+)
+def test_a_task_on_a_worker_may_use_the_memory_that_the_worker_declares(
+    monkeypatch: pytest.MonkeyPatch, asked_mb: int | None, declared: dict[str, float], want: int | None
+) -> None:
+    state = SimpleNamespace(nthreads=1, tasks={}, total_resources=declared)
+    worker = SimpleNamespace(get_current_task=lambda: "key", state=state)
+    monkeypatch.setattr("distributed.get_worker", lambda: worker)
+    monkeypatch.setattr(dask_cluster, "run_order", lambda order, *_: order)
+    answer = dask_cluster._on_worker({"task": {"threads": 1}, "memory_mb": asked_mb}, "topic")
+    assert answer["memory_mb"] == want
 
 
 def test_a_worker_tells_its_progress_not_more_often_than_once_a_second(
@@ -146,7 +168,7 @@ def test_a_worker_tells_its_progress_not_more_often_than_once_a_second(
     now = [100.0]
     worker = SimpleNamespace(
         get_current_task=lambda: "key",
-        state=SimpleNamespace(nthreads=1, tasks={}),
+        state=SimpleNamespace(nthreads=1, tasks={}, total_resources={}),
         log_event=lambda _, message: told.append(message["done"]),
     )
     monkeypatch.setattr("distributed.get_worker", lambda: worker)
@@ -159,7 +181,7 @@ def test_a_worker_tells_its_progress_not_more_often_than_once_a_second(
         return {}
 
     monkeypatch.setattr(dask_cluster, "run_order", perform)
-    dask_cluster._on_worker({"task": {"threads": 1}}, "topic")
+    dask_cluster._on_worker({"task": {"threads": 1}, "memory_mb": None}, "topic")
     assert told[0] == 0
     # 2 s, rounding of the clock's steps aside.
     assert len(told) == 2

@@ -11,7 +11,8 @@ import pytest
 
 from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.runner import Task, TaskEnvironment
-from bodycap_batch.runner.pool import Slots, machine_memory_mb
+from bodycap_batch.runner.memory_limit import machine_memory_mb
+from bodycap_batch.runner.pool import Slots
 from bodycap_batch.runner.turns import Turns, TurnTakingExecutor
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 

@@ -27,7 +27,7 @@ def test_every_camera_model_has_default_parameters(model):
         ({"lens": "MAGIC"}, "unknown model"),
         ({"lens": "OPENCV", "lens_params": (1.0, 2.0)}, "takes 8 parameters"),
         ({"offsets_s": {"head": 0.1}}, "no camera head"),
-        ({"offsets_s": {"torso": -5.0}}, "no earlier"),
+        ({"offsets_s": {"torso": -5.0}}, "greater than or equal to -3"),
         ({"exposure_s": 0.05}, "frame interval"),
         ({"rolling_shutter_s": 0.05}, "frame interval"),
         ({"motion": "walk.bvh", "t_pose_s": 2.0}, "followed as it is"),
