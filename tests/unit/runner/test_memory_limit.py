@@ -131,7 +131,7 @@ def test_a_child_in_a_control_group_does_not_limit_itself(
     bench: Bench, groups: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     create = MemoryGroup.create
-    monkeypatch.setattr(child_process.MemoryGroup, "create", lambda pid: create(pid, groups.parent))
+    monkeypatch.setattr(MemoryGroup, "create", lambda pid: create(pid, groups.parent))
     assert bench.with_rules(memory_mb=300).run(a_task("allocate_at_once", mb=1500))[1]
     (folder,) = groups.glob("bodycap-*")
     assert (folder / "memory.max").read_text() == str(300 << 20)
