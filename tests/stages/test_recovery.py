@@ -71,6 +71,10 @@ class _Video:
     mask: np.ndarray | None = None
 
     @property
+    def damaged(self) -> np.ndarray:
+        return np.zeros(0, np.int64)
+
+    @property
     def times_ns(self) -> np.ndarray:
         return np.arange(COUNT, dtype=np.int64) * 33_333_333
 

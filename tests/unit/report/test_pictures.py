@@ -20,6 +20,7 @@ class NoiseVideo:
         self.levels = levels
         self.kept = kept
         self.frame_numbers = np.arange(90)
+        self.damaged = np.zeros(0, np.int64)
         self.nominal_fps = 30.0
         self.passes = 0
 
