@@ -52,7 +52,7 @@ def decode_frames(video: VideoFile, indices: IntArray, threads: int = 0) -> Iter
             yield index, frame
     except av.error.FFmpegError as error:
         raise CaptureError(
-            f"decoding fails after frame {frame_decoder.position} ({error_reason(error)})",
+            f"the video cannot be decoded after frame {frame_decoder.position} ({error_reason(error)})",
             path=video.path,
             hint=COPY_AGAIN,
         ) from error
@@ -79,9 +79,11 @@ def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
                 return frame, bool(stream.codec_context.has_b_frames)
         except av.error.FFmpegError as error:
             raise CaptureError(
-                f"none of its frames can be decoded ({error_reason(error)})", path=video.path, hint=COPY_AGAIN
+                f"no frame of the video can be decoded ({error_reason(error)})",
+                path=video.path,
+                hint=COPY_AGAIN,
             ) from error
-    raise CaptureError("none of its frames can be decoded", path=video.path, hint=COPY_AGAIN)
+    raise CaptureError("no frame of the video can be decoded", path=video.path, hint=COPY_AGAIN)
 
 
 def open_stream(container: InputContainer, video: VideoFile, threads: int = 0) -> VideoStream:
@@ -176,5 +178,6 @@ def _undecodable_frame(video: VideoFile, index: int) -> CaptureError:
     return CaptureError(
         f"frame {index} (at {seconds:.2f} s) cannot be decoded",
         path=video.path,
-        hint="re-encode the video (ffmpeg -i in.mp4 -fps_mode passthrough out.mp4), or set an earlier end_s",
+        hint="convert the video (ffmpeg -i in.mp4 -fps_mode passthrough out.mp4), or set end_s to a time "
+        "before this frame",
     )
