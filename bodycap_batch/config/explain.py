@@ -16,7 +16,7 @@ from bodycap_batch.core.errors import JobError
 
 _MAX_FURTHER = 5
 """Maximum number of problems that a message lists after the first problem. Evidence: none."""
-_MISSING = "this is missing"
+_MISSING = "this key is missing"
 _DID_YOU_MEAN = "did you mean "
 _EXPECTED = {
     "string_type": "text",
@@ -48,7 +48,7 @@ class Problem(typing.NamedTuple):
 
 
 def job_error(problems: Sequence[Problem], path: Path, source: YamlSource | None = None) -> JobError:
-    """Return one error for all problems: the first problem in full, further problems briefly.
+    """Return one error for several problems: the first in full, at most five further problems briefly.
 
     Args:
         problems: The problems, at least one.
@@ -115,7 +115,7 @@ def _problem_of(details: Any, model: type[BaseModel], data: object) -> Problem:
     if kind == "literal_error":
         return _not_among(location, details)
     if kind == "too_short" and not details["input"]:
-        return Problem(location, "this is an empty list", None)
+        return Problem(location, "this list is empty", None)
     text = str(details["msg"]).removeprefix("Value error, ").replace("Input should be", "should be")
     if kind == "value_error":
         return Problem(location, text, None)
@@ -148,13 +148,13 @@ def _description(location: Location, model: type[BaseModel]) -> str:
         if text:
             return f"{location[-1]}: {text}"
         location = location[:-1]
-    return "the folder jobs/ has a commented example"
+    return "see the example with comments in the folder jobs/"
 
 
 def _unknown_key(location: Location, model: type[BaseModel]) -> Problem:
     known = known_keys(model, location[:-1])
     near = difflib.get_close_matches(str(location[-1]), known, n=1)
-    hint = f"{_DID_YOU_MEAN}{near[0]!r}?" if near else f"known here: {', '.join(known)}"
+    hint = f"{_DID_YOU_MEAN}{near[0]!r}?" if near else f"use one of these keys: {', '.join(known)}"
     return Problem(location, f"unknown key {str(location[-1])[:60]!r}", hint)
 
 
