@@ -28,7 +28,7 @@ _PROGRESS_AT_FAILURE = {
     "keyframes": "the videos were opened; the selection of keyframes was not finished",
     "map": "the keyframes were selected; the map could not be built",
     "registration": "the map was built; the registration of frames was not finished",
-    "merge": "map and camera paths are finished; the body could not be solved",
+    "merge": "the map and the camera paths are finished; the body could not be solved",
 }
 
 
@@ -78,7 +78,7 @@ def page_content(
 
 _CAUSE_CRITERIA = {
     LossCause.DARK: "the mean brightness of the lost frame is below 30 of 255",
-    LossCause.FAST: "the camera turned more than 8° per frame next to the gap",
+    LossCause.FAST: "just before or after the lost frames, the camera turned more than 8° per frame",
     LossCause.BLUR: "the sharpness is below 60 % of the sharpness of the registered frames",
     LossCause.PLAIN: "the frame has under 30 % of the corners of the camera's registered frames",
     LossCause.SHALLOW: "the visible points did not determine the position",
@@ -169,7 +169,7 @@ def _facts(diagnosed: DiagnosedLoss) -> str:
     if np.isfinite(diagnosed.loss.sharpness):
         parts.append(f"sharpness {diagnosed.loss.sharpness:.0%}")
     if np.isfinite(diagnosed.loss.turn_deg):
-        parts.append(f"turn {diagnosed.loss.turn_deg:.0f}° per frame")
+        parts.append(f"turned {diagnosed.loss.turn_deg:.0f}° per frame")
     if diagnosed.appearance is not None:
         parts.append(f"{diagnosed.appearance.corners} corners")
     return ", ".join(parts)

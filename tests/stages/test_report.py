@@ -343,18 +343,18 @@ def test_distances_beyond_the_reach_at_any_scale_are_graded_poor(inputs: ReportI
         "distances": 120,
         "within_reach": 0.62,
         "keyframes_out_of_reach": 0,
-        "reason": "no scale puts 80% of the distances within the body's reach",
+        "reason": "for no scale, 80% of the distances between cameras are possible on one body",
     }
-    (found,) = [each for each in judge(metrics, None).criteria if "reach" in each.name]
+    (found,) = [each for each in judge(metrics, None).criteria if each.name == "Distances between cameras"]
     assert found.grade is Grade.POOR
     assert found.finding.startswith("62")
-    assert "do not suit" in found.finding
+    assert "are wrong" in found.finding
     # If a camera is not part of the body, the finding names it as the reason.
     metrics["merge"]["unused_cameras"] = {"left_palm": "it lies on a table"}
-    (found,) = [each for each in judge(metrics, None).criteria if "reach" in each.name]
+    (found,) = [each for each in judge(metrics, None).criteria if each.name == "Distances between cameras"]
     assert found.grade is Grade.FAIR
     assert "left_palm" in found.finding
-    assert "do not suit" not in found.finding
+    assert "are wrong" not in found.finding
 
 
 @pytest.mark.parametrize("reach", [None, {"judged": False, "reason": "3 distances are too few"}])
@@ -363,7 +363,7 @@ def test_a_map_without_distance_check_has_no_criterion_about_reach(
 ) -> None:
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["mapping"]["reach"] = reach
-    assert not [each for each in judge(metrics, None).criteria if "reach" in each.name]
+    assert not [each for each in judge(metrics, None).criteria if each.name == "Distances between cameras"]
 
 
 def test_the_verdict_shows_a_camera_that_ended_early(inputs: ReportInputs) -> None:
@@ -518,8 +518,8 @@ def test_recommendations_follow_from_measurements(inputs: ReportInputs) -> None:
 @pytest.mark.parametrize(
     ("source", "says"),
     [
-        ("height", "Name a known distance, or give the subject's own skeleton (--skeleton subject.bvh)."),
-        ("skeleton", "Name a known distance."),
+        ("height", "Give a known distance, or give the subject's own skeleton (--skeleton subject.bvh)."),
+        ("skeleton", "Give a known distance."),
     ],
 )
 def test_a_given_skeleton_is_not_recommended_again(inputs: ReportInputs, source: str, says: str) -> None:
@@ -527,7 +527,8 @@ def test_a_given_skeleton_is_not_recommended_again(inputs: ReportInputs, source:
     scale = {
         "source": f"{source} and floor",
         "relative_sigma": 0.03,
-        "known_to": "the metric scale is known to 3.0 % (1 sigma); to know it better, name a known distance",
+        "known_to": "the uncertainty of the metric scale is 3.0 % (1 sigma); to reduce this, "
+        "give a known distance",
         "sources": [{"name": source}, {"name": "floor"}],
     }
     changed = replace(inputs, merge=replace(inputs.merge, report=MergeReport.from_dict({"scale": scale})))
@@ -539,14 +540,17 @@ def test_an_elbow_that_violates_its_hinge_model_gets_a_recommendation(inputs: Re
     loose = {
         "LeftForeArm": {
             "sigma_m": 0.021,
-            "known_to": "the left elbow bends 2.1 cm out of its plane; to know it better, strap it",
+            "known_to": "the left elbow moves 2.1 cm out of its bending plane; to reduce this, strap it",
         }
     }
     changed = replace(
         inputs, merge=replace(inputs.merge, report=MergeReport.from_dict({"loose_hinges": loose}))
     )
     (advice,) = (each for each in recommend_changes(changed, {}) if "left elbow" in each.reason)
-    assert (advice.action, advice.reason) == ("Strap it.", "the left elbow bends 2.1 cm out of its plane")
+    assert (advice.action, advice.reason) == (
+        "Strap it.",
+        "the left elbow moves 2.1 cm out of its bending plane",
+    )
 
 
 def test_a_t_pose_that_improves_several_constants_is_recommended_once(inputs: ReportInputs) -> None:
@@ -554,7 +558,7 @@ def test_a_t_pose_that_improves_several_constants_is_recommended_once(inputs: Re
     assert merge is not None
 
     def recommended_actions(*cameras: str) -> list[str]:
-        text = "known to 11°; to know it better, swing the elbow, or stand in a T-pose for two seconds first"
+        text = "uncertainty 11°; to reduce this, swing the elbow, or stand in a T-pose for two seconds first"
         report = {"mounts": {name: {"known_to": text, "sigma_deg": 11.0} for name in cameras}}
         found = recommend_changes(
             replace(inputs, merge=replace(merge, report=MergeReport.from_dict(report))), {}
