@@ -75,8 +75,9 @@ def align_maps_initially(
 
     Some distances between cameras in different maps contain no information about the scale. One example is
     the distance between shoulder and hand. At every scale, the alignment places the hand as far from the
-    shoulder as it is in the rest pose: one arm length. A smaller scale only makes the swing of the arm smaller. Another example is the
-    distance between trunk and head. At every scale, this distance equals the distance in the rest pose.
+    shoulder as it is in the rest pose: one arm length. A smaller scale only makes the swing of the arm
+    smaller. Another example is the distance between trunk and head. At every scale, this distance equals the
+    distance in the rest pose.
 
     Args:
         bones: The graph's bones.
