@@ -161,8 +161,8 @@ class MergeOptions(Options):
     )
     foot_contact: bool = Field(
         True,
-        description="prevent standing feet from sliding, if cameras on the shins or feet show that the "
-        "feet stand still",
+        description="prevent feet that stand on the floor from sliding; this needs cameras on the shins "
+        "or the feet",
     )
     known_distance: tuple[FrameName, FrameName, Annotated[float, Field(gt=0)]] | None = Field(
         None,

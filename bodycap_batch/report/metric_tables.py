@@ -289,7 +289,7 @@ def _limb_scales_table(merge: Mapping[str, Any]) -> Table:
         for index in range(len(limbs.get("alone", ())))
     )
     return Table(
-        caption="Scale that follows from each limb alone",
+        caption="Metric scale, estimated from each limb alone",
         heads=("Limb", "Uncertainty", "Difference from the used scale"),
         rows=rows,
         note=_chi_square_note(limbs),

@@ -134,7 +134,7 @@ def test_cameras_that_see_mirror_images_get_the_advice_to_check_them(inputs: Rep
     metrics = json.loads(json.dumps(inputs.metrics))
     metrics["mapping"]["mirror_images"] = [[["left_palm"], ["torso"]]]
     first, *_ = recommend_changes(replace(inputs, metrics=metrics), {})
-    assert first.action.startswith("See whether text reads backwards in the video of left_palm or torso")
+    assert first.action.startswith("Check whether text reads backwards in the video of left_palm or torso")
 
 
 def test_the_verdict_names_cameras_placed_by_the_body_alone_and_a_job_without_poses(
@@ -178,7 +178,7 @@ def test_a_lens_that_the_map_contradicts_is_not_graded_good(
     metrics["mapping"]["freed_lenses"] = ["left_palm", "torso"]
     (freed,) = (each for each in judge(metrics, None).criteria if "Lenses" in each.name)
     assert freed.grade is Grade.FAIR
-    assert "the lens that fits was used instead" in freed.finding
+    assert "the lens was estimated together with the map" in freed.finding
     # With a larger error the estimated lens does not fit either, as a pinhole for a wide lens does not.
     strained = json.loads(json.dumps(metrics))
     strained["total"]["mean_reprojection_error_px"] = 1.1
@@ -249,7 +249,9 @@ def test_cameras_that_start_late_or_end_early_get_the_advice_to_cut(inputs: Repo
     paths = (torso, without_poses(left, slice(0, 40)), without_poses(right, slice(20, None)))
     without_cut = recommend_changes(replace(inputs, merge=replace(inputs.merge, trajectories=paths)), {})
     (ends,) = (each for each in without_cut if "Start all cameras" in each.action)
-    assert ends.action.endswith("stop them after it.")  # no time remains between 1.33 and 0.63 s
+    assert ends.action.endswith(
+        "stop all cameras after the movement."
+    )  # no time remains between 1.33 and 0.63 s
     assert f"{right.camera} has no measurement after" in ends.reason
 
 
@@ -391,7 +393,15 @@ def test_the_page_shows_scale_hinges_soft_limits_and_joined_maps(
         "merge.joined_cameras.left_palm.sigma_m",
         "merge.mounts.left_palm.roll_deg",
     } <= shown
-    for says in ("7.10 mm", "4.3 cm", "± 1.3 cm", "-4.0%", "χ² 2.4", "90°"):
+    for says in (
+        "Left palm must stay below the shoulder",
+        "7.10 mm",
+        "4.3 cm",
+        "± 1.3 cm",
+        "-4.0%",
+        "is 2.4; a value of about",
+        "90°",
+    ):
         assert says in text
 
 
