@@ -77,7 +77,10 @@ class ChangeNotifier:
             except (OSError, RuntimeError) as error:
                 # The system has no free inotify watches, or the folder is gone. Poll the folder instead.
                 if not self.polling:
-                    sys.stderr.write(f"note: {self._folder} is polled from now on, because: {error}\n")
+                    sys.stderr.write(
+                        f"note: the watcher reads {self._folder} regularly from now on, because the system "
+                        f"reports no changes of this folder: {error}\n"
+                    )
                 self.polling = True
                 self._stop.wait(_STOP_CHECK_MS / 1000)
 

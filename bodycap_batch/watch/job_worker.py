@@ -99,7 +99,7 @@ class JobWorker:
             if isinstance(away, DiskAway):
                 return self._postpone(claim, status, away)
             append_log(claim.job, traceback.format_exc())
-            hint = "this is a bug in bodycap; please report it with this log and the job"
+            hint = "this is a bug in bodycap; please report it with this log and the job file"
             bug = BodycapError(f"{type(error).__name__}: {error}", path=claim.job.log, hint=hint)
             return self._end(claim, status, "failed", bug)
         return self._end(claim, status, "done", None)
@@ -116,7 +116,11 @@ class JobWorker:
             store=str(self._store.root),
         )
         if not job_dir.job.is_file():  # an earlier watcher ended before it wrote the job
-            raise JobError("the job was never read", path=job_dir.input, hint="retry it: it is then read")
+            raise JobError(
+                "the job was not read, because the watcher ended too early",
+                path=job_dir.input,
+                hint="run `bodycap retry` for this job",
+            )
         job = read_job(job_dir, self._options.permissions)
         settings = Settings(
             store=self._store,
@@ -139,17 +143,18 @@ class JobWorker:
 
     def _check_cancelled(self, claim: Claim) -> None:
         if self._is_cancelled(claim):
-            raise Cancelled("stopped before it started", hint="retry it")
+            raise Cancelled("the job was stopped before it started", hint="run `bodycap retry` for this job")
 
     def _handle_cancelled(self, claim: Claim, status: JobStatusFile, error: Cancelled) -> JobOutcome:
         """Handle a stop: a user cancelled the job, this watcher ends, or another watcher has the job."""
         name = claim.job.name
         if not claim.ownership.is_held():
             claim.lost.set()
-            return JobOutcome(name=name, state="lost", message="another watcher has taken it over")
+            return JobOutcome(name=name, state="lost", message="another watcher runs this job now")
         if claim.job.cancel.exists():
             error = Cancelled(
-                "cancelled; finished stages are kept", hint=f"`bodycap retry {name}` continues the job"
+                "the job was cancelled; the results of finished stages stay in the store",
+                hint=f"run `bodycap retry {name}` to continue the job",
             )
             return self._end(claim, status, "cancelled", error)
         return self._leave(claim, status, error)
@@ -179,7 +184,9 @@ class JobWorker:
         """
         claim.stop_heartbeat()
         code, name = StoreError.exit_code, claim.job.name
-        return JobOutcome(name=name, state="stuck", exit_code=code, message=f"continues later: {error}")
+        return JobOutcome(
+            name=name, state="stuck", exit_code=code, message=f"the job continues later: {error}"
+        )
 
     def _leave(self, claim: Claim, status: JobStatusFile, error: BodycapError) -> JobOutcome:
         """Leave the job in `running`, so that this or another watcher can run the job again later."""
@@ -190,9 +197,9 @@ class JobWorker:
     def _release(self, claim: Claim, error: BodycapError) -> JobOutcome:
         claim.release()
         message = (
-            "continues at the next start"
+            "the job continues when the watcher starts again"
             if isinstance(error, Cancelled)
-            else f"continues later: {error.message}"
+            else f"the job continues later: {error.message}"
         )
         return JobOutcome(name=claim.job.name, state="stopped", exit_code=error.exit_code, message=message)
 
@@ -229,7 +236,7 @@ class JobWorker:
             claim.stop_heartbeat()
             if not claim.ownership.is_held():
                 return JobOutcome(
-                    name=claim.job.name, state="lost", message="another watcher has taken it over"
+                    name=claim.job.name, state="lost", message="another watcher runs this job now"
                 )
 
             def write_final_status(target: Path) -> None:

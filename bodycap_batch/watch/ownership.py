@@ -52,7 +52,7 @@ class Ownership:
             return False
         found = read_owner(self.owner)
         # A suspended earlier owner may write `owner.json` once more after it has lost the job. Such a file
-        # has a lower number and is ignored.
+        # has a lower claim number and is ignored.
         outdated = int(found.get("generation", 0)) < self.generation
         return outdated or (found.get("token"), found.get("generation")) == (self.token, self.generation)
 
@@ -60,9 +60,10 @@ class Ownership:
         """Raise `Cancelled` if another watcher has taken the job over."""
         if not self.is_held():
             raise Cancelled(
-                "another watcher has taken this job over",
+                "another watcher runs this job now",
                 path=self.owner,
-                hint="nothing to do: the other watcher continues the job after its finished stages",
+                hint="you need not do anything: the other watcher continues the job after its finished "
+                "stages",
             )
 
 
@@ -72,7 +73,10 @@ def generation_marker(folder: Path, generation: int) -> Path:
 
 
 def read_owner(path: Path) -> dict[str, Any]:
-    """Return the content of `owner.json`; empty if the file is missing or cannot be read."""
+    """Return the content of `owner.json`; empty if the file is missing or cannot be read.
+
+    Fields whose values have the wrong type are left out.
+    """
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
