@@ -77,11 +77,11 @@ def partly_black(root: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (shorter, "all cameras run together for 0.6 s"),
+        (shorter, "all cameras recorded at the same time for 0.6 s"),
         (upside_down, "ready to run"),
         (variable_rate, "variable rate"),
-        (dropped, "15 frames were dropped"),
-        (frozen, "the picture stands still"),
+        (dropped, "dropped 15 frames"),
+        (frozen, "the picture does not change"),
         (no_contrast, "hardly any contrast"),
         (partly_black, "inspected pictures are black"),
         (edit("capture:", "skeleton: none\ncapture:"), "ready to run"),
