@@ -192,7 +192,11 @@ def select_keyframes(
     times_s = (camera.times_ns - camera.times_ns[:1]) * 1e-9
     count = len(times_s)
     if count == 0:
-        raise CaptureError("no frames to work on", path=camera.chapters[0], hint="check start_s and end_s")
+        raise CaptureError(
+            "the camera has no frames between start_s and end_s",
+            path=camera.chapters[0],
+            hint="check start_s and end_s",
+        )
     limit_px = options.parallax_px * pixel_scale(camera.camera.width_px, camera.camera.height_px)
     sharp = np.zeros(count)
     selected: list[int] = []

@@ -21,8 +21,8 @@ CODES = {"JobError": 2, "CaptureError": 3, "EstimationError": 4, "StoreError": 5
 CODES |= {"Problem": 2, "error": 2}
 """Also what a job's rules find, and what the BVH parser says of a line."""
 DEFAULT_REMEDY = {
-    "Problem": "what the field means is printed with it",
-    "error": "export the skeleton again as BVH, or take a preset: `skeleton: upper_body`",
+    "Problem": "see the description of the field, which is printed with the message",
+    "error": "export the skeleton again as BVH, or use a preset: `skeleton: upper_body`",
 }
 """What these say where the code gives no remedy of its own."""
 

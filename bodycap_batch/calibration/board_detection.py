@@ -67,15 +67,16 @@ class CalibrationBoard:
         min_size = 3 if self.kind == "chessboard" else 4
         if min(self.columns, self.rows) < min_size:
             raise JobError(
-                f"a {self.kind} of {self.columns}x{self.rows} is too small",
+                f"a {self.kind} board of {self.columns}x{self.rows} is too small",
                 field=f"--{self.kind}",
-                hint="chessboard: inner corners, for example 9x6; ChArUco: squares, for example 7x5",
+                hint="for a chessboard, give the number of inner corners, for example 9x6; for a ChArUco "
+                "board, give the number of squares, for example 7x5",
             )
         if self.kind == "charuco" and not 0.1 < self.marker < 1.0:
             raise JobError(
                 f"a marker cannot be {self.marker:g} times as wide as a square",
                 field="--marker",
-                hint="for example 0.75",
+                hint="give the side of a marker divided by the side of a square, for example 0.75",
             )
 
     def __str__(self) -> str:
@@ -130,9 +131,9 @@ class CalibrationBoard:
             if not hasattr(cv2.aruco, name):
                 known = sorted(item[5:] for item in dir(cv2.aruco) if item.startswith("DICT_"))
                 raise JobError(
-                    f"unknown markers {self.dictionary!r}",
+                    f"there is no family of markers {self.dictionary!r}",
                     field="--dictionary",
-                    hint=f"known: {', '.join(known)}",
+                    hint=f"choose one of {', '.join(known)}",
                 )
             markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
             board = cv2.aruco.CharucoBoard((self.columns, self.rows), 1.0, self.marker, markers)

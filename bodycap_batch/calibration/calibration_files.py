@@ -67,10 +67,11 @@ def _read_camera_entries(path: Path) -> dict[str, Any]:
         ) from error
     if not isinstance(content, dict) or not isinstance(content.get("cameras"), dict):
         raise JobError(
-            "the file holds one calibration for all cameras, so a camera cannot be added",
+            "the file contains one calibration for all cameras, so the calibration of a single camera "
+            "cannot be added",
             path=path,
             field="--camera",
-            hint="choose another file with --out, or delete this one",
+            hint="choose another file with --out, or delete this file",
         )
     return content
 

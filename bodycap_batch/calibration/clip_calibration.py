@@ -82,11 +82,12 @@ class CalibrationResult:
         sigma = ", ".join(f"{value:.2f}" for value in fit.focal_sigma_px)
         worst = max(fit.view_rms_px)
         return [
-            f"{self.board}: found in {self.found} of {self.inspected} pictures, {len(fit.kept)} views used",
+            f"{self.board}: the board was found in {self.found} of {self.inspected} pictures, and "
+            f"{len(fit.kept)} of these views were used",
             f"{fit.model} at {width}×{height}: focal length {fit.matrix[0, 0]:.2f}, "
             f"{fit.matrix[1, 1]:.2f} px (±{sigma})",
-            f"reprojection error {fit.rms_px:.3f} px, worst view {worst:.3f} px; corners seen in "
-            f"{100 * self.coverage:.0f} % of the picture",
+            f"reprojection error {fit.rms_px:.3f} px, in the worst view {worst:.3f} px; corners of the "
+            f"board were found in {100 * self.coverage:.0f} % of the picture",
             *(f"note: {note}" for note in self.notes),
         ]
 
@@ -191,9 +192,10 @@ def _best_fit(
     fits = [fit for model in _MODELS[lens] if (fit := fit_intrinsics(model, views, size)) is not None]
     if not fits:
         raise EstimationError(
-            f"no lens fits the {len(views)} views of the board",
+            f"no camera model fits the {len(views)} views of the board",
             path=video,
-            hint="film the board tilted to all sides and in all corners of the picture, and keep it flat",
+            hint="film the board in all corners of the picture, tilt the board to all sides, and keep the "
+            "board flat",
         )
     best = fits[0]
     for other in fits[1:]:
@@ -263,19 +265,21 @@ def _notes(fit: IntrinsicsFit, size: ImageSize, coverage: float) -> list[str]:
     notes = []
     if coverage < _MIN_COVERAGE:
         notes.append(
-            f"corners of the board were found in {100 * coverage:.0f} % of the picture, and in the rest the "
-            "distortion is uncertain: film the board in all parts of the picture, also at the edges"
+            f"corners of the board were found in only {100 * coverage:.0f} % of the picture, so the "
+            "distortion of the rest is uncertain: film the board in all parts of the picture, also at the "
+            "edges"
         )
     sigma = max(fit.focal_sigma_px) / fit.matrix[0, 0]
     if sigma > _MAX_FOCAL_SIGMA_RATIO:
         notes.append(
-            f"the focal length has an uncertainty of {100 * sigma:.1f} %: tilt the board more, to all sides, "
-            "and film it from a shorter distance"
+            f"the focal length has an uncertainty of {100 * sigma:.1f} %: tilt the board more to all "
+            "sides, and film the board from a shorter distance"
         )
     if fit.rms_px > _MAX_RMS_PX * max(size) / 640.0:
         notes.append(
-            f"an error of {fit.rms_px:.1f} px is large: is the board flat, its size correct, the focus fixed "
-            "and stabilisation off?"
+            f"a reprojection error of {fit.rms_px:.1f} px is large: check that the board is flat, that its "
+            "numbers of columns and rows are correct, that the focus is fixed, and that stabilisation is "
+            "off"
         )
     return notes
 
@@ -285,8 +289,10 @@ def _too_few_views(video: Path, board: CalibrationBoard, found: int, inspected: 
     if board.kind == "chessboard":
         size = "count inner corners, not squares; the whole board must be in the picture, with a white border"
     return CaptureError(
-        f"the {board} was found in {found} of {inspected} inspected pictures; {MIN_VIEWS} are needed",
+        f"the {board} was found in {found} of {inspected} inspected pictures, but {MIN_VIEWS} pictures "
+        "with the board are needed",
         path=video,
-        hint=f"check the board's size ({size}) and kind, light it evenly, let it fill a third of the "
-        "picture, and hold it still for a moment in each of twenty positions",
+        hint=f"check the numbers of columns and rows ({size}) and the kind of the board, light the board "
+        "evenly, let the board fill a third of the picture, and hold the board still for a moment in each "
+        "of twenty positions",
     )

@@ -188,7 +188,10 @@ class CaptureCamera:
         return prefetch(self._decode(chosen, colour=colour), self.threads)
 
     def frame_candidates(self) -> Generator[FrameCandidate, None, None]:
-        """Decode all frames at the work size, in a form that can be stored as a copy.
+        """Decode all frames.
+
+        Each result has the grey image at the work size, and a function that returns the planes from which a
+        copy of the frame can be stored.
 
         Damaged frames are omitted. A thread decodes the next frames ahead.
 
@@ -232,7 +235,11 @@ class CaptureCamera:
                 try:
                     image = next(kept_images)
                 except CaptureError as error:  # the frame can still be decoded from the video
-                    logger.warning("%s: the kept copy fails, so the video is read: %s", self.name, error)
+                    logger.warning(
+                        "%s: the stored copy of the frames cannot be read, so the video is decoded again: %s",
+                        self.name,
+                        error,
+                    )
                     yield from replace(self, kept=None)._decode(indices[position:], colour=colour)
                     return
                 yield index, image

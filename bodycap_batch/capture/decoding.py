@@ -57,7 +57,7 @@ def decode_frames(
                 raise _undecodable_frame(video, index)
     except av.error.FFmpegError as error:
         raise CaptureError(
-            f"decoding fails after frame {frame_decoder.position} ({error_reason(error)})",
+            f"the video cannot be decoded after frame {frame_decoder.position} ({error_reason(error)})",
             path=video.path,
             hint=COPY_AGAIN,
         ) from error
@@ -207,5 +207,6 @@ def _undecodable_frame(video: VideoFile, index: int) -> CaptureError:
     return CaptureError(
         f"frame {index} (at {seconds:.2f} s) cannot be decoded",
         path=video.path,
-        hint="re-encode the video (ffmpeg -i in.mp4 -fps_mode passthrough out.mp4), or set an earlier end_s",
+        hint="convert the video (ffmpeg -i in.mp4 -fps_mode passthrough out.mp4), or set end_s to a time "
+        "before this frame",
     )

@@ -61,7 +61,9 @@ def index_video(path: Path, threads: int = 0) -> VideoFile:
         time_base, rate = Fraction(stream.time_base or 0), stream.average_rate or stream.guessed_rate
         pixel_aspect = _pixel_aspect(stream.sample_aspect_ratio)
     if max(abs(int(pts[0])), abs(int(pts[-1]))) * time_base > _MAX_SECONDS or time_base <= 0:
-        raise CaptureError("its timestamps are implausible", path=path, hint=COPY_AGAIN)
+        raise CaptureError(
+            "the times of the frames in the video file are not plausible", path=path, hint=COPY_AGAIN
+        )
     video = VideoFile(
         path=path,
         pts=pts,
@@ -109,15 +111,18 @@ def _scan_packets(
                 key.append(packet.pts)
     except av.error.FFmpegError as error:
         raise CaptureError(
-            f"the video breaks off after {len(pts)} frames ({error_reason(error)})",
+            f"the video cannot be read after {len(pts)} frames ({error_reason(error)})",
             path=path,
             hint=COPY_AGAIN,
         ) from error
     if read < expected:
-        message = f"the video is cut short: it has {read} of the {expected} frames that its index lists"
+        message = (
+            f"the video file is incomplete: its index lists {expected} frames, but the file contains only "
+            f"{read} of these frames"
+        )
         raise CaptureError(message, path=path, hint=COPY_AGAIN)
     if not pts:
-        raise CaptureError("the video holds no frame", path=path, hint=COPY_AGAIN)
+        raise CaptureError("the video contains no frame", path=path, hint=COPY_AGAIN)
     frame_pts = np.unique(np.array(pts, dtype=np.int64))
     if len(frame_pts) > 1 and end <= int(frame_pts[-1]):
         end = int(frame_pts[-1]) + int(np.median(np.diff(frame_pts)))

@@ -64,13 +64,15 @@ def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Cam
     if not any(_same_aspect(calibration, *size) for size in (video.shown_size, video.turned_size)):
         is_turned = _same_aspect(calibration, height, width)
         raise CaptureError(
-            f"calibrated at {calibration.width}×{calibration.height}, but the video shows {width}×{height}: "
-            "another aspect ratio",
+            f"the camera was calibrated at {calibration.width}×{calibration.height}, but the video shows "
+            f"{width}×{height}: the aspect ratios differ",
             path=video.path,
             field="calibration",
-            hint="the video is rotated relative to the calibration: calibrate as a player shows it"
+            hint="the video is rotated relative to the calibration: calibrate with pictures in the "
+            "orientation that a video player shows"
             if is_turned
-            else "calibrate in the video mode that was recorded (a crop cannot be guessed), or use `auto`",
+            else "calibrate in the same video mode as the recording (the program cannot know how the "
+            "camera crops the picture), or use `calibration: auto`",
         )
     camera = calibration.camera()
     size = work_size((width, height), work_px, video.turned_size)

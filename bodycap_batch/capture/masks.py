@@ -38,21 +38,25 @@ def read_mask(path: Path, size: tuple[int, int]) -> BoolArray:
         return CaptureError(reason, path=path, field="mask", hint=hint)
 
     if not path.is_file():
-        raise error_because("no such mask", "check the path in the job, relative to the job file")
+        raise error_because(
+            "there is no such mask file",
+            "correct the path of the mask in the job; a relative path starts at the folder of the job file",
+        )
     image = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise error_because("the mask is not an image", "save it as PNG")
+        raise error_because("the mask cannot be read as a picture", "save the mask as a PNG picture")
     height, width = image.shape
     if abs(width * size[1] / (height * size[0]) - 1.0) > _ASPECT_TOLERANCE:
         raise error_because(
-            f"the mask is {width}×{height}, the picture {size[0]}×{size[1]}: their aspects differ",
-            "paint it over a frame as a player shows it",
+            f"the mask is {width}×{height}, but the picture is {size[0]}×{size[1]}: their aspect ratios "
+            "differ",
+            "paint the mask over one frame of the video, in the orientation that a video player shows",
         )
     mask: BoolArray = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA) >= _WHITE_LEVEL)
     if mask.mean() < _MIN_WHITE_RATIO:
         raise error_because(
             f"the mask leaves only {100 * mask.mean():.1f} % of the picture visible",
-            "the room must be white, the wearer black: is the mask inverted?",
+            "paint the room white and the wearer black; the mask may be inverted",
         )
     mask.flags.writeable = False
     return mask

@@ -99,10 +99,10 @@ def _check_one_format(videos: tuple[VideoFile, ...]) -> None:
     for video in videos[1:]:
         if video.shown_size != videos[0].shown_size:
             raise CaptureError(
-                f"this chapter shows {video.shown_size[0]}×{video.shown_size[1]}, the first one "
-                f"{videos[0].shown_size[0]}×{videos[0].shown_size[1]}",
+                f"this chapter has pictures of {video.shown_size[0]}×{video.shown_size[1]} pixels, but the "
+                f"first chapter has pictures of {videos[0].shown_size[0]}×{videos[0].shown_size[1]} pixels",
                 path=video.path,
-                hint="chapters of one camera come from one recording; list this video as another camera",
+                hint="list only chapters of one recording for a camera; list this video as another camera",
             )
 
 
@@ -123,9 +123,9 @@ def _no_frames_error(
     """Return the error for a camera that has no frame between start_s and end_s."""
     first, last = times_ns[0] / 1e9 + offset_s, times_ns[-1] / 1e9 + offset_s
     return CaptureError(
-        f"camera {config.name} has no frame between start_s and end_s: its video runs from {first:.2f} s to "
-        f"{last:.2f} s on the common clock",
+        f"camera {config.name} has no frame between start_s and end_s: on the common clock, its video runs "
+        f"from {first:.2f} s to {last:.2f} s",
         path=config.video[0],
         field="capture.start_s" if spec.start_s is not None else "capture.end_s",
-        hint="start_s and end_s are on the common clock: camera time + offset_s",
+        hint="set start_s and end_s on the common clock (common time = camera time + offset_s)",
     )

@@ -60,12 +60,16 @@ def read_timestamps(path: Path) -> IntArray:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise CaptureError(
-                "too large for a file of timestamps", path=path, hint="one time in seconds on each line"
+                "the file is too large for a file of timestamps",
+                path=path,
+                hint="write one time in seconds on each line",
             )
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CaptureError(
-            f"cannot read the timestamps ({error})", path=path, hint="a text file of seconds"
+            f"the timestamps cannot be read ({error})",
+            path=path,
+            hint="give a text file with one time in seconds on each line",
         ) from error
     times: list[int] = []
     for number, line in enumerate(lines, start=1):
@@ -77,7 +81,8 @@ def read_timestamps(path: Path) -> IntArray:
                     f"time {text} is not later than the previous time",
                     path=path,
                     line=number,
-                    hint="one time for each frame, in seconds, increasing",
+                    hint="write one time in seconds for each frame; each time must be later than the time "
+                    "before",
                 )
     return np.array(times, dtype=np.int64)
 
@@ -94,7 +99,7 @@ def _parse_seconds(text: str, path: Path, line: int) -> int:
     except InvalidOperation:
         pass
     raise CaptureError(
-        f"{text[:40]!r} is not a time in seconds", path=path, line=line, hint="one number on each line"
+        f"{text[:40]!r} is not a time in seconds", path=path, line=line, hint="write one number on each line"
     )
 
 
@@ -127,9 +132,10 @@ def _sidecar_times(path: Path, frames: int) -> IntArray:
     times = read_timestamps(path)
     if len(times) != frames:
         raise CaptureError(
-            f"{len(times)} timestamps for {frames} frames",
+            f"there are {len(times)} timestamps for {frames} frames",
             path=path,
-            hint="one line for each frame of the video; export both again from the same recording",
+            hint="write one line for each frame of the video, or export the video and the timestamps "
+            "again from the same recording",
         )
     return times
 
@@ -177,5 +183,7 @@ def _join_parts(videos: tuple[VideoFile, ...], parts: list[IntArray]) -> Timelin
         gap_ns = int(part[0]) - (int(start[-1]) + frame_ns)
         if abs(gap_ns) > 1.5 * frame_ns:
             kind = "a gap of" if gap_ns > 0 else "an overlap of"
-            notes.append(f"{kind} {abs(gap_ns) / _NS:.2f} s between {before.path.name} and {video.path.name}")
+            notes.append(
+                f"there is {kind} {abs(gap_ns) / _NS:.2f} s between {before.path.name} and {video.path.name}"
+            )
     return Timeline(times_ns=times, usable=usable, notes=tuple(notes))

@@ -22,9 +22,11 @@ Orientation = tuple[tuple[int, int], tuple[int, int]]
 """Matrix (2,2) that converts the coordinates of a stored image to the coordinates of the shown image: shown =
 orientation · stored. x points to the right and y down. The matrix is a signed permutation."""
 
-COPY_AGAIN = "copy it again from the camera's card, or leave this camera out"
+COPY_AGAIN = "copy the video again from the memory card of the camera, or leave this camera out"
 """Hint of the error about a damaged file."""
-MAY_READ = "let the user who runs this program read the file and enter its folders (chmod)"
+MAY_READ = (
+    "give the user who runs this program the permission to read the file and to enter its folders (chmod)"
+)
 """Hint of the error about a file that the user has no permission to read."""
 
 
@@ -97,18 +99,24 @@ def open_container(path: Path) -> InputContainer:
     try:
         if not path.is_file():
             raise CaptureError(
-                "no such video", path=path, hint="check the path in the job, relative to the job file"
+                "there is no such video file",
+                path=path,
+                hint="correct the path of the video in the job; a relative path starts at the folder "
+                "of the job file",
             )
         if path.stat().st_size == 0:
             raise CaptureError("the video is empty (0 bytes)", path=path, hint=COPY_AGAIN)
         container: InputContainer = av.open(str(path), metadata_errors="replace")
     except av.error.EOFError as error:
-        raise CaptureError("the video holds no frame", path=path, hint=COPY_AGAIN) from error
+        raise CaptureError("the video contains no frame", path=path, hint=COPY_AGAIN) from error
     except PermissionError as error:
-        raise CaptureError("no permission to read it", path=path, hint=MAY_READ) from error
+        raise CaptureError(
+            "the program has no permission to read the video", path=path, hint=MAY_READ
+        ) from error
     except (av.error.FFmpegError, OSError) as error:
         raise CaptureError(
-            f"not a readable video ({error_reason(error)}); a recording that was cut short has no index",
+            f"the file cannot be read as a video ({error_reason(error)}); this happens, for example, if "
+            "the recording was interrupted",
             path=path,
             hint=COPY_AGAIN,
         ) from error
@@ -126,12 +134,18 @@ def video_stream(container: InputContainer, path: Path) -> VideoStream:
     cover = av.stream.Disposition.attached_pic
     streams = [stream for stream in container.streams.video if not stream.disposition & cover]
     if not streams:
-        what = "it contains sound only, no video" if container.streams.audio else "the video holds no frame"
-        raise CaptureError(what, path=path, hint="give the file that holds the camera's pictures")
+        what = (
+            "the file contains only sound, no video"
+            if container.streams.audio
+            else "the video contains no frame"
+        )
+        raise CaptureError(what, path=path, hint="give the file that contains the pictures of the camera")
     for stream in streams:
         if stream.codec_context is not None:
             return stream
-    raise CaptureError("there is no decoder for this kind of video", path=path, hint="convert it to H.264")
+    raise CaptureError(
+        "the program cannot decode this kind of video", path=path, hint="convert the video to H.264"
+    )
 
 
 def error_reason(error: Exception) -> str:

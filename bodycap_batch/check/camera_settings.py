@@ -120,11 +120,14 @@ def _gopro_notes(settings: dict[str, str]) -> list[str]:
     if settings.get("EISE", mode).upper() not in _OFF_VALUES:
         level = f" ({mode})" if mode.upper() not in (*_OFF_VALUES, "Y") else ""
         notes.append(
-            f"stabilised in the camera{level}: the picture moves relative to the lens, so no calibration "
-            "fits; film again with HyperSmooth off"
+            f"the camera stabilised the video{level}: the picture moves relative to the lens, so no "
+            "calibration fits; film again with HyperSmooth off"
         )
     if settings.get("DZOM", "N").upper() not in _OFF_VALUES:
-        notes.append("filmed with digital zoom: film without zoom, or calibrate the camera at the same zoom")
+        notes.append(
+            "the video was filmed with digital zoom: film without zoom, or calibrate the camera at the "
+            "same zoom"
+        )
     return notes
 
 
@@ -135,8 +138,9 @@ def _phone_notes(path: Path) -> list[str]:
         if metadata.get(model):
             name = " ".join(part for part in (metadata.get(maker, ""), metadata[model]) if part)
             return [
-                f"filmed with a phone ({name}): the phone's own camera app stabilises and refocuses; film "
-                "with an app that can switch stabilisation off and lock focus and zoom"
+                f"the video was filmed with a phone ({name}), and the camera app of the phone stabilises "
+                "the picture and changes the focus; film with an app that can switch off stabilisation "
+                "and lock the focus and the zoom"
             ]
     return []
 
@@ -158,6 +162,7 @@ def _rate_notes(times_ns: IntArray) -> list[str]:
     if slow < _MAX_RATE_RATIO * fast:
         return []
     return [
-        f"the frame rate varies between {1e9 / slow:.0f} and {1e9 / fast:.0f} per second, and the "
-        "exposure time varies with it; set a fixed rate (in phones: switch the automatic frame rate off)"
+        f"the frame rate varies between {1e9 / slow:.0f} and {1e9 / fast:.0f} frames per second, and the "
+        "exposure time varies with the frame rate; set a fixed frame rate (on a phone, switch off the "
+        "automatic frame rate)"
     ]

@@ -28,7 +28,7 @@ def require_distinct_videos(job: Job) -> None:
                 raise CaptureError(
                     f"camera {second.name} shows the same video as camera {first.name} ({same_video.name})",
                     path=video,
-                    hint=f"copy the video of {second.name} again, or leave that camera out",
+                    hint=f"copy the right video of camera {second.name}, or leave camera {second.name} out",
                 )
 
 
@@ -65,6 +65,6 @@ def _require_all_chapters(camera: CameraConfig) -> None:
                 f"chapter {last + 1} of recording {numbers[1]['video']} is missing between {before.name} and "
                 f"{after.name}",
                 path=after,
-                hint="copy it from the card; if it is lost, list only the chapters before it, and set end_s "
-                "to their end",
+                hint="copy the missing chapter from the memory card; if the chapter is lost, list only "
+                "the chapters before it, and set end_s to the end of these chapters",
             )

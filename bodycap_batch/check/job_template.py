@@ -53,7 +53,9 @@ def write_job_template(folder: Path, *, replace: bool = False) -> Path:
     """
     path = folder / JOB_FILE
     if path.exists() and not replace:
-        raise JobError("there is a job file already", path=path, hint="--force overwrites it")
+        raise JobError(
+            "the folder already contains a job file", path=path, hint="use --force to overwrite the file"
+        )
     write_text(path, job_template(folder))
     return path
 
@@ -67,7 +69,8 @@ def job_template(folder: Path) -> str:
     recordings = recordings_in(folder)
     lines = [
         "# A job for bodycap. Paths are relative to this file. Lines that begin with # have no effect.",
-        "#   bodycap check job.yaml    shows what the job uses, and its problems",
+        "#   bodycap check job.yaml    shows which files and settings the job uses, and the problems of "
+        "the job",
         "#   bodycap run job.yaml      computes the results",
         "",
         f"name: {_yaml_text(_safe_name(folder.resolve().name))}",
@@ -76,7 +79,8 @@ def job_template(folder: Path) -> str:
         "",
         "capture:",
         *_calibration_lines(folder),
-        "  # The part to use (seconds on the common clock); leave out the time of putting on the cameras.",
+        "  # The part of the recording to use (seconds on the common clock). Leave out the time in which "
+        "the cameras are put on.",
         "  # start_s: 12.0",
         "  # end_s: 95.5",
         *(_mount_lines() if any(mount_of(name) is None for name, _ in recordings) else ()),
@@ -88,7 +92,8 @@ def job_template(folder: Path) -> str:
         lines += _camera_lines(safe, name, files, folder)
     lines += [
         "",
-        "# The defaults of every stage follow: change what you need, leave the rest.",
+        "# The options of every stage follow, with their defaults. To change an option, remove the # "
+        "before it.",
         *_option_lines(),
     ]
     return "\n".join(lines) + "\n"
@@ -97,23 +102,29 @@ def job_template(folder: Path) -> str:
 def _body_lines(folder: Path) -> list[str]:
     rigs = sorted(path.name for path in folder.glob("*.bvh"))
     lines = [
-        "# The filmed person. The height gives the metric scale; the person's own skeleton is more accurate."
+        "# The person who wears the cameras. The body height gives the metric scale; a file of the "
+        "person's own skeleton gives a more accurate scale."
     ]
     if rigs:
         lines += [f"skeleton: {_yaml_text(rigs[0])}", "# height_m: 1.75"]
     else:
         lines += [
             "# height_m: 1.75",
-            "# skeleton: subject.bvh     # or none: only the map and the camera paths",
+            "# skeleton: subject.bvh     # or none, if you need only the map and the camera paths",
         ]
-    return [*lines, "# activity: walk             # soft limits for walking; default: generic"]
+    return [
+        *lines,
+        "# activity: walk             # if the person only walks: the hands are expected below the "
+        "shoulders, each hand on its own side; default: generic",
+    ]
 
 
 def _calibration_lines(folder: Path) -> list[str]:
     if (folder / "calib.json").is_file():
         return ["  calibration: calib.json"]
     return [
-        "  # The lens is estimated together with the map. Better: film a board, then",
+        "  # With auto, the lens is estimated together with the map. It is more accurate to film a board "
+        "and to run",
         "  #   bodycap calibrate board.mp4 --charuco 7x5 --out calib.json",
         "  # The file calib.json in this folder is used as soon as it exists.",
         "  # calibration: auto          # always estimate the lens",

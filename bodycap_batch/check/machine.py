@@ -90,9 +90,15 @@ def examine_machine(folder: Path) -> Iterator[MachineFinding]:
     yield _writing_finding(folder)
     for extra in _EXTRAS:
         yield _extra_finding(extra)
-    yield _program_finding("Blender", ("blender",), "it opens every result; not needed for jobs")
     yield _program_finding(
-        "a browser", _BROWSERS, "opens report.html and plays preview.mp4; any other browser will do"
+        "Blender",
+        ("blender",),
+        "install Blender if you want to open the results with it; jobs do not need Blender",
+    )
+    yield _program_finding(
+        "a browser",
+        _BROWSERS,
+        "install Chromium or use any other browser to open report.html and to play preview.mp4",
     )
 
 
@@ -109,7 +115,10 @@ def _processor_finding() -> MachineFinding:
     if count > 1:
         return MachineFinding(what="processors", state="ok", found=f"{count}; no GPU is used")
     return MachineFinding(
-        what="processors", state="note", found="one", remedy="jobs run at half the speed of two processors"
+        what="processors",
+        state="note",
+        found="one",
+        remedy="use a machine with two processors, if you can: jobs then run twice as fast",
     )
 
 
@@ -117,14 +126,17 @@ def _memory_finding() -> MachineFinding:
     total_mb = _total_memory_mb()
     if total_mb is None:
         return MachineFinding(
-            what="memory", state="note", found="unknown", remedy=f"{_ENOUGH_MEMORY_MB / 1000:g} GB are enough"
+            what="memory",
+            state="note",
+            found="unknown",
+            remedy=f"jobs need {_ENOUGH_MEMORY_MB / 1000:g} GB of memory",
         )
     found = f"{total_mb / 1000:.1f} GB"
     if total_mb >= _ENOUGH_MEMORY_MB:
         return MachineFinding(what="memory", state="ok", found=found)
     remedy = (
-        f"long captures need {_ENOUGH_MEMORY_MB / 1000:g} GB: cut them with start_s and end_s, "
-        "or lower work_px"
+        "shorten long captures with start_s and end_s, or lower work_px: long captures need "
+        f"{_ENOUGH_MEMORY_MB / 1000:g} GB"
     )
     return MachineFinding(what="memory", state="note", found=found, remedy=remedy)
 
@@ -141,9 +153,9 @@ def _library_finding(name: str) -> MachineFinding:
     failure = _error_of_code(f"import zlib, {_LIBRARIES[name]}")
     if failure is None:
         return MachineFinding(what=name, state="ok", found=_installed_version(name))
-    remedy = "make setup (or pip install -r requirements.lock)"
+    remedy = "run make setup (or pip install -r requirements.lock)"
     if ".so" in failure:
-        remedy = f"a system library is missing: {_SYSTEM_PACKAGES}"
+        remedy = f"install the missing system library: {_SYSTEM_PACKAGES}"
     return MachineFinding(what=name, state="problem", found=failure, remedy=remedy)
 
 
@@ -194,7 +206,7 @@ def _disk_finding(folder: Path) -> MachineFinding:
     if free_mb >= _ENOUGH_DISK_MB:
         return MachineFinding(what="disk", state="ok", found=found)
     remedy = (
-        "free some space, or name another disk with --out and --store; `bodycap gc` removes old artefacts"
+        "free some space (`bodycap gc` removes old artefacts), or choose another disk with --out and --store"
     )
     return MachineFinding(
         what="disk", state="note" if free_mb > 500 else "problem", found=found, remedy=remedy
@@ -214,7 +226,7 @@ def _writing_finding(folder: Path) -> MachineFinding:
             first.replace(Path(scratch) / "second")
             linked = _can_hard_link(Path(scratch) / "second", Path(scratch) / "third")
     except OSError as error:
-        remedy = "choose a folder you may write to (--out, --store)"
+        remedy = "choose a folder in which you may write (--out, --store)"
         return MachineFinding(
             what="writing", state="problem", found=f"{place}: {error.strerror}", remedy=remedy
         )
@@ -247,9 +259,9 @@ def _extra_finding(name: str) -> MachineFinding:
     missing = [module for module in modules if util.find_spec(module) is None]
     if not missing:
         return MachineFinding(what=f"extra [{name}]", state="ok", found=purpose)
-    remedy = f"for {purpose}: pip install 'bodycap-batch[{name}]'"
+    remedy = f"if you need {purpose}, run: pip install 'bodycap-batch[{name}]'"
     return MachineFinding(
-        what=f"extra [{name}]", state="note", found=f"no {', '.join(missing)}", remedy=remedy
+        what=f"extra [{name}]", state="note", found=f"not installed: {', '.join(missing)}", remedy=remedy
     )
 
 

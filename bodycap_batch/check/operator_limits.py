@@ -35,15 +35,17 @@ def _require_video_within_limits(path: Path, limits: Limits, field: str) -> None
         seconds = max(seconds, container.duration / 1e6 if container.duration else 0.0)
     if side > limits.video_px:
         raise CaptureError(
-            f"{side} pixels wide or high, the limit is {limits.video_px:g}",
+            f"the video is {side} pixels wide or high, but the limit is {limits.video_px:g} pixels",
             path=path,
             field=field,
-            hint="film or convert it smaller, or ask the operator to raise --limit video_px",
+            hint="convert the video to a smaller picture size, or ask the operator of the watched folder "
+            "to raise --limit video_px",
         )
     if seconds > 3600 * limits.video_hours:
         raise CaptureError(
-            f"{seconds / 3600:.2f} hours, the limit is {limits.video_hours:g}",
+            f"the video lasts {seconds / 3600:.2f} hours, but the limit is {limits.video_hours:g} hours",
             path=path,
             field=field,
-            hint="cut the recording, or ask the operator to raise --limit video_hours",
+            hint="shorten the recording, or ask the operator of the watched folder to raise --limit "
+            "video_hours",
         )

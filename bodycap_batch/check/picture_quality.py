@@ -61,9 +61,9 @@ def check_picture_quality(camera: CaptureCamera) -> list[str]:
     """
     if sum(len(video.pts) for video in camera.videos) < 2:
         raise CaptureError(
-            f"camera {camera.name} has a single frame: it is a picture, not a video",
+            f"the video of camera {camera.name} contains only one frame, so it shows no movement",
             path=camera.chapters[0],
-            hint="copy the video again, or leave the camera out",
+            hint=f"copy the video again, or leave camera {camera.name} out",
         )
     dark, bright = [], []
     grey, corners = [], []
@@ -87,7 +87,7 @@ def check_picture_quality(camera: CaptureCamera) -> list[str]:
         raise CaptureError(
             f"camera {camera.name} shows only black pictures ({black} of {black} inspected)",
             path=camera.chapters[0],
-            hint="was the lens covered? Then leave the camera out. If a player shows other pictures, "
+            hint="if the lens was covered, leave this camera out; if a video player shows other pictures, "
             "convert the video to H.264",
         )
     notes = []
@@ -100,12 +100,16 @@ def check_picture_quality(camera: CaptureCamera) -> list[str]:
     notes += static_notes(reduced_pictures, times_s[indices], float(times_s[-1] - times_s[0]))
     if black:
         notes.append(
-            f"{black} of {len(bright)} inspected pictures are black; cut them off with start_s and end_s"
+            f"{black} of {len(bright)} inspected pictures are black; exclude the black part of the video "
+            "with start_s and end_s"
         )
     notes += _tracking_notes(grey, corners)
     contrast = np.array(bright) - np.array(dark)
     if float(np.median(contrast)) < _MIN_CONTRAST:
-        notes.append("the pictures have hardly any contrast: few features can be tracked")
+        notes.append(
+            "the pictures have hardly any contrast, so few features can be tracked: use more light, and "
+            "clean the lens"
+        )
     return notes
 
 
@@ -133,13 +137,14 @@ def _tracking_notes(grey: list[float], corners: list[float]) -> list[str]:
     lit = [value for value in grey if value >= _MAX_BLACK_GREY]
     if lit and float(np.median(lit)) < _MIN_MEDIAN_GREY:
         out.append(
-            f"dark pictures (median grey {np.median(lit):.0f} of 255): the shutter stays open long and "
-            "movement blurs; more light helps more than any setting"
+            f"the pictures are dark (median grey value {np.median(lit):.0f} of 255), so the exposure is "
+            "long and movement blurs the picture: film with more light, which helps more than any camera "
+            "setting"
         )
     few_corners = sum(count < _MIN_CORNERS for count in corners)
     if 2 * few_corners >= len(corners) and few_corners > 1:
         out.append(
-            f"{few_corners} of {len(corners)} inspected pictures show hardly any texture (plain walls, "
+            f"{few_corners} of {len(corners)} inspected pictures show hardly any texture (plain walls, a "
             "ceiling, or blur): turn the camera towards furniture, or hang up posters"
         )
     return out

@@ -53,7 +53,10 @@ def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
         loaded = load_job_with_origins(path, overrides)
     except (JobError, CaptureError) as error:
         if error.field == "capture.synthetic":
-            note = f"this is a sample capture: `bodycap run {path.name}` renders its videos first"
+            note = (
+                f"the videos of this sample capture have not been rendered yet; `bodycap run {path.name}` "
+                "renders these videos first"
+            )
             return CheckReport(notes=(note,))
         return CheckReport(errors=(error,))
     report = check_job(loaded.job, loaded.origins)
@@ -188,8 +191,14 @@ def _intrinsics_text(camera: CaptureCamera) -> str:
     width, focal = max(camera.camera.width_px, camera.camera.height_px), camera.camera.focal_px
     view = 2.0 * np.degrees(np.arctan(0.5 * width / focal))
     if camera.calibrated:
-        return f"calibrated: {camera.camera.model}, focal length {focal:.0f} px at the work size"
-    return f"not calibrated: estimated with the map, starting at {view:.0f}° field of view (long side)"
+        return (
+            f"the camera is calibrated: {camera.camera.model}, focal length {focal:.0f} px in the reduced "
+            "frames (long side: work_px)"
+        )
+    return (
+        "the camera is not calibrated: its lens is estimated together with the map; the first guess is a "
+        f"field of view of {view:.0f}° along the long side"
+    )
 
 
 def _intrinsics_notes(camera: CaptureCamera) -> list[str]:
@@ -198,14 +207,15 @@ def _intrinsics_notes(camera: CaptureCamera) -> list[str]:
     notes = []
     if not 0.2 < lens.focal_px / long_side < 3.0:
         notes.append(
-            f"a focal length of {lens.focal_px / long_side:.2f} image widths is unusual; is it the "
-            "calibration of this camera?"
+            f"the focal length is {lens.focal_px / long_side:.2f} times the long side of the picture, "
+            "which is unusual; check that this calibration belongs to this camera"
         )
     centre_x, centre_y = lens.principal_point_px
     off = max(abs(centre_x / lens.width_px - 0.5), abs(centre_y / lens.height_px - 0.5))
     if off > 0.15:
         notes.append(
-            f"the principal point is {100 * off:.0f} % off the centre; is it the calibration of this camera?"
+            f"the principal point is {100 * off:.0f} % of the picture size away from the centre; check "
+            "that this calibration belongs to this camera"
         )
     return notes
 
@@ -227,13 +237,19 @@ def _dropped_frame_notes(camera: CaptureCamera, usual_ns: float) -> list[str]:
         return []
     longest = (lost.max() + 1) * usual_ns / 1e9
     return [
-        f"{int(lost.sum())} frames were dropped at {len(lost)} places, the longest gap is {longest:.2f} s"
+        f"the camera dropped {int(lost.sum())} frames at {len(lost)} places of the video; the longest gap "
+        f"is {longest:.2f} s"
     ]
 
 
 def _duration_notes(duration_s: float) -> list[str]:
     return (
-        [f"only {duration_s:.1f} s: hardly enough movement for a map"] if duration_s < _MIN_DURATION_S else []
+        [
+            f"the video lasts only {duration_s:.1f} s, which is hardly enough movement for a map: use a "
+            "longer part"
+        ]
+        if duration_s < _MIN_DURATION_S
+        else []
     )
 
 
@@ -244,10 +260,14 @@ def _body_notes(job: Job) -> list[str]:
     notes = []
     if not roles & set(TRUNK_ROLES):
         notes.append(
-            "no camera on the trunk or head: the body's position can only be inferred from the limbs"
+            "no camera is on the trunk or the head, so the position of the body is only inferred from the "
+            "limbs"
         )
     if job.height_m is None and job.skeleton in SKELETON_PRESETS:
-        notes.append("no height_m: a mean adult's height is assumed, and distances scale with it")
+        notes.append(
+            "the job does not give height_m, so the height of a mean adult is assumed; if the height is "
+            "wrong, all distances are wrong by the same factor"
+        )
     return notes
 
 
@@ -261,22 +281,23 @@ def _check_clocks(job: Job, summaries: list[CameraSummary]) -> list[str]:
             raise _no_common_time_error(job, camera, others)
     start, end = max(c.start_s for c in summaries), min(c.end_s for c in summaries)
     if end <= start:
-        return ["there is no moment at which all cameras ran"]
+        return ["there is no moment at which all cameras recorded"]
     return [
-        f"all cameras run together for {end - start:.1f} s, {start:.2f} to {end:.2f} s on the common clock"
+        f"all cameras recorded at the same time for {end - start:.1f} s, from {start:.2f} to {end:.2f} s "
+        "on the common clock"
     ]
 
 
 def _no_common_time_error(job: Job, camera: CameraSummary, others: list[CameraSummary]) -> CaptureError:
     config = next(c for c in job.capture.cameras if c.name == camera.name)
     clocks = {c.start_s > _MIN_UNIX_TIME_S for c in (camera, *others)}
-    hint = "set offset_s: common time = camera time + offset_s"
-    if len(clocks) == 2:
-        hint = "some timestamps are Unix times, others start near 0; " + hint
+    set_offset = "set offset_s of this camera (common time = camera time + offset_s)"
+    mixed = "some cameras have Unix times as timestamps, other cameras have times that start near 0; "
+    hint = mixed + set_offset if len(clocks) == 2 else set_offset
     first, last = min(o.start_s for o in others), max(o.end_s for o in others)
     return CaptureError(
-        f"camera {camera.name} ({camera.start_s:.2f} to {camera.end_s:.2f} s) shares no time with the others "
-        f"({first:.2f} to {last:.2f} s)",
+        f"camera {camera.name} recorded from {camera.start_s:.2f} to {camera.end_s:.2f} s on the common "
+        f"clock, but the other cameras recorded from {first:.2f} to {last:.2f} s",
         path=config.video[0],
         field="offset_s",
         hint=hint,
@@ -307,11 +328,12 @@ def _check_skeleton(job: Job, _findings: list[CameraSummary]) -> list[str]:
     for camera in job.capture.cameras:
         if camera.role is not None and skeleton.index_of_role(camera.role) is None:
             raise JobError(
-                f"no joint is recognised as {camera.role}, which carries camera {camera.name}",
+                f"the skeleton has no joint with the role {camera.role}, but camera {camera.name} is "
+                f"mounted on {camera.role}",
                 path=path,
                 field="skeleton",
-                hint=f"`bodycap skeleton {path.name}` shows the mapping, skeleton_map changes it; "
-                "the file's joints: " + ", ".join(skeleton.joints[:30]),
+                hint=f"give the role to a joint with skeleton_map; `bodycap skeleton {path.name}` shows "
+                "the roles of all joints; the joints of the file are: " + ", ".join(skeleton.joints[:30]),
             )
     return [f"skeleton {path.name}: {len(skeleton.joints)} joints"]
 
@@ -330,9 +352,10 @@ def _check_formats(job: Job, _findings: list[CameraSummary]) -> list[str]:
         require_blender()
     if job.export.names != "hik" and job.skeleton not in SKELETON_PRESETS:
         raise JobError(
-            f"names: {job.export.names} cannot be used with a skeleton file: its joints keep their names",
+            f"`names: {job.export.names}` cannot be used with a skeleton file, because the joints keep the "
+            "names in the file",
             field="export.names",
-            hint="leave names out, or use the skeleton upper_body or full_body",
+            hint="leave out `names`, or use `skeleton: upper_body` or `skeleton: full_body`",
         )
     return []
 
@@ -348,14 +371,14 @@ def _check_named_frames(job: Job, summaries: list[CameraSummary]) -> list[str]:
             raise JobError(
                 f"camera {camera} has no frame {number}",
                 field=f"{block}.{field}",
-                hint=f"its frames are counted from 0 to {finding.frames - 1}",
+                hint=f"choose a frame from 0 to {finding.frames - 1} (the first frame of the video is 0)",
             )
         first, last = finding.used_runs[0][0], finding.used_runs[-1][1]
         raise JobError(
             f"frame {number} of camera {camera} is not used",
             field=f"{block}.{field}",
-            hint=f"frames {first} to {last}, counted from 0 at the start of the video, lie between start_s "
-            "and end_s, except those with unusable times",
+            hint=f"choose a frame from {first} to {last} (the first frame of the video is 0); only frames "
+            "between start_s and end_s with usable times are used",
         )
     return []
 

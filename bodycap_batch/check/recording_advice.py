@@ -59,8 +59,9 @@ def _intrinsics_advice(cameras: Sequence[CameraSummary]) -> Iterator[str]:
     guessed = [camera.name for camera in cameras if camera.guessed_lens]
     if guessed:
         yield (
-            f"the lens of {_joined_names(guessed)} will be estimated together with the map. That works for "
-            "walks with much sideways movement; half a minute of a filmed board (bodycap calibrate) is safer"
+            f"the program estimates the lens of {_joined_names(guessed)} together with the map. This works "
+            "if the person moves sideways a lot; it is safer to film a board for half a minute and to run "
+            "bodycap calibrate"
         )
 
 
@@ -70,8 +71,8 @@ def _clock_advice(job: Job, cameras: Sequence[CameraSummary]) -> Iterator[str]:
     if len(cameras) > 1 and not stated:
         yield (
             "no camera states an offset_s, so all videos are assumed to start at the same instant. If the "
-            "cameras were started by hand, read the time of your clap in every video: offset_s = time in the "
-            "first video - time in this one"
+            "cameras were started by hand, read the time of a clap in every video, and set the offset_s "
+            "of each camera: offset_s = time in the first video - time in the video of this camera"
         )
 
 
@@ -87,23 +88,25 @@ def _length_advice(cameras: Sequence[CameraSummary]) -> Iterator[str]:
             when = "starts" if late >= early else "ends"
             order = "after" if late >= early else "before"
             yield (
-                f"{camera.name} {when} {missing:.1f} s {order} the others: the motion of its bone is "
-                "inferred there. start_s and end_s restrict the job to the time when all cameras ran"
+                f"{camera.name} {when} {missing:.1f} s {order} the others, and during this time the motion "
+                "of its bone is only inferred. To use only the time in which all cameras recorded, set "
+                "start_s and end_s"
             )
     for camera in cameras:
         if camera.fps < _LOW_FPS:
             yield (
-                f"{camera.name} runs at {camera.fps:.3g} frames a second: enough for a slow walk, hardly "
-                "enough for swinging arms; 30 or more are better, 60 for fast movement"
+                f"{camera.name} records {camera.fps:.3g} frames per second. This is enough for a slow "
+                "walk, but hardly enough for swinging arms; film at 30 frames per second or more, and at "
+                "60 for fast movement"
             )
 
 
 def _scale_advice(job: Job) -> Iterator[str]:
     if job.skeleton in SKELETON_PRESETS and job.skeleton != "none" and job.height_m is not None:
         yield (
-            "with a height alone the bones are those of a standard body, which differ from a real body by "
-            "several centimetres. If there is a BVH file of the subject's own skeleton, use it: --skeleton "
-            "subject.bvh"
+            "with only a body height, the bones have the proportions of a standard body, which differ "
+            "from a real body by several centimetres. If you have a BVH file of the subject's own "
+            "skeleton, use this file: --skeleton subject.bvh"
         )
 
 
@@ -112,8 +115,9 @@ def _duration_advice(cameras: Sequence[CameraSummary]) -> Iterator[str]:
     if seconds > _LONG_CAPTURE_S:
         least, most = (max(1.0, factor * seconds / 60.0) for factor in _SECONDS_PER_VIDEO_SECOND)
         yield (
-            f"{seconds:.0f} s of video in all: expect {least:.0f} to {most:.0f} minutes on two cores. To see "
-            "sooner whether it works, try a short part first (start_s, end_s)"
+            f"the videos last {seconds:.0f} s in all: expect a run time of {least:.0f} to {most:.0f} "
+            "minutes on two cores. To see sooner whether the recording is usable, run a short part first "
+            "(start_s, end_s)"
         )
 
 

@@ -78,15 +78,15 @@ def static_notes(pictures: Sequence[FloatArray], times_s: FloatArray, length_s: 
     count = stop - start + 1
     if count == len(pictures) and last - first >= max(step, _MIN_SPAN_RATIO * length_s):
         return [
-            "the picture stands still throughout: a frozen recording, or a camera that is not on the body; "
-            "it gives no motion, so record it again or leave the camera out"
+            "the picture does not change in the whole video: the recording froze, or the camera was not "
+            "on the body. This video shows no motion, so record again or leave this camera out"
         ]
     if count < _MIN_RUN_PICTURES or last - first < _MIN_RUN_STEPS * step:
         return []
     return [
-        f"the picture stands still from about {first:.1f} to {last:.1f} s ({count} pictures "
-        "are equal): does the person stand still, is the recording frozen, or is the camera off the body? "
-        "start_s and end_s can exclude this part"
+        f"the picture does not change from about {first:.1f} to {last:.1f} s ({count} pictures are equal): "
+        "check whether the person stands still, the recording froze, or the camera was not on the body. "
+        "To exclude this part, set start_s and end_s"
     ]
 
 

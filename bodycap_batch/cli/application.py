@@ -34,12 +34,13 @@ def _options(
 ) -> None:
     """Body motion and a map of the room from body-worn cameras.
 
-    The input is videos. The results are the room (PLY), the motion (BVH), camera paths (TUM) and figures.
+    The input is a folder of videos. The results are a map of the room (PLY), the motion (BVH), the camera
+    paths (TUM) and numbers about their quality (metrics.json).
 
     \b
     Try it:
       bodycap run my_walk/            a folder with torso.mp4, left_palm.mp4, right_palm.mp4
-      bodycap check my_walk/          show what the job uses, and its problems
+      bodycap check my_walk/          show the files and settings of the job, and its problems
       make job                        run the example, in a clone of the repository
 
     \b

@@ -46,8 +46,8 @@ _ExecutorOption = Annotated[
     str,
     typer.Option(
         metavar="local|ADDRESS|slurm|pbs",
-        help="Where the tasks run: on this machine, on the workers of a Dask scheduler (tcp://HOST:8786), "
-        "or in a queue.",
+        help="Where the tasks run: on this machine (local), on the workers of a Dask scheduler "
+        "(tcp://HOST:8786), or in a queue.",
     ),
 ]
 
@@ -62,14 +62,17 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
     max_jobs: Annotated[
         int | None, typer.Option(min=1, help="Maximum number of jobs at the same time.", show_default=False)
     ] = None,
-    threads: Annotated[int, typer.Option(min=1, max=1024, help="Number of threads of one task.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, max=1024, help="Number of threads that each task uses.")] = 1,
     workers: Annotated[int, typer.Option(min=1, help="Number of workers to request from a queue.")] = 2,
     worker_memory: Annotated[
         int, typer.Option(min=500, metavar="MB", help="Memory of each worker in a queue.")
     ] = 4000,
     priority: Annotated[
         list[str] | None,
-        typer.Option(metavar="JOB=NUMBER", help="Priority of a job; higher numbers run first. Repeatable."),
+        typer.Option(
+            metavar="JOB=NUMBER",
+            help="Priority of a job; jobs with higher numbers run first. You can repeat this option.",
+        ),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON line per event and per job.")
@@ -113,7 +116,10 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
         work = Batch(settings, lambda job: _batch_results_folder(job, folder), max_jobs or busy_jobs)
         outcomes = [reporter.report_outcome(outcome) for outcome in work.run(batch_jobs)]
         if stop.is_set():
-            raise Cancelled("stopped on request; finished stages are kept", hint="run it again to continue")
+            raise Cancelled(
+                "the batch stopped on request; the results of finished stages stay in the store",
+                hint="run the same command again to continue",
+            )
     reporter.print_summary(batch_jobs, outcomes)
     raise typer.Exit(max(outcome.exit_code for outcome in outcomes))
 
@@ -145,7 +151,9 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
         raise JobError(
             f"there is no executor {kind!r}",
             field="--executor",
-            hint=f"local, an address ({', '.join(SCHEMES)}HOST:8786), {' or '.join(QUEUES)}",
+            hint="give `local`, the address of a scheduler "
+            f"({' or '.join(f'{scheme}HOST:8786' for scheme in SCHEMES)}), or the name of a queue "
+            f"({' or '.join(QUEUES)})",
         )
 
 
@@ -180,9 +188,9 @@ def _batch_jobs(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJo
         name, _, number = text.rpartition("=")
         if Path(name) not in jobs or not _INTEGER.fullmatch(number):
             raise JobError(
-                f"{text!r} is not JOB=NUMBER for a job of this batch",
+                f"{text!r} does not have the form JOB=NUMBER with a job of this batch",
                 field="--priority",
-                hint="for example --priority monday.yaml=5, with the job as written on the command line",
+                hint="write the job as on the command line, for example --priority monday.yaml=5",
             )
         priority_of_job[Path(name)] = int(number)
     return [BatchJob(path=path, priority=priority_of_job.get(path, 0)) for path in jobs]

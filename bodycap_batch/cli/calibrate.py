@@ -29,45 +29,59 @@ class CameraModelOption(StrEnum):
 
 @app.command()
 def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
-    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="A clip of the board.")],
+    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="A video of the board.")],
     chessboard: Annotated[
-        str | None, typer.Option(metavar="CxR", help="A chessboard, by its inner corners, for example 9x6.")
+        str | None,
+        typer.Option(
+            metavar="CxR",
+            help="The board is a chessboard with this number of inner corners, for example 9x6.",
+        ),
     ] = None,
     charuco: Annotated[
-        str | None, typer.Option(metavar="CxR", help="A ChArUco board, by its squares, for example 7x5.")
+        str | None,
+        typer.Option(
+            metavar="CxR", help="The board is a ChArUco board with this number of squares, for example 7x5."
+        ),
     ] = None,
-    dictionary: Annotated[str, typer.Option(help="ChArUco: dictionary of its markers.")] = "4X4_50",
-    marker: Annotated[float, typer.Option(help="ChArUco: side of a marker / side of a square.")] = 0.75,
+    dictionary: Annotated[
+        str, typer.Option(help="ChArUco: name of the family of markers (OpenCV's dictionary).")
+    ] = "4X4_50",
+    marker: Annotated[
+        float, typer.Option(help="ChArUco: side of a marker divided by the side of a square.")
+    ] = 0.75,
     legacy: Annotated[
-        bool, typer.Option("--legacy", help="ChArUco: the board comes from OpenCV before 4.6.")
+        bool, typer.Option("--legacy", help="ChArUco: the board was made with OpenCV before version 4.6.")
     ] = False,
     lens: Annotated[
         CameraModelOption,
-        typer.Option(help="Camera model; auto selects opencv, or fisheye if it fits better."),
+        typer.Option(help="Camera model; auto selects opencv, or fisheye if fisheye fits better."),
     ] = (CameraModelOption.AUTO),
     camera: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Camera to calibrate. The file keeps its other cameras. Default: one result for all.",
+            help="Camera to calibrate. The calibrations of other cameras in the file stay unchanged. "
+            "Default: one calibration for all cameras.",
         ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="FILE", help="File for the result (default: calib.json beside the video)."
+            "--out",
+            metavar="FILE",
+            help="File for the result (default: calib.json in the folder of the video).",
         ),
     ] = None,
     json_progress: Annotated[
         bool, typer.Option("--json-progress", help="Print progress as JSON lines.")
     ] = False,
 ) -> None:
-    """Calibrate a camera from a clip of a board.
+    """Calibrate a camera from a video of a board.
 
-    Print a board, and glue it on something flat. Film it with the camera settings of your captures:
-    stabilisation off, the same size, zoom and lens mode. Move the board slowly to every corner of the
-    picture, near and far, tilted to all sides; half a minute is enough. The command writes calib.json and a
-    preview picture from which the distortion is removed.
+    Print a board, and glue the board on something flat. Film the board with the camera settings of your
+    captures: stabilisation is off; picture size, zoom and lens mode are the same. Move the board slowly to
+    every corner of the picture, near and far, and tilt the board to all sides; half a minute is enough. The
+    command writes calib.json and a picture from which the distortion is removed, so that you can check it.
 
     \b
     Examples:
@@ -110,11 +124,17 @@ def _board_size(
         return ("charuco", *_parse_size(charuco, "--charuco"))
     if chessboard is not None and charuco is None:
         return ("chessboard", *_parse_size(chessboard, "--chessboard"))
-    raise JobError("name one board", field="--charuco or --chessboard", hint="for example --charuco 7x5")
+    raise JobError(
+        "exactly one board is needed",
+        field="--charuco or --chessboard",
+        hint="give one of the two options, for example --charuco 7x5",
+    )
 
 
 def _parse_size(text: str, flag: str) -> tuple[int, int]:
     found = re.fullmatch(r"(\d{1,3})[xX×](\d{1,3})", text.strip())
     if found is None:
-        raise JobError(f"not a board size: {text!r}", field=flag, hint="columns x rows, for example 7x5")
+        raise JobError(
+            f"{text!r} is not the size of a board", field=flag, hint="give columns x rows, for example 7x5"
+        )
     return int(found[1]), int(found[2])

@@ -19,7 +19,7 @@ def check(
     height: HeightOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
 ) -> None:
-    """Show what a job uses, and its problems.
+    """Show the files and settings that a job uses, and its problems.
 
     Opens every video and prints which file belongs to which camera, where each setting comes from, and which
     files are not used. Checks calibration, mounts, clocks and disk space. Nothing is computed or written.

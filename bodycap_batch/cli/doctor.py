@@ -22,7 +22,8 @@ def doctor(
 ) -> None:
     """Check this machine: libraries, memory, disk, extras, Blender, a browser.
 
-    Loads every library in a process of its own and tests the disk. The exit code is 5 if jobs will fail.
+    The command loads every library in a separate process and tests the disk. The exit code is 5 if jobs
+    will fail on this machine.
 
     \b
     Example:

@@ -35,30 +35,37 @@ def evaluate(
     estimate: Annotated[
         Path,
         typer.Argument(
-            metavar="ESTIMATE", help="Results of a run, a folder of .tum files, or a .tum or .bvh file."
+            metavar="ESTIMATE",
+            help="Results folder of a job, a folder of .tum files, or a .tum or .bvh file.",
         ),
     ],
     truth: Annotated[
         Path,
-        typer.Argument(metavar="TRUTH", help="The truth: a gt/ folder, or a .tum, .bvh or joints.npz file."),
+        typer.Argument(
+            metavar="TRUTH", help="The true values: a gt/ folder, or a .tum, .bvh or joints.npz file."
+        ),
     ],
     align: Annotated[
-        Align, typer.Option(help="Alignment of all cameras together: similarity, rigid, or none.")
+        Align,
+        typer.Option(
+            help="Alignment with the truth, one for all cameras together: similarity, rigid, or none."
+        ),
     ] = Align.SIM3,
     reference: Annotated[
         str | None,
         typer.Option(
             metavar="CAMERA",
-            help="Also compare the position of every other camera relative to this camera, in metres, "
-            "without scaling.",
+            help="Also compare the position of every other camera relative to this camera. These "
+            "positions are compared in metres and are not scaled.",
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print all figures as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all numbers as JSON.")] = False,
 ) -> None:
-    """Compare results with the truth.
+    """Compare results with the true motion or the true camera paths.
 
-    For camera paths: ATE, RPE and coverage. For a motion: joint errors. Cameras are paired by file name and
-    aligned together. A frame without a pose reduces the coverage.
+    For camera paths, the command prints ATE, RPE and coverage. For a motion, the command prints the errors of
+    the joints. The files of a camera are found by their name, and all cameras are aligned together. A frame
+    without a pose reduces the coverage.
 
     \b
     Examples:
@@ -74,8 +81,9 @@ def evaluate(
         reports |= _evaluate_motion(*motions)
     if not reports:
         raise JobError(
-            f"nothing in {estimate} can be compared with {truth}",
-            hint="name two .tum files, two .bvh files, or two folders with .tum files of the same names",
+            f"{estimate} contains nothing that can be compared with {truth}",
+            hint="give two .tum files, two .bvh files, or two folders in which .tum files have the same "
+            "names",
         )
     values = {name: report.to_dict() for name, report in reports.items()}
     if as_json:
@@ -163,7 +171,7 @@ def _table_lines(reports: dict[str, Any]) -> list[str]:
 _CAMERA_COLUMNS = f"{'ATE rmse':>10}{'max':>8}{'cm':>4}{'turn rmse':>11}{'deg':>5}{'RPE rmse':>10}{'cm/s':>6}"
 _MOTION_ROWS = (
     ("mpjpe_m", "joints, cm", 100),
-    ("root_relative_m", "joints from the root, cm", 100),
+    ("root_relative_m", "joints relative to the root, cm", 100),
     ("procrustes_m", "joints, each pose aligned, cm", 100),
     ("angle_deg", "angles, degrees", 1),
     ("angle_offset_free_deg", "angles, offset removed, degrees", 1),

@@ -18,10 +18,10 @@ def init(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A folder of videos.")],
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing job file.")] = False,
 ) -> None:
-    """Write a commented job.yaml for the videos found in a folder.
+    """Write a job.yaml with comments for the videos in a folder.
 
-    The file lists every camera, and every option with its default and meaning. You fill in what the videos do
-    not state.
+    The file lists every camera, and every option with its default and meaning. Fill in the values that the
+    videos do not contain.
 
     \b
     Example:
@@ -43,6 +43,7 @@ def init(
     missing = text.count(UNKNOWN_MOUNT)
     if missing:
         print_line(
-            f"fill in `mount:`, the place on the body, of {missing} camera{'s' if missing > 1 else ''}, then"
+            f"first, fill in `mount:` (the place on the body) of {missing} "
+            f"camera{'s' if missing > 1 else ''} in the file"
         )
     print_line(f"next: bodycap check {shlex.quote(str(path))}")

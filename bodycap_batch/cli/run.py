@@ -48,20 +48,24 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         StageName | None, typer.Option("--from", help="Repeat this stage and all later ones.")
     ] = None,
     until: Annotated[
-        StageName | None, typer.Option(help="Stop after this stage. Only the last stage writes results.")
+        StageName | None,
+        typer.Option(help="Stop after this stage. Only the last stage writes the results folder."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Repeat every stage.")] = False,
     json_progress: Annotated[
         bool, typer.Option("--json-progress", help="Print progress as JSON lines on standard output.")
     ] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Print time and memory of each stage at the end.")
+        bool,
+        typer.Option(
+            "--verbose", "-v", help="At the end, print the time and the memory that each stage used."
+        ),
     ] = False,
 ) -> None:
     """Compute the map, the camera paths and the motion of a capture.
 
-    Finished stages are kept. A run that was stopped, or is started again with other options, computes only
-    the stages that are missing. The last printed line names the results folder.
+    The results of finished stages stay in the store. If a run was stopped, or if you start a run again with
+    other options, only the missing stages are computed. The last printed line names the results folder.
 
     \b
     Examples:
@@ -77,7 +81,11 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.store.artefacts import Store
 
     if force and from_ is not None:
-        raise JobError("--force repeats every stage, --from some of them", hint="leave one of them out")
+        raise JobError(
+            "--force and --from cannot be used together: --force repeats all stages, --from repeats only "
+            "some stages",
+            hint="use only one of the two options",
+        )
     first_repeated: StageName | None = "check" if force else from_
     redo = frozenset[str]() if first_repeated is None else stages_from(first_repeated)
     overrides = Overrides(out=out, skeleton=skeleton, height_m=height)
@@ -100,13 +108,19 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
             )
 
         def announce_results(folder: Path) -> None:
-            display(Event(kind="note", stage="", what=f"the results are in {folder}, preview.mp4 follows"))
+            display(
+                Event(
+                    kind="note",
+                    stage="",
+                    what=f"the results are in {folder}; only preview.mp4 is still being made",
+                )
+            )
 
         def prepare(options: Mapping[str, Any], folder: Path) -> None:
             prepare_capture(options, folder, settings(default_store(out or default_out())))
 
         if job.is_dir() and (job_file := job_file_in(job)) is not None:
-            display(Event(kind="note", stage="", what=f"as {job_file} says"))
+            display(Event(kind="note", stage="", what=f"the settings are taken from {job_file}"))
         loaded = load_job_with_origins(job, overrides, prepare=prepare)
         for text in loaded.warnings_of_run():
             display(Event(kind="note", stage="", what=text))
@@ -135,13 +149,18 @@ def _print_summary(summary: RunSummary, job: Job, display: ProgressDisplay, *, v
     if verbose:
         for stage in summary.stages:
             cost = f"{stage.seconds:8.1f} s {stage.peak_memory_mb:7.0f} MB"
-            print_line(f"{cost}  {stage.stage} {stage.camera}{' (kept)' if stage.reused else ''}".rstrip())
+            print_line(
+                f"{cost}  {stage.stage} {stage.camera}{' (already done)' if stage.reused else ''}".rstrip()
+            )
     if not summary.files:
         # Report the last stage with a name that the user knows. Stages such as rig and recover belong to
         # registration.
         reached = next(stage.stage for stage in reversed(summary.stages) if stage.stage in STAGE_ORDER)
-        print_line(f"{job.name}: stopped after {reached}, as requested; run it again for the rest")
+        print_line(
+            f"{job.name}: stopped after the stage {reached}, as requested; run the job again without "
+            "--until to compute the other stages"
+        )
         return
     if summary.executed == 0:
-        print_line(f"{job.name}: nothing to do, all {len(summary.stages)} stages were finished before")
+        print_line(f"{job.name}: nothing to do, because all {len(summary.stages)} stages were already done")
     print_line(f"results: {summary.out_dir}")

@@ -22,7 +22,7 @@ def _store(default: str) -> Any:
     return typer.Option(
         "--store",
         metavar="DIR",
-        help=f"Folder of finished stages, reused by the next run (default: {default}).",
+        help=f"Folder for the results of finished stages, which the next run reuses (default: {default}).",
         envvar=STORE_VARIABLE,
         show_envvar=True,
     )
@@ -32,12 +32,15 @@ JobArgument = Annotated[
     Path,
     typer.Argument(
         metavar="JOB_OR_FOLDER",
-        help="A job file (YAML), or a folder of videos (its job.yaml is used, if it has one).",
+        help="A job file (YAML), or a folder of videos. If the folder contains a job.yaml, this file is "
+        "used.",
         readable=False,  # typer does not check this: the job loader gives a better message, with advice
     ),
 ]
 OutOption = Annotated[Path | None, _out("Folder for the results (default: out/<job>).")]
-BatchOutOption = Annotated[Path | None, _out("Folder for the results folders of the jobs (default: out).")]
+BatchOutOption = Annotated[
+    Path | None, _out("Folder that contains the results folder of each job (default: out).")
+]
 SkeletonOption = Annotated[
     str | None,
     typer.Option(

@@ -21,25 +21,32 @@ if TYPE_CHECKING:
 @app.command()
 def skeleton(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE.bvh", help="The skeleton of a subject or a character.")
+        Path,
+        typer.Argument(metavar="FILE.bvh", help="BVH file with the skeleton of a subject or a character."),
     ],
     roles: Annotated[
         list[str] | None,
-        typer.Option("--map", metavar="JOINT=ROLE", help="Role of a joint (none: no role). Repeatable."),
+        typer.Option(
+            "--map",
+            metavar="JOINT=ROLE",
+            help="Give a role to a joint; the role `none` means no role. You can repeat this option.",
+        ),
     ] = None,
     tpose_frame: Annotated[
         int | None,
         typer.Option(
-            metavar="N", help="Frame with the T-pose, counted from 0, if the zero pose is not a T-pose."
+            metavar="N",
+            help="Number of the frame with the T-pose (the first frame is 0), if the zero pose is not "
+            "a T-pose.",
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the mapping as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the roles of all joints as JSON.")] = False,
 ) -> None:
     """Show how a rig is interpreted, before a job uses it.
 
-    Lists the role of each joint, the length and direction of its bone, and the missing roles. Joints without
-    a role (fingers, twist bones, helpers) stay at zero. The results keep the file's hierarchy, OFFSETs,
-    channel order and zero pose.
+    Lists the role of each joint, the length and direction of its bone, and the missing roles. The motion does
+    not rotate joints without a role (fingers, twist bones, helpers). The results keep the file's hierarchy,
+    OFFSETs, channel order and zero pose.
 
     \b
     Examples:
@@ -75,7 +82,9 @@ def _parse_roles(words: list[str]) -> dict[str, str]:
     )
     if bad is not None:
         raise JobError(
-            f"not a mapping: {bad!r}", field="--map", hint="JOINT=ROLE, for example --map Bip_Chest=Spine1"
+            f"{bad!r} does not have the form JOINT=ROLE",
+            field="--map",
+            hint="write JOINT=ROLE, for example --map Bip_Chest=Spine1",
         )
     return {name: role for name, _, role in pairs}
 
@@ -119,11 +128,11 @@ def _closing_lines(rig: SkeletonModel, options: RigOptions) -> list[str]:
     from bodycap_batch.formats.bvh.skeleton_description import missing_roles, skeleton_warnings
 
     missing = missing_roles(rig)
-    lines = [f"missing: {', '.join(missing)}" if missing else "missing: nothing"]
+    lines = [f"roles without a joint: {', '.join(missing)}" if missing else "every role has a joint"]
     lines += [f"warning: {text}" for text in skeleton_warnings(rig)]
     if options.roles:
         pairs = ", ".join(f"{json.dumps(name)}: {role}" for name, role in options.roles.items())
-        lines.append(f"in the job: skeleton_map: {{{pairs}}}")
+        lines.append(f"write in the job: skeleton_map: {{{pairs}}}")
     if options.tpose_frame is not None:
-        lines.append(f"in the job: tpose_frame: {options.tpose_frame}")
+        lines.append(f"write in the job: tpose_frame: {options.tpose_frame}")
     return lines

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 SpoolArgument = Annotated[
     Path,
     typer.Argument(
-        metavar="[DIR]", help="The watched folder, or its parent with inbox/, running/ and done/."
+        metavar="[DIR]", help="The watched folder, or the folder that contains inbox/, running/ and done/."
     ),
 ]
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the job in `bodycap status`.")]
@@ -61,14 +61,15 @@ def status(
     for watcher in watchers:
         print_line(str(watcher))
     if not watchers and any(row.state in ("waiting", "interrupted", "stopped") for row in rows):
-        print_line(f"no watcher runs here: `bodycap watch {watched.inbox}` starts one")
+        print_line(f"no watcher runs for this folder; start a watcher with: bodycap watch {watched.inbox}")
 
 
 @app.command()
 def retry(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
     """Move a failed or cancelled job back to the inbox.
 
-    You may correct its folder before that (failed/NAME/input/). Finished stages are not computed again.
+    Before that, you may correct the files of the job in failed/NAME/input/. Finished stages are not computed
+    again.
 
     \b
     Example:
@@ -76,12 +77,12 @@ def retry(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.watch import retry_job
 
-    print_line(f"back in the inbox: {retry_job(_find_spool(spool), name)}")
+    print_line(f"the job is in the inbox again: {retry_job(_find_spool(spool), name)}")
 
 
 @app.command()
 def cancel(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
-    """Cancel a waiting or running job within five seconds. Its finished stages are kept for a retry.
+    """Cancel a waiting or running job. The results of its finished stages stay in the store for a retry.
 
     \b
     Example:
@@ -91,9 +92,14 @@ def cancel(name: NameArgument, spool: SpoolArgument = Path("jobs")) -> None:
 
     place = cancel_job(_find_spool(spool), name)
     if place is None:
-        print_line(f"{name}: no watcher has stopped the job yet; the next active watcher cancels the job")
+        print_line(
+            f"{name}: no watcher has cancelled the job yet; the next watcher that runs will cancel the job"
+        )
     elif (state := read_status(place).get("state")) != "cancelled":
-        print_line(f"{name}: the job ended before it could be stopped: {state}, {place.path}")
+        print_line(
+            f"{name}: the job ended before it could be cancelled; its state is {state}, its folder is "
+            f"{place.path}"
+        )
     else:
         print_line(f"cancelled: {place.path}")
 
@@ -104,7 +110,7 @@ def _find_spool(path: Path) -> Spool:
 
     if not path.is_dir():
         raise JobError(
-            "there is no such folder", path=path, hint="name the watched folder, for example jobs/inbox"
+            "there is no such folder", path=path, hint="give the watched folder, for example jobs/inbox"
         )
     return spool_from_path(path)
 

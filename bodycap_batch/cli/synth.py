@@ -20,12 +20,15 @@ from bodycap_batch.core.progress import Event
 
 @app.command()
 def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
-    out: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder for the videos and the truth.")],
+    out: Annotated[
+        Path, typer.Argument(metavar="DIR", help="A new folder for the videos and the true motion.")
+    ],
     seconds: Annotated[float | None, typer.Option(help="Duration of each video (default: 12).")] = None,
     cameras: Annotated[
         str | None,
         typer.Option(
-            metavar="NAMES", help="Mounts, separated by commas (default: torso,left_palm,right_palm)."
+            metavar="NAMES",
+            help="Mount names of the cameras, separated by commas (default: torso,left_palm,right_palm).",
         ),
     ] = None,
     size: Annotated[
@@ -33,18 +36,25 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames per second (default: 30).")] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Seed of the random body, walk and room (default: 0).")
+        int | None,
+        typer.Option(help="Seed of the random numbers for the body, the walk and the room (default: 0)."),
     ] = None,
     motion: Annotated[
-        Path | None, typer.Option(metavar="FILE.bvh", help="Use this motion instead of the built-in walk.")
+        Path | None,
+        typer.Option(
+            metavar="FILE.bvh", help="BVH file with the motion to use instead of the built-in walk."
+        ),
     ] = None,
-    poses: Annotated[bool, typer.Option("--poses", help="Write noisy camera poses only, no videos.")] = False,
+    poses: Annotated[
+        bool, typer.Option("--poses", help="Write only camera poses with noise, and no videos.")
+    ] = False,
     more: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Another option of the renderer, with a YAML value. Repeatable.",
+            help="Set another option of the synthetic capture, with a YAML value. You can repeat this "
+            "option.",
         ),
     ] = None,
     threads: ThreadsOption = None,
@@ -52,7 +62,7 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
         bool, typer.Option("--json-progress", help="Print progress as JSON lines on standard output.")
     ] = False,
 ) -> None:
-    """Render a sample capture with its exact truth.
+    """Render a sample capture, for which the true motion is known.
 
     A person with body cameras walks through a textured room. The command writes <camera>.mp4, calib.json, and
     the truth in gt/ (camera paths, joints, skeleton, motion).
@@ -93,7 +103,11 @@ def _parse_size(text: str | None) -> dict[str, int]:
         return {}
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal()):
-        raise JobError(f"not an image size: {text!r}", field="--size", hint="for example 640x480")
+        raise JobError(
+            f"{text!r} is not an image size",
+            field="--size",
+            hint="give width x height in pixels, for example 640x480",
+        )
     return {"width": int(width), "height": int(height)}
 
 
@@ -104,12 +118,16 @@ def _parse_settings(settings: list[str]) -> dict[str, Any]:
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not equals:
-            raise JobError(f"not KEY=VALUE: {setting!r}", field="--set", hint="for example --set noise=4")
+            raise JobError(
+                f"{setting!r} does not have the form KEY=VALUE",
+                field="--set",
+                hint="write KEY=VALUE, for example --set noise=4",
+            )
         try:
             found[key.strip()] = yaml.safe_load(value)
         except yaml.YAMLError as error:
-            hint = "a number, a word, or a list in brackets"
-            raise JobError(f"not a YAML value: {value!r}", field=f"--set {key}", hint=hint) from error
+            hint = "give a number, a word, or a list in brackets"
+            raise JobError(f"{value!r} is not a YAML value", field=f"--set {key}", hint=hint) from error
     return found
 
 

@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 _REPORT_FILES = ("report.html", "partial/report.html")
 
 
-@app.command(short_help="Show a finished job together with its videos.")
+@app.command(short_help="Show the report of a finished job together with the videos.")
 def view(
     job: JobArgument,
     out: OutOption = None,
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port of the server (default: a free one).")
     ] = 0,
-    browser: Annotated[bool, typer.Option(help="Open the browser.")] = True,
+    browser: Annotated[bool, typer.Option(help="Open the page in a browser.")] = True,
     rerun: Annotated[
         Path | None,
         typer.Option(
@@ -45,7 +45,7 @@ def view(
     ] = None,
     store: StoreOption = None,
 ) -> None:
-    """Show a finished job in the browser, synchronised with its videos.
+    """Show a finished job in the browser, together with its videos.
 
     Serves the report on this machine only (127.0.0.1) until Ctrl-C. The job may also be given by its results
     folder. The report itself, report.html, needs no server; it shows small pictures instead of the videos.
@@ -73,7 +73,9 @@ def view(
     page = next((out_dir / name for name in _REPORT_FILES if (out_dir / name).is_file()), None)
     if page is None:
         raise JobError(
-            "there is no report", path=out_dir, hint="run the job, or write the report with `bodycap report`"
+            "the folder contains no report",
+            path=out_dir,
+            hint="run the job, or write the report with `bodycap report`",
         )
     server = make_server(
         make_served_content(page, open_capture(resolved.capture), _StoredMarks(resolved, out_dir, store)),

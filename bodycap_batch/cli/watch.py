@@ -21,26 +21,31 @@ if TYPE_CHECKING:
 
 RootOption = Annotated[
     list[Path] | None,
-    typer.Option(metavar="DIR", help="A folder with files that every job may use. Repeatable."),
+    typer.Option(
+        metavar="DIR", help="A folder with files that every job may read. You can repeat this option."
+    ),
 ]
 LimitOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME=VALUE",
-        help="Limit of a job's size (default: video_gb=64 video_hours=4 video_px=8192 files=10000 "
-        "yaml_kb=1024 yaml_depth=20). Repeatable.",
+        help="Change a limit for jobs (default: video_gb=64 video_hours=4 video_px=8192 files=10000 "
+        "yaml_kb=1024 yaml_depth=20). You can repeat this option.",
     ),
 ]
 
 WebOption = Annotated[
     str | None,
-    typer.Option(metavar="HOST:PORT", help="Serve a live page of the jobs, for example on 127.0.0.1:8080."),
+    typer.Option(
+        metavar="HOST:PORT", help="Serve a web page that shows the jobs, for example on 127.0.0.1:8080."
+    ),
 ]
 TokenOption = Annotated[
     str,
     typer.Option(
         metavar="TOKEN",
-        help="Token that a browser must send (/?token=TOKEN); required if --web is not a loopback address.",
+        help="Token that a browser must send (/?token=TOKEN). A token is required if other machines can "
+        "reach the address of --web.",
         envvar="BODYCAP_WEB_TOKEN",
         show_envvar=True,
         show_default=False,
@@ -48,11 +53,15 @@ TokenOption = Annotated[
 ]
 
 
-@app.command(short_help="Run every folder of videos that is dropped into an inbox.")
+@app.command(short_help="Run every folder of videos that someone puts into an inbox.")
 def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     inbox: Annotated[
         Path,
-        typer.Argument(metavar="[INBOX]", help="The folder to watch, or its parent.", show_default=True),
+        typer.Argument(
+            metavar="[INBOX]",
+            help="The folder to watch (inbox/), or the folder that contains inbox/.",
+            show_default=True,
+        ),
     ] = Path("jobs/inbox"),
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Number of jobs at the same time.")] = 1,
     threads: ThreadsOption = None,
@@ -66,30 +75,35 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
             "--settle",
             min=0.0,
             metavar="SECONDS",
-            help="Time without changes after which a folder is complete.",
+            help="If a folder has not changed for this time, the folder is complete and its job starts.",
         ),
     ] = 10.0,
     poll: Annotated[
         bool | None,
-        typer.Option("--poll/--no-poll", help="Poll the folder for changes (default: on network disks)."),
+        typer.Option(
+            "--poll/--no-poll",
+            help="Read the folder regularly to find changes (default: only on network disks).",
+        ),
     ] = None,
     stale: Annotated[
         float,
         typer.Option(
-            min=1.0, metavar="SECONDS", help="Time without a heartbeat after which a job is taken over."
+            min=1.0,
+            metavar="SECONDS",
+            help="If a watcher has shown no activity for this time, another watcher takes over its jobs.",
         ),
     ] = 60.0,
     web: WebOption = None,
     web_token: TokenOption = "",
     once: Annotated[bool, typer.Option("--once", help="Stop when nothing is left to do.")] = False,
 ) -> None:
-    """Run every folder of videos, or job file, that is dropped into INBOX.
+    """Run every folder of videos, or job file, that someone puts into INBOX.
 
-    A folder is complete when it has not changed for a while and holds no *.part or hidden file. A folder with
-    a file named READY is complete at once. Jobs move from inbox/ to running/, then to done/ or failed/. These
-    folders are next to inbox/. done/NAME/result/ holds the results, done/NAME/input/ the dropped files. Stop
-    the command with Ctrl-C at any time: the jobs continue at the next start. Several watchers, also on
-    several machines, may share the folders.
+    A folder is complete when it has not changed for a while and contains no *.part or hidden file. A folder
+    with a file named READY is complete at once. Jobs move from inbox/ to running/, then to done/ or failed/.
+    These folders are next to inbox/. done/NAME/result/ holds the results, done/NAME/input/ holds the dropped
+    files. Stop the command with Ctrl-C at any time: the jobs continue when you start the command again.
+    Several watchers, also on several machines, may share the folders.
 
     A dropped job may only use files in its own folder and in the folders given by --root.
 
@@ -120,11 +134,11 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     )
     with event_on_signal() as stop:
         watcher = Watcher(spool, options, print_timed_message)
-        print_timed_message(f"watching {spool.inbox}; results go to {spool.done}")
+        print_timed_message(f"watching {spool.inbox}; finished jobs are moved to {spool.done}")
         with _live_page(watcher, options, web, web_token):
             worst = _run(watcher, stop)
     if stop.is_set():
-        print_timed_message("stopped; running jobs continue at the next start")
+        print_timed_message("the watcher stopped; unfinished jobs continue when you start the watcher again")
         raise typer.Exit(signal_exit_code())
     raise typer.Exit(worst)
 
@@ -158,5 +172,5 @@ def _existing_folder(path: Path) -> Path:
     from bodycap_batch.core.errors import JobError
 
     if not path.is_dir():
-        raise JobError("there is no such folder", path=path, field="--root", hint="name an existing folder")
+        raise JobError("there is no such folder", path=path, field="--root", hint="give an existing folder")
     return path.resolve()

@@ -75,13 +75,13 @@ def gc(
             metavar="STORE", help="Folder of the store (default: BODYCAP_STORE, else out/.store)."
         ),
     ] = None,
-    delete: Annotated[bool, typer.Option("--delete", help="Remove the listed artefacts.")] = False,
+    delete: Annotated[bool, typer.Option("--delete", help="Remove the artefacts that no job uses.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """List the artefacts that no job uses, or remove them.
 
-    The artefacts of each job's last run are kept as long as its results folder exists. Results are never
-    removed.
+    The artefacts of each job's last run stay in the store as long as the job's results folder exists. Results
+    are never removed.
 
     \b
     Example:
@@ -92,7 +92,11 @@ def gc(
 
     store_dir = store or Path(os.environ.get(STORE_VARIABLE) or default_store(default_out()))
     if not (store_dir / "artefacts").is_dir():
-        raise StoreError("there is no store", path=store_dir, hint="name its folder: bodycap gc FOLDER")
+        raise StoreError(
+            "there is no store in this folder",
+            path=store_dir,
+            hint="give the folder of the store: bodycap gc FOLDER",
+        )
     garbage = collect_garbage(Store(store_dir), delete=delete)
     if as_json:
         print_json({**asdict(garbage), "deleted": delete}, indent=1)
@@ -100,9 +104,10 @@ def gc(
     for name in (*garbage.artefacts, *(f"corrupt/{name}" for name in garbage.corrupt)):
         print_line(name)
     for owner in garbage.gone:
-        print_line(f"results that no longer exist: {owner}")
+        print_line(f"these results no longer exist: {owner}")
     count, size = len(garbage.artefacts) + len(garbage.corrupt), f"{garbage.freed_bytes / 1e6:.1f} MB"
     verb = "removed" if delete else "would remove"
     print_line(
-        f"{verb} {count} of {count + garbage.kept}, {size}{'' if delete else ' (--delete removes them)'}"
+        f"{verb} {count} of {count + garbage.kept} artefacts, "
+        f"{size}{'' if delete else ' (use --delete to remove these artefacts)'}"
     )

@@ -103,7 +103,8 @@ class Calibration(BaseModel):
     width: int = Field(gt=0, le=65536, description="image width of the calibration, pixels")
     height: int = Field(gt=0, le=65536, description="image height of the calibration, pixels")
     pixel_origin: Literal["colmap", "opencv"] = Field(
-        "colmap", description="centre of the first pixel: colmap = (0.5, 0.5), opencv = (0, 0)"
+        "colmap",
+        description="coordinates of the centre of the first pixel: colmap = (0.5, 0.5), opencv = (0, 0)",
     )
 
     @field_validator("model")
@@ -113,7 +114,7 @@ class Calibration(BaseModel):
         if name in CAMERA_MODELS:
             return name
         near = difflib.get_close_matches(name, CAMERA_MODELS, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(CAMERA_MODELS)}"
+        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(CAMERA_MODELS)}"
         raise ValueError(f"unknown camera model {value!r}; {hint}")
 
     @field_validator("pixel_origin", mode="before")
@@ -225,7 +226,8 @@ def read_calibration(path: Path, camera: str) -> CalibrationEntry:
             f"the calibration is not valid: {first['msg'].removeprefix('Value error, ')}",
             path=path,
             field=name or None,
-            hint='{"model": "PINHOLE", "params": [fx, fy, cx, cy], "width": 1920, "height": 1080}',
+            hint="write the calibration like this example: "
+            '{"model": "PINHOLE", "params": [fx, fy, cx, cy], "width": 1920, "height": 1080}',
         ) from error
     if (implausible := calibration.implausible_parameter()) is not None:
         raise implausible_calibration(implausible, path, f"{field}params")
@@ -267,24 +269,31 @@ def implausible_calibration(
 def _read_object(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise CaptureError("too large for a calibration", path=path, hint="give a calib.json")
+            raise CaptureError(
+                "the file is too large for a calibration",
+                path=path,
+                hint="give a calib.json that `bodycap calibrate` wrote",
+            )
         data = json.loads(path.read_text(encoding="utf-8"))
     except json.JSONDecodeError as error:
         raise CaptureError(
-            f"not JSON: {error.msg}",
+            f"the file is not valid JSON: {error.msg}",
             path=path,
             line=error.lineno,
-            hint="correct the file, or use calibration: auto",
+            hint="correct the file, or use `calibration: auto`",
         ) from error
     except (OSError, ValueError, RecursionError) as error:
         raise CaptureError(
-            f"cannot read the calibration ({error})",
+            f"the calibration cannot be read ({error})",
             path=path,
-            hint="give a calib.json, or calibration: auto",
+            hint="give a calib.json, or use `calibration: auto`",
         ) from error
     if not isinstance(data, dict):
         raise CaptureError(
-            "the calibration is not a JSON object", path=path, hint='it starts with {"model": ...'
+            "the calibration is not a JSON object",
+            path=path,
+            hint="write the calibration like this example: "
+            '{"model": "PINHOLE", "params": [fx, fy, cx, cy], "width": 1920, "height": 1080}',
         )
     return data
 
@@ -293,10 +302,12 @@ def _no_such_camera(path: Path, camera: str, cameras: object) -> CaptureError:
     names = [str(name) for name in cameras] if isinstance(cameras, dict) else []
     near = difflib.get_close_matches(camera, names, n=1)
     return CaptureError(
-        f"no calibration of a camera named {camera!r}",
+        f"the file has no calibration of a camera named {camera!r}",
         path=path,
         field="cameras",
-        hint=f"did you mean {near[0]!r}?" if near else f"the file has: {', '.join(names) or 'none'}",
+        hint=f"did you mean {near[0]!r}?"
+        if near
+        else f"use one of the camera names in the file: {', '.join(names) or 'none'}",
     )
 
 

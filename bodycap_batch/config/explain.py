@@ -16,7 +16,7 @@ from bodycap_batch.core.errors import JobError
 
 _MAX_FURTHER = 5
 """Maximum number of problems that a message lists after the first problem. Evidence: none."""
-_MISSING = "this is missing"
+_MISSING = "this key is missing"
 _DID_YOU_MEAN = "did you mean "
 _EXAMPLES = "the folder jobs/ has a commented example"
 _EXPECTED = {
@@ -121,7 +121,7 @@ def _problem_of(details: Any, model: type[BaseModel], data: object) -> Problem:
     if kind == "literal_error":
         return _not_among(location, details)
     if kind == "too_short" and not details["input"]:
-        return Problem(location, "this is an empty list", None)
+        return Problem(location, "this list is empty", None)
     text = str(details["msg"]).removeprefix("Value error, ").replace("Input should be", "should be")
     if kind == "value_error":
         # The text of a rule for several fields starts with the name of the field that is wrong.
@@ -165,7 +165,7 @@ def _description(location: Location, model: type[BaseModel]) -> str | None:
 def _unknown_key(location: Location, model: type[BaseModel]) -> Problem:
     known = known_keys(model, location[:-1])
     near = difflib.get_close_matches(str(location[-1]), known, n=1)
-    hint = f"{_DID_YOU_MEAN}{near[0]!r}?" if near else f"known here: {', '.join(known)}"
+    hint = f"{_DID_YOU_MEAN}{near[0]!r}?" if near else f"use one of these keys: {', '.join(known)}"
     return Problem(location, f"unknown key {str(location[-1])[:60]!r}", hint)
 
 

@@ -67,12 +67,14 @@ def chapters_in(folder: Path) -> tuple[Path, ...]:
     try:
         chapters = sorted((path for path in folder.iterdir() if is_video(path)), key=natural_key)
     except OSError as error:
-        raise CaptureError(f"cannot read the folder ({error})", path=folder, hint="check the path") from error
+        raise CaptureError(
+            f"the folder cannot be read ({error})", path=folder, hint="correct the path"
+        ) from error
     if not chapters:
         raise CaptureError(
-            "no video in this camera's folder",
+            "the folder of this camera contains no video",
             path=folder,
-            hint=f"known: {', '.join(sorted(VIDEO_SUFFIXES))}",
+            hint=f"give a folder that contains videos, which end with {', '.join(sorted(VIDEO_SUFFIXES))}",
         )
     return tuple(chapters)
 
@@ -89,12 +91,15 @@ def videos_in(folder: Path) -> list[Path]:
         entries = visible_entries(folder)
         videos = [path for path in entries if is_video(path) or (path.is_dir() and _has_chapters(path))]
     except OSError as error:
-        raise CaptureError(f"cannot read the folder ({error})", path=folder, hint="check the path") from error
+        raise CaptureError(
+            f"the folder cannot be read ({error})", path=folder, hint="correct the path"
+        ) from error
     if not videos:
         raise CaptureError(
-            "no video in this folder",
+            "the folder contains no video",
             path=folder,
-            hint="name them after their place on the body, e.g. torso.mp4, left_palm.mp4, right_palm.mp4",
+            hint="put the videos into the folder, and name each video after its place on the body, for "
+            "example torso.mp4, left_palm.mp4, right_palm.mp4",
         )
     return videos
 
@@ -210,7 +215,9 @@ def _refuse_missing_videos(folder: Path) -> None:
     for path in sorted(folder.iterdir()):
         if path.is_symlink() and not path.exists() and path.suffix.lower() in VIDEO_SUFFIXES:
             raise CaptureError(
-                "a link that leads nowhere", path=path, hint="link it again, or copy the video itself"
+                "this link leads to a file that does not exist",
+                path=path,
+                hint="correct the link, or replace the link by the video itself",
             )
         if path.is_dir() and mount_of(path.name) is not None and not (path / RUN_FILE).is_file():
             chapters_in(path)
@@ -221,9 +228,10 @@ def _refuse_equal_names(named: list[tuple[str, Path]]) -> None:
     for name, path in named:
         if name.lower() in seen:
             raise JobError(
-                f"two cameras named {name!r}: {seen[name.lower()].name} and {path.name}",
+                f"two cameras would have the name {name!r}: {seen[name.lower()].name} and {path.name}",
                 path=path.parent,
-                hint="rename one (torso and torso_back may share a segment), or put chapters into one folder",
+                hint="rename one of the two (cameras on one segment can have the names torso and "
+                "torso_back); if both are chapters of one camera, put both into one folder",
             )
         seen[name.lower()] = path
 
@@ -232,8 +240,9 @@ def _refuse_unknown_mounts(named: list[tuple[str, Path]]) -> None:
     unknown = [path.name for name, path in named if mount_of(name) is None]
     if unknown:
         raise JobError(
-            f"where on the body was {', '.join(unknown)}? The name does not say",
+            f"the place of {', '.join(unknown)} on the body is unknown, because the name does not contain "
+            "a place",
             path=named[0][1].parent,
-            hint=f"rename to one of {', '.join(MOUNT_NAMES)}; put the chapters of one camera into a folder "
-            "of that name; or write a job file that gives each camera its `mount:`",
+            hint=f"rename each video to one of {', '.join(MOUNT_NAMES)}; put the chapters of one camera "
+            "into a folder with such a name; or write a job file that gives each camera its `mount:`",
         )

@@ -115,9 +115,10 @@ def load_job_with_origins(
     except PermissionError as error:
         kind = JobError if error.filename == str(full) else CaptureError
         raise kind(
-            "no permission to read it",
+            "the program has no permission to read the file",
             path=error.filename,
-            hint="let the user who runs this read the file and enter its folders (chmod)",
+            hint="give the user who runs this program the permission to read the file and to enter its "
+            "folders (chmod)",
         ) from error
 
 
@@ -137,7 +138,9 @@ def _read_source(full: Path, limits: Limits) -> YamlSource | None:
         return None
     if full.suffix.lower() in VIDEO_SUFFIXES:
         raise JobError(
-            "a video is not a job", path=full, hint=f"give the folder that it lies in: {full.parent}"
+            "this file is a video, not a job",
+            path=full,
+            hint=f"give the folder that contains the video: {full.parent}",
         )
     return read_yaml(full, max_bytes=int(1024 * limits.yaml_kb), max_depth=int(limits.yaml_depth))
 
@@ -316,19 +319,22 @@ def synthetic_folder(job: Job, base: Path) -> Path:
     folders = {(base / video).resolve().parent for camera in job.capture.cameras for video in camera.video}
     if len(folders) > 1:
         raise JobError(
-            "the videos of a synthetic capture must be in one folder, but these are in several",
+            "the videos of a synthetic capture must be in one folder, but these videos are in several "
+            "folders",
             field="capture.cameras",
-            hint="bodycap synth writes <folder>/<camera>.mp4",
+            hint="write each video as <folder>/<camera>.mp4, with the same folder for all cameras",
         )
     return folders.pop()
 
 
 def _top_mapping(source: YamlSource) -> dict[str, Any]:
     if source.data is None:
-        raise JobError("the job is empty", path=source.path, hint="it needs at least `capture:`")
+        raise JobError("the job is empty", path=source.path, hint="write at least `capture:`")
     if not isinstance(source.data, dict):
         raise JobError(
-            "the job is not a block of `key: value` lines", path=source.path, hint="start with `capture:`"
+            "the job is not a block of `key: value` lines",
+            path=source.path,
+            hint="start the file with `capture:`",
         )
     return source.data
 
@@ -387,9 +393,9 @@ def _with_overrides(job: Job, overrides: Overrides) -> Job:
     if overrides.height_m is not None:
         if not _HEIGHT_M[0] <= overrides.height_m <= _HEIGHT_M[1]:
             raise JobError(
-                f"a subject {overrides.height_m:g} m tall?",
+                f"a body height of {overrides.height_m:g} m is not plausible",
                 field="height_m",
-                hint="the height in metres, e.g. 1.75",
+                hint="give the height in metres, for example 1.75",
             )
         update["height_m"] = float(overrides.height_m)
     return job.model_copy(update=update)
@@ -405,10 +411,10 @@ def _prepare_synthetic(job: Job, base: Path, path: Path, prepare: Prepare | None
     missing = [v for camera in job.capture.cameras for v in camera.video if not (base / v).is_file()]
     if missing:
         raise CaptureError(
-            "the sample capture has not been rendered yet",
+            "the videos of this synthetic capture have not been rendered yet",
             path=(base / missing[0]).resolve(),
             field="capture.synthetic",
-            hint=f"`bodycap run {path.name}` renders it on first use",
+            hint=f"run `bodycap run {path.name}`, which renders the videos first",
         )
 
 
@@ -457,7 +463,7 @@ def _require_apart(job: Job, full: Path) -> None:
     kept = full.name == JOB_FILES[0] and full.parent == job.out and not (full.parent / RUN_FILE).is_file()
     if job.out in videos or kept:
         raise JobError(
-            f"the results would go to the folder of the job's own files, {job.out}",
+            f"the results would be written into the folder of the job's own files, {job.out}",
             path=full,
             field="out",
             hint=f"use a separate folder for the results, for example {Path(str(job.out)) / 'results'}",

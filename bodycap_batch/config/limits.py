@@ -39,11 +39,13 @@ class Limits:
         for field in dataclasses.fields(self):
             if not (math.isfinite(value := getattr(self, field.name)) and value > 0):
                 raise JobError(
-                    f"{field.name}={value:g} is not a limit", field="--limit", hint="a number above 0"
+                    f"{field.name}={value:g} is not a limit", field="--limit", hint="give a number above 0"
                 )
         if self.yaml_depth > _MAX_YAML_DEPTH:
-            hint = f"at most {_MAX_YAML_DEPTH}; the shipped limit is {MAX_DEPTH}"
-            raise JobError(f"yaml_depth={self.yaml_depth:g} is too deep", field="--limit", hint=hint)
+            hint = f"give at most {_MAX_YAML_DEPTH}; the default is {MAX_DEPTH}"
+            raise JobError(
+                f"the limit yaml_depth={self.yaml_depth:g} is too large", field="--limit", hint=hint
+            )
 
 
 def limits_from(settings: Iterable[str]) -> Limits:
@@ -61,6 +63,6 @@ def limits_from(settings: Iterable[str]) -> Limits:
                 raise ValueError(name)
             values[name] = float(value)
         except ValueError as error:
-            hint = f"NAME=NUMBER, with NAME one of {', '.join(known)}"
-            raise JobError(f"not a limit: {setting!r}", field="--limit", hint=hint) from error
+            hint = f"write NAME=NUMBER, where NAME is one of {', '.join(known)}"
+            raise JobError(f"{setting!r} is not a limit", field="--limit", hint=hint) from error
     return Limits(**values)

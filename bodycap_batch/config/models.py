@@ -83,39 +83,66 @@ AnyPose = Annotated[
 class CameraConfig(_Block):
     """One camera of the capture. Loaded jobs hold absolute paths and list all chapters and sidecar files."""
 
-    name: str = Field(max_length=64, description="names the camera's results")
+    name: str = Field(max_length=64, description="name of the camera; the camera's results have this name")
     video: tuple[Path, ...] = Field(
-        min_length=1, description="video file, folder of chapters, or list of chapters"
+        min_length=1, description="a video file, a folder of chapters, or a list of chapters"
     )
-    mount: str | None = Field(None, description="place on the body; default: from the camera's name")
-    segment: str | None = Field(None, description="bone of the camera, if no mount name fits")
+    mount: str | None = Field(
+        None,
+        description="place of the camera on the body; default: the place that the camera's name contains",
+    )
+    segment: str | None = Field(
+        None, description="bone on which the camera is mounted, if no mount name describes its place"
+    )
     joint_from_cam: AnyPose | None = Field(
-        None, description="measured mount: 4x4 matrix, or translation_m and quat_xyzw"
+        None,
+        description="measured pose of the camera on its bone: a 4x4 matrix, or translation_m and quat_xyzw",
     )
     sigma_deg: float | None = Field(
-        None, ge=MIN_SIGMA_DEG, le=MAX_ANGLE_DEG, description="uncertainty of the mount's rotation"
+        None,
+        ge=MIN_SIGMA_DEG,
+        le=MAX_ANGLE_DEG,
+        description="standard deviation of the mount's rotation, in degrees",
     )
     sigma_m: float | None = Field(
-        None, ge=MIN_SIGMA_M, le=MAX_REACH_M, description="uncertainty of the mount's position"
+        None,
+        ge=MIN_SIGMA_M,
+        le=MAX_REACH_M,
+        description="standard deviation of the mount's position, in metres",
     )
     calibration: AnyCalibration | None = Field(
-        None, description="inline block, path of a calib.json, or auto; default: the capture's"
+        None,
+        description="a block with the calibration, the path of a calib.json, or auto; default: the "
+        "calibration of the capture",
     )
     fov_deg: float | None = Field(
-        None, gt=10, lt=170, description="field of view along the long side: first guess of calibration: auto"
+        None,
+        gt=10,
+        lt=170,
+        description="field of view along the long side of the picture, in degrees; `calibration: "
+        "auto` starts from this value",
     )
     timestamps: tuple[Path, ...] = Field(
-        (), description="sidecar with one time in seconds per frame (of all chapters, or one per chapter)"
+        (),
+        description="file with one time in seconds for each frame; one file for all chapters, or one "
+        "file for each chapter",
     )
     mask: Path | None = Field(
-        None, description="PNG in the video's shape, white where the room is seen, black over the wearer"
+        None,
+        description="PNG picture with the aspect ratio of the video: white where the room is visible, "
+        "black where the wearer is visible",
     )
-    offset_s: Seconds | None = Field(None, description="common time = camera time + offset_s")
+    offset_s: Seconds | None = Field(
+        None, description="offset of the camera's clock in seconds: common time = camera time + offset_s"
+    )
     rolling_shutter_s: float | None = Field(
         None,
         ge=-MAX_ROLLING_SHUTTER_S,
         le=MAX_ROLLING_SHUTTER_S,
-        description="time from the first row's exposure to the last's; default: found from the video",
+        description=(
+            "time in seconds from the exposure of the first row to the exposure of the last row; "
+            "default: estimated from the video"
+        ),
     )
 
     @property
@@ -142,27 +169,34 @@ class CaptureConfig(_Block):
     """The videos of one recording."""
 
     cameras: tuple[CameraConfig, ...] = Field(
-        min_length=1, max_length=64, description="a list of blocks: - {name: torso, video: torso.mp4}"
+        min_length=1,
+        max_length=64,
+        description="the cameras, as a list of blocks: - {name: torso, video: torso.mp4}",
     )
     cameras_only: bool = Field(
         False, description="true: no other cameras; default: videos beside a job.yaml become cameras, too"
     )
     calibration: AnyCalibration | None = Field(
         None,
-        description="calibration of every camera that does not give a calibration itself; "
-        "default: the calib.json beside a job.yaml, else auto",
+        description="calibration of every camera that has no calibration of its own",
     )
     rig: Literal["free", "synced"] = Field(
         "free",
-        description="synced: cameras on one segment are held rigidly and exposed by one hardware trigger",
+        description="synced: the cameras on one segment are fixed rigidly to each other, and one hardware "
+        "trigger exposes all of these cameras",
     )
-    start_s: Seconds | None = Field(None, description="first moment used, common clock")
-    end_s: Seconds | None = Field(None, description="last moment used, common clock")
+    start_s: Seconds | None = Field(None, description="first moment to use, in seconds on the common clock")
+    end_s: Seconds | None = Field(None, description="last moment to use, in seconds on the common clock")
     work_px: int = Field(
-        960, ge=160, le=8192, description="long side of the frames, pixels; larger frames are reduced to it"
+        960,
+        ge=160,
+        le=8192,
+        description="larger frames are reduced until their long side has this number of pixels",
     )
     synthetic: dict[str, Any] | None = Field(
-        None, description="options of `bodycap synth`: the videos are rendered on first use"
+        None,
+        description="options of `bodycap synth`; if given, the videos are rendered when the job runs "
+        "for the first time",
     )
 
     def segments(self) -> list[list[CameraConfig]]:
@@ -178,25 +212,35 @@ class Job(_Block):
     """A job: everything that a run needs. Without named cameras, the videos in the job's folder are used."""
 
     capture: CaptureConfig
-    name: str = Field("", max_length=100, description="names the results; default: the file's or folder's")
-    out: Path | None = Field(None, description="folder of the results; default out/<name>")
+    name: str = Field(
+        "",
+        max_length=100,
+        description="name of the job and its results; default: the name of the job file or the folder",
+    )
+    out: Path | None = Field(None, description="folder for the results; default: out/<name>")
     skeleton: str | None = Field(
-        None, description="none, upper_body, full_body or a BVH file; default upper_body, none for one camera"
+        None,
+        description="none, upper_body, full_body or a BVH file; default: upper_body, or none if all "
+        "cameras are on one bone",
     )
     skeleton_map: dict[str, str] = Field(
         default_factory=dict,
-        description="role by joint name of a skeleton file; replaces the role found from the joint's name",
+        description="roles of joints in the skeleton file, by joint name; a role given here replaces the "
+        "role that the program finds from the joint's name",
     )
     tpose_frame: int | None = Field(
         None,
         ge=0,
         le=_MAX_FRAME,
-        description="frame of the skeleton file with the T-pose, if the zero pose is not a T-pose",
+        description=(
+            "number of the frame with the T-pose in the skeleton file (the first frame is 0), if "
+            "the zero pose is not a T-pose"
+        ),
     )
     height_m: float | None = Field(
-        None, ge=0.4, le=2.6, description="the subject's height in metres, e.g. 1.75"
+        None, ge=0.4, le=2.6, description="the subject's body height in metres, for example 1.75"
     )
-    activity: Activity = Field("generic", description="what the subject does")
+    activity: Activity = Field("generic", description="what the subject does; walk: the subject only walks")
     keyframes: KeyframeOptions = KeyframeOptions()
     map: MapOptions = MapOptions()
     registration: RegistrationOptions = RegistrationOptions()

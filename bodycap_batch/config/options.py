@@ -54,24 +54,39 @@ class KeyframeOptions(Options):
         15.0,
         gt=0,
         le=_MAX_PARALLAX_PX,
-        description="a larger parallax causes a keyframe; pixels at a long side of 640 px, rotation removed",
+        description=(
+            "a frame becomes a keyframe if its parallax is larger than this; in pixels of a picture"
+            " with a long side of 640 px; the effect of camera rotation is subtracted"
+        ),
     )
     min_survival: float = Field(
-        0.5, gt=0, lt=1, description="a keyframe is selected if a smaller share of the tracks is left"
+        0.5,
+        gt=0,
+        lt=1,
+        description="a frame becomes a keyframe if less than this share of the last keyframe's tracks is "
+        "still visible",
     )
-    max_gap_s: float = Field(0.5, gt=0, le=MAX_CAPTURE_S, description="largest time between two keyframes")
-    min_gap_s: float = Field(0.05, ge=0, le=MAX_CAPTURE_S, description="smallest time between two keyframes")
+    max_gap_s: float = Field(
+        0.5, gt=0, le=MAX_CAPTURE_S, description="maximum time between two keyframes, in seconds"
+    )
+    min_gap_s: float = Field(
+        0.05, ge=0, le=MAX_CAPTURE_S, description="minimum time between two keyframes, in seconds"
+    )
     max_per_min: float | None = Field(
         None,
         gt=0,
         le=60.0 * MAX_FPS,
-        description="most keyframes per minute; the keyframes that add least are left out",
+        description=(
+            "maximum number of keyframes per minute; the keyframes with the least new content are left out"
+        ),
     )
     window: int = Field(
         4,
         ge=1,
         le=_MAX_WINDOW,
-        description="number of last frames; the sharpest of these frames becomes the keyframe",
+        description=(
+            "number of latest frames to choose from: the sharpest of these frames becomes the keyframe"
+        ),
     )
 
 
@@ -82,17 +97,24 @@ class MapOptions(Options):
         512,
         ge=128,
         le=_MAX_FEATURES,
-        description="number of SIFT features per keyframe; the strongest features are used",
+        description="maximum number of SIFT features per keyframe; the strongest features are used",
     )
     pairs: Literal["retrieval", "exhaustive"] = Field(
-        "retrieval", description="keyframe pairs to match: neighbours and similar keyframes, or all pairs"
+        "retrieval",
+        description="pairs of keyframes to match; retrieval: neighbouring and similar keyframes, "
+        "exhaustive: all pairs",
     )
     init_frames: tuple[FrameName, FrameName] | None = Field(
-        None, description="two frames to start from, each camera:frame; default: selected automatically"
+        None,
+        description="two frames from which the map is started, each written as camera:frame; default: "
+        "selected automatically",
     )
-    seed: int = Field(0, ge=0, le=MAX_SEED, description="seed of every random choice")
+    seed: int = Field(0, ge=0, le=MAX_SEED, description="seed of all random numbers")
     min_coverage: float = Field(
-        0.1, ge=0, le=1, description="smallest share of the keyframes that the map must contain"
+        0.1,
+        ge=0,
+        le=1,
+        description="the job stops if the map contains a smaller share of the keyframes than this",
     )
 
 
@@ -100,13 +122,25 @@ class RegistrationOptions(Options):
     """Options of stage 3, the registration of every frame."""
 
     rounds: int = Field(
-        3, ge=0, le=_MAX_ROUNDS, description="how often the map may be extended to localise lost frames"
+        3,
+        ge=0,
+        le=_MAX_ROUNDS,
+        description="maximum number of times that the map is extended to localise lost frames",
     )
     min_inliers: int = Field(
-        15, ge=4, le=_MAX_INLIERS, description="smallest number of PnP inliers of a frame"
+        15,
+        ge=4,
+        le=_MAX_INLIERS,
+        description="minimum number of map points that must agree with the pose of a frame (PnP inliers)",
     )
     max_sigma_depth: float = Field(
-        0.015, gt=0, le=1, description="largest sigma of the camera centre, as a share of the median depth"
+        0.015,
+        gt=0,
+        le=1,
+        description=(
+            "maximum standard deviation of a camera position, divided by the median depth of the "
+            "visible points"
+        ),
     )
 
 
@@ -125,7 +159,9 @@ MARKER_COUNTS = {
 class MarkerBoard(Options):
     """A flat board in the room, with squares of known size."""
 
-    square_m: float = Field(ge=1e-3, le=2, description="side of one square, metres, as measured on the print")
+    square_m: float = Field(
+        ge=1e-3, le=2, description="side of one square in metres, as measured on the printed board"
+    )
     columns: int = Field(
         ge=3, le=_MAX_SQUARES, description="chessboard: inner corners in a row; ChArUco: squares in a row"
     )
@@ -135,13 +171,17 @@ class MarkerBoard(Options):
         description="chessboard: inner corners in a column; ChArUco: squares in a column",
     )
     kind: Literal["charuco", "chessboard"] = Field("charuco", description="kind of board")
-    dictionary: str = Field("4X4_50", description="ChArUco: family of its markers, as OpenCV names it")
-    marker: float = Field(0.75, gt=0.1, lt=1, description="ChArUco: side of a marker / side of a square")
-    legacy: bool = Field(False, description="ChArUco: true for a board from OpenCV before 4.6")
+    dictionary: str = Field("4X4_50", description="ChArUco: name of the family of markers, as in OpenCV")
+    marker: float = Field(
+        0.75, gt=0.1, lt=1, description="ChArUco: side of a marker divided by the side of a square"
+    )
+    legacy: bool = Field(
+        False, description="ChArUco: true if the board was made with OpenCV before version 4.6"
+    )
     placed: Literal["lying", "hanging"] | None = Field(
         None,
-        description="lying on a level floor or table, or hanging on a wall with its edges level and upright; "
-        "if given, the board also determines the vertical",
+        description="lying: the board lies on a level floor or table; hanging: the board is attached to a "
+        "wall, with two edges horizontal; if this is given, the board also determines the vertical",
     )
 
 
@@ -155,32 +195,46 @@ class MergeOptions(Options):
         None,
         ge=MIN_FPS,
         le=MAX_MOTION_FPS,
-        description="rate of the motion; default: the rate of the torso camera",
+        description="rate of the motion in frames per second; default: the rate of the torso camera",
     )
     max_gap_s: float = Field(
         1.0,
         gt=0,
         le=MAX_CAPTURE_S,
-        description="longest gap between the poses of a camera that is not marked as filled",
+        description=(
+            "a gap between two poses of a camera is marked as filled if it is longer than this time"
+            " in seconds"
+        ),
     )
     t_pose_s: float | None = Field(
         None,
         ge=0,
         le=MAX_CAPTURE_S,
-        description="duration of the T-pose at the start; default: detected; 0: there is no T-pose",
+        description=(
+            "duration of the T-pose at the start, in seconds; default: detected automatically; 0: "
+            "there is no T-pose"
+        ),
     )
     camera_paths: Literal["joint", "measured"] = Field(
-        "joint", description="camera centres: joint = solved together with the body, measured = as registered"
+        "joint",
+        description="camera positions in the results; joint: solved together with the body, measured: "
+        "as registered in the map",
     )
     foot_contact: bool = Field(
         True,
-        description="keep standing feet from sliding, if cameras on shins or feet show that the feet stand",
+        description="prevent feet that stand on the floor from sliding; this needs cameras on the shins "
+        "or the feet",
     )
     known_distance: tuple[FrameName, FrameName, _Distance] | None = Field(
-        None, description="two frames, each camera:frame, and the metres between their lenses; sets the scale"
+        None,
+        description=(
+            "two frames, each written as camera:frame, and the distance in metres between the "
+            "camera positions in these frames; sets the scale"
+        ),
     )
     marker_board: MarkerBoard | None = Field(
-        None, description="a board of known squares that keyframes see in the room; sets the scale"
+        None,
+        description="a board in the room with squares of known size, which the cameras see; sets the scale",
     )
 
 
@@ -190,26 +244,37 @@ class ExportOptions(Options):
     formats: tuple[FileFormat, ...] = Field(
         ("ply", "bvh", "glb", "tum", "csv", "colmap"), description="files to write, as a list: [ply, bvh]"
     )
-    units: Literal["cm", "m"] = Field("cm", description="unit of the BVH")
-    names: NamePreset = Field("hik", description="joint names and spine count of the files for animation")
+    units: Literal["cm", "m"] = Field("cm", description="unit of length in the BVH file")
+    names: NamePreset = Field(
+        "hik", description="set of joint names, and number of spine joints, in the files for animation"
+    )
     root: RootMode = Field(
-        "hips", description="joint that holds the travel: the hips, an extra root on the ground, or none"
+        "hips",
+        description="joint that contains the travel of the person; hips: the hips, ground: an additional "
+        "root on the ground, in_place: no joint, so that the person stays in place",
     )
     fps: float | None = Field(
         None,
         ge=MIN_FPS,
         le=MAX_FPS,
-        description="rate of the files for animation; default: the rate of the motion",
+        description="rate of the files for animation, in frames per second; default: the rate of the motion",
     )
-    tpose: bool = Field(False, description="a T-pose as frame 0 of the files for animation")
+    tpose: bool = Field(False, description="insert a T-pose as frame 0 of the files for animation")
     smoothing_hz: float | None = Field(
         None,
         ge=_CUTOFF_HZ[0],
         le=_CUTOFF_HZ[1],
-        description="cutoff of a low-pass filter for the files for animation, usually 6; default: no filter",
+        description=(
+            "cutoff frequency in Hz of a low-pass filter for the files for animation, usually 6; "
+            "default: no filter"
+        ),
     )
     euler_order: Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"] = Field(
         "ZXY", description="rotation channels"
     )
-    hierarchy: Literal["full", "solved"] = Field("full", description="whole humanoid, or solved joints only")
-    preview: bool = Field(True, description="preview.mp4: the body in its room beside the videos")
+    hierarchy: Literal["full", "solved"] = Field(
+        "full", description="joints in the files: the whole body, or only the solved joints"
+    )
+    preview: bool = Field(
+        True, description="write preview.mp4, which shows the body in the room next to the videos"
+    )

@@ -66,11 +66,16 @@ def _camera_names(job: Job, index: int) -> Iterator[Problem]:
         if other.name.lower() == name.lower():
             yield Problem(
                 ("name",),
-                f"two cameras named {name!r}",
-                "give each camera a different name; cameras on one segment: torso and torso_back",
+                f"two cameras have the name {name!r}",
+                "give each camera a different name; two cameras on one segment can have the names torso "
+                "and torso_back",
             )
         elif set(other.video) & set(job.capture.cameras[index].video):
-            yield Problem(("video",), f"the same video as camera {other.name!r}", "give each camera its own")
+            yield Problem(
+                ("video",),
+                f"this camera has the same video as camera {other.name!r}",
+                "give each camera its own video",
+            )
 
 
 def _mount(job: Job, camera: CameraConfig) -> Iterator[Problem]:
@@ -81,13 +86,15 @@ def _mount(job: Job, camera: CameraConfig) -> Iterator[Problem]:
         message = f"still to be filled in: where on the body was camera {camera.name!r}?"
         yield Problem(("mount",), message, f"one of {', '.join(MOUNT_NAMES)}")
     elif camera.segment is None and camera.mount is not None and camera.role is None:
-        yield Problem(("mount",), f"unknown mount {camera.mount!r}", _nearest(camera.mount, MOUNT_NAMES))
+        yield Problem(("mount",), f"there is no mount {camera.mount!r}", _nearest(camera.mount, MOUNT_NAMES))
     elif camera.role is None and skeleton_of(job) != NO_SKELETON:
         near = [*difflib.get_close_matches(camera.name, MOUNT_NAMES, n=1), "torso"][0]
         yield Problem(
             (),
-            f"where on the body is camera {camera.name!r}? Its name does not say",
-            f"add `mount: {near}` (one of {', '.join(MOUNT_NAMES)}), or `skeleton: none`",
+            f"the place of camera {camera.name!r} on the body is unknown, because the camera's name does "
+            "not contain a place",
+            f"add `mount:` with the place, for example `mount: {near}` (use one of "
+            f"{', '.join(MOUNT_NAMES)}), or set `skeleton: none`",
         )
 
 
@@ -95,7 +102,11 @@ def _pose(camera: CameraConfig) -> Iterator[Problem]:
     where = ("joint_from_cam",)
     if isinstance(camera.joint_from_cam, MountPose):
         if abs(np.linalg.norm(camera.joint_from_cam.quat_xyzw) - 1.0) > _ROTATION_TOLERANCE:
-            yield Problem((*where, "quat_xyzw"), "the quaternion's length is not 1", "order: x, y, z, w")
+            yield Problem(
+                (*where, "quat_xyzw"),
+                "the length of the quaternion is not 1",
+                "write the quaternion in the order x, y, z, w, with length 1",
+            )
         return
     matrix = camera.mount_matrix()
     if matrix is None:
@@ -103,9 +114,17 @@ def _pose(camera: CameraConfig) -> Iterator[Problem]:
     rotation = matrix[:3, :3]
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        yield Problem(where, "the upper left 3×3 is not a rotation", "rows of an orthonormal matrix, det +1")
+        yield Problem(
+            where,
+            "the upper left 3×3 block is not a rotation",
+            "write the rows of an orthonormal 3×3 matrix with determinant +1",
+        )
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        yield Problem(where, "the last row is not 0, 0, 0, 1", "four rows, translation in the last column")
+        yield Problem(
+            where,
+            "the last row of the matrix is not 0, 0, 0, 1",
+            "write four rows, with the translation in the last column and 0, 0, 0, 1 as the last row",
+        )
 
 
 def _paths(camera: CameraConfig) -> Iterator[Problem]:
@@ -126,7 +145,7 @@ def _paths(camera: CameraConfig) -> Iterator[Problem]:
 def _unusable(field: str, path: Path) -> Iterator[Problem]:
     """Yield a problem if common file systems do not accept the path `path` of the job's field `field`."""
     if "\0" in str(path) or any(len(part.encode(errors="replace")) > _MAX_NAME_BYTES for part in path.parts):
-        yield Problem((field,), f"{str(path)[:40]!r} cannot be a path", "check the path")
+        yield Problem((field,), f"{str(path)[:40]!r} cannot be a path", "correct the path")
 
 
 def _job_names(job: Job) -> Iterator[Problem]:
@@ -143,7 +162,9 @@ def _skeleton(job: Job) -> Iterator[Problem]:
     value = job.skeleton
     if value is not None and value not in SKELETON_PRESETS and not value.lower().endswith(".bvh"):
         hint = _nearest(value, SKELETON_PRESETS)
-        yield Problem(("skeleton",), f"unknown skeleton {value!r}", f"{hint}; or the path of a .bvh file")
+        yield Problem(
+            ("skeleton",), f"there is no skeleton {value!r}", f"{hint}; or give the path of a .bvh file"
+        )
     elif value is not None:
         yield from _unusable("skeleton", Path(value))
     roles = {camera.role for camera in job.capture.cameras}
@@ -151,7 +172,8 @@ def _skeleton(job: Job) -> Iterator[Problem]:
         yield Problem(
             ("skeleton",),
             f"every camera is on {roles.pop()}; the motion of a body needs cameras on two bones or more",
-            "`skeleton: none` gives the cameras' path and the map",
+            "add a camera on another bone, or set `skeleton: none` to compute only the map and the paths "
+            "of the cameras",
         )
 
 
@@ -166,16 +188,20 @@ def _size(job: Job) -> Iterator[Problem]:
     if skeleton_of(job) != NO_SKELETON and all_differ and all(limb is not None for _, limb in limbs):
         yield Problem(
             ("skeleton",),
-            "these cameras do not determine the size of the body: each is on a different limb",
-            "add a camera on the trunk or the head (torso), or a second camera on one of the limbs; "
-            "`skeleton: none` gives the cameras' paths and the map",
+            "these cameras do not determine the size of the body, because each camera is on a different limb",
+            "add a camera on the trunk or the head (for example torso), or a second camera on one of the "
+            "limbs; or set `skeleton: none` to compute only the map and the paths of the cameras",
         )
 
 
 def _times(job: Job) -> Iterator[Problem]:
     start, end = job.capture.start_s, job.capture.end_s
     if start is not None and end is not None and end <= start:
-        yield Problem(("capture", "end_s"), f"end_s {end:g} is not after start_s {start:g}", "swap them?")
+        yield Problem(
+            ("capture", "end_s"),
+            f"end_s {end:g} is not after start_s {start:g}",
+            "exchange start_s and end_s, or correct one of these times",
+        )
 
 
 def _rig(job: Job) -> Iterator[Problem]:
@@ -183,7 +209,7 @@ def _rig(job: Job) -> Iterator[Problem]:
     if job.capture.rig == "synced" and not job.capture.segments():
         message = "`synced` needs two cameras on one segment, but no two cameras share a segment"
         yield Problem(
-            ("capture", "rig"), message, "give them the same `mount` or `segment`, or leave out `rig`"
+            ("capture", "rig"), message, "give two cameras the same `mount` or `segment`, or leave out `rig`"
         )
 
 
@@ -220,20 +246,28 @@ def _board(job: Job) -> Iterator[Problem]:
         return
     if min(board.columns, board.rows) < 4:
         small = f"a ChArUco board of {size} squares has too few corners"
-        yield Problem(where, small, "at least four squares each way, for example 7 columns and 5 rows")
+        yield Problem(
+            where,
+            small,
+            "use a board with at least four columns and four rows, for example 7 columns and 5 rows",
+        )
     count = MARKER_COUNTS.get(board.dictionary.upper().removeprefix("DICT_"))
     if count is None:
         nearest = _nearest(board.dictionary, tuple(MARKER_COUNTS))
-        yield Problem((*where, "dictionary"), f"unknown markers {board.dictionary[:40]!r}", nearest)
-    elif board.columns * board.rows // 2 > count:
-        many = f"a ChArUco board of {size} squares takes more markers than {board.dictionary} has"
         yield Problem(
-            (*where, "dictionary"), many, "name the family of the printed markers; it must be a larger one"
+            (*where, "dictionary"), f"there is no family of markers {board.dictionary[:40]!r}", nearest
+        )
+    elif board.columns * board.rows // 2 > count:
+        many = f"a ChArUco board of {size} squares needs more markers than the family {board.dictionary} has"
+        yield Problem(
+            (*where, "dictionary"),
+            many,
+            "give the family of the markers on your printed board, which must be a larger family",
         )
 
 
 def _nearest(value: str, known: tuple[str, ...]) -> str:
     near = difflib.get_close_matches(value.lower(), [word.lower() for word in known], n=1)
     if not near:
-        return f"one of {', '.join(known)}"
+        return f"use one of {', '.join(known)}"
     return f"did you mean {next(word for word in known if word.lower() == near[0])!r}?"

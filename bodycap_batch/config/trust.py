@@ -40,7 +40,11 @@ class PathPolicy:
         """
         for field, path in _paths_of(job):
             if ".." in path.parts:
-                raise JobError(f"{path} leads out of its folder", field=field, hint=self._hint())
+                raise JobError(
+                    f"the path {path} is not permitted, because `..` may lead out of the folder of the job",
+                    field=field,
+                    hint=self._hint(),
+                )
             self.require(base / path, field)
 
     def require_resolved(self, job: Job) -> None:
@@ -62,23 +66,27 @@ class PathPolicy:
             target = path.resolve()
         except (OSError, RuntimeError) as error:  # the links form a loop
             raise JobError(
-                "cannot be followed: it is a loop of links",
+                "this link cannot be followed, because the links form a loop",
                 path=path,
                 field=field,
-                hint="put the file itself there",
+                hint="replace the link by the file itself",
             ) from error
         allowed = [folder.resolve() for folder in (self.folder, *self.roots) if folder is not None]
         if not any(target == folder or target.is_relative_to(folder) for folder in allowed):
             link = f"{path} is a link to {target}, which is" if target != path.absolute() else f"{path} is"
-            raise JobError(f"{link} outside of what this job may read", field=field, hint=self._hint())
+            raise JobError(
+                f"{link} outside the folders that this job may read", field=field, hint=self._hint()
+            )
 
     def _hint(self) -> str:
         where = "copy the file into the folder of the job"
         if self.folder is None:
-            where = "drop a folder that holds the videos and this file as job.yaml"
+            where = "drop a folder that contains the videos and this job file with the name job.yaml"
         opened = ", ".join(map(str, self.roots))
         also = (
-            f"folders open to all jobs: {opened}" if opened else "the operator can open a folder with --root"
+            f"or use a folder that all jobs may read: {opened}"
+            if opened
+            else "or ask the operator to open the folder of the file with --root"
         )
         return f"{where}; {also}"
 

@@ -70,15 +70,17 @@ def read_yaml(path: Path, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DE
     """
     try:
         if path.stat().st_size > max_bytes:
-            raise JobError("too large for a job", path=path, hint="give the job's YAML file")
+            raise JobError(
+                "the file is too large for a job file", path=path, hint="give the YAML file of the job"
+            )
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise JobError(
-            "no such job file", path=path, hint="give a YAML file or a folder of videos"
+            "there is no such job file", path=path, hint="give a YAML file or a folder of videos"
         ) from error
     except (OSError, UnicodeDecodeError) as error:
         raise JobError(
-            f"cannot read the job ({error})", path=path, hint="a YAML file, saved as UTF-8"
+            f"the job cannot be read ({error})", path=path, hint="give a YAML file, saved as UTF-8"
         ) from error
     try:
         _refuse_unsupported(text, path, max_depth)
@@ -87,7 +89,9 @@ def read_yaml(path: Path, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DE
         raise _syntax_error(error, text, path) from error
     except (yaml.YAMLError, ValueError) as error:
         raise JobError(
-            f"not YAML: {error}".splitlines()[0], path=path, hint="save the file as plain UTF-8 text"
+            f"the file is not valid YAML: {error}".splitlines()[0],
+            path=path,
+            hint="save the file as plain UTF-8 text",
         ) from error
     lines: dict[Location, int] = {}
     data = None if node is None else _value(node, (), lines, path)
@@ -102,8 +106,8 @@ def _refuse_unsupported(text: str, path: Path, max_depth: int) -> None:
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > max_depth:
-                message = f"nested deeper than {max_depth} levels"
-                raise JobError(message, path=path, line=line, hint="jobs need fewer levels")
+                message = f"the blocks of the file are nested deeper than {max_depth} levels"
+                raise JobError(message, path=path, line=line, hint="use fewer levels")
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
         for feature, mark in (("anchor", "& or *"), ("tag", "!")):
@@ -122,14 +126,14 @@ def _syntax_error(error: yaml.MarkedYAMLError, text: str, path: Path) -> JobErro
     tabbed = next((n for n, row in enumerate(text.splitlines(), 1) if _TAB_INDENT.match(row)), None)
     if tabbed is not None or "'\\t'" in str(error.problem):
         return JobError(
-            "a tab where YAML needs spaces",
+            "the line contains a tab where YAML needs spaces",
             path=path,
             line=tabbed or line,
             hint="indent with spaces, not tabs",
         )
     problem = " ".join(part for part in (error.problem, error.context) if part)
-    hint = "check indentation, colons and quotes on this line and the one before"
-    return JobError(f"not YAML: {problem}", path=path, line=line, hint=hint)
+    hint = "check the indentation, the colons and the quotes on this line and on the line before"
+    return JobError(f"the file is not valid YAML: {problem}", path=path, line=line, hint=hint)
 
 
 def _value(node: yaml.Node, location: Location, lines: dict[Location, int], path: Path) -> object:
@@ -149,16 +153,18 @@ def _mapping(
     for key_node, value_node in node.value:
         line = key_node.start_mark.line + 1
         if not isinstance(key_node, yaml.ScalarNode):
-            raise JobError("a key must be a word", path=path, line=line, hint="write `key: value`")
+            raise JobError(
+                "a key must be a word", path=path, line=line, hint="write each entry as `key: value`"
+            )
         key = str(key_node.value)
         here = (*location, key)
         if key in out:
             raise JobError(
-                f"{key!r} is given twice, first on line {lines[here]}",
+                f"the key {key!r} is given twice, the first time on line {lines[here]}",
                 path=path,
                 line=line,
                 field=dotted(here),
-                hint="keep one of them",
+                hint="keep only one of the two entries",
             )
         lines[here] = line
         out[key] = _value(value_node, here, lines, path)
@@ -186,11 +192,11 @@ def _scalar(node: yaml.Node, location: Location, path: Path) -> object:
     in_range = math.isfinite(number) and abs(number) < _MAX_INT
     if not in_range and location[-3:-1] != ("calibration", "params"):
         raise JobError(
-            f"number out of range: {text[:40]}",
+            f"the number {text[:40]} is out of range",
             path=path,
             line=node.start_mark.line + 1,
             field=dotted(location) or None,
-            hint="check the digits",
+            hint="correct the number",
         )
     return number
 

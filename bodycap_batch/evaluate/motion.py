@@ -132,7 +132,9 @@ def evaluate_motion(estimate: Path, truth: Path, options: MotionOptions | None =
     true_joints = _read_truth(Path(truth))
     _, motion = read_bvh(estimate)
     if motion is None:
-        raise JobError("no frames in the file", path=estimate, hint="give the motion.bvh of a result")
+        raise JobError(
+            "the BVH file contains no frames", path=estimate, hint="give the motion.bvh of a results folder"
+        )
     return _compare_joints(_joints_from_motion(motion), true_joints, options or MotionOptions())
 
 
@@ -151,16 +153,18 @@ def _read_truth(path: Path) -> _JointPoses:
     if path.suffix.lower() != ".npz":
         _, motion = read_bvh(path)
         if motion is None:
-            raise JobError("no frames in the file", path=path, hint="give a BVH file with its motion")
+            raise JobError(
+                "the BVH file contains no frames", path=path, hint="give a BVH file that contains a motion"
+            )
         return _joints_from_motion(motion)
     try:
         with np.load(path, allow_pickle=False) as content:
             names, seconds, world = (np.asarray(content[key]) for key in ("names", "t", "world"))
     except (OSError, KeyError, ValueError) as error:
         raise JobError(
-            f"not a joints file: {error}",
+            f"the file cannot be read as a file of joint positions: {error}",
             path=path,
-            hint="the file must contain the arrays names, t and world",
+            hint="give a .npz file that contains the arrays names, t and world",
         ) from error
     kept = [index for index, name in enumerate(names.tolist()) if name in _ROLE_BY_TRUTH_NAME]
     return _JointPoses(
@@ -192,13 +196,19 @@ def _compare_joints(estimate: _JointPoses, truth: _JointPoses, options: MotionOp
     roles = tuple(role for role in estimate.roles if role in truth.roles and role in selected)
     if options.root not in roles or len(roles) < 3:
         message = (
-            f"the two motions share {len(roles)} joints ({', '.join(roles)}); "
-            f"{options.root} and two more are needed"
+            f"the two motions have {len(roles)} joints in common ({', '.join(roles)}), but {options.root} "
+            "and two more common joints are needed"
         )
-        raise JobError(message, hint="joints are matched by name: HumanIK, Mixamo, Biped, CMU ... names")
+        raise JobError(
+            message,
+            hint="use joint names that the program knows, for example the names of HumanIK, Mixamo, Biped "
+            "or CMU",
+        )
     positions, true_positions, rotations, true_rotations = _match_joints(estimate, truth, roles, options)
     if len(positions) == 0:
-        raise JobError("the two motions share no time", hint="check offset_s and the frame times")
+        raise JobError(
+            "the two motions have no time in common", hint="check offset_s and the times of the frames"
+        )
     alignment = Similarity(1.0, np.eye(3), np.zeros(3))
     if options.align == "se3":
         alignment = align_points(positions.reshape(-1, 3), true_positions.reshape(-1, 3), with_scale=False)

@@ -60,7 +60,8 @@ def relative_camera_error(
     for name in (camera, reference):
         if name not in estimates or name not in truths:
             raise JobError(
-                f"camera {name!r} has no estimate or no truth", hint="name a camera that both folders contain"
+                f"camera {name!r} has no estimated path or no true path",
+                hint="give a camera that both folders contain",
             )
     times = estimates[camera].times_ns
     columns = [
@@ -72,7 +73,7 @@ def relative_camera_error(
     found = np.logical_and.reduce([mask for _, mask in columns])
     if found.sum() < 3:
         hint = "check that all files use the same clock"
-        raise JobError(f"{found.sum()} frames have estimated and true poses of both cameras", hint=hint)
+        raise JobError(f"only {found.sum()} frames have estimated and true poses of both cameras", hint=hint)
     limb, trunk, true_limb, true_trunk = (poses[found] for poses, _ in columns)
     centres = np.concatenate([limb[:, :3, 3], trunk[:, :3, 3]])
     alignment = align_points(

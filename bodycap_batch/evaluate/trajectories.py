@@ -182,13 +182,16 @@ def score_trajectories(
     options = options or TrajectoryOptions()
     missing = sorted(set(estimates) - set(truths))
     if missing:
-        hint = f"truth is given for {', '.join(sorted(truths)) or 'none'}"
-        raise JobError(f"no truth for camera {', '.join(missing)}", hint=hint)
+        hint = (
+            "add a .tum file with the true path of each camera; the cameras with a true path are: "
+            f"{', '.join(sorted(truths)) or 'none'}"
+        )
+        raise JobError(f"there is no true path for camera {', '.join(missing)}", hint=hint)
     empty = sorted(name for name in estimates if len(truths[name].times_ns) == 0)
     if empty:
         raise JobError(
-            f"the truth of camera {', '.join(empty)} has no poses",
-            hint="a line of a TUM file holds: time tx ty tz qx qy qz qw",
+            f"the true path of camera {', '.join(empty)} has no poses",
+            hint="write one pose on each line: time tx ty tz qx qy qz qw",
         )
     pairs = {name: _match_poses(estimates[name], truths[name], options) for name in sorted(estimates)}
     alignment = _truth_from_estimate(pairs, options.align)
@@ -244,7 +247,8 @@ def _truth_from_estimate(pairs: Mapping[str, _MatchedPoses], align: Alignment) -
         return align_points(estimate, truth, with_scale=align == "sim3")
     except ValueError as error:
         raise JobError(
-            f"{len(estimate)} poses have a true pose at their time: cannot align ({error})",
+            f"the paths cannot be aligned, because only {len(estimate)} poses have a true pose at the same "
+            f"time ({error})",
             hint="check that both files use the same clock",
         ) from error
 

@@ -89,11 +89,14 @@ def _verify(path: Path, motion: Motion, read: Callable[[Path], Motion | None]) -
         position_m, angle_deg = motion_difference(read(path), motion)
     except JobError as error:
         path.unlink(missing_ok=True)
-        raise StoreError(f"cannot be read back: {error.message}", path=path, hint="check the disk") from error
+        raise StoreError(
+            f"the written file cannot be read: {error.message}", path=path, hint="check the disk for errors"
+        ) from error
     if not (position_m <= POSITION_TOLERANCE_M and angle_deg <= ANGLE_TOLERANCE_DEG):
         path.unlink(missing_ok=True)
         raise StoreError(
-            f"the motion read back differs by {position_m * 1000:.3g} mm and {angle_deg:.3g}°",
+            f"the motion in the written file differs from the solved motion by {position_m * 1000:.3g} mm "
+            f"and {angle_deg:.3g}°",
             path=path,
             hint="check the disk; if the disk has no errors, report this as a bug",
         )

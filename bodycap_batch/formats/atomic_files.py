@@ -12,9 +12,9 @@ from pathlib import Path
 from bodycap_batch.core.errors import StoreError
 
 _HINTS = {
-    errno.ENOSPC: "the disk is full: free some space, or write elsewhere with --out",
-    errno.EDQUOT: "the disk quota is used up: free some space, or write elsewhere with --out",
-    errno.EACCES: "no permission to write there: choose another folder with --out",
+    errno.ENOSPC: "the disk is full: free some space, or choose another disk with --out",
+    errno.EDQUOT: "your disk quota is used up: free some space, or choose another disk with --out",
+    errno.EACCES: "the program has no permission to write into this folder: choose another folder with --out",
     errno.EROFS: "the file system is read-only: choose another folder with --out",
 }
 
@@ -22,9 +22,9 @@ _HINTS = {
 def store_error_from_os_error(error: OSError, path: Path) -> StoreError:
     """Convert the error of a failed write to `path` into a `StoreError` with a hint."""
     return StoreError(
-        f"cannot write: {error.strerror or error}",
+        f"the file cannot be written: {error.strerror or error}",
         path=path,
-        hint=_HINTS.get(error.errno or 0, "check the folder and the disk"),
+        hint=_HINTS.get(error.errno or 0, "check the folder, and check the disk for errors"),
     )
 
 

@@ -65,7 +65,7 @@ def write_c3d(path: Path, points: LabelledPoints) -> Path:
         same = back.names == points.names and back.x_in_world_m.shape == points.x_in_world_m.shape
         if not same or np.abs(back.x_in_world_m - points.x_in_world_m).max(initial=0.0) > _TOLERANCE_M:
             raise StoreError(
-                "the points read back differ from what was written",
+                "the points in the written file differ from the solved points",
                 path=path,
                 hint="check that the disk is not full",
             )
@@ -84,7 +84,9 @@ def read_c3d(path: Path) -> LabelledPoints:
         content = ezc3d.c3d(str(path))
     except (OSError, RuntimeError, ValueError) as error:
         raise JobError(
-            f"cannot be read as C3D: {error}", path=path, hint="run the job again to write a new file"
+            f"the file cannot be read as C3D: {error}",
+            path=path,
+            hint="run the job again to write a new file",
         ) from error
     group = content["parameters"]["POINT"]
     return LabelledPoints(

@@ -59,13 +59,13 @@ def read_dataclass(cls: type[T], folder: Path, name: str) -> T:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         if document["type"] != cls.__name__:
-            raise StoreError(f"holds a {document['type']}, not a {cls.__name__}", path=path)
+            raise StoreError(f"the folder contains a {document['type']}, not a {cls.__name__}", path=path)
         archive = folder / f"{name}.npz"
         arrays = read_npz(archive) if archive.exists() else {}
         return typing.cast(T, _decode(document["value"], cls, _Location(folder, arrays)))
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        hint = "remove the folder; the next run creates it again"
-        raise StoreError(f"cannot be read: {error}", path=path, hint=hint) from error
+        hint = "remove the folder; the next run creates the folder again"
+        raise StoreError(f"the stored result cannot be read: {error}", path=path, hint=hint) from error
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:

@@ -123,7 +123,9 @@ class VideoWriter:
         """Convert an error of the encoder or of the disk to a `StoreError`."""
         if isinstance(error, OSError):
             return store_error_from_os_error(error, self._path)
-        return StoreError(f"cannot write the video: {error}", path=self._path, hint="check the disk")
+        return StoreError(
+            f"the video cannot be written: {error}", path=self._path, hint="check the disk for errors"
+        )
 
     def __enter__(self) -> Self:
         return self

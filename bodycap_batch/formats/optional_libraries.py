@@ -27,5 +27,6 @@ def require_libraries(formats: Iterable[str]) -> None:
             raise JobError(
                 f"{name.upper()} files need a library that is not installed ({_LIBRARY_MODULES[name]})",
                 field="export.formats",
-                hint="`make extras`, or `pip install 'bodycap_batch[formats]'`; or leave the format out",
+                hint="run `make extras` or `pip install 'bodycap_batch[formats]'` to install the library, "
+                "or leave the format out",
             )

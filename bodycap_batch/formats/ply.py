@@ -120,7 +120,11 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
         same = back.points.shape == cloud.points.shape and np.array_equal(back.points, cloud.points)
         if not same or not np.array_equal(back.colors, cloud.colors):
             hint = "check that the disk is not full"
-            raise StoreError("the point cloud read back differs from what was written", path=path, hint=hint)
+            raise StoreError(
+                "the point cloud in the written file differs from the point cloud of the map",
+                path=path,
+                hint=hint,
+            )
 
 
 def read_ply(path: Path) -> PointCloud:

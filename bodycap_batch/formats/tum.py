@@ -71,9 +71,13 @@ def read_tum(path: Path | str) -> TimedPoses:
                 times.append(time_ns)
                 rows.append(row)
     except OSError as error:
-        raise JobError(f"cannot read: {error.strerror or error}", path=path, hint="check the path") from error
+        raise JobError(
+            f"the file cannot be read: {error.strerror or error}", path=path, hint="correct the path"
+        ) from error
     if not rows and not headed:
-        raise JobError("no poses in the file", path=path, hint=f"a line holds: {_COLUMNS}")
+        raise JobError(
+            "the file contains no poses", path=path, hint=f"write one pose on each line: {_COLUMNS}"
+        )
     times_ns, first = np.unique(np.array(times, dtype=np.int64), return_index=True)
     table = np.array(rows).reshape(-1, 7)[first]
     poses = make_transform(rotation_from_quat_xyzw(table[:, 3:]), table[:, :3])
@@ -83,22 +87,32 @@ def read_tum(path: Path | str) -> TimedPoses:
 def _parse_line(path: Path, number: int, words: list[str]) -> tuple[int, list[float]]:
     """Return the time in nanoseconds and the seven numbers of the pose of one line."""
     if len(words) != 8:
-        message = f"{len(words)} columns, expected 8"
-        raise JobError(message, path=path, line=number, hint=f"a line holds: {_COLUMNS}")
+        message = f"the line has {len(words)} columns, but must have 8"
+        raise JobError(message, path=path, line=number, hint=f"write one pose on each line: {_COLUMNS}")
     try:
         time_ns = int((Decimal(words[0]) * _NS_PER_S).to_integral_value())
         row = [float(word) for word in words[1:]]
     except (ValueError, InvalidOperation, OverflowError):
-        raise JobError("not a number", path=path, line=number, hint=f"a line holds: {_COLUMNS}") from None
-    if not np.isfinite(row).all() or abs(time_ns) >= 2**63:
         raise JobError(
-            "NaN, infinity or a time out of range",
+            "the line contains a word that is not a number",
             path=path,
             line=number,
-            hint="omit frames without a pose",
+            hint=f"write one pose on each line: {_COLUMNS}",
+        ) from None
+    if not np.isfinite(row).all() or abs(time_ns) >= 2**63:
+        raise JobError(
+            "the line contains NaN, infinity or a time out of range",
+            path=path,
+            line=number,
+            hint="leave out the lines of frames without a pose",
         )
     if np.linalg.norm(row[3:]) < 1e-6:
-        raise JobError("the quaternion is zero", path=path, line=number, hint="order: qx qy qz qw")
+        raise JobError(
+            "the quaternion is zero",
+            path=path,
+            line=number,
+            hint="write the quaternion in the order qx qy qz qw",
+        )
     return time_ns, row
 
 

@@ -64,7 +64,7 @@ def write_usd(path: Path, motion: Motion) -> Path:
     with atomic_replacement(path) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
             raise StoreError(
-                "USD could not write the stage", path=path, hint="check that the disk is not full"
+                "the USD library could not write the file", path=path, hint="check that the disk is not full"
             )
     return path
 
@@ -168,14 +168,18 @@ def read_usd(path: Path) -> Motion:
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        raise JobError("cannot be read as USD", path=path, hint="give the motion.usd of a result") from error
+        raise JobError(
+            "the file cannot be read as USD", path=path, hint="give the motion.usd of a results folder"
+        ) from error
     skeleton, animation = (
         UsdSkel.Skeleton.Get(stage, _SKELETON_PATH),
         UsdSkel.Animation.Get(stage, _MOTION_PATH),
     )
     if not skeleton or not animation:
         raise JobError(
-            "contains no skeleton with a motion", path=path, hint="give the motion.usd of a result"
+            "the file contains no skeleton with a motion",
+            path=path,
+            hint="give the motion.usd of a results folder",
         )
     frames = [float(frame) for frame in range(round(stage.GetEndTimeCode()) + 1)]
     tokens = list(animation.GetJointsAttr().Get())

@@ -77,10 +77,12 @@ def align_usable_cameras(
     usable = [each.camera for each in inputs.trajectories if each.camera not in unused]
     reasons = "; ".join(f"{camera!r}: {reason}" for camera, reason in sorted(unused.items()))
     raise EstimationError(
-        f"no two cameras determine the size of the body: {', '.join(map(repr, usable)) or 'none'} can be used"
-        + (f"; {reasons}" if reasons else ""),
-        hint="a skeleton needs one map with two cameras on trunk, head or the same limb; frames.csv has the "
-        "reasons of lost frames; more texture, more light or a slower start help",
+        "no two cameras determine the size of the body: the usable cameras are "
+        f"{', '.join(map(repr, usable)) or 'none'}"
+        + (f"; the unusable cameras are {reasons}" if reasons else ""),
+        hint="let two cameras on the trunk, on the head or on one limb film the same places, so that both "
+        "cameras are in one map; film more texture, use more light, and start slowly; frames.csv lists "
+        "why frames were lost",
     )
 
 

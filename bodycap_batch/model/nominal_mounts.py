@@ -62,9 +62,11 @@ def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
     """
     if skeleton.index_of_role(role) is None:
         raise JobError(
-            f"camera {camera!r} is mounted on {role}, which the skeleton {skeleton.name!r} does not have",
+            f"camera {camera!r} is mounted on {role}, but the skeleton {skeleton.name!r} has no joint with "
+            "this role",
             field="capture.cameras",
-            hint=f"it has {', '.join(name for name in skeleton.roles if name)}",
+            hint="use a skeleton with this joint, or mount the camera on one of "
+            f"{', '.join(name for name in skeleton.roles if name)}",
         )
     entry = load_preset_data("mounts.yaml")[split_side(role)[1]]
     axes = segment_axes(skeleton, role)
@@ -138,7 +140,11 @@ def _joints_to_root(skeleton: SkeletonModel, mount: Mount) -> list[int]:
     """Return the index of the joint that a camera is mounted on, followed by its ancestors up to the root."""
     joint = skeleton.index_of_role(mount.role)
     if joint is None:
-        raise JobError(f"no joint has the role {mount.role}", field="capture.cameras")
+        raise JobError(
+            f"no joint of the skeleton has the role {mount.role}",
+            field="capture.cameras",
+            hint="use a skeleton with this joint, or change the `mount` of the camera",
+        )
     path = [joint]
     while skeleton.parents[path[-1]] >= 0:
         path.append(int(skeleton.parents[path[-1]]))

@@ -184,12 +184,12 @@ def not_rigid_note(relative: RelativePose) -> str:
     pair = " and ".join(relative.cameras)
     if relative.instants < MIN_INSTANTS:
         return (
-            f"{pair}: only {relative.instants} common frames in one map, too few for their relative pose: "
-            "each camera is treated separately"
+            f"{pair} are not treated as a rig: they have only {relative.instants} common frames in one "
+            "map, which is too few to determine their relative pose"
         )
     found_deg, expected_deg = np.degrees(relative.spread_rad), np.degrees(relative.explained_rad)
     return (
-        f"{pair}: their relative rotation scatters by {found_deg:.2f} degrees, in a rig it would scatter by "
-        f"{expected_deg:.2f}: each camera is treated separately. Check offset_s, and that one trigger "
-        "exposes both"
+        f"{pair} are not treated as a rig: their relative rotation varies by {found_deg:.2f} degrees, but "
+        f"in a rig it would vary by only {expected_deg:.2f} degrees. Check offset_s, and check that one "
+        "trigger exposes both cameras"
     )

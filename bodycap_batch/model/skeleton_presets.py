@@ -63,13 +63,17 @@ def load_skeleton(preset: str, height_m: float | None = None) -> SkeletonModel:
     """
     if preset not in PRESETS:
         raise JobError(
-            f"no skeleton preset {preset!r}", field="skeleton", hint=f"one of {', '.join(PRESETS)}"
+            f"there is no skeleton preset {preset!r}",
+            field="skeleton",
+            hint=f"use one of {', '.join(PRESETS)}",
         )
     height = MEAN_HEIGHT_M if height_m is None else height_m
     low, high = _STATURE_RANGE_M
     if not low <= height <= high:
         raise JobError(
-            f"a stature of {height} m is not plausible", field="height_m", hint="give it in metres"
+            f"a body height of {height} m is not plausible",
+            field="height_m",
+            hint="give the height in metres",
         )
     joints: dict[str, Any] = load_preset_data("humanoid.yaml")["joints"]
     names = tuple(joints)

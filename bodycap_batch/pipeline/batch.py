@@ -109,7 +109,7 @@ class Batch:
 
     def _run_one(self, job: BatchJob) -> RunSummary:
         if self._settings(job, None).cancelled():
-            raise Cancelled("stopped before it started", hint="run it again to go on")
+            raise Cancelled("the job was stopped before it started", hint="run the batch again to continue")
 
         def prepare(options: Mapping[str, Any], folder: Path) -> None:
             prepare_capture(options, folder, self._settings(job, None))
@@ -128,10 +128,11 @@ class Batch:
             other = self._owners.setdefault(out_dir.resolve(), path)
         if other != path:
             raise JobError(
-                f"its results and the results of {other} would go to the same folder, {out_dir}",
+                f"the results of this job and the results of {other} would be written to the same folder, "
+                f"{out_dir}",
                 path=path,
                 field="name",
-                hint="give the jobs different names (`name:`) or folders (`out:`)",
+                hint="give the jobs different names (`name:`) or different folders for the results (`out:`)",
             )
 
 
@@ -145,7 +146,11 @@ def _outcome(job: BatchJob, future: Future[RunSummary], seconds: float) -> Outco
     disk = disk_error(failure, job.path) if isinstance(failure, OSError) else None
     if disk is not None:
         return Outcome(job=job, seconds=seconds, error=disk)
-    bug = BodycapError(f"{type(failure).__name__}: {failure}", path=job.path, hint="this is a bug")
+    bug = BodycapError(
+        f"{type(failure).__name__}: {failure}",
+        path=job.path,
+        hint="this is a bug in bodycap; please report it with the job file",
+    )
     bug.exit_code = EXIT_BUG
     bug.add_note("".join(traceback.format_exception(failure)))
     return Outcome(job=job, seconds=seconds, error=bug)

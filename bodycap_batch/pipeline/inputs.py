@@ -68,7 +68,7 @@ def camera_digests(
         nonlocal read
         read += count
         if cancelled():
-            raise Cancelled("stopped on request", hint="run it again to go on")
+            raise Cancelled("the job stopped on request", hint="run the job again to continue")
         listener(
             Event(kind="progress", stage="reading videos", done=read >> 20, total=total >> 20, what="MB")
         )
@@ -80,7 +80,9 @@ def _footage_digest(path: Path, digests: FileDigests, on_bytes: Callable[[int], 
     try:
         return digests.sha256(path, on_bytes)
     except FileNotFoundError as error:
-        raise CaptureError("there is no such file", path=path, hint="check the path") from error
+        raise CaptureError(
+            "there is no such video file", path=path, hint="correct the path of the video"
+        ) from error
     except OSError as error:
         if error.errno in DISK_ERRORS:
             raise store_error(error, path) from error
@@ -164,9 +166,9 @@ def skeleton_file(job: Job) -> Path | None:
 def _mount_input(camera: CameraConfig) -> MountInput:
     if camera.role is None:
         raise JobError(
-            f"where on the body is camera {camera.name!r}?",
+            f"the place of camera {camera.name!r} on the body is unknown",
             field=f"capture.cameras.{camera.name}.mount",
-            hint="name its mount, e.g. `mount: torso`, or set `skeleton: none`",
+            hint="add the place of the camera, for example `mount: torso`, or set `skeleton: none`",
         )
     stated = camera.mount_matrix()
     return MountInput(

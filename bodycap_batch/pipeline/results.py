@@ -98,7 +98,7 @@ def _files_of_last_run(folder: Path) -> list[str]:
 
 
 def _remove_empty(folder: Path, top: Path) -> None:
-    """Remove a folder and those above it, up to `top`, as long as they are empty."""
+    """Remove a folder and its parent folders below `top`, as long as they are empty. `top` itself is kept."""
     while folder != top:
         try:
             folder.rmdir()

@@ -81,7 +81,7 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
         if runs_to_end and results.exported is not None:
             folder = _publish_results(job, flow, results, out_dir, settings)
             if stopped_by is not None:
-                _add_hint(stopped_by, f"the other results are in {folder}")
+                _add_hint(stopped_by, f"see {folder} for the other results")
             if results.failure is None:
                 flow.runner.keep_only_these()
         elif stopped_by is not None:
@@ -184,9 +184,9 @@ def _publish_failure_report(
         settings.require_owner()
         publish(dict(files_of(results.reported)), out_dir / PARTIAL)
     except BodycapError as another:
-        error.add_note(f"the report of the job could not be written: {another.message}")
+        error.add_note(f"the report about this job could not be written: {another.message}")
         return
-    _add_hint(error, f"the report of the finished stages is {out_dir / PARTIAL / REPORT_FILE}")
+    _add_hint(error, f"see the report of the finished stages in {out_dir / PARTIAL / REPORT_FILE}")
 
 
 def _add_hint(error: BodycapError, text: str) -> None:
@@ -214,7 +214,7 @@ def _publish_results(job: Job, flow: Flow, results: StageResults, out_dir: Path,
         return out_dir
     partial = out_dir / PARTIAL
     _write_results(job, results, _summary(flow, results, partial), settings)
-    _add_hint(results.failure, f"the map, the cameras' paths and the frames are in {partial}")
+    _add_hint(results.failure, f"see {partial} for the map, the camera paths and the frames")
     return partial
 
 

@@ -77,7 +77,9 @@ def _motion_ref(path: Path | None, digests: FileDigests) -> FileRef | None:
     except OSError as error:
         field = "capture.synthetic.motion"
         hint = "give the path of a BVH file, relative to the job file"
-        raise JobError(f"cannot be read: {error.strerror}", path=path, field=field, hint=hint) from error
+        raise JobError(
+            f"the motion file cannot be read: {error.strerror}", path=path, field=field, hint=hint
+        ) from error
 
 
 def _is_complete(folder: Path, key: ArtefactKey) -> bool:

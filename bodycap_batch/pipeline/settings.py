@@ -96,7 +96,10 @@ class Settings:
     def require_owner(self) -> None:
         """Raise `Cancelled` if another process has taken the job over."""
         if not self.may_commit():
-            raise Cancelled("the job was stopped or taken over; finished stages are kept")
+            raise Cancelled(
+                "the job was stopped, or another process runs it now; the results of finished stages stay "
+                "in the store"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,8 +20,8 @@ from bodycap_batch.store.artefacts import MANIFEST, Store
 from bodycap_batch.tasks.order import STAGE_ORDER
 
 _INPUTS = {
-    "capture": "the video, calibration, clock or window of {}",
-    "cameras": "the video, calibration, clock or window of {}",
+    "capture": "the video, the calibration, the clock, start_s or end_s of {}",
+    "cameras": "the video, the calibration, the clock, start_s or end_s of {}",
     "keyframes": "the keyframes of {}",
     "registrations": "the poses of {}",
     "body": "the body: {}",
@@ -122,7 +122,7 @@ def _reason(task: Task, store: Store) -> str:
     """
     wanted = dict(_leaves(task.key.document()))
     if any((store.root / "corrupt").glob(f"{task.key.stage}-{task.key.name}-*")):
-        return "its stored result was damaged"
+        return "the stored result of this stage was damaged"
     fewest: list[str] | None = None
     for path in sorted((store.root / "artefacts" / task.key.stage).glob(f"*/{MANIFEST}")):
         stored = dict(_leaves(_stored_key(path)))
@@ -130,7 +130,7 @@ def _reason(task: Task, store: Store) -> str:
         if changes and (fewest is None or len(changes) < len(fewest)):
             fewest, before = changes, stored
     if fewest is None:
-        return "not computed before"
+        return "this stage has not been computed before"
     return "; ".join(dict.fromkeys(_describe_change(name, before, wanted) for name in fewest))
 
 

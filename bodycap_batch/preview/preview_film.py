@@ -43,8 +43,8 @@ as large. Evidence: none."""
 _MAX_CLOCK_S = 1e8
 """Seconds: maximum common time that the caption shows unchanged. A larger time comes from a clock that counts
 from 1970. The caption shows such a time relative to the start."""
-_STROKE_LEGEND = "solid: measured · dashed: inferred"
-_DOT_LEGEND = "dots: map points, green if they fit, red if not"
+_STROKE_LEGEND = "solid lines: measured · dashed lines: inferred"
+_DOT_LEGEND = "dots: map points, green if they agree with the pose, else red"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

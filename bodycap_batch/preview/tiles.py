@@ -26,12 +26,12 @@ from bodycap_batch.preview.layout import Box
 WORLD = "world"
 _LOSS_REASONS = {
     FrameStatus.BLUR: "blurred",
-    FrameStatus.FEW_TRACKS: "too little could be followed",
-    FrameStatus.FEW_INLIERS: "too few points agree",
-    FrameStatus.UNCONSTRAINED: "the points do not fix the pose",
+    FrameStatus.FEW_TRACKS: "too few points could be tracked",
+    FrameStatus.FEW_INLIERS: "too few points agree with the pose",
+    FrameStatus.UNCONSTRAINED: "the points do not determine the pose",
     FrameStatus.POSE_JUMP: "the pose jumped",
-    FrameStatus.UNCONFIRMED: "no neighbour confirms it",
-    FrameStatus.NO_MAP: "not in the map",
+    FrameStatus.UNCONFIRMED: "no neighbouring frame confirms the pose",
+    FrameStatus.NO_MAP: "camera not in the map",
     FrameStatus.DAMAGED: "damaged in the video",
 }
 _LOST_BRIGHTNESS = 0.45
@@ -181,7 +181,9 @@ def describe_status(status: FrameStatus, points: ObservedPoints | None) -> tuple
     """Return the text about a frame's pose, and the colour of this text."""
     if not status.localised or points is None:
         return f"lost: {_LOSS_REASONS.get(status, status.value)}", RED
-    name = {FrameStatus.KEYFRAME: "keyframe", FrameStatus.RIG: "carried by the rig"}.get(status, "")
+    name = {FrameStatus.KEYFRAME: "keyframe", FrameStatus.RIG: "pose from the other camera of the rig"}.get(
+        status, ""
+    )
     if not len(points.px):  # recovery stores no observations for the frames that it poses
         return name or "found again", AMBER
     text = f"{len(points.px)} points, {float(points.error_px.mean()):.1f} px"

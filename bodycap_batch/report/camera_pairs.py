@@ -48,13 +48,14 @@ def distance_criteria(reach: Mapping[str, Any] | None, unused: Collection[str]) 
         grade = Grade.FAIR
         doubt += f", including cameras that are not part of the body ({' and '.join(sorted(unused))})"
     elif not reach["judged"]:
-        doubt += "; body, clocks or map do not suit each other"
+        doubt += "; the body, the clocks or the map are wrong"
     yield Criterion(
         subject="cameras",
-        name="Cameras within the body's reach",
+        name="Distances between cameras",
         grade=grade,
-        finding=f"{format_percent(share, 1)} of {reach['distances']:,} distances between cameras{doubt}",
-        rationale="Cameras on one body cannot be farther apart than the body reaches. A small fraction shows "
+        finding=f"{format_percent(share, 1)} of {reach['distances']:,} distances between cameras are "
+        f"possible on one body{doubt}",
+        rationale="Cameras on one body cannot be farther apart than the body reaches. A small share shows "
         "that the map merges two similar places, even if the map's error in pixels is small.",
         metric="mapping.reach.within_reach",
         value=share,
@@ -95,10 +96,10 @@ def shared_segment_criteria(
             finding=f"{' and '.join(worst['cameras'])} are turned by {worst['spread_deg']:.1f}° relative to "
             f"their usual positions (median of {worst['instants']:,} frames); the noise of their poses "
             f"explains {noise:.1f}°",
-            rationale="Cameras on one bone keep their relative position, except for soft straps and the "
-            "forearm's twist. If they turn by more than the noise, one of them is loose or a clock is wrong "
-            "(offset_s): a clock error of 0.4 s turned a slowly moving camera by 5°. Up to 2° beyond the "
-            "noise is good; more than 6° is poor.",
+            rationale="Cameras on one bone keep their relative position, except if their straps are soft "
+            "or the forearm twists. If these cameras turn by more than the noise of their poses, one "
+            "camera is loose or a clock is wrong (offset_s): a clock error of 0.4 s turned a slowly "
+            "moving camera by 5°. Up to 2° more than the noise is good; more than 6° is poor.",
             value=unexplained_deg,
         )
 

@@ -30,7 +30,7 @@ _PROGRESS_AT_FAILURE = {
     "keyframes": "the videos were opened; the selection of keyframes was not finished",
     "map": "the keyframes were selected; the map could not be built",
     "registration": "the map was built; the registration of frames was not finished",
-    "merge": "map and camera paths are finished; the body could not be solved",
+    "merge": "the map and the camera paths are finished; the body could not be solved",
 }
 
 
@@ -80,7 +80,8 @@ def page_content(
 
 _CAUSE_CRITERIA = {
     LossCause.DARK: f"the mean brightness of the lost frame is below {DARK_BRIGHTNESS:.0f} of 255",
-    LossCause.FAST: f"the camera turned more than {FAST_DEG:.0f}° per frame next to the gap",
+    LossCause.FAST: f"just before or after the lost frames, the camera turned more than {FAST_DEG:.0f}° per "
+    "frame",
     LossCause.BLUR: f"the sharpness is below {BLUR_SHARPNESS_RATIO * 100:.0f} % of the sharpness of the "
     "registered frames",
     LossCause.PLAIN: f"the frame has under {PLAIN_RATIO * 100:.0f} % of the corners of the camera's "
@@ -175,7 +176,7 @@ def _facts(diagnosed: DiagnosedLoss) -> str:
     if np.isfinite(diagnosed.loss.sharpness):
         parts.append(f"sharpness {diagnosed.loss.sharpness:.0%}")
     if np.isfinite(diagnosed.loss.turn_deg):
-        parts.append(f"turn {diagnosed.loss.turn_deg:.0f}° per frame")
+        parts.append(f"turned {diagnosed.loss.turn_deg:.0f}° per frame")
     if diagnosed.appearance is not None:
         parts.append(f"{diagnosed.appearance.corners} corners")
     return ", ".join(parts)

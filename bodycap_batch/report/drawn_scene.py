@@ -85,7 +85,8 @@ def make_drawn_scene(inputs: ReportInputs) -> DrawnScene:
 def common_times_s(inputs: ReportInputs, camera: str, times_ns: IntArray) -> FloatArray:
     """Convert a camera's timestamps into common times.
 
-    A camera that is not registered has no estimated clock. The capture's time offset is used for this camera.
+    A camera that is not registered has no estimated clock. The camera's
+    `offset_s` in the capture is used for this camera; the offset is 0 without a capture.
 
     Args:
         inputs: The results of the job.

@@ -13,6 +13,15 @@ from bodycap_batch.report.metric_paths import metric_at, metric_path
 from bodycap_batch.report.report_inputs import ReportInputs
 from bodycap_batch.report.viewer_data import known_joint_sigma_m
 
+_LIMIT_TEXTS = {
+    "elbow not overstretched": "elbow must not bend backward",
+    "knee not overstretched": "knee must not bend backward",
+    "palm within reach": "palm must stay within reach of the shoulder",
+    "palm below the shoulder": "palm must stay below the shoulder",
+    "palm on its side": "palm must stay on its own side of the body",
+}
+"""Text for the user, by the name of a soft limit without its side."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
@@ -54,7 +63,7 @@ def make_tables(inputs: ReportInputs) -> dict[str, Table]:
             "residuals": _residuals_table(merge),
             "joints": _joint_distance_table(merge, "joint_gap_m", "Distance between bones at each joint"),
             "hinges": _joint_distance_table(
-                merge, "hinge_off_plane_m", "Distance of each hinge from its plane"
+                merge, "hinge_off_plane_m", "Distance of elbows and knees from their bending plane"
             ),
             "mounts": _mounts_table(merge),
             "joined": _joined_cameras_table(merge),
@@ -129,7 +138,7 @@ def _map_table(metrics: Mapping[str, Any]) -> Table:
         caption="Table 2. The map",
         heads=("Seen by", "Points", "Measurements", "Mean reprojection error"),
         rows=tuple(rows),
-        note="Pixels refer to the frames at their work size.",
+        note="Errors in pixels are measured in the reduced frames (long side: `work_px`).",
     )
 
 
@@ -160,10 +169,12 @@ def _residuals_table(merge: Mapping[str, Any]) -> Table:
         "Down-weighted",
         "Longest gap",
         "Distance, median",
-        "Distance, 95 %",
-        "Rotation, 95 %",
+        "Distance, 95th percentile",
+        "Rotation, 95th percentile",
     )
-    return Table(caption="Residual of each camera against the solved body", heads=heads, rows=tuple(rows))
+    return Table(
+        caption="Difference between each camera's poses and the solved body", heads=heads, rows=tuple(rows)
+    )
 
 
 def _joint_distance_table(merge: Mapping[str, Any], key: str, caption: str) -> Table:
@@ -190,7 +201,9 @@ def _joint_distance_table(merge: Mapping[str, Any], key: str, caption: str) -> T
                 replace(p95, share=share),
             )
         )
-    return Table(caption=caption, heads=("Joint", "Distance, median", "Distance, 95 %"), rows=tuple(rows))
+    return Table(
+        caption=caption, heads=("Joint", "Distance, median", "Distance, 95th percentile"), rows=tuple(rows)
+    )
 
 
 def _mounts_table(merge: Mapping[str, Any]) -> Table:
@@ -213,8 +226,8 @@ def _mounts_table(merge: Mapping[str, Any]) -> Table:
         "Camera",
         "Bone",
         "Roll",
-        "Turned from assumed",
-        "Moved from assumed",
+        "Rotation from the assumed mount",
+        "Distance from the assumed mount",
         "Rotation uncertainty",
         "Position uncertainty",
     )
@@ -234,10 +247,10 @@ def _joined_cameras_table(merge: Mapping[str, Any]) -> Table:
         for name in merge.get("joined_cameras", {})
     )
     return Table(
-        caption="Cameras placed by the body alone",
+        caption="Cameras whose position only the body's movement determines",
         heads=("Camera", "Rotation uncertainty", "Position uncertainty"),
         rows=rows,
-        note="The map of these cameras shares no view with the main map.",
+        note="The map of these cameras has no place in common with the main map.",
     )
 
 
@@ -265,7 +278,7 @@ def _limb_scales_table(merge: Mapping[str, Any]) -> Table:
         for index in range(len(limbs.get("alone", ())))
     )
     return Table(
-        caption="The scale that each limb alone would give",
+        caption="Metric scale, estimated from each limb alone",
         heads=("Limb", "Uncertainty", "Difference from the used scale"),
         rows=rows,
         note=_chi_square_note(limbs),
@@ -293,7 +306,10 @@ def _chi_square_note(agreement: Mapping[str, Any]) -> str:
     degrees_of_freedom = agreement.get("degrees_of_freedom")
     if not degrees_of_freedom:
         return ""
-    return f"χ² {agreement['chi2']:.1f}; about {degrees_of_freedom} is expected if all estimates are right."
+    return (
+        f"The χ² of these estimates is {agreement['chi2']:.1f}; a value of about {degrees_of_freedom} is "
+        "expected if all estimates are right."
+    )
 
 
 def _soft_limits_table(merge: Mapping[str, Any]) -> Table:
@@ -306,18 +322,25 @@ def _soft_limits_table(merge: Mapping[str, Any]) -> Table:
         excess = [metric_cell(metrics, f"{path}.{key}", "{:.1f} cm", 100.0) for key in ("p50", "p95")]
         rows.append(
             (
-                Cell(text=str(name)),
+                Cell(text=_limit_text(str(name))),
                 replace(active, share=float(share)),
                 *(excess if has_excess else (Cell(text="–"), Cell(text="–"))),
             )
         )
     return Table(
-        caption="Soft limits: share of the time in which each limit was exceeded, and size of the excess",
+        caption="Soft limits: share of the time in which each limit was exceeded, and distance by which "
+        "the limit was exceeded",
         heads=("Limit", "Share of the time", "Median", "95 %"),
         rows=tuple(rows),
-        note="A limit that is active all the time contradicts the measurements: check the mount and the "
-        "activity.",
+        note="If a limit is exceeded all the time, it contradicts the measurements: check the camera's "
+        "mount and the `activity` of the job.",
     )
+
+
+def _limit_text(name: str) -> str:
+    """Return the text that describes a soft limit to the user, from the limit's name in ``metrics.json``."""
+    side, _, limit = name.partition(" ")
+    return f"{side} {_LIMIT_TEXTS[limit]}" if limit in _LIMIT_TEXTS else name
 
 
 def _joint_sigma_table(inputs: ReportInputs) -> Table:

@@ -76,9 +76,9 @@ def viewer_library() -> str:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise StoreError(
-            "the 3D library's bundle is missing",
+            "a file of the 3D library is missing",
             path=path,
-            hint=f"install it again: pip install --force-reinstall {LIBRARY}",
+            hint=f"install the library again: pip install --force-reinstall {LIBRARY}",
         ) from error
     # These character sequences in the library's strings would end the script element or start a comment.
     return re.sub("</(script)", r"<\\/\1", text, flags=re.IGNORECASE).replace("<!--", r"<\!--")

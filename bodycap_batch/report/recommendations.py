@@ -41,21 +41,22 @@ _MIN_SHARED_SHARE = 0.03
 If every other camera sees a smaller fraction, a recommendation is given. Evidence: none.
 """
 _NARROW_DEG = 3.0
-"""Minimum median triangulation angle, degrees. With a smaller angle depth is poorly known. Evidence: none."""
+"""Minimum median triangulation angle, degrees. With a smaller angle, depth is poorly known. Evidence:
+none."""
 _SUFFICIENT_SCALE_SIGMA = 0.02
 """Maximum relative sigma of the metric scale that needs no recommendation. Evidence: none."""
 _ARM_LENGTH_M = 0.6
 """Length of an arm (metres), used to express a relative error of the scale as a length."""
 _T_POSE = re.compile(r",? or stand in a T-pose for two seconds first")
 """Pattern of the phrase about a T-pose in the advice that merging gives."""
-_ADVICE_SEPARATOR = "; to know it better, "
+_ADVICE_SEPARATOR = "; to reduce this, "
 """Text that separates the finding from the advice in the sentences that merging gives."""
 
 _ACTIONS = {
     LossCause.DARK: "Switch lights on or film by day, and keep sleeves and straps away from the lens.",
     LossCause.FAST: "Turn and swing more slowly, or film at 60 frames per second or more.",
-    LossCause.BLUR: "Use more light and a shutter of 1/240 s or shorter: sharp frames with high gain are "
-    "better than smooth ones.",
+    LossCause.BLUR: "Use more light and an exposure time of 1/240 s or shorter: sharp frames with noise are "
+    "better than blurred frames.",
     LossCause.PLAIN: "Put up posters or patterned cloth where the cameras look, or turn the cameras away "
     "from plain walls and ceilings.",
     LossCause.SHALLOW: "Turn the camera so that it sees both near and far objects, spread over the whole "
@@ -64,19 +65,19 @@ _ACTIONS = {
     "out of the picture, and walk past each place more than once.",
     LossCause.DAMAGED: "Copy the video again from the camera's card. If it is damaged there, too, use "
     "another card.",
-    LossCause.NO_MAP: "Let every camera see the same places as the others: walk a loop and look around "
-    "in each place.",
+    LossCause.NO_MAP: "Let all cameras see the same places: walk in a loop and look around in each place.",
 }
 _OBSERVATIONS = {
     LossCause.DARK: "hardly any light reached the camera",
     LossCause.FAST: f"the camera turned more than {FAST_DEG:.0f}° from one frame to the next",
     LossCause.BLUR: f"the picture was blurred (sharpness below {BLUR_SHARPNESS_RATIO * 100:.0f} % of the "
     "frames near it)",
-    LossCause.PLAIN: f"the camera looked at plain surfaces (under {PLAIN_RATIO * 100:.0f} % of its "
-    "usual corners)",
-    LossCause.SHALLOW: "the visible points did not determine the position (too far away, or close together)",
+    LossCause.PLAIN: f"the camera looked at plain surfaces (the frames have under "
+    f"{PLAIN_RATIO * 100:.0f} % of the camera's usual number of corners)",
+    LossCause.SHALLOW: "the visible points did not determine the camera's position (the points are too far "
+    "away or too close together)",
     LossCause.UNKNOWN_PLACE: "the picture was sharp and textured, but its content is not in the map",
-    LossCause.NO_MAP: "the camera has no map",
+    LossCause.NO_MAP: "no map contains the camera",
     LossCause.DAMAGED: "the video file is damaged there",
 }
 """Observation that explains each cause of a loss. The limits are those of `frame_losses`."""
@@ -120,8 +121,8 @@ def recommend_changes(inputs: ReportInputs, lost: Mapping[str, Counter[LossCause
 def _combine_t_poses(found: Sequence[Recommendation]) -> list[Recommendation]:
     """Combine several recommendations of a T-pose into a single recommendation.
 
-    The phrase about the T-pose is removed from the original recommendations. The combined recommendation gets
-    a higher priority than the original recommendations.
+    The phrase about the T-pose is removed from the original recommendations, and one recommendation of a
+    T-pose is added. The added recommendation has a higher priority than the original recommendations.
     """
     improved = [recommendation for recommendation in found if _T_POSE.search(recommendation.action)]
     if len(improved) < 2:
@@ -134,8 +135,9 @@ def _combine_t_poses(found: Sequence[Recommendation]) -> list[Recommendation]:
     ]
     combined = Recommendation(
         action="Stand still for two seconds before you start, with the arms stretched out to the sides (a "
-        "T-pose). This improves every constant below that is not well known.",
-        reason=f"no T-pose was seen, and {len(improved)} of the body's constants are not well known",
+        "T-pose). This reduces the uncertainty of the mounts and of the scale.",
+        reason=f"no T-pose was found, and {len(improved)} of the mounts and scales below have a large "
+        "uncertainty",
         priority=max(recommendation.priority for recommendation in improved) + 1e-3,
     )
     return [*others, combined]
@@ -160,15 +162,15 @@ def _about_mirrored_cameras(inputs: ReportInputs) -> Iterator[Recommendation]:
         yield Recommendation(
             action=f"Flip the video of {', '.join(names)} back (ffmpeg -i in -vf hflip out.mp4), and switch "
             "off the mirroring in the front camera or the app.",
-            reason="compared with the other cameras, left and right are exchanged, and the map excludes "
-            "mirrored videos",
+            reason="compared with the other cameras, left and right are exchanged in this video, and a "
+            "mirrored video is not used in the map",
             priority=3.0,
         )
     for one, other in _map_diagnostics(inputs).undecided_groups:
         yield Recommendation(
-            action=f"See whether text reads backwards in the video of {', '.join(one)} or "
-            f"{', '.join(other)}. If it does, flip that video back (ffmpeg -i in -vf hflip out.mp4). "
-            "If text reads correctly in all of these videos, cover wall mirrors.",
+            action=f"Check whether text reads backwards in the video of {', '.join(one)} or "
+            f"{', '.join(other)}. If text reads backwards, flip that video back (ffmpeg -i in -vf hflip "
+            "out.mp4). If text reads correctly in all of these videos, cover wall mirrors.",
             reason="these cameras see mirror images of each other; it is unknown which video is mirrored",
             priority=3.0,
         )
@@ -185,8 +187,8 @@ def _about_lenses(inputs: ReportInputs) -> Iterator[Recommendation]:
             f"{name} has {describe_lens_misfit(factor)}" for name, factor in sorted(misfits.items())
         )
         yield Recommendation(
-            action="Run again with `calibration: auto`, or calibrate the camera in the video mode of this "
-            "capture, with stabilisation and digital zoom off.",
+            action="Run the job again with `calibration: auto`, or calibrate the camera in the video mode "
+            "of this capture, with stabilisation and digital zoom off.",
             reason=f"according to the pictures, {fits} than the calibration says",
             priority=3.0,
         )
@@ -246,9 +248,9 @@ def _about_overlap(inputs: ReportInputs) -> Iterator[Recommendation]:
         best = int(np.delete(shared[index], index).max(initial=0))
         if own and best < _MIN_SHARED_SHARE * own:
             yield Recommendation(
-                action=f"Let {name} see what the other cameras see: hold it forward for a few steps, and "
-                "walk past the same places twice.",
-                reason=f"it shares only {best:,} of its {own:,} points with any other camera",
+                action=f"Let {name} see the same places as the other cameras: hold this camera forward for "
+                "a few steps, and walk past the same places twice.",
+                reason=f"no other camera sees more than {best:,} of the {own:,} points that {name} sees",
                 priority=1.5,
             )
 
@@ -271,23 +273,27 @@ def _about_parallax(inputs: ReportInputs) -> Iterator[Recommendation]:
     only_forward = bool(forward_shares) and min(forward_shares) > _MAX_FORWARD_SHARE
     if only_forward or (angle_deg is not None and angle_deg < _NARROW_DEG):
         angle = (
-            "" if angle_deg is None else f"half of the map's points are seen at angles below {angle_deg:.1f}°"
+            ""
+            if angle_deg is None
+            else "for half of the map's points, the directions from which the cameras saw them differ by "
+            f"less than {angle_deg:.1f}°"
         )
         forward = (
-            f"every camera moved along its view for {format_percent(min(forward_shares))} of its path"
+            f"every camera moved in its viewing direction for {format_percent(min(forward_shares))} of its "
+            "path"
             if only_forward
             else ""
         )
         yield Recommendation(
-            action="Start with a few steps to the side and an arc around a near object: only sideways "
-            "movement shows depth.",
+            action="Start with a few steps to the side, and walk in an arc around a near object: only "
+            "sideways movement shows depth.",
             reason=" and ".join(part for part in (forward, angle) if part),
             priority=1.2,
         )
 
 
 def _about_start_and_end(inputs: ReportInputs) -> Iterator[Recommendation]:
-    """Recommend to start all cameras before the movement and to stop them after the movement.
+    """Recommend starting all cameras before the movement and stopping all cameras after the movement.
 
     The recommendation is given if a camera has no measurement at the motion's start or end. If shortening
     this capture helps, the recommendation also gives values for start_s and end_s.
@@ -309,10 +315,14 @@ def _about_start_and_end(inputs: ReportInputs) -> Iterator[Recommendation]:
     missing += [f"{name} has no measurement after {time:.2f} s" for name, time in early.items()]
     # If one camera ended before another camera started, shortening the capture does not help.
     remaining_s = min(early.values(), default=end_s) - max(late.values(), default=start_s)
-    cut = f"; this capture can be cut with {' and '.join(cuts)} under `capture`" if remaining_s > 0.0 else ""
+    cut = (
+        f"; to use only the common part of this capture, set {' and '.join(cuts)} under `capture`"
+        if remaining_s > 0.0
+        else ""
+    )
     if missing:
         yield Recommendation(
-            action=f"Start all cameras before the movement and stop them after it{cut}.",
+            action=f"Start all cameras before the movement and stop all cameras after the movement{cut}.",
             reason=f"the motion runs from {start_s:.2f} s to {end_s:.2f} s, but {', '.join(missing)}",
             priority=1.4,
         )
@@ -344,7 +354,7 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
     report = inputs.merge.report
     if report.exchanged_sides is not None:
         yield Recommendation(
-            action="Exchange the names (or mounts) of the left and the right cameras, and run again.",
+            action="Exchange the names (or mounts) of the left and the right cameras, and run the job again.",
             reason=report.exchanged_sides.says,
             priority=2.8,
         )
@@ -354,9 +364,9 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
             f"about {clock.offset_s:.1f} for {name}" for name, clock in sorted(clocks.items())
         )
         yield Recommendation(
-            action="Clap once in view of all cameras, and state the `offset_s` of each camera (the time of "
-            "the clap in the first video minus the time of the clap in the camera's own video). Or try "
-            f"{offsets}.",
+            action="Clap once in view of all cameras, and set the `offset_s` of each camera (the time of "
+            "the clap in the first video minus the time of the clap in the camera's own video). Or try an "
+            f"`offset_s` of {offsets}.",
             reason="; ".join(clock.says for _, clock in sorted(clocks.items())),
             priority=2.5,
         )
@@ -367,10 +377,12 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
     for name, mount in report.mounts.items():
         finding, _, advice = mount.known_to.partition(_ADVICE_SEPARATOR)
         if advice or mount.sigma_deg > GOOD_MOUNT_DEG:
-            measure = f"measure how {name} is mounted and state it (joint_from_cam)"
+            measure = f"measure the pose of {name} on its bone and give this pose in the job (joint_from_cam)"
             yield Recommendation(
                 action=_as_sentence(f"{advice}; or {measure}" if advice else measure),
-                reason=finding if advice else f"the mount of {name} is known only to {mount.sigma_deg:.0f}°",
+                reason=finding
+                if advice
+                else f"the uncertainty of the mount of {name} is {mount.sigma_deg:.0f}°",
                 priority=1.0 + mount.sigma_deg / 1000.0,
             )
 
@@ -386,7 +398,7 @@ def _about_scale(scale: ScaleReport) -> Iterator[Recommendation]:
     if ways:
         yield Recommendation(
             action=_as_sentence(", or ".join(ways)),
-            reason=f"the metric scale comes from {scale.source} and is known to {sigma:.1%}: "
-            f"{100 * _ARM_LENGTH_M * sigma:.1f} cm on the length of an arm",
+            reason=f"the metric scale comes from {scale.source}; its uncertainty is {sigma:.1%}, which is "
+            f"{100 * _ARM_LENGTH_M * sigma:.1f} cm for the length of an arm",
             priority=1.1 + sigma,
         )

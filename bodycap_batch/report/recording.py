@@ -42,12 +42,15 @@ def write_recording(inputs: ReportInputs, target: Path) -> None:
         import rerun as rr
     except ImportError as error:
         raise JobError(
-            "rerun-sdk is not installed", hint="install the extra: pip install 'bodycap_batch[viewer]'"
+            "the library rerun-sdk is not installed",
+            hint="install the library: pip install 'bodycap_batch[viewer]'",
         ) from error
     scene = make_drawn_scene(inputs)
     if not scene.has_content:
         failure = inputs.failure or {}
-        message = failure.get("message", f"the store holds neither map nor camera paths of {inputs.name}")
+        message = failure.get(
+            "message", f"the store contains neither the map nor the camera paths of {inputs.name}"
+        )
         raise JobError(message, hint=failure.get("hint") or "run the job again")
     stream = rr.RecordingStream("bodycap", recording_id=inputs.name)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -62,7 +65,7 @@ def write_recording(inputs: ReportInputs, target: Path) -> None:
         stream.save(target)
     except OSError as error:
         raise StoreError(
-            f"cannot be written: {error}", path=target, hint="name another file with --rerun"
+            f"the recording cannot be written: {error}", path=target, hint="choose another file with --rerun"
         ) from error
 
 

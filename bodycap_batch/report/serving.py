@@ -95,7 +95,7 @@ def make_server(content: ServedContent, port: int = 0) -> ThreadingHTTPServer:
         return _Server((LOOPBACK, port), Handler)
     except OSError as error:
         raise StoreError(
-            f"port {port} cannot be used: {error.strerror}", hint="name another port with --port"
+            f"port {port} cannot be used: {error.strerror}", hint="choose another port with --port"
         ) from error
 
 

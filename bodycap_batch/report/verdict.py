@@ -151,8 +151,8 @@ def _frame_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
         if share > 0.0
         else Grade.NONE,
         finding=f"{total['frames_registered']:,} of {total['frames']:,} frames ({format_percent(share, 1)})",
-        rationale="At 98 % or more, only short moments are missing, and the body's smoothness bridges them. "
-        "Below 85 %, more than one frame in seven has no measurement.",
+        rationale="At 98 % or more, only short moments are missing, and the smoothness of the motion "
+        "bridges these moments. Below 85 %, more than one frame in seven has no measurement.",
         metric="total.coverage",
         value=share,
     )
@@ -179,7 +179,7 @@ def _map_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
             subject="cameras",
             name="Map error",
             grade=grade_value(float(error), _GOOD_ERROR_PX, _FAIR_ERROR_PX),
-            finding=f"{error:.2f} px mean reprojection error",
+            finding=f"the mean reprojection error is {error:.2f} px",
             rationale="Sharp corners are located to about half a pixel. An error above one pixel comes from "
             "the lens, the shutter or blur; above two pixels the map does not fit the pictures. A low value "
             "alone does not prove that the map is right.",
@@ -203,11 +203,15 @@ def _one_map_criterion(metrics: Mapping[str, Any]) -> Criterion:
     lost = {name for name, camera in metrics["cameras"].items() if not camera["frames_registered"]}
     joined = sorted(metrics.get("merge", {}).get("joined_cameras", {}))
     if separate or lost:
-        grade, finding = Grade.POOR, f"not in the main map: {', '.join(sorted(separate | lost))}"
+        grade, finding = (
+            Grade.POOR,
+            f"these cameras are not in the main map: {', '.join(sorted(separate | lost))}",
+        )
     elif joined:
         grade = Grade.FAIR
         finding = (
-            f"placed by the body alone, because they share no view with the main map: {', '.join(joined)}"
+            "only the body's movement determines the positions of these cameras, because their map has no "
+            f"place in common with the main map: {', '.join(joined)}"
         )
     else:
         grade, finding = Grade.GOOD, "all cameras are in one map"
@@ -243,11 +247,11 @@ def _lens_criteria(misfits: Mapping[str, float], freed: Collection[str]) -> Iter
             subject="cameras",
             name="Lenses fit the pictures",
             grade=grade,
-            finding=f"{name}: the pictures fit {describe_lens_misfit(worst)} than the calibration says"
-            f"{'' if not_corrected else '; the lens that fits was used instead'}",
-            rationale="A wrong lens bends the whole map although its error in pixels is small. On a walk of "
-            "2 m, an error of 25 % in the focal length moved every camera by 9 cm; an image centre that was "
-            "wrong by 9 % moved them by 16 cm.",
+            finding=f"{name}: the pictures fit {describe_lens_misfit(worst)} than the calibration "
+            f"says{'' if not_corrected else '; therefore the lens was estimated together with the map'}",
+            rationale="A wrong calibration bends the whole map, although the map's error in pixels is "
+            "small. On a walk of 2 m, an error of 25 % in the focal length moved every camera by 9 cm; an "
+            "image centre that was wrong by 9 % moved every camera by 16 cm.",
             metric=metric_path("mapping", "misfitting_lenses", name),
             value=float(worst),
         )
@@ -273,9 +277,9 @@ def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
             subject="body",
             name="Metric scale",
             grade=grade_value(float(scale), _GOOD_SCALE_SIGMA, _FAIR_SCALE_SIGMA),
-            finding=f"known to {scale:.1%} (one standard deviation)",
-            rationale="An error of the scale stretches everything by the same factor. 2.5 % is 1.5 cm on the "
-            "length of an arm, about as much as the other errors of the chain. 10 % is the difference "
+            finding=f"the uncertainty is {scale:.1%} (one standard deviation)",
+            rationale="An error of the scale changes all lengths by the same factor. 2.5 % is 1.5 cm for "
+            "the length of an arm, about as much as all other errors together. 10 % is the difference "
             "between a short and a tall adult.",
             metric="merge.scale.relative_sigma",
             value=float(scale),
@@ -286,20 +290,21 @@ def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
     if residuals:
         yield Criterion(
             subject="body",
-            name="Body against cameras",
+            name="Distance between cameras and body",
             grade=grade_value(max(residuals), _GOOD_RESIDUAL_M, _FAIR_RESIDUAL_M),
-            finding=f"{100 * max(residuals):.1f} cm at the 95th percentile of the worst camera",
-            rationale="This is the distance between the cameras of the solved body and their positions in "
-            "the map. 1 cm is a few times a camera's own error. 3 cm is visible as a hand that slides on the "
-            "object it holds.",
+            finding=f"{100 * max(residuals):.1f} cm for the worst camera (95th percentile)",
+            rationale="This is the distance between a camera's position on the solved body and the same "
+            "camera's position in the map. 1 cm is a few times the error of a camera's position. 3 cm is "
+            "visible: a hand slides on the object that the hand holds.",
         )
     distances = [float(joint["p95"]) for joint in merge.get("joint_gap_m", {}).values()]
     if distances:
         yield Criterion(
             subject="body",
-            name="Joints hold together",
+            name="Distance between bones at the joints",
             grade=grade_value(max(distances), _GOOD_RESIDUAL_M, _FAIR_RESIDUAL_M),
-            finding=f"{1000 * max(distances):.1f} mm at the 95th percentile of the worst joint",
+            finding=f"{1000 * max(distances):.1f} mm between the two bones at the worst joint (95th "
+            "percentile)",
             rationale="If bones do not meet at their joint, a bone length, a mount or the scale is wrong.",
         )
     yield from _clock_criteria(merge.get("doubted_clocks", {}))
@@ -309,8 +314,8 @@ def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
             name="Left and right",
             grade=Grade.POOR,
             finding=str(merge["exchanged_sides"]["says"]),
-            rationale="No body fits arms with exchanged sides: on one such walk the metric scale was wrong "
-            "by 62 %.",
+            rationale="If left and right are exchanged, no body fits the cameras: on one such walk, the "
+            "metric scale was wrong by 62 %.",
         )
     if merge.get("inverted_cameras"):
         yield Criterion(
@@ -334,7 +339,7 @@ def _gap_criteria(cameras: Mapping[str, Any]) -> Iterator[Criterion]:
         subject="body",
         name="Longest gap",
         grade=grade_value(gap_s, _GOOD_GAP_S, FAIR_GAP_S),
-        finding=f"{gap_s:.2f} s without a measurement ({name})",
+        finding=f"camera {name} has no measurement for {gap_s:.2f} s",
         rationale="An arm swings forward and back in about a second. The smoothness of the motion bridges a "
         "fifth of a second well. In more than half a second a whole swing can be missing. The time before a "
         "camera's first measurement and after its last measurement also counts as a gap.",
@@ -350,9 +355,9 @@ def _clock_criteria(doubted: Mapping[str, Any]) -> Iterator[Criterion]:
             name="One clock",
             grade=Grade.POOR,
             finding="; ".join(str(doubt["says"]) for _, doubt in sorted(doubted.items())),
-            rationale="Half a second is half a step. If a clock is wrong by half a second, the limb of its "
-            "camera has the position of half a step earlier or later. The metric scale is wrong too: by "
-            "28 % on a walk with two clocks that were wrong by 0.5 and 0.2 s.",
+            rationale="Half a second is half a step. If a camera's clock is wrong by half a second, the "
+            "limb with this camera is half a step too early or too late. The metric scale is wrong too: "
+            "by 28 % on a walk with two clocks that were wrong by 0.5 and 0.2 s.",
         )
 
 
@@ -365,9 +370,11 @@ def _mount_criteria(mounts: Mapping[str, Any]) -> Iterator[Criterion]:
         subject="body",
         name="Mounts",
         grade=grade_value(sigma, GOOD_MOUNT_DEG, _FAIR_MOUNT_DEG),
-        finding=f"the worst mount is known to {sigma:.1f}° and {100 * worst['sigma_m']:.1f} cm ({name})",
-        rationale="An error of the mount is a constant error of the bone that carries the camera. An "
-        "animator aims a hand by eye to about 4°. Above 12° a palm visibly faces the wrong way.",
+        finding=f"the worst mount ({name}) has an uncertainty of {sigma:.1f}° and "
+        f"{100 * worst['sigma_m']:.1f} cm",
+        rationale="An error of the mount is a constant error of the bone with the camera. By eye, an "
+        "animator turns a hand into the right direction with an error of about 4°. Above 12°, a palm "
+        "visibly faces the wrong way.",
         metric=metric_path("merge", "mounts", name, "sigma_deg"),
         value=sigma,
     )
@@ -392,7 +399,8 @@ def _observed_time_criteria(joints: Mapping[str, Any]) -> Iterator[Criterion]:
             subject="body",
             name="Time measured",
             grade=grade_value(share, _GOOD_OBSERVED_SHARE, _FAIR_OBSERVED_SHARE, more_is_better=True),
-            finding=f"{format_percent(share, 1)} of the motion at the joint that was measured least ({name})",
+            finding=f"the joint that was measured least ({name}) was measured in "
+            f"{format_percent(share, 1)} of the motion",
             rationale="If a camera starts late, ends early or is lost for a long time, its limb is inferred. "
             "An average over all joints would hide such a limb.",
             metric=metric_path("motion", "joints", name, "observed_share"),

@@ -76,8 +76,8 @@ def _select_points(scene: DrawnScene, budget: PageBudget) -> tuple[FloatArray, n
 def _extent(scene: DrawnScene, points: FloatArray) -> tuple[FloatArray, float]:
     """Return the scene's centre (3,) and the scene's half width.
 
-    The centre is the median camera position, or the median point without cameras. A cube around the centre
-    with this half width contains all cameras and 90 % of the points.
+    The centre is the median camera position. If there are no cameras, it is the median point. A cube around
+    the centre with this half width contains all cameras and 90 % of the points.
     """
     centres = _camera_centres(scene)
     middle = np.median(centres if len(centres) else points, axis=0)

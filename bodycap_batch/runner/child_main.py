@@ -113,7 +113,10 @@ class _Parent:
         self.messages.send("ready")
         answer = self.orders.next()
         if answer is None or not answer["commit"]:
-            raise Cancelled("not committed: the job was stopped or taken over", hint="run it again to go on")
+            raise Cancelled(
+                "the result was not stored, because the job was stopped or another process runs it now",
+                hint="run the job again to continue",
+            )
 
 
 def _run_task(document: Mapping[str, Any], stages: Mapping[str, TaskFunction], parent: _Parent) -> int:
@@ -233,7 +236,10 @@ def _read_failure(path: Path) -> OSError | None:
 
 def disk_full(root: Path) -> StoreError:
     """Return the error for a store whose disk is full."""
-    hint = "free some space, or name a folder on another disk with --store; finished stages are kept"
+    hint = (
+        "free some space, or choose a folder on another disk with --store; the results of finished stages "
+        "stay in the store"
+    )
     return StoreError("No space left on device", path=root, hint=hint)
 
 

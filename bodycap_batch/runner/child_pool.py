@@ -21,7 +21,7 @@ from bodycap_batch.store.digests import write_atomically
 
 CHILDREN_LOG = "children.log"
 """Name of the log file for the output that children print while they have no task."""
-STOPPED = "stopped on request; finished stages are kept"
+STOPPED = "the job stopped on request; the results of finished stages stay in the store"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,7 +128,7 @@ class Children:
         else:
             child.end(at_once=stopped)
         if stopped:
-            raise Cancelled(STOPPED, hint="run it again to go on")
+            raise Cancelled(STOPPED, hint="run the job again to continue")
         if last is None or last["event"] == "error":
             raise _task_error(task, last, child, log, environment)
 
@@ -200,7 +200,7 @@ def _task_error(
         error = error_from_dict(last["error"])
         if "traceback" in last:
             error.message = f"{task.label}: {error.message}"
-            error.hint = f"this is a bug; please report it with {log} and the job file"
+            error.hint = f"this is a bug in bodycap; please report it with {log} and the job file"
             error.add_note(last["traceback"])
         return error
     if child.ended_by_memory() or log_says_out_of_memory(log):

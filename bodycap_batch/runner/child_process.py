@@ -172,18 +172,19 @@ def _environment() -> dict[str, str]:
 def describe_end(returncode: int) -> str:
     """Return a text that says how a child without a last message ended, from the child's exit code."""
     if returncode >= 0:
-        return f"the stage's process ended with code {returncode} and no message"
+        return f"the process of the stage ended with code {returncode} and without a message"
     try:
         name = signal.Signals(-returncode).name
     except ValueError:
         name = f"signal {-returncode}"
-    return f"the stage's process was ended by {name}"
+    return f"the process of the stage was ended by {name}"
 
 
 def crash_hint(returncode: int) -> str:
     """Return advice for the user, from the exit code of a child that sent no last message."""
     if returncode == -signal.SIGKILL:
         return (
-            "probably out of memory: close other programs, or lower work_px in the job; run it again to go on"
+            "the machine probably had too little memory: close other programs, or lower work_px in the "
+            "job, then run the job again"
         )
     return "a native library crashed; run the job again; if it crashes again, please report it with this log"

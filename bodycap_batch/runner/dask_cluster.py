@@ -100,7 +100,10 @@ class Cluster:
 
     def _submit(self, task: Task, environment: TaskEnvironment) -> None:
         if not environment.may_commit():
-            raise Cancelled("the job was stopped or taken over; finished stages are kept")
+            raise Cancelled(
+                "the job was stopped, or another process runs it now; the results of finished stages stay "
+                "in the store"
+            )
         key = f"{task.file_stem}-{uuid.uuid4().hex}"
         with self._lock:
             self._progress[key] = environment.progress
@@ -133,7 +136,7 @@ class Cluster:
         """
         while (largest := self._largest_worker()) is None:
             if environment.cancelled():
-                raise Cancelled(STOPPED, hint="run it again to go on")
+                raise Cancelled(STOPPED, hint="run the job again to continue")
             environment.progress(0, 0, "waiting for a worker")
             time.sleep(_POLL_S)
         return {MEMORY: min(float(task.memory_mb), largest)} if largest else None
@@ -160,7 +163,7 @@ class Cluster:
         while not ended.wait(_POLL_S):
             if environment.cancelled():
                 future.cancel()
-                raise Cancelled(STOPPED, hint="run it again to go on")
+                raise Cancelled(STOPPED, hint="run the job again to continue")
             if self._client.status in _CLIENT_LEFT:
                 raise _lost()
         if future.status == "finished":
@@ -214,7 +217,7 @@ def start_queue(kind: str, workers: int, cores: int, memory_mb: int) -> Any:
             worker_extra_args=["--nthreads", "1", "--resources", f"{MEMORY}={memory_mb}"],
         )
     except (ValueError, OSError, RuntimeError) as error:
-        hint = "describe the queue in ~/.config/dask/jobqueue.yaml (see the Dask-Jobqueue documentation)"
+        hint = "describe the queue in ~/.config/dask/jobqueue.yaml (see the documentation of Dask-Jobqueue)"
         raise JobError(f"{kind}: {error}", field="--executor", hint=hint) from error
     cluster.scale(n=workers)
     return cluster
@@ -231,20 +234,22 @@ def _connect(address: str) -> Client:
         return Client(address, set_as_default=False)
     except TypeError as error:  # Dask has no TLS certificates
         raise JobError(
-            f"no certificates for the connection to {address}",
+            f"the connection to {address} needs certificates, but none are given",
             field="--executor",
-            hint="name them below distributed.comm.tls in ~/.config/dask/distributed.yaml",
+            hint="give the paths of the certificates below distributed.comm.tls in "
+            "~/.config/dask/distributed.yaml",
         ) from error
     except (OSError, TimeoutError, ValueError) as error:
         raise JobError(
             f"no scheduler answers at {address}",
             field="--executor",
-            hint="start one: dask scheduler; and on each machine: dask worker tcp://HOST:8786 --nthreads 1",
+            hint="start a scheduler (dask scheduler), and start a worker on each machine (dask worker "
+            "tcp://HOST:8786 --nthreads 1)",
         ) from error
 
 
 def _not_installed() -> JobError:
-    hint = "install the extra: pip install 'bodycap_batch[cluster]' (make extras)"
+    hint = "install Dask: pip install 'bodycap_batch[cluster]' (or make extras)"
     return JobError("this executor needs Dask, which is not installed", field="--executor", hint=hint)
 
 
@@ -296,9 +301,10 @@ def _dask_error(failure: BaseException, task: Task, environment: TaskEnvironment
     log = environment.logs / f"{task.file_stem}.log"
     if isinstance(failure, KilledWorker):
         return BodycapError(
-            f"{task.label}: {_ALLOWED_FAILURES + 1} workers died while they ran it",
+            f"{task.label}: {_ALLOWED_FAILURES + 1} workers ended unexpectedly while they ran this stage",
             path=log,
-            hint="probably out of memory: give the workers more memory, or lower work_px in the job",
+            hint="give the workers more memory, or lower work_px in the job: the workers probably had too "
+            "little memory",
         )
     hint = "install the same bodycap_batch on the scheduler and all workers"
     return BodycapError(f"{task.label}: {type(failure).__name__}: {failure}", path=log, hint=hint)
@@ -316,6 +322,6 @@ def _lost_connection() -> Iterator[None]:
 def _lost() -> StoreError:
     """Return the error for the case that the scheduler can no longer be reached."""
     return StoreError(
-        "the scheduler was lost",
-        hint="start the scheduler and the same batch again; finished stages are kept",
+        "the connection to the scheduler was lost",
+        hint="start the scheduler and the same batch again; the results of finished stages stay in the store",
     )

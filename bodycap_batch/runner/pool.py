@@ -64,7 +64,7 @@ class Slots:
                 while self._waiting[0] != position or not self._fits(need):
                     self._changed.wait(_POLL_S)
                     if cancelled():
-                        raise Cancelled(STOPPED, hint="run it again to go on")
+                        raise Cancelled(STOPPED, hint="run the job again to continue")
                 self._free = (self._free[0] - need[0], self._free[1] - need[1])
             finally:
                 self._waiting.remove(position)
@@ -94,7 +94,10 @@ class LocalPool:
         self._turns = Turns()
 
     def execute(self, task: Task, environment: TaskEnvironment) -> None:
-        """Wait for cores and memory; compute and commit the task's artefact. Raises `BodycapError`."""
+        """Wait for cores and memory; compute and commit the task's artefact. Raises `BodycapError`.
+
+        Nothing is computed if the artefact is stored already.
+        """
         with self._turns.taken(task, environment) as is_stored:
             if is_stored:
                 return

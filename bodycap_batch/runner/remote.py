@@ -73,7 +73,7 @@ def _require_shared(root: Path) -> None:
         raise StoreError(
             f"worker {platform.node()} cannot find the store",
             path=root,
-            hint="put the store and the videos on a disk that all machines mount at the same path",
+            hint="put the store and the videos on a disk that all machines mount under the same path",
         )
 
 

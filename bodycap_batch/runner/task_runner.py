@@ -13,7 +13,9 @@ from bodycap_batch.runner.child_pool import Executor, TaskEnvironment
 from bodycap_batch.runner.task import Task
 from bodycap_batch.store.artefacts import Artefact, Store
 
-_HINT = "run the job first (`bodycap run`); if it was run before, `bodycap why` shows what has changed since"
+_HINT = (
+    "run the job (`bodycap run`); if the job was run before, `bodycap why` shows what has changed since then"
+)
 
 
 class NotStored(StoreError):
@@ -25,7 +27,7 @@ class NotStored(StoreError):
 
     def __init__(self, tasks: Sequence[Task], path: Path) -> None:
         labels = ", ".join(task.label for task in tasks)
-        super().__init__(f"{labels}: not computed yet", path=path, hint=_HINT)
+        super().__init__(f"these stages have not been computed yet: {labels}", path=path, hint=_HINT)
         self.tasks = tuple(tasks)
 
 
@@ -132,7 +134,11 @@ class Runner:
         )
         self._executor.execute(replace(task, replaces=task.key.stage in self._rules.redo), environment)
         if (artefact := self.store.find(task.key)) is None:
-            raise StoreError(f"{task.label}: its result is gone", path=self.store.root, hint="run it again")
+            raise StoreError(
+                f"{task.label}: the stored result of this stage is missing",
+                path=self.store.root,
+                hint="run the job again",
+            )
         return artefact
 
     def _notify(self, task: Task, kind: Any, **values: Any) -> None:

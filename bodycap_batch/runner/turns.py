@@ -36,7 +36,7 @@ class Turns:
             while artefact in self._under_way:
                 self._changed.wait(_POLL_S)
                 if environment.cancelled():
-                    raise Cancelled(STOPPED, hint="run it again to go on")
+                    raise Cancelled(STOPPED, hint="run the job again to continue")
             self._under_way.add(artefact)
         try:
             yield not task.replaces and environment.store.find(task.key) is not None

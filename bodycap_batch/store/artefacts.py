@@ -166,8 +166,11 @@ class Store:
         """
         with disk_errors(self.root):
             if not _is_sound(path) and not self._set_aside(path, lambda: _is_sound(path)):
-                hint = "check the disk; run the job again, damaged results are computed again"
-                raise StoreError("a stored artefact is damaged", path=path, hint=hint)
+                hint = (
+                    "check the disk for errors, then run the job again: the program computes damaged "
+                    "results again"
+                )
+                raise StoreError("a stored result of a stage is damaged", path=path, hint=hint)
 
     def artefacts_in(self, value: Any) -> Iterator[Path]:
         """Yield the folder of each artefact to which the arguments of a task (`value`) refer."""
@@ -268,9 +271,9 @@ class Store:
                 return artefact
             if not files.is_dir():
                 raise StoreError(
-                    "an artefact differs from what was written",
+                    "a stored result of a stage differs from the data that were written",
                     path=path,
-                    hint="check the disk, or choose another store with --store",
+                    hint="check the disk for errors, or choose a store on another disk with --store",
                 )
 
     def _verified(self, path: Path, key: ArtefactKey) -> Artefact | None:
@@ -331,19 +334,27 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 def store_error(error: OSError, path: Path) -> StoreError:
     """Return the `StoreError` for an operating system error, with advice for the user."""
+    no_permission = (
+        "the program has no permission to use this folder; choose another folder with --store or --out"
+    )
     hints = {
-        errno.ENOSPC: "free some space, or name another disk with --store; finished stages are kept",
-        errno.EDQUOT: "your disk quota is used up; name a folder on another disk with --store",
-        errno.EROFS: "the file system is read-only; name another folder with --store or --out",
-        errno.EACCES: "no permission; choose a folder that you may write to, with --store or --out",
-        errno.EPERM: "no permission; choose a folder that you may write to, with --store or --out",
-        errno.ENOTDIR: "a file stands where a folder is needed; name another folder",
+        errno.ENOSPC: "free some space, or choose another disk with --store; the results of finished stages "
+        "stay in the store",
+        errno.EDQUOT: "your disk quota is used up; choose a folder on another disk with --store",
+        errno.EROFS: "the file system is read-only; choose another folder with --store or --out",
+        errno.EACCES: no_permission,
+        errno.EPERM: no_permission,
+        errno.ENOTDIR: "there is a file where a folder is needed; choose another folder with --store or "
+        "--out",
     }
     where = error.filename if isinstance(error.filename, str) else path
     reason = os.strerror(error.errno) if error.errno else str(error)
-    hint = hints.get(error.errno or 0, "check the disk; another folder can be named with --store")
+    hint = hints.get(error.errno or 0, "check the disk for errors, or choose another folder with --store")
     if error.errno in _AWAY:
-        hint = "is the disk mounted and its server reachable? Choose another folder with --store or --out"
+        hint = (
+            "check that the disk is mounted and that its server is reachable, or choose another folder "
+            "with --store or --out"
+        )
         return DiskAway(reason, path=where, hint=hint)
     return StoreError(reason, path=where, hint=hint)
 

@@ -122,7 +122,9 @@ class FileDigests:
         digest = file_sha256(path, on_bytes)
         if _identity(path) != before:
             raise CaptureError(
-                "the file changes while it is read", path=path, hint="wait until it is copied completely"
+                "the file changed while the program read it",
+                path=path,
+                hint="wait until the file is copied completely, then run the job again",
             )
         if time.time() - max(before[3], before[4]) / 1e9 > _MIN_AGE_S:
             self._folder.mkdir(parents=True, exist_ok=True)

@@ -40,16 +40,21 @@ def require_room(folder: Path, frames: int, large: int = 0) -> list[str]:
         folder = folder.parent
     if not folder.is_dir() or not os.access(folder, os.W_OK):
         raise StoreError(
-            "results cannot be written here", path=folder, hint="choose another folder with --out"
+            "the results cannot be written into this folder",
+            path=folder,
+            hint="choose another folder with --out",
         )
     need = _MIN_BYTES + _BYTES_PER_FRAME * frames + _BYTES_PER_LARGE_FRAME * large
     free = shutil.disk_usage(folder).free
     if free < need:
         raise StoreError(
-            f"{free / 1e6:.0f} MB free, the job needs about {need / 1e6:.0f} MB",
+            f"the disk has {free / 1e6:.0f} MB of free space, but the job needs about {need / 1e6:.0f} MB",
             path=folder,
-            hint="make room, or choose another disk with --out",
+            hint="free some space, or choose another disk with --out",
         )
     if free < _HARD_CAPTURE_FACTOR * need:
-        return [f"{free / 1e6:.0f} MB free on the disk of {folder}: enough for an easy capture only"]
+        return [
+            f"the disk of {folder} has {free / 1e6:.0f} MB of free space, which may be too little: free "
+            "some space, or choose another disk with --out"
+        ]
     return []

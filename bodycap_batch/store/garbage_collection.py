@@ -40,7 +40,7 @@ def collect_garbage(store: Store, *, delete: bool) -> Garbage:
     Raises:
         StoreError: A job is using the store, a list of used artefacts is damaged, or the disk fails.
     """
-    busy = "a job is running on this store", "wait until it has ended"
+    busy = "a job that uses this store is running", "wait until the job has ended"
     with locked(store, fcntl.LOCK_EX | fcntl.LOCK_NB, *busy), disk_errors(store.root):
         lists = {path: _read_list(path) for path in sorted((store.root / REFERENCES_FOLDER).glob("*.json"))}
         gone = {path: places[0] for path, (places, _) in lists.items() if not any(map(_exists, places))}

@@ -120,7 +120,12 @@ def in_use(store: Store, *, wait: bool = False) -> Iterator[None]:
     `StoreBusy`.
     """
     kind = fcntl.LOCK_SH if wait else fcntl.LOCK_SH | fcntl.LOCK_NB
-    with locked(store, kind, "the store is being cleaned", "start again when `bodycap gc` has ended"):
+    with locked(
+        store,
+        kind,
+        "`bodycap gc` is removing artefacts from the store",
+        "start the job again when `bodycap gc` has ended",
+    ):
         yield
 
 

@@ -61,11 +61,17 @@ def load_clip(path: Path, start_s: float, length_s: float) -> Clip:
     """
     _, motion = read_bvh(path)
     if motion is None or len(motion.root_in_world_m) < 2:
-        raise JobError("holds no motion", path=path, field="motion", hint="a BVH file of two frames or more")
+        raise JobError(
+            "the file contains no motion",
+            path=path,
+            field="motion",
+            hint="give a BVH file with two frames or more",
+        )
     lasts = (len(motion.root_in_world_m) - 1) / motion.fps
     if start_s + length_s > lasts + 1.5 / motion.fps:
         raise JobError(
-            f"the motion lasts {lasts:.2f} s, the capture needs {start_s:.2f} to {start_s + length_s:.2f} s",
+            f"the motion in the file lasts {lasts:.2f} s, but the capture needs the part from "
+            f"{start_s:.2f} to {start_s + length_s:.2f} s",
             path=path,
             field="motion",
             hint="set seconds or motion_start_s to a smaller value",

@@ -275,10 +275,14 @@ def _check_output_folder(out_dir: Path, overwrite: bool) -> None:
     if not out_dir.exists() or (out_dir.is_dir() and not any(out_dir.iterdir())):
         return
     if not overwrite:
-        raise JobError("exists already", path=out_dir, hint="name another folder, or delete this one")
+        raise JobError(
+            "this folder exists already", path=out_dir, hint="choose another folder, or delete this folder"
+        )
     if not (out_dir / MARKER).is_file():
         raise JobError(
-            "is not a synthetic capture, so it is not overwritten", path=out_dir, hint="name another folder"
+            "this folder is not a synthetic capture, so it is not overwritten",
+            path=out_dir,
+            hint="choose another folder",
         )
 
 

@@ -48,116 +48,197 @@ _GapFrames = Annotated[int, Field(ge=1, le=_MAX_FRAMES)]
 class SynthOptions(Options):
     """Options of a synthetic capture: a person walks with body cameras in a textured room."""
 
-    seconds: float = Field(12.0, gt=0, le=_MAX_SECONDS, description="length of each camera's video")
+    seconds: float = Field(12.0, gt=0, le=_MAX_SECONDS, description="duration of each video, in seconds")
     fps: float = Field(30.0, ge=MIN_FPS, le=MAX_MOTION_FPS, description="frames per second of every camera")
     width: int = Field(640, ge=32, le=7680, multiple_of=2, description="image width in pixels (even)")
     height: int = Field(480, ge=32, le=4320, multiple_of=2, description="image height in pixels (even)")
     cameras: tuple[str, ...] = Field(
-        ("torso", "left_palm", "right_palm"), min_length=1, description="mount names, one camera each"
+        ("torso", "left_palm", "right_palm"),
+        min_length=1,
+        description="mount names; each name adds one camera",
     )
     lens: str = Field("PINHOLE", description="COLMAP camera model of every camera")
     lens_params: tuple[_LensParameter, ...] | None = Field(
         None,
         max_length=16,
-        description="parameters in COLMAP's order, pixels of the given size, COLMAP's pixel origin; "
-        "default: a lens 75 degrees wide, principal point in the middle, no distortion",
+        description=(
+            "parameters of the camera model in COLMAP's order, in pixels of the given image size, "
+            "with COLMAP's pixel origin; default: a lens with a field of view of 75 degrees, the "
+            "principal point in the middle and no distortion"
+        ),
     )
-    seed: int = Field(0, ge=0, le=MAX_SEED, description="seed of body, mounts, walk, textures and noise")
-    subject_height_m: float = Field(1.75, ge=1.2, le=2.2, description="stature of the built-in walker")
-    motion: Path | None = Field(None, description="BVH file to follow instead of the built-in walk")
+    seed: int = Field(
+        0,
+        ge=0,
+        le=MAX_SEED,
+        description=(
+            "seed of the random numbers for the body, the mounts, the walk, the textures and the noise"
+        ),
+    )
+    subject_height_m: float = Field(
+        1.75, ge=1.2, le=2.2, description="body height of the person in the built-in walk, in metres"
+    )
+    motion: Path | None = Field(
+        None, description="BVH file with the motion to use instead of the built-in walk"
+    )
     motion_start_s: float = Field(
-        0.0, ge=0, le=MAX_CAPTURE_S, description="time (s) in the BVH file at the capture's start"
+        0.0,
+        ge=0,
+        le=MAX_CAPTURE_S,
+        description="time in the BVH file at which the capture starts, in seconds",
     )
     t_pose_s: float = Field(
-        0.0, ge=0, le=_MAX_SECONDS, description="duration of the T-pose before the built-in walk, s"
+        0.0, ge=0, le=_MAX_SECONDS, description="duration of the T-pose before the built-in walk, in seconds"
     )
     proportion_range: float = Field(
-        0.05, ge=0, lt=0.5, description="bone lengths of the built-in walker differ by up to this ratio"
+        0.05,
+        ge=0,
+        lt=0.5,
+        description="in the built-in walk, the bone lengths differ from a mean person by up to this ratio",
     )
     posture_spread: float = Field(
         0.0,
         ge=0,
         le=3,
-        description="random posture of the built-in walker; 1: varies as between people, 0: mean of people",
+        description="in the built-in walk, the posture is random; 1: varies as much as between people, 0: "
+        "the mean posture of people",
     )
     mount_sigma_deg: float = Field(
         15.0,
         ge=0,
         le=MAX_ANGLE_DEG,
-        description="standard deviation of mount rotations from nominal, total of three axes",
+        description=(
+            "standard deviation of the rotation between the true and the nominal mount, in degrees,"
+            " for all three axes together"
+        ),
     )
     mount_sigma_m: float = Field(
         0.05,
         ge=0,
         le=MAX_REACH_M,
-        description="standard deviation of mount positions from nominal, total of three axes",
+        description=(
+            "standard deviation of the distance between the true and the nominal mount, in metres, "
+            "for all three axes together"
+        ),
     )
     noise: float = Field(
-        2.0, ge=0, le=50, description="standard deviation of noise at mid grey, grey levels of 0 to 255"
+        2.0,
+        ge=0,
+        le=50,
+        description="standard deviation of the image noise at medium grey, in grey levels from 0 to 255",
     )
     exposure_s: float = Field(
-        0.0, ge=0, le=1, description="exposure time, s: causes motion blur; the timestamp is at its middle"
+        0.0,
+        ge=0,
+        le=1,
+        description=(
+            "exposure time in seconds, which causes motion blur; the timestamp is the middle of the exposure"
+        ),
     )
     rolling_shutter_s: float = Field(
-        0.0, ge=0, le=MAX_ROLLING_SHUTTER_S, description="time from the first row to the last"
+        0.0,
+        ge=0,
+        le=MAX_ROLLING_SHUTTER_S,
+        description="time in seconds from the exposure of the first row to the exposure of the last row",
     )
     offsets_s: Mapping[str, _Offset] = Field(
-        default_factory=dict, description="clock offset by camera: common time = camera time + offset"
+        default_factory=dict,
+        description="clock offset of each camera in seconds: common time = camera time + offset",
     )
     drop_frames: float = Field(
-        0.0, ge=0, lt=0.5, description="fraction of frames that are lost; writes <camera>.timestamps.txt"
+        0.0,
+        ge=0,
+        lt=0.5,
+        description="share of frames that are left out of the videos; the times of the other frames "
+        "are written to <camera>.timestamps.txt",
     )
-    body_in_view: bool = Field(False, description="render the wearer's own body")
+    body_in_view: bool = Field(False, description="show the wearer's own body in the videos")
     arms_ahead: float = Field(
         0.0,
         ge=0,
         le=1,
-        description="how far both forearms are held up ahead; 1 brings them into the torso's view",
+        description="how far both forearms are lifted forward; with 1, the torso camera sees both forearms",
     )
     on_the_spot: bool = Field(
-        False, description="the built-in walker stands and turns to both sides: hardly any parallax"
+        False,
+        description="in the built-in walk, the person stands and turns to both sides, so that there "
+        "is hardly any parallax",
     )
-    furnished: bool = Field(True, description="False: a bare room, with pictures on its walls only")
-    repeated_posters: bool = Field(False, description="hang one and the same poster in several places")
+    furnished: bool = Field(True, description="false: the room is empty except for pictures on the walls")
+    repeated_posters: bool = Field(False, description="hang the same poster in several places of the room")
     pressed_s: Mapping[str, tuple[_Moment, _Moment]] = Field(
         default_factory=dict,
-        description="for a camera on a hand: start and end (s) of a time with the hand on the wearer's chest",
+        description=(
+            "for each camera on a hand, the start and the end (in seconds) of a time in which the "
+            "hand lies on the wearer's chest"
+        ),
     )
-    poses_only: bool = Field(False, description="write noisy camera poses, no video")
+    poses_only: bool = Field(False, description="write only camera poses with noise, and no videos")
     pose_sigma_m: float = Field(
-        0.005, ge=0, le=MAX_REACH_M, description="poses only: noise of each position, per axis"
+        0.005,
+        ge=0,
+        le=MAX_REACH_M,
+        description="with poses_only: standard deviation of each position, per axis, in metres",
     )
     pose_sigma_deg: float = Field(
-        0.3, ge=0, le=MAX_ANGLE_DEG, description="poses only: noise of each rotation, per axis"
+        0.3,
+        ge=0,
+        le=MAX_ANGLE_DEG,
+        description="with poses_only: standard deviation of each rotation, per axis, in degrees",
     )
-    outliers: float = Field(0.02, ge=0, lt=0.5, description="poses only: share of gross outliers, in bursts")
-    lost: float = Field(0.02, ge=0, lt=0.9, description="poses only: share of frames lost, in gaps")
+    outliers: float = Field(
+        0.02,
+        ge=0,
+        lt=0.5,
+        description=(
+            "with poses_only: share of frames with a grossly wrong pose; these frames come in groups"
+        ),
+    )
+    lost: float = Field(
+        0.02,
+        ge=0,
+        lt=0.9,
+        description="with poses_only: share of frames without a pose; these frames come in gaps",
+    )
     gap_frames: tuple[_GapFrames, _GapFrames] = Field(
-        (10, 20), description="poses only: shortest and longest gap"
+        (10, 20), description="with poses_only: shortest and longest gap, in frames"
     )
     rates_fps: Mapping[str, _Rate] = Field(
-        default_factory=dict, description="poses only: frame rate of each camera that differs from fps"
+        default_factory=dict,
+        description="with poses_only: frame rate of each camera whose rate differs from fps",
     )
-    quality: Literal["high", "lossless"] = Field("high", description="H.264 at CRF 16, or lossless")
+
+    quality: Literal["high", "lossless"] = Field(
+        "high", description="quality of the videos; high: H.264 with CRF 16, lossless: no loss of quality"
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         for name in self.cameras:
             if mount_of(name) is None:
-                raise ValueError(f"cameras: {name!r} names no place on the body")
+                raise ValueError(f"cameras: {name!r} is not the name of a place on the body")
         if len(set(self.cameras)) != len(self.cameras):
-            raise ValueError("cameras: every name once")
+            raise ValueError("cameras: each name must occur only once")
         if self.lens not in CAMERA_MODELS:
-            raise ValueError(f"lens: unknown model {self.lens!r}; known: {', '.join(CAMERA_MODELS)}")
+            raise ValueError(
+                f"lens: there is no camera model {self.lens!r}; use one of {', '.join(CAMERA_MODELS)}"
+            )
         if self.lens_params is not None and len(self.lens_params) != parameter_count(self.lens):
-            raise ValueError(f"lens_params: {self.lens} takes {parameter_count(self.lens)} parameters")
+            raise ValueError(
+                f"lens_params: the model {self.lens} needs {parameter_count(self.lens)} parameters"
+            )
         self._check_cameras_named()
         self._check_frames()
         if self.exposure_s > 1.0 / self.fps or self.rolling_shutter_s > 1.0 / self.fps:
-            raise ValueError("exposure_s and rolling_shutter_s cannot exceed the frame interval")
+            raise ValueError(
+                "exposure_s and rolling_shutter_s cannot be longer than the time between two frames (1 / fps)"
+            )
         for key in ("t_pose_s", "on_the_spot"):
             if self.motion is not None and getattr(self, key):
-                raise ValueError(f"{key}: a BVH motion is followed as it is")
+                raise ValueError(
+                    f"{key} cannot be used with motion, because a BVH motion is not changed; leave out one "
+                    "of the two"
+                )
         self._check_pressed()
         return self
 
@@ -169,7 +250,7 @@ class SynthOptions(Options):
         for key, named in (("offsets_s", self.offsets_s), ("rates_fps", self.rates_fps)):
             unknown = sorted(set(named) - set(self.cameras))
             if unknown:
-                raise ValueError(f"{key}: no camera {', '.join(unknown)}")
+                raise ValueError(f"{key}: there is no camera {', '.join(unknown)}")
         if self.rates_fps and not self.poses_only:
             raise ValueError("rates_fps: videos have one rate; set poses_only")
         if self.gap_frames[0] > self.gap_frames[1]:
@@ -194,13 +275,19 @@ class SynthOptions(Options):
         for name, (start_s, end_s) in self.pressed_s.items():
             place = mount_of(name)
             if name not in self.cameras or place is None or not place[1].endswith("Hand"):
-                raise ValueError(f"pressed_s: no camera {name} on a hand")
+                raise ValueError(f"pressed_s: there is no camera {name} on a hand")
             if end_s <= start_s:
-                raise ValueError(f"pressed_s: {name} leaves the chest before it gets there")
+                raise ValueError(f"pressed_s: the end of the time for {name} is not after its start")
         if self.pressed_s and not self.body_in_view:
-            raise ValueError("pressed_s: needs body_in_view, else there is no chest to see")
+            raise ValueError(
+                "pressed_s cannot be used without body_in_view, because the chest is not visible; set "
+                "body_in_view"
+            )
         if self.pressed_s and self.motion is not None:
-            raise ValueError("pressed_s: a BVH motion is followed as it is")
+            raise ValueError(
+                "pressed_s cannot be used with motion, because a BVH motion is not changed; leave out one "
+                "of the two"
+            )
 
     @property
     def frame_count(self) -> int:

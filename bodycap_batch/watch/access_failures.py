@@ -63,7 +63,9 @@ class AccessFailures:
             self._since = self._clock()
         self.current = failure
         if self.text != previous_text:
-            self._write_line(f"{self.text}; the watcher tries again until it succeeds ({failure.hint})")
+            self._write_line(
+                f"{self.text}; the watcher tries again until the folder is accessible ({failure.hint})"
+            )
         self._pause_s = min(_MAX_PAUSE_S, 2.0 * self._pause_s or _FIRST_PAUSE_S)
         return self._pause_s
 

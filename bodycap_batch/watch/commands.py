@@ -105,7 +105,7 @@ def inbox_rows(spool: Spool) -> list[JobRow]:
             name=path.name,
             state="ignored",
             cause=NOT_A_JOB,
-            hint="put the videos into a folder and drop the folder",
+            hint="put the videos into a folder, and put this folder into the inbox",
             path=str(path),
         )
         for path in ignored_paths_in(spool.inbox)
@@ -126,11 +126,18 @@ def retry_job(spool: Spool, name: str) -> Path:
     job = spool.find(name)
     if job is None or job.path.parent != spool.failed:
         raise _unknown_job(
-            spool, name, "has not failed", [path.name for path in visible_entries(spool.failed)]
+            spool,
+            name,
+            "cannot be retried, because it has not failed",
+            [path.name for path in visible_entries(spool.failed)],
         )
     with disk_errors(job.path):
         if not path_exists(input_path(job)):
-            raise JobError("the job's input is gone", path=job.path, hint="drop the videos again")
+            raise JobError(
+                "the videos of the job no longer exist",
+                path=job.path,
+                hint="put the videos into the inbox again",
+            )
         dropped = dropped_name(job)
         hidden = JobDir(spool.failed / f"{RETRY_PREFIX}{process_tag()}-{uuid.uuid4().hex}")
         with _keep_artefacts(job, hidden, spool) as keep_for:
@@ -138,8 +145,10 @@ def retry_job(spool: Spool, name: str) -> Path:
             try:
                 os.rename(job.path, hidden.path)
             except FileNotFoundError:
-                hint = "`bodycap status` lists all jobs"
-                raise JobError(f"job {name!r} is being retried already", path=job.path, hint=hint) from None
+                hint = "run `bodycap status` to list all jobs"
+                raise JobError(
+                    f"another command already retries job {name!r}", path=job.path, hint=hint
+                ) from None
             target = return_to_inbox(spool, hidden, keep_for)
     return target or spool.inbox / dropped
 
@@ -211,7 +220,10 @@ def _request_cancel(spool: Spool, name: str) -> JobDir | None:
     except FileNotFoundError:  # another process has claimed the job, or moved it to its final folder
         return None
     raise _unknown_job(
-        spool, name, "is not waiting or running", [entry.name for entry in entries_in(spool.inbox)]
+        spool,
+        name,
+        "cannot be cancelled, because it is not waiting or running",
+        [entry.name for entry in entries_in(spool.inbox)],
     )
 
 
@@ -240,7 +252,10 @@ def _cancel_waiting(spool: Spool, entry: InboxEntry) -> JobDir:
         raise
     move_to_running(spool, claim)
     status.set_job_dir(claim.job)
-    error = Cancelled("cancelled before it started", hint=f"`bodycap retry {claim.job.name}` starts it")
+    error = Cancelled(
+        "the job was cancelled before it started",
+        hint=f"run `bodycap retry {claim.job.name}` to start the job",
+    )
     target = move_to_free_name(
         claim.job.path,
         spool.failed,
@@ -285,9 +300,9 @@ def job_row(job: JobDir) -> JobRow:
     cause = str(error.get("message", ""))
     if state == "stopped" and cause:  # the job waits for a disk or for `bodycap gc`
         where = error.get("path")
-        cause = f"continues later: {f'{where}: ' if where else ''}{cause}"
+        cause = f"the job continues later: {f'{where}: ' if where else ''}{cause}"
     if state == "interrupted":
-        cause = "its watcher is gone; the job continues when a watcher starts"
+        cause = "the watcher of this job has ended; the job continues when a watcher starts"
     return JobRow(
         name=job.name,
         state=state,
@@ -331,8 +346,10 @@ def _unknown_job(spool: Spool, name: str, why: str, names: list[str]) -> JobErro
     if known is not None:
         state = read_status(known).get("state", known.path.parent.name)
         return JobError(
-            f"job {name!r} {why}: it is {state}", path=known.path, hint="`bodycap status` lists all jobs"
+            f"job {name!r} {why}; its state is {state}",
+            path=known.path,
+            hint="run `bodycap status` to list all jobs",
         )
     near = difflib.get_close_matches(name, names, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else "`bodycap status` lists all jobs"
-    return JobError(f"no job named {name!r}", path=spool.root, hint=hint)
+    hint = f"did you mean {near[0]!r}?" if near else "run `bodycap status` to list all jobs"
+    return JobError(f"there is no job with the name {name!r}", path=spool.root, hint=hint)

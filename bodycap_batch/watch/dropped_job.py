@@ -57,20 +57,28 @@ def read_dropped_job(
     """
     if snapshot.undecodable:
         shown = snapshot.undecodable.encode(errors="backslashreplace").decode()
-        raise JobError(f"the name {shown} is not UTF-8 text", hint="rename it and drop it again")
+        raise JobError(
+            f"the name {shown} is not UTF-8 text",
+            hint="rename this file, and put the folder into the inbox again",
+        )
     policy = path_policy(entry.path, permissions.roots, is_file=entry.is_file)
     if policy.folder is None:
         # A link must lead to a permitted folder. A job file in the inbox itself may always be read.
         if entry.path.is_symlink():
             policy.require(entry.path)
     elif snapshot.files > permissions.limits.files:
-        hint = "put each recording into its own folder, or ask the operator to raise --limit files"
-        raise CaptureError(f"more than {permissions.limits.files:g} files", path=entry.path, hint=hint)
+        hint = (
+            "put each recording into its own folder, or ask the operator of the watched folder to raise "
+            "--limit files"
+        )
+        raise CaptureError(
+            f"the folder contains more than {permissions.limits.files:g} files", path=entry.path, hint=hint
+        )
     if snapshot.special:
         raise JobError(
             f"{snapshot.special} is neither a file nor a folder",
             path=entry.path,
-            hint="remove it from the folder",
+            hint="remove this entry from the folder",
         )
     decides = None if entry.is_file else job_file_in(entry.path)
     if decides is not None:
@@ -210,8 +218,10 @@ def _require_video_sizes(job: Job, limits: Limits) -> None:
         for path in camera.video:
             if path.is_file() and path.stat().st_size > 1e9 * limits.video_gb:
                 raise CaptureError(
-                    f"{path.stat().st_size / 1e9:.3g} GB, the limit is {limits.video_gb:g}",
+                    f"the video has {path.stat().st_size / 1e9:.3g} GB, but the limit is "
+                    f"{limits.video_gb:g} GB",
                     path=path,
                     field=f"capture.cameras.{index}.video",
-                    hint="cut the recording, or ask the operator to raise --limit video_gb",
+                    hint="shorten the recording, or ask the operator of the watched folder to raise "
+                    "--limit video_gb",
                 )

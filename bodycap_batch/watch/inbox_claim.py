@@ -188,7 +188,7 @@ def _write_job_files(
         write_job(job, job_dir, entry.path.parent / entry.path.name if not entry.is_file else job_dir.input)
     status = JobStatusFile(job_dir)
     for name in [] if entry.is_file else unread_job_files(entry.path):
-        status.add_note(f"{name} was not read: a job file in a folder must be called job.yaml")
+        status.add_note(f"{name} was not used, because a job file in a folder must have the name job.yaml")
     for warning in warnings:
         status.add_note(warning)
     status.update(kind="file" if entry.is_file else "folder", dropped=entry.path.name)

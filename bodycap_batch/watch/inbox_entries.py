@@ -16,7 +16,7 @@ from bodycap_batch.formats.file_completeness import missing_part
 from bodycap_batch.watch.spool import visible_entries
 
 READY = "READY"
-NOT_A_JOB = "not a job: neither a folder nor a YAML file"
+NOT_A_JOB = "this is not a job, because it is neither a folder nor a YAML file"
 """Text that explains why a path in the inbox is ignored."""
 YAML_SUFFIXES = (".yaml", ".yml")
 _PARTIAL_SUFFIX = ".part"

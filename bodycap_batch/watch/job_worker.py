@@ -122,7 +122,11 @@ class JobWorker:
             store=str(self._store.root),
         )
         if not job_dir.job.is_file():  # an earlier watcher ended before it wrote the job
-            raise JobError("the job was never read", path=job_dir.input, hint="retry it: it is then read")
+            raise JobError(
+                "the job was not read, because the watcher ended too early",
+                path=job_dir.input,
+                hint="run `bodycap retry` for this job",
+            )
         job = read_job(job_dir, self._options.permissions)
         settings = Settings(
             store=self._store,
@@ -146,7 +150,7 @@ class JobWorker:
 
     def _check_cancelled(self, claim: Claim) -> None:
         if self._is_cancelled(claim):
-            raise Cancelled("stopped before it started", hint="retry it")
+            raise Cancelled("the job was stopped before it started", hint="run `bodycap retry` for this job")
 
     def _handle_cancelled(self, claim: Claim, status: JobStatusFile, error: Cancelled) -> JobOutcome:
         """Handle a stop: a user cancelled the job, this watcher ends, or another watcher has the job."""
@@ -155,7 +159,8 @@ class JobWorker:
             return self._give_up(claim)
         if claim.job.cancel.exists():
             error = Cancelled(
-                "cancelled; finished stages are kept", hint=f"`bodycap retry {name}` continues the job"
+                "the job was cancelled; the results of finished stages stay in the store",
+                hint=f"run `bodycap retry {name}` to continue the job",
             )
             return self._end(claim, status, "cancelled", error)
         return self._leave(claim, status, error)
@@ -218,9 +223,9 @@ class JobWorker:
     def _release(self, claim: Claim, error: BodycapError) -> JobOutcome:
         claim.release()
         message = (
-            "continues at the next start"
+            "the job continues when the watcher starts again"
             if isinstance(error, Cancelled)
-            else f"continues later: {error.message}"
+            else f"the job continues later: {error.message}"
         )
         return JobOutcome(name=claim.job.name, state="stopped", exit_code=error.exit_code, message=message)
 

@@ -51,7 +51,7 @@ class Ownership:
             return False
         found = read_owner(self.owner)
         # A suspended earlier owner may write `owner.json` once more after it has lost the job. Such a file
-        # has a lower number and is ignored.
+        # has a lower claim number and is ignored.
         outdated = int(found.get("generation", 0)) < self.generation
         return outdated or (found.get("token"), found.get("generation")) == (self.token, self.generation)
 

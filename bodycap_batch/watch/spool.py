@@ -145,8 +145,8 @@ class Spool:
             if error.errno != errno.EXDEV:
                 raise
             raise StoreError(
-                f"{self.inbox} and {folder_after} are on different file systems, "
-                "so no job can be moved in one step",
+                f"{self.inbox} and {folder_after} are on different file systems, so a job cannot be moved "
+                "in one step",
                 path=self.root,
                 hint=f"put the folders {INBOX}, {RUNNING}, {DONE} and {FAILED} on one disk",
             ) from error
@@ -166,7 +166,9 @@ def spool_from_path(path: Path) -> Spool:
     """
     full = Path(os.path.abspath(path))
     if os.path.lexists(full) and not full.is_dir():
-        raise StoreError("not a folder", path=full, hint="give the folder to watch, for example jobs/inbox")
+        raise StoreError(
+            "this path is not a folder", path=full, hint="give the folder to watch, for example jobs/inbox"
+        )
     if full.name == INBOX:
         return Spool(inbox=full, root=full.parent)
     if not (full / INBOX).is_dir():

@@ -34,11 +34,11 @@ from bodycap_batch.watch.watcher_status import WatcherStatusFile
 
 MessageSink = Callable[[str], None]
 _BUSY_POLL_S = 1.0
-"""Time (seconds) between two scans of the inbox while a job runs or an entry is in the inbox. Evidence: none.
-"""
+"""Time (seconds) between two scans of the inbox while a job runs, an entry is in the inbox, or jobs of other
+watchers may have to be taken over. Evidence: none."""
 _IDLE_POLL_S = 5.0
-"""Time (seconds) between two scans while no job runs and the inbox is empty. The scans find changes that the
-system does not report. Evidence: none."""
+"""Time (seconds) between two scans while no job runs, the inbox is empty, and no jobs are left to take over.
+The scans find changes that the system does not report. Evidence: none."""
 _SCAN_PAUSE_FACTOR = 20.0
 """Minimum ratio of the time between two scans to the duration of a scan. With a ratio of 20, scans take at
 most 5 % of the time. A scan of a thousand large folders on a slow disk takes several seconds."""
@@ -156,9 +156,9 @@ class Watcher:
     def _report_left_entries(self) -> None:
         """Report for each path that stays in the inbox why it is not processed."""
         for path, reason in self._tracker.incomplete.items():
-            self._write_line(f"{path.name}: left in the inbox: {reason}")
+            self._write_line(f"{path.name} stays in the inbox: {reason}")
         for path in ignored_paths_in(self.spool.inbox):
-            self._write_line(f"{path.name}: left in the inbox: {NOT_A_JOB}")
+            self._write_line(f"{path.name} stays in the inbox: {NOT_A_JOB}")
 
     def _write_heartbeats(self) -> None:
         status_file = WatcherStatusFile(self.spool)
@@ -211,7 +211,9 @@ class Watcher:
             return
         if not self.spool.inbox.is_dir():
             raise StoreError(
-                "the inbox is gone", path=self.spool.inbox, hint="mount its disk, or create it again"
+                "the inbox no longer exists",
+                path=self.spool.inbox,
+                hint="mount the disk of the inbox, or create the inbox again",
             )
         entries = entries_in(self.spool.inbox)
         self._complete = collections.deque(self._tracker.complete_entries(entries))

@@ -78,7 +78,7 @@ def test_a_task_that_kills_two_workers_is_given_up_and_the_other_jobs_are_done(s
     out, err = process.communicate(timeout=200)
     assert process.returncode == 70, err
     rows = {line.split()[0]: line for line in out.splitlines()}
-    assert "2 workers died while they ran it" in rows["tuesday"]
+    assert "2 workers ended unexpectedly while they ran this stage" in rows["tuesday"]
     assert out.splitlines()[-1] == "2 of 3 jobs done"
 
 

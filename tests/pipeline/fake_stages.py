@@ -58,7 +58,7 @@ def stage(name: str) -> Any:
         if name in as_list(orders().get("fail")) and meant:
             raise EstimationError(f"{name} does not work out", hint="film more")
         if name == "check" and any("unreadable" in text for text in videos(arguments["job"])):
-            raise CaptureError("not a readable video", hint="copy it again")
+            raise CaptureError("the file cannot be read as a video", hint="copy the video again")
         if orders().get("fill") == name:
             with (files / "big.bin").open("wb") as stream:
                 for _ in range(1000):

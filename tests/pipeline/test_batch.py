@@ -93,10 +93,10 @@ def test_jobs_of_high_priority_go_first(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--priority", "nobody=1"], "not JOB=NUMBER"),
-        (["--priority", "monday=x"], "not JOB=NUMBER"),
-        (["--priority", "monday=--5"], "not JOB=NUMBER"),
-        (["--priority", "monday=²"], "not JOB=NUMBER"),
+        (["--priority", "nobody=1"], "does not have the form JOB=NUMBER"),
+        (["--priority", "monday=x"], "does not have the form JOB=NUMBER"),
+        (["--priority", "monday=--5"], "does not have the form JOB=NUMBER"),
+        (["--priority", "monday=²"], "does not have the form JOB=NUMBER"),
         (["--executor", "moon"], "there is no executor 'moon'"),
     ],
 )

@@ -105,7 +105,7 @@ def test_the_second_run_has_nothing_to_do(bench: Bench) -> None:
     bench.run("run", "my walk")
     code, out, _ = bench.run("run", "my walk")
     assert code == 0
-    assert "nothing to do, all 10 stages were finished before" in out
+    assert "nothing to do, because all 10 stages were already done" in out
 
 
 def test_results_elsewhere_have_their_store_beside_them(bench: Bench) -> None:
@@ -127,18 +127,20 @@ def test_a_run_until_registration_names_that_stage(bench: Bench) -> None:
     code, out, _ = bench.run("run", "my walk", "--until", "registration")
     assert (code, out) == (
         0,
-        "my_walk: stopped after registration, as requested; run it again for the rest\n",
+        "my_walk: stopped after the stage registration, as requested; run the job again without --until to "
+        "compute the other stages\n",
     )
 
 
 @pytest.mark.slow
 def test_stages_are_repeated_skipped_explained_and_removed(bench: Bench) -> None:
     code, out, _ = bench.run("run", "my walk", "--until", "keyframes")
-    assert (code, out) == (0, "my_walk: stopped after keyframes, as requested; run it again for the rest\n")
+    assert code == 0
+    assert out.startswith("my_walk: stopped after the stage keyframes, as requested; run the job again")
     code, out, _ = bench.run("why", "my walk")
     assert code == 0
     lines = [" ".join(line.split()) for line in out.splitlines()]
-    assert "map would run: not computed before" in lines
+    assert "map would run: this stage has not been computed before" in lines
     assert "merge would run: after map" in lines
     bench.run("run", "my walk")
     assert bench.run("why", "my walk")[1].splitlines()[-1] == "nothing to do"
@@ -148,7 +150,7 @@ def test_stages_are_repeated_skipped_explained_and_removed(bench: Bench) -> None
     assert "check: done" in bench.run("run", "my walk", "--force")[2]
     code, _, err = bench.run("run", "my walk", "--force", "--from", "merge")
     assert code == 2
-    assert "leave one of them out" in err
+    assert "use only one of the two options" in err
     bench.run("run", "my walk", "--skeleton", "none")
     code, out, _ = bench.run("gc")
     assert code == 0

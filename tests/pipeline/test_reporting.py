@@ -48,4 +48,4 @@ def test_an_empty_store_gives_no_marks_and_one_message(
     marks = _StoredMarks(bench.job(), bench.out, tmp_path / "nothing")
     assert marks("torso", 0) == []
     assert marks("torso", 60) == []
-    assert capsys.readouterr().err.count("over the stored pictures only") == 1
+    assert capsys.readouterr().err.count("only over the pictures in the report") == 1

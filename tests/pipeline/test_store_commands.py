@@ -94,7 +94,7 @@ def test_until_a_stage_before_the_last_no_result_is_touched(done: Bench, stage: 
 
 def test_a_job_taken_over_publishes_nothing(done: Bench) -> None:
     before = done.results()
-    with pytest.raises(Cancelled, match="taken over"):
+    with pytest.raises(Cancelled, match="another process runs it now"):
         run_job(
             done.job(map={"features": 1024}),
             out_dir=done.out,
@@ -107,7 +107,7 @@ def test_a_job_is_taken_over_while_it_runs(bench: Bench) -> None:
     def until_the_map() -> bool:
         return not any(event.stage == "map" for event in bench.events)
 
-    with pytest.raises(Cancelled, match="taken over"):
+    with pytest.raises(Cancelled, match="another process runs it now"):
         executed(bench, may_commit=until_the_map)
     assert {name.split("/")[0] for name in artefacts(bench)} == {"check", "keyframes"}
     assert bench.results() == {}
@@ -128,7 +128,12 @@ def test_why_a_finished_job_would_do_nothing(done: Bench) -> None:
         ),
         ({"height_m": 1.8}, "check", "the body: height_m changed", None),
         ({"export": {"units": "m"}}, "export", 'units: "cm" -> "m"', ["report"]),
-        ({"torso": {"offset_s": 0.1}}, "check", "the video, calibration, clock or window of torso", None),
+        (
+            {"torso": {"offset_s": 0.1}},
+            "check",
+            "the video, the calibration, the clock, start_s or end_s of torso",
+            None,
+        ),
     ],
 )
 def test_why_names_the_change_and_what_follows(
@@ -177,7 +182,7 @@ def test_why_describes_a_changed_input(
 
 def test_why_lists_the_preview_that_runs_beside_the_export(done: Bench) -> None:
     shutil.rmtree(done.folder / "store" / "artefacts" / "preview")
-    assert steps(done)["preview"] == "not computed before"
+    assert steps(done)["preview"] == "this stage has not been computed before"
     found = steps(done, export={"units": "m"})
     assert [name for name, why in found.items() if why] == ["export", "preview", "report"]
     assert not (done.folder / "store" / "artefacts" / "preview").exists(), "asking computes nothing"
@@ -185,7 +190,7 @@ def test_why_lists_the_preview_that_runs_beside_the_export(done: Bench) -> None:
 
 def test_why_of_a_job_never_run_and_of_a_damaged_artefact(bench: Bench) -> None:
     assert steps(bench) == {
-        "check": "not computed before",
+        "check": "this stage has not been computed before",
         **dict.fromkeys(
             ("keyframes", "map", "registration", "merge", "export", "preview", "report"), "after check"
         ),
@@ -193,7 +198,7 @@ def test_why_of_a_job_never_run_and_of_a_damaged_artefact(bench: Bench) -> None:
     bench.run()
     victim = next((bench.folder / "store" / "artefacts" / "merge").glob("*/made_of.txt"))
     victim.write_text("something else")
-    assert steps(bench)["merge"] == "its stored result was damaged"
+    assert steps(bench)["merge"] == "the stored result of this stage was damaged"
 
 
 def test_why_says_that_the_program_has_changed(done: Bench) -> None:
@@ -256,7 +261,7 @@ def test_a_removed_folder_of_results_claims_nothing(alone: Bench) -> None:
 
 def test_no_garbage_is_collected_under_a_running_job(done: Bench) -> None:
     store = Store(done.folder / "store")
-    with in_use(store), pytest.raises(StoreError, match="a job is running"):
+    with in_use(store), pytest.raises(StoreError, match="a job that uses this store is running"):
         collect_garbage(store, delete=True)
 
 
@@ -267,7 +272,7 @@ def space(free: int) -> Callable[[object], SimpleNamespace]:
 def test_a_stored_check_does_not_answer_for_the_disk(done: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", space(20_000_000))
     assert done.executed() == [], "what is finished needs no room"
-    with pytest.raises(StoreError, match="20 MB free, the job needs about") as caught:
+    with pytest.raises(StoreError, match="20 MB of free space, but the job needs about") as caught:
         done.run(map={"features": 1024})
     assert caught.value.hint
     monkeypatch.setattr(shutil, "disk_usage", space(10**9))
@@ -318,7 +323,7 @@ def test_no_store_no_garbage(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     from bodycap_batch.cli import main
 
     assert main(["gc", str(tmp_path)]) == 5
-    assert "there is no store" in capsys.readouterr().err
+    assert "there is no store in this folder" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -338,7 +343,7 @@ def test_what_a_folder_is_made_from_is_kept_while_it_is_moved(tmp_path: Path) ->
 
     moves = moving(store, here)
     keep_for = moves.__enter__()
-    with pytest.raises(StoreError, match="a job is running"):
+    with pytest.raises(StoreError, match="a job that uses this store is running"):
         unused()
     keep_for(taken)  # a name that somebody else takes first
     keep_for(there)

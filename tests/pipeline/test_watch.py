@@ -113,8 +113,8 @@ ONE = "capture: {{cameras: [{{name: torso, video: {}}}]}}"
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (ONE.format("../secret.mp4"), "leads out"),
-        (ONE.format("torso/../../secret.mp4"), "leads out"),
+        (ONE.format("../secret.mp4"), "may lead out"),
+        (ONE.format("torso/../../secret.mp4"), "may lead out"),
         (ONE.format("/etc/passwd"), "outside"),
         (ONE.format("link.mp4"), "link"),
         (ONE.format("torso.mp4, calibration: /etc/passwd"), "outside"),
@@ -123,7 +123,7 @@ ONE = "capture: {{cameras: [{{name: torso, video: {}}}]}}"
         (ONE.format("loop.mp4"), ""),
         (
             "skeleton: ../secret.bvh\n" + ONE.format("torso.mp4}, {name: head, video: left_palm.mp4"),
-            "leads out",
+            "may lead out",
         ),
         (
             "skeleton: /etc/secret.bvh\n" + ONE.format("torso.mp4}, {name: head, video: left_palm.mp4"),
@@ -230,14 +230,17 @@ def test_a_job_waits_while_the_store_is_cleaned(bench: SpoolFixture) -> None:
             fcntl.flock(cleaning, fcntl.LOCK_EX)
             thread.start()
             wait_for(lambda: any("continues later" in line for line in bench.lines))
-            cause = f"continues later: {bench.spool.root / '.store'}: the store is being cleaned"
+            cause = (
+                f"the job continues later: {bench.spool.root / '.store'}: "
+                "`bodycap gc` is removing artefacts from the store"
+            )
             wait_for(lambda: job_row(bench.job("walk")).cause == cause)
         wait_for((bench.spool.done / "walk").is_dir)
     finally:
         watcher.stop()
         thread.join()
     assert bench.status("walk")["attempts"] == 1
-    message = "walk: stopped: continues later: the store is being cleaned"
+    message = "walk: stopped: the job continues later: `bodycap gc` is removing artefacts from the store"
     assert bench.lines == ["walk: started", message, f"walk: done -> {bench.spool.done / 'walk'}"]
 
 
@@ -254,7 +257,7 @@ def test_waiting_for_gc_is_reported_once(bench: SpoolFixture) -> None:
         finally:
             watcher.stop()
             thread.join()
-    assert [line.partition(": continues")[0] for line in lines] == ["walk: started", "walk: stopped"]
+    assert [line.partition(": the job continues")[0] for line in lines] == ["walk: started", "walk: stopped"]
 
 
 def test_a_watcher_with_once_leaves_no_job_behind(bench: SpoolFixture) -> None:
@@ -349,7 +352,10 @@ def test_an_abandoned_claim_is_removed_only_if_it_is_empty(bench: SpoolFixture) 
             bench.drop("walk").rename(job_dir.input)
             JobStatusFile(job_dir).update(dropped="walk")
     assert bench.run_once() == JobError.exit_code
-    assert bench.status("walk")["error"]["message"] == "the job was never read"
+    assert (
+        bench.status("walk")["error"]["message"]
+        == "the job was not read, because the watcher ended too early"
+    )
     assert (bench.job("walk").input / "torso.mp4").is_file()
     assert leftovers(bench) == []
 
@@ -582,7 +588,7 @@ def test_a_suspended_watcher_gives_up_a_lost_job_when_it_resumes(bench: SpoolFix
     wait_for(lambda: gone(child))
     process.terminate()
     _, err = process.communicate(timeout=30)
-    assert "another watcher has taken it over" in err
+    assert "another watcher runs this job now" in err
     assert {path: path.stat().st_mtime_ns for path in bench.spool.done.rglob("*")} == before
     assert leftovers(bench) == []
 

@@ -80,20 +80,20 @@ def test_the_watcher_waits_for_a_missing_inbox_and_does_not_create_it(bench: Spo
     away = bench.folder / "unmounted"
     with running(bench.watcher(once=False)) as watcher:
         bench.spool.inbox.rename(away)
-        wait_for(lambda: "the inbox is gone" in watcher.access_failures.text)
+        wait_for(lambda: "the inbox no longer exists" in watcher.access_failures.text)
         assert not bench.spool.inbox.exists()
         away.rename(bench.spool.inbox)
         bench.drop("walk")
         wait_for((bench.spool.done / "walk").is_dir)
     assert watcher.access_failures.text == ""
-    assert sum("the inbox is gone" in line for line in bench.lines) == 1
+    assert sum("the inbox no longer exists" in line for line in bench.lines) == 1
 
 
 def test_a_watcher_with_once_does_not_wait_for_ever(bench: SpoolFixture) -> None:
     watcher = bench.watcher(stale_s=1.0)
     bench.spool.inbox.rmdir()
     assert watcher.run() == StoreError.exit_code
-    assert any("the inbox is gone" in line for line in bench.lines)
+    assert any("the inbox no longer exists" in line for line in bench.lines)
 
 
 def test_pauses_grow_and_each_cause_is_reported_once(bench: SpoolFixture) -> None:
@@ -171,7 +171,10 @@ def test_a_job_that_ends_while_the_store_is_cleaned_is_filed_later(bench: SpoolF
     with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
         fcntl.flock(cleaning, fcntl.LOCK_EX)
         outcome = worker.process(*claimed)
-    assert (outcome.state, outcome.message) == ("stopped", "continues later: the store is being cleaned")
+    assert (outcome.state, outcome.message) == (
+        "stopped",
+        "the job continues later: `bodycap gc` is removing artefacts from the store",
+    )
     before = bench.status("walk")
     assert bench.run_once() == 2
     assert bench.job("walk").path == bench.spool.failed / "walk"
@@ -296,11 +299,11 @@ def test_paths_left_in_the_inbox_are_reported_when_a_watcher_ends(bench: SpoolFi
     bench.drop("walk")
     assert bench.run_once(unchanged_s=0.5) == 0
     assert bench.status("walk")["state"] == "done"
-    left = dict(line.split(": left in the inbox: ") for line in bench.lines if "left in the inbox" in line)
+    left = dict(line.split(" stays in the inbox: ") for line in bench.lines if "stays in the inbox" in line)
     assert left == {
         "empty": "the folder is empty",
         "copied": "head.mp4.part is being copied",
-        "torso.mp4": "not a job: neither a folder nor a YAML file",
+        "torso.mp4": "this is not a job, because it is neither a folder nor a YAML file",
     }
     assert (bench.spool.inbox / "copied" / "head.mp4.part").exists()
 
@@ -321,7 +324,7 @@ def test_an_unreadable_entry_is_reported_and_delays_no_other(
     assert bench.run_once() == StoreError.exit_code
     assert bench.status("walk")["state"] == "done"
     assert "locked: cannot be read: Permission denied" in bench.lines
-    assert "locked: left in the inbox: Permission denied" in bench.lines
+    assert "locked stays in the inbox: Permission denied" in bench.lines
 
 
 @pytest.mark.parametrize(
@@ -359,7 +362,9 @@ def test_watchers_and_their_failures_are_listed_with_the_jobs(
         return [line for line in capfd.readouterr().out.splitlines() if "watche" in line]
 
     bench.drop("walk", ready=False)
-    assert reported() == [f"no watcher runs here: `bodycap watch {bench.spool.inbox}` starts one"]
+    assert reported() == [
+        f"no watcher runs for this folder; start a watcher with: bodycap watch {bench.spool.inbox}"
+    ]
     with running(bench.watcher(once=False, unchanged_s=1000.0, stale_s=1.0)):
         wait_for(lambda: any(f"(process {os.getpid()}) since" in line for line in reported()))
         assert len(reported()) == 1
@@ -368,11 +373,15 @@ def test_watchers_and_their_failures_are_listed_with_the_jobs(
         assert (watching["pid"], watching["trouble"]) == (os.getpid(), "")
         away = bench.spool.inbox.rename(bench.folder / "unmounted")
         wait_for(
-            lambda: any("cannot continue" in line and "the inbox is gone" in line for line in reported())
+            lambda: any(
+                "cannot continue" in line and "the inbox no longer exists" in line for line in reported()
+            )
         )
         away.rename(bench.spool.inbox)
         wait_for(lambda: not any("cannot continue" in line for line in reported()))
-    assert reported() == [f"no watcher runs here: `bodycap watch {bench.spool.inbox}` starts one"]
+    assert reported() == [
+        f"no watcher runs for this folder; start a watcher with: bodycap watch {bench.spool.inbox}"
+    ]
     assert list(bench.spool.running.iterdir()) == []
 
 

@@ -92,7 +92,10 @@ def test_a_missing_disk_is_reported_and_the_last_jobs_stay_listed(
         raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr("bodycap_batch.watch.web.job_list.inbox_rows", fail)
-    for message, shown in (("", "Input/output error"), ("the inbox is gone", "the inbox is gone")):
+    for message, shown in (
+        ("", "Input/output error"),
+        ("the inbox no longer exists", "the inbox no longer exists"),
+    ):
         failure[0] = message
         now[0] += 10.0
         found = json.loads(job_list.json_text())
@@ -328,7 +331,7 @@ def test_a_folder_is_not_finished_while_a_file_is_being_sent(bench: SpoolFixture
     partial = PartialUpload(client, key, "torso.mp4")
     wait_for(lambda: any(bench.spool.inbox.glob(".upload-*/*.part")))
     code, data, _ = client.ask("POST", f"/api/uploads/{key}/finish")
-    assert (code, json.loads(data)["message"]) == (400, "torso.mp4: still being sent")
+    assert (code, json.loads(data)["message"]) == (400, "torso.mp4: the browser is still sending this file")
     assert partial.send_rest()[0] == 200
     client.json("POST", f"/api/uploads/{key}/finish")
     code, _, _ = client.ask("POST", f"/api/uploads/{key}/finish")

@@ -94,7 +94,7 @@ def test_the_second_of_two_retries_is_an_error(bench: SpoolFixture, monkeypatch:
         first.append(retry_job(bench.spool, "walk"))
 
     monkeypatch.setattr(commands.os, "rename", preceded_by(rename, other))  # type: ignore[attr-defined]
-    with pytest.raises(JobError, match="being retried already"):
+    with pytest.raises(JobError, match="already retries job"):
         retry_job(bench.spool, "walk")
     assert first == [bench.spool.inbox / "walk.yaml"]
     assert first[0].read_text() == "capture: {}"
@@ -215,7 +215,7 @@ def test_a_job_that_ends_during_the_cancellation_is_done(
 
     monkeypatch.setattr(Path, "touch", end)
     assert main(["cancel", "walk"]) == 0
-    assert "the job ended before it could be stopped: done" in capfd.readouterr().out
+    assert "the job ended before it could be cancelled; its state is done" in capfd.readouterr().out
 
 
 def test_parallel_jobs_share_their_stage_turns(bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -111,5 +111,5 @@ def test_it_can_be_cancelled_and_leaves_no_partial_file(estimated: Estimated, tm
 
 def test_a_folder_that_cannot_be_written_is_an_error(estimated: Estimated, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
-    with pytest.raises(StoreError, match="cannot write"):
+    with pytest.raises(StoreError, match="cannot be written"):
         render_preview(preview_inputs(estimated, tmp_path / "file" / "preview.mp4"), context(tmp_path))

@@ -101,11 +101,11 @@ def test_camera_paths_use_common_time_and_are_interrupted_at_gaps(
 
 
 def test_a_job_without_stored_results_has_no_recording(tmp_path: Path) -> None:
-    with pytest.raises(JobError, match="neither map nor camera paths"):
+    with pytest.raises(JobError, match="neither the map nor the camera paths"):
         write_recording(ReportInputs(name="x"), tmp_path / "x.rrd")
     # If stored results come from another version, the error states it, as the report does.
     failure = NotStored([], tmp_path).to_dict()
-    with pytest.raises(JobError, match="not computed yet") as caught:
+    with pytest.raises(JobError, match="have not been computed yet") as caught:
         write_recording(ReportInputs(name="x", failure=failure), tmp_path / "x.rrd")
     assert "bodycap why" in str(caught.value.hint)
 

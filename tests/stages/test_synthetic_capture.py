@@ -255,7 +255,7 @@ def test_an_earlier_capture_is_replaced_on_request(tmp_path):
 
 def test_a_disk_that_refuses_a_file_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match="cannot write"):
+    with pytest.raises(StoreError, match="cannot be written"):
         _make(tmp_path / "file" / "capture", poses_only=True)
 
 

@@ -297,7 +297,7 @@ def test_the_valid_files_are_read() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a: " * 50, "not YAML"),
+        ("a: " * 50, "not valid YAML"),
         ("[" * 10_000, "deep"),
         ("a: &x [1]\nb: *x", "anchor"),
         ("a: !!python/object/apply:os.system ['true']", "tag"),

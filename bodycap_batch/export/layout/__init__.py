@@ -14,8 +14,8 @@ __all__ = ["apply_layout"]
 def apply_layout(motion: Motion, options: ExportOptions) -> Motion:
     """Return the motion with the layout of the files for animation (BVH, GLB, FBX, USD).
 
-    New joint names and additional spine joints do not move the existing joints in the world. The joint names
-    and the number of joints of a user's own skeleton do not change.
+    New joint names and additional spine joints do not move the existing joints in the world. A user's
+    own skeleton keeps its joint names and gets no spine joints; only ``root: ground`` adds a joint, the root.
 
     Args:
         motion: The solved motion in the world.

@@ -71,7 +71,9 @@ def parse_bvh(path: Path) -> BvhFile:
             size_bytes = path.stat().st_size
             values, frame_time = _read_motion(lines, joints, size_bytes) if at_motion else (None, "")
     except OSError as error:
-        raise JobError(f"cannot read: {error.strerror or error}", path=path, hint="check the path") from error
+        raise JobError(
+            f"the file cannot be read: {error.strerror or error}", path=path, hint="correct the path"
+        ) from error
     return BvhFile(joints=joints, values=values, frame_time=frame_time)
 
 
@@ -101,7 +103,7 @@ class _LineReader:
             message,
             path=self.path,
             line=self.number if line is None else line,
-            hint=hint or "export the skeleton again as BVH, or take a preset: `skeleton: upper_body`",
+            hint=hint or "export the skeleton again as BVH, or use a preset: `skeleton: upper_body`",
         )
 
 
@@ -120,7 +122,9 @@ def _read_hierarchy(lines: _LineReader) -> tuple[list[FileJoint], bool]:
         The joints, and a flag: True if MOTION follows the block, False if the file ends after the block.
     """
     if (lines.next() or "").upper() != "HIERARCHY":
-        raise lines.error("a BVH file begins with HIERARCHY", line=max(lines.number, 1))
+        raise lines.error(
+            "the file does not begin with HIERARCHY, as a BVH file must", line=max(lines.number, 1)
+        )
     joints: list[FileJoint] = []
     stack: list[int | None] = []  # for each open block, the index of the joint; None for an End Site
     opening: list[int | None] = []  # the block whose opening brace must follow
@@ -132,18 +136,20 @@ def _read_hierarchy(lines: _LineReader) -> tuple[list[FileJoint], bool]:
             break
         if keyword == "{":
             if not opening:
-                raise lines.error("an opening brace without ROOT, JOINT or End Site before it")
+                raise lines.error("there is no ROOT, JOINT or End Site before this opening brace")
             stack.append(opening.pop())
         elif opening:
-            raise lines.error(f"expected an opening brace, found {text[:40]!r}")
+            raise lines.error(f"there is {text[:40]!r} where an opening brace must be")
         elif keyword == "}":
             if not stack:
-                raise lines.error("a closing brace too many")
+                raise lines.error("there is no opening brace for this closing brace")
             stack.pop()
         else:
             _read_statement(lines, text, joints, stack, opening)
     if stack or opening:
-        raise lines.error("the hierarchy ends inside an open block", hint="the file is truncated")
+        raise lines.error(
+            "the file ends before the hierarchy is complete", hint="export the file again: its end is missing"
+        )
     _check_joints(lines, joints)
     return joints, at_motion
 
@@ -165,11 +171,13 @@ def _read_statement(
     if keyword in ("ROOT", "JOINT"):
         inside = stack[-1] if stack else None
         if keyword == "ROOT" and joints:
-            raise lines.error("a second ROOT", hint="the file must have one skeleton")
+            raise lines.error(
+                "the file contains a second ROOT", hint="export only one skeleton into the file"
+            )
         if keyword == "JOINT" and inside is None:
-            raise lines.error("a JOINT outside of ROOT or inside an End Site")
+            raise lines.error("this JOINT is outside of ROOT or inside an End Site")
         if len(joints) >= _MAX_JOINTS:
-            raise lines.error(f"more than {_MAX_JOINTS} joints")
+            raise lines.error(f"the file has more than {_MAX_JOINTS} joints")
         parent = -1 if inside is None else inside
         joints.append(FileJoint(_unique_name(rest or f"joint{len(joints)}", joints), parent, lines.number))
         if parent >= 0:
@@ -178,13 +186,13 @@ def _read_statement(
         return
     if keyword == "END":
         if not stack or stack[-1] is None:
-            raise lines.error("an End Site outside of a joint")
+            raise lines.error("this End Site is outside of a joint")
         opening.append(None)
         return
     if keyword not in ("OFFSET", "CHANNELS"):
-        raise lines.error(f"unknown keyword {text.split(' ', 1)[0][:40]!r}")
+        raise lines.error(f"the keyword {text.split(' ', 1)[0][:40]!r} is unknown")
     if not stack:
-        raise lines.error(f"{keyword} outside of a joint")
+        raise lines.error(f"{keyword} is outside of a joint")
     if keyword == "OFFSET":
         _read_offset(lines, rest, joints, stack)
     elif stack[-1] is not None:
@@ -195,7 +203,7 @@ def _read_offset(lines: _LineReader, rest: str, joints: list[FileJoint], stack: 
     """Parse an OFFSET line and store it in the joint of the innermost open block."""
     numbers = [_parse_number(lines, token) for token in rest.split()]
     if len(numbers) != 3:
-        raise lines.error(f"OFFSET needs 3 numbers, found {len(numbers)}")
+        raise lines.error(f"OFFSET needs 3 numbers, but has {len(numbers)}")
     inside = stack[-1]
     if inside is None:
         owner = next(index for index in reversed(stack) if index is not None)
@@ -208,14 +216,17 @@ def _read_channels(lines: _LineReader, rest: str) -> tuple[str, ...]:
     """Parse a CHANNELS line and return the channel names."""
     count, *names = rest.split() or [""]
     if not count.isdigit() or int(count) != len(names):
-        raise lines.error(f"CHANNELS {count or '?'} is followed by {len(names)} names")
+        raise lines.error(f"CHANNELS {count or '?'} is followed by {len(names)} names of channels")
     unknown = [name for name in names if name.lower() not in _CHANNELS]
     if unknown:
-        raise lines.error(f"unknown channel {unknown[0]!r}", hint=f"known: {', '.join(_CHANNELS.values())}")
+        raise lines.error(
+            f"the channel {unknown[0]!r} is unknown",
+            hint=f"use only these channels: {', '.join(_CHANNELS.values())}",
+        )
     channels = tuple(_CHANNELS[name.lower()] for name in names)
     positions = [name for name in channels if name.endswith("position")]
     if len(set(positions)) != len(positions):
-        raise lines.error("a position channel twice in one joint")
+        raise lines.error("one joint has the same position channel twice")
     return channels
 
 
@@ -231,7 +242,7 @@ def _unique_name(name: str, joints: list[FileJoint]) -> str:
 def _check_joints(lines: _LineReader, joints: list[FileJoint]) -> None:
     """Raise `JobError` if there is no root, or if a joint has no OFFSET."""
     if not joints:
-        raise lines.error("no ROOT in the hierarchy")
+        raise lines.error("the hierarchy contains no ROOT")
     for joint in joints:
         if joint.offset is None:
             raise lines.error(f"joint {joint.name!r} has no OFFSET", line=joint.line)
@@ -261,20 +272,21 @@ def _read_motion(
         return None, ""
     count = _parse_number(lines, frames)
     if count < 0 or count != int(count):
-        raise lines.error(f"Frames: {frames} is not a count")
+        raise lines.error(f"the number of frames is {frames}, which is not possible")
     if count == 0:
         return None, ""
     frame_time = _read_header(lines, "FRAME TIME")
     if frame_time is None:
-        raise lines.error("no Frame Time")
+        raise lines.error("the line with the Frame Time is missing")
     if _parse_number(lines, frame_time) < 0 or (_parse_number(lines, frame_time) == 0 and count > 1):
-        raise lines.error(f"Frame Time {frame_time} is not a positive duration")
+        raise lines.error(f"the Frame Time is {frame_time}, but must be positive")
     width = sum(len(joint.channels) for joint in joints)
     total = int(count) * width
     if 2 * total > size_bytes + 1:  # every value needs at least a digit and a separator
         raise lines.error(
-            f"{int(count)} frames of {width} channels do not fit into {size_bytes} bytes",
-            hint="the file is truncated, or Frames is wrong",
+            f"the file has only {size_bytes} bytes, which cannot contain {int(count)} frames of {width} "
+            "channels",
+            hint="export the file again: its end is missing, or its number of Frames is wrong",
         )
     values = np.empty(total)
     done = 0
@@ -284,8 +296,9 @@ def _read_motion(
         done += len(row)
     if done < total:
         raise lines.error(
-            f"the motion ends after {done} of {total} values ({int(count)} frames of {width} channels)",
-            hint="the file is truncated, or Frames is wrong",
+            f"the file contains only {done} of the {total} values of the motion ({int(count)} frames of "
+            f"{width} channels)",
+            hint="export the file again: its end is missing, or its number of Frames is wrong",
         )
     return values.reshape(int(count), width), frame_time
 
@@ -298,7 +311,7 @@ def _read_header(lines: _LineReader, label: str) -> str | None:
     name, colon, value = text.partition(":")
     value = value.strip()
     if not colon or name.strip().upper() != label or len(value.split()) != 1:
-        raise lines.error(f"expected '{label.title()}: <number>', found {text[:40]!r}")
+        raise lines.error(f"there is {text[:40]!r} where '{label.title()}: <number>' must be")
     return value
 
 
@@ -310,5 +323,5 @@ def _parse_row(lines: _LineReader, text: str) -> list[float]:
     except ValueError:
         return [_parse_number(lines, token) for token in tokens]
     if not all(map(math.isfinite, row)):
-        raise lines.error("NaN or infinity in the motion")
+        raise lines.error("the motion contains NaN or infinity")
     return row

@@ -147,7 +147,8 @@ def _offsets_from_channels(
         spread = float(np.ptp(positions, axis=0).max())
         if spread > _WARNING_THRESHOLD:
             logger.warning(
-                "%s: the offset of joint %s changes by %.3g units; its OFFSET is used",
+                "%s: the position of joint %s relative to its parent changes by %.3g units in the motion; "
+                "the joint's OFFSET is used instead",
                 path,
                 joint.name,
                 spread,

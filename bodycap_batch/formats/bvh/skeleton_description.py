@@ -76,7 +76,7 @@ def describe_joints(skeleton: SkeletonModel) -> tuple[JointDescription, ...]:
         length = float(np.linalg.norm(bone))
         role = skeleton.roles[joint]
         is_helper = parent >= 0 and float(np.linalg.norm(skeleton.offsets_m[joint])) < _MIN_BONE_M
-        note = "rotation stays zero" if not role else ""
+        note = "not rotated by the motion" if not role else ""
         if is_helper:
             note = f"{note}, " * bool(note) + "same position as its parent"
         out.append(
@@ -139,7 +139,7 @@ def describe_arm_pose(skeleton: SkeletonModel) -> str:
         if joint is not None:
             arms.append((side.lower(), _describe_direction_or_empty(_bone_vector(skeleton, rest, joint))))
     if not arms:
-        return "no arms recognised"
+        return "no joints of the arms were found"
     if all(word.split(",")[0] == side for side, word in arms):
         return "arms stretched out to the sides (T-pose)"
     if all(word.split(",")[0] == "down" for _, word in arms):
@@ -162,25 +162,25 @@ def skeleton_warnings(skeleton: SkeletonModel) -> Iterator[str]:
     missing = [role for role in missing_roles(skeleton) if not role.endswith(_OPTIONAL_PARTS)]
     if missing:
         yield (
-            f"no joint has the role {', '.join(missing)}: give the role to a joint with --map JOINT=ROLE; "
-            "no camera can be mounted there"
+            f"no joint has the role {', '.join(missing)}, so no camera can be mounted on this part of the "
+            "body: give the role to a joint with --map JOINT=ROLE"
         )
     rest = rest_pose(skeleton)
     head, hips, foot = (skeleton.index_of_role(role) for role in ("Head", "Hips", "LeftFoot"))
     height, margin = rest[:, 2, 3], _MIN_HEIGHT_DIFFERENCE_M
     if head is not None and hips is not None and not height[head] > height[hips] + margin:
         yield (
-            "the head is not above the hips in the T-pose: "
-            "choose a frame in which the person stands, with --tpose-frame N"
+            "in the T-pose, the head is not above the hips: use --tpose-frame N to choose a frame in "
+            "which the person stands"
         )
     elif foot is not None and hips is not None and not height[foot] < height[hips] - margin:
         yield (
-            "the feet are not below the hips in the T-pose: "
-            "choose a frame in which the person stands, with --tpose-frame N"
+            "in the T-pose, the feet are not below the hips: use --tpose-frame N to choose a frame in "
+            "which the person stands"
         )
     left, right = (skeleton.index_of_role(f"{side}UpLeg") for side in ("Left", "Right"))
     if left is not None and right is not None and not rest[left, 0, 3] > rest[right, 0, 3]:
         yield (
-            "the left leg is not on +X (facing +Z in the file): "
-            "choose a frame in which the person stands, with --tpose-frame N"
+            "in the T-pose, the left leg is not on the left side of the person: use --tpose-frame N to "
+            "choose a frame in which the person stands"
         )

@@ -78,7 +78,7 @@ def _override_roles(path: Path, skeleton: SkeletonModel, user_roles: Mapping[str
     for name, role in user_roles.items():
         if name not in skeleton.joints:
             hint = _suggest_name(name, skeleton.joints)
-            raise JobError(f"it has no joint {name!r}", path=path, field="skeleton_map", hint=hint)
+            raise JobError(f"the skeleton has no joint {name!r}", path=path, field="skeleton_map", hint=hint)
         if role not in (*ROLES, NO_ROLE):
             hint = _suggest_name(role, (*ROLES, NO_ROLE))
             raise JobError(f"there is no role {role!r}", path=path, field="skeleton_map", hint=hint)
@@ -86,7 +86,9 @@ def _override_roles(path: Path, skeleton: SkeletonModel, user_roles: Mapping[str
     repeated = next((role for role in assigned if assigned.count(role) > 1), None)
     if repeated is not None:
         hint = "give each role to only one joint"
-        raise JobError(f"{repeated} is given to two joints", path=path, field="skeleton_map", hint=hint)
+        raise JobError(
+            f"the role {repeated} is given to two joints", path=path, field="skeleton_map", hint=hint
+        )
     for index, name in enumerate(skeleton.joints):
         if name in user_roles:
             roles[index] = "" if user_roles[name] == NO_ROLE else user_roles[name]
@@ -98,15 +100,15 @@ def _override_roles(path: Path, skeleton: SkeletonModel, user_roles: Mapping[str
 def _suggest_name(word: str, names: tuple[str, ...]) -> str:
     """Return a hint with the most similar name. If no name is similar, the hint lists the first names."""
     similar = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
-    return f"did you mean {similar[0]!r}?" if similar else f"one of {', '.join(names[:40])}"
+    return f"did you mean {similar[0]!r}?" if similar else f"use one of {', '.join(names[:40])}"
 
 
 def _tpose_rotations(path: Path, skeleton: SkeletonModel, motion: Motion | None, frame: int) -> FloatArray:
     """Return the local rotations (J,3,3) of a frame. The whole body is rotated so that it faces −Y."""
     count = 0 if motion is None else len(motion.root_in_world_m)
     if motion is None or not 0 <= frame < count:
-        hint = f"frames are counted from 0; the file has {count} frames"
-        raise JobError(f"it has no frame {frame}", path=path, field="tpose_frame", hint=hint)
+        hint = f"choose a frame from 0 to {count - 1}: the file has {count} frames, and the first frame is 0"
+        raise JobError(f"the file has no frame {frame}", path=path, field="tpose_frame", hint=hint)
     local: FloatArray = motion.local_rotation[frame].copy()
     pose = rest_pose(replace(skeleton, tpose_rotation=local))
     for part in ("Arm", "UpLeg", "Shoulder"):

@@ -15,8 +15,8 @@ BLENDER_VARIABLE = "BODYCAP_BLENDER"
 """Name of the environment variable for the path of Blender, or of a Python that has the module ``bpy``."""
 
 _HINT = (
-    f"`make blender` installs it as a Python module (Python 3.11); or set {BLENDER_VARIABLE} to a Python "
-    "that has bpy, or to a blender executable"
+    f"install Blender as a Python module with `make blender` (Python 3.11), or set {BLENDER_VARIABLE} to a "
+    "Python that has the module bpy or to a blender executable"
 )
 _TIMEOUT_S = 3600.0
 """Maximum duration of a run of Blender, seconds. Evidence: none; it only ends a process that hangs."""
@@ -37,7 +37,7 @@ def find_blender() -> Path:
     named = os.environ.get(BLENDER_VARIABLE)
     if named:
         if not os.access(named, os.X_OK) or Path(named).is_dir():
-            raise JobError(f"{BLENDER_VARIABLE} names no program", path=named, hint=_HINT)
+            raise JobError(f"{BLENDER_VARIABLE} is not the path of a program", path=named, hint=_HINT)
         return Path(named)
     if importlib.util.find_spec("bpy") is not None:
         return Path(sys.executable)
@@ -60,7 +60,7 @@ def require_blender() -> None:
     done = _run([str(blender), *_flags(blender), *script])
     if done.returncode != 0:
         last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-        raise JobError(f"Blender does not start: {last}", path=blender, hint=_HINT)
+        raise JobError(f"Blender cannot be started: {last}", path=blender, hint=_HINT)
 
 
 def run_script(script: Path, arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:

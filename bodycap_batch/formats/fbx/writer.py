@@ -54,11 +54,17 @@ def write_fbx(path: Path, motion: Motion) -> Path:
         )
         if done.returncode != 0 or not report.is_file():
             last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-            raise StoreError(f"Blender could not write the file: {last}", path=path, hint="check the disk")
+            raise StoreError(
+                f"Blender could not write the file: {last}", path=path, hint="check the disk for errors"
+            )
         off_m = _max_joint_difference_m(json.loads(report.read_text(encoding="utf-8")), motion)
         if not off_m <= POSITION_TOLERANCE_M:
             hint = "check the disk; if the disk has no errors, report this as a bug"
-            raise StoreError(f"joints read back differ by {off_m * 1000:.3g} mm", path=path, hint=hint)
+            raise StoreError(
+                f"the joints in the written file differ from the solved joints by {off_m * 1000:.3g} mm",
+                path=path,
+                hint=hint,
+            )
     return path
 
 

@@ -35,14 +35,16 @@ def read_glb(path: Path | str) -> Motion:
         document = gl.GLTF2.load_binary(str(path))
         if document is None or len(document.skins) != 1 or len(document.animations) != 1:
             raise JobError(
-                "does not contain exactly one skin and one animation",
+                "the file does not contain exactly one skin and one animation",
                 path=path,
-                hint="give the motion.glb of a result",
+                hint="give the motion.glb of a results folder",
             )
         return _read_motion(document, Path(path).stem)
     except (OSError, struct.error, ValueError, LookupError, TypeError, AttributeError) as error:
         raise JobError(
-            f"cannot be read as GLB: {error}", path=path, hint="give the motion.glb of a result"
+            f"the file cannot be read as GLB: {error}",
+            path=path,
+            hint="give the motion.glb of a results folder",
         ) from error
 
 

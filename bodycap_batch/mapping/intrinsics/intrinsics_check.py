@@ -290,24 +290,24 @@ def misfit_note(camera: str, factor: float, *, freed: bool = False) -> str:
         factor: Ratio of the focal length that fits the map to the given focal length.
         freed: True if refined intrinsics were used instead of the given intrinsics.
     """
-    instead = "; the refined values were used instead" if freed else ""
+    instead = "; therefore the lens was estimated together with the map" if freed else ""
     if abs(factor - 1.0) > _MAX_FOCAL_CHANGE:
         longer = "longer" if factor > 1.0 else "shorter"
         fits = f"a focal length {round(100 * abs(factor - 1.0))} % {longer} than"
         cause = (
-            "stabilisation or digital zoom on, or was the calibration made with another lens mode or picture "
-            "size? Film without stabilisation and digital zoom"
+            "stabilisation or digital zoom was on, or the calibration was made with another lens mode or "
+            "picture size. Film without stabilisation and digital zoom"
         )
     else:
         # Refined intrinsics may also have another distortion. The check does not refine the distortion.
-        fits = "another centre or distortion than" if freed else "another centre than"
+        fits = "another image centre or another distortion than" if freed else "another image centre than"
         cause = (
-            "the picture cropped, or was the calibration made with another lens mode or picture size? "
-            "Film the whole picture"
+            "the camera cropped the picture, or the calibration was made with another lens mode or "
+            "picture size. Film the whole picture"
         )
     return (
-        f"{camera}: the pictures fit {fits} the calibration says{instead}: was {cause}, calibrate in the "
-        "same mode, or use calibration: auto"
+        f"{camera}: the pictures fit {fits} the calibration says{instead}. Possible causes: {cause}, "
+        "calibrate the camera in the same video mode, or use `calibration: auto`"
     )
 
 

@@ -42,12 +42,14 @@ _MIN_TOTAL_MATCHES = 60
 """Minimum number of matches of two cameras, summed over all their image pairs, in the orientation with more
 matches. Two cameras with fewer matches give no evidence. Evidence: none."""
 _HINT = (
-    "a front camera's setting, or an app, may flip the picture; flip it back: ffmpeg -i in -vf hflip out.mp4"
+    "flip the video back (ffmpeg -i in -vf hflip out.mp4); a setting of a front camera, or an app, may "
+    "have mirrored the picture"
 )
 
 _UNDECIDED_HINT = (
-    "that is right if one of them films a wall mirror, or if the room's halves are mirror images of each "
-    "other; otherwise the result is wrong: the camera in whose video text reads backwards flips the picture"
+    "the result is right if one of these cameras films a wall mirror, or if the two halves of the room "
+    "are mirror images of each other; otherwise the result is wrong, and you must flip the video in which "
+    "text reads backwards"
 )
 
 
@@ -103,7 +105,8 @@ def flip_notes(diagnostics: MapDiagnostics) -> list[str]:
     return [
         *map(excluded_camera_note, diagnostics.flipped_cameras),
         *(
-            f"map.init_frames is not used, because it names camera {name}, which is left out"
+            f"map.init_frames is not used, because one of its frames belongs to camera {name}, which is "
+            "left out"
             for name in diagnostics.excluded_from_pair
         ),
         *(

@@ -1,6 +1,6 @@
 """Select the pairs of keyframes to match.
 
-In a large capture, the number of pairs for each keyframe does not depend on the total number of keyframes.
+With retrieval, the number of pairs for each keyframe does not depend on the total number of keyframes.
 """
 
 from __future__ import annotations
@@ -238,7 +238,7 @@ class PairGenerator:
                 yield x, y
 
     def _is_link(self, a: int, b: int) -> bool:
-        """Return whether a pair of rows can be a link: different cameras, or distant times of one camera."""
+        """Return whether a pair of rows can be a link: different cameras, or distant rows of one camera."""
         return bool(self._cameras[a] != self._cameras[b]) or abs(a - b) > _NEAR_KEYFRAMES
 
     def _sorted(self, rows: Collection[tuple[int, int]]) -> list[Pair]:
@@ -247,7 +247,7 @@ class PairGenerator:
         return [(self._images[a], self._images[b]) for a, b in ordered]
 
     def _partners(self, row: int) -> set[int]:
-        """Return the rows of all partners with which the keyframe `row` is matched first."""
+        """Return the rows of the keyframes with which `initial_pairs` pairs the keyframe in row `row`."""
         own = self._rows_of[self._cameras[row]]
         position = int(np.searchsorted(own, row))
         steps = [step * sign for step in _NEIGHBOUR_STEPS for sign in (-1, 1)]

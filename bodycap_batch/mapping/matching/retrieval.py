@@ -33,8 +33,8 @@ _SHORTLIST_SIZE = 128
 It is twice the maximum number of retrieved partners in pair selection.
 Evidence: docs/decisions/mapping.md."""
 _SHORTLIST_SIZE_PER_CAMERA = 24
-"""Number of images of each camera that are always on the shortlist of an image: the most similar images of
-this camera. It is three times the number of retrieved partners of each camera in pair selection.
+"""Number of images of each camera that are always on the shortlist of an image: of each camera, the most
+similar images. It is three times the number of retrieved partners of each camera in pair selection.
 Evidence: docs/decisions/mapping.md."""
 _QUANTISATION_STEPS = 2048.0
 """Number of rounding steps between 0 and 1. Each component of a unit VLAD vector is rounded to a whole number

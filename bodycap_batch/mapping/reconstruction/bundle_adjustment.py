@@ -155,5 +155,5 @@ def bundle_adjust(
     if not summary.is_solution_usable():
         raise EstimationError(
             f"the map of {model.num_reg_images()} keyframes could not be refined: {summary.brief_report()}",
-            hint="set registration: {rounds: 0} to keep the map as it was first built",
+            hint="set `registration: {rounds: 0}` to use the map as it was first built",
         )

@@ -77,9 +77,12 @@ class InitialPair:
     def rejection_reason(self) -> str:
         """The most likely reason why a reconstruction from this pair fails, for the log."""
         if self.parallax_rad < _MIN_PARALLAX_RAD:
-            return f"the cameras hardly moved apart ({np.degrees(self.parallax_rad):.1f} degrees of parallax)"
+            return (
+                f"the two cameras are too close to each other ({np.degrees(self.parallax_rad):.1f} degrees "
+                "of parallax)"
+            )
         if self.coverage < _MIN_COVERAGE:
-            return f"the matches fill {self.coverage:.0%} of the images"
+            return f"the matches cover only {self.coverage:.0%} of the images"
         return f"there were too few matches ({self.matches}), or their geometry was too weak"
 
     def to_log(self) -> dict[str, object]:
@@ -140,7 +143,11 @@ def find_user_pair(
         image_ids = read_image_ids(database)
         ids = sorted(image_ids[_nearest_keyframe(name, image_ids, frame_numbers)] for name in names)
         if ids[0] == ids[1]:
-            raise JobError(f"{' and '.join(names)} have the same nearest keyframe", field="map.init_frames")
+            raise JobError(
+                f"the frames {' and '.join(names)} have the same nearest keyframe",
+                field="map.init_frames",
+                hint="choose two frames that are farther apart in time",
+            )
         if not database.exists_two_view_geometry(*ids):
             return None
         return _measure_pair(database, (ids[0], ids[1]), intrinsics)
@@ -154,9 +161,9 @@ def _nearest_keyframe(
     candidates = sorted(ref for ref in keyframes if ref.camera == camera)
     if not candidates:
         raise JobError(
-            f"no keyframes of a camera {camera!r}",
+            f"there are no keyframes of a camera {camera!r}",
             field="map.init_frames",
-            hint=f"cameras: {', '.join(sorted({ref.camera for ref in keyframes}))}",
+            hint=f"use one of the cameras {', '.join(sorted({ref.camera for ref in keyframes}))}",
         )
     return min(candidates, key=lambda ref: abs(int(frame_numbers[camera][ref.frame]) - int(frame)))
 

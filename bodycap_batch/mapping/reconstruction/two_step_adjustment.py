@@ -1,6 +1,7 @@
 """Adjust a large map in two steps: first the skeletal keyframes, then all other keyframes.
 
-Skeletal keyframes are the reduced set of keyframes, Snavely's skeletal set.
+The skeletal keyframes are a subset of the keyframes, against which all other keyframes can be resected (the
+skeletal set of Snavely et al.).
 """
 
 from __future__ import annotations

@@ -66,7 +66,10 @@ class DistanceCheck:
     def to_log(self) -> dict[str, object]:
         """Return the entries for the log. The entries do not depend on the map's arbitrary scale."""
         if self.metres_per_unit is None:
-            return {"judged": False, "reason": f"{self.distances} distances between cameras are too few"}
+            return {
+                "judged": False,
+                "reason": f"only {self.distances} distances between cameras are known, which is too few",
+            }
         out: dict[str, object] = {
             "judged": self.is_conclusive,
             "distances": self.distances,
@@ -74,7 +77,10 @@ class DistanceCheck:
             "keyframes_out_of_reach": int(self.violations.sum()),
         }
         if not self.is_conclusive:
-            out["reason"] = f"no scale puts {MIN_WITHIN_REACH:.0%} of the distances within the body's reach"
+            out["reason"] = (
+                f"for no scale, {MIN_WITHIN_REACH:.0%} of the distances between cameras are possible on "
+                "one body"
+            )
         return out
 
 

@@ -145,12 +145,17 @@ def check_consistency(ratio: float, reach: Mapping[str, object] | None) -> Estim
         return None
     body = ""
     if reach is not None:
-        found = reach.get("reason", f"{reach.get('keyframes_out_of_reach')} keyframes are out of reach")
-        body = f"; the body's reach: {found}"
+        found = reach.get(
+            "reason",
+            f"in {reach.get('keyframes_out_of_reach')} keyframes, a camera is farther from the other "
+            "cameras than the body reaches",
+        )
+        body = f"; check of the distances between cameras: {found}"
     return EstimationError(
-        f"{ratio:.0%} of the matches between keyframes contradict the map: places that look the same "
-        f"(repeated pictures, tiles, windows) were taken for one place{body}",
-        hint="film objects that distinguish the places, or cover repeated pictures; check the calibration",
+        f"{ratio:.0%} of the matches between keyframes contradict the map: different places that look the "
+        f"same (repeated pictures, tiles, windows) were mapped as one place{body}",
+        hint="film objects that are different in each place, or cover repeated pictures; check the "
+        "calibration",
     )
 
 
@@ -173,7 +178,7 @@ def check_coverage(
     if registered >= max(2, options.min_coverage * keyframes):
         return None
     return EstimationError(
-        f"the map holds {registered} of {keyframes} keyframes, "
-        f"fewer than {options.min_coverage:.0%}; initial pairs: {attempts}",
-        hint="move the cameras sideways past textured, well lit surfaces; check the calibration",
+        f"the map contains only {registered} of {keyframes} keyframes, which is fewer than "
+        f"{options.min_coverage:.0%}; the map was started from these pairs of keyframes: {attempts}",
+        hint="move the cameras sideways past bright surfaces with texture; check the calibration",
     )

@@ -104,8 +104,9 @@ def provisional_scale(
     constraints = [link for link in links if link is not None]
     if not constraints:
         raise EstimationError(
-            "no two cameras at places of known distance on the body were localised at the same time",
-            hint="metric scale comes from a camera on the trunk and one on a limb (or the head) in one map",
+            "no two cameras whose distance on the body is known were localised at the same time",
+            hint="to determine the metric scale, wear a camera on the trunk and a camera on a limb or the "
+            "head, and let both cameras film the same places",
         )
     typical = [constraint.typical_scale() for constraint in constraints]
     scales = float(np.median(typical)) * np.geomspace(0.2, 5.0, 320)
@@ -113,8 +114,9 @@ def provisional_scale(
     best = int(np.argmin(costs))
     if best in (0, len(scales) - 1):
         raise EstimationError(
-            f"the cameras' distances fit no person: {scales[best]:.3g} m per map unit is out of bounds",
-            hint="check which camera sits where (the job's mounts)",
+            "the distances between the cameras are not possible for a person: the scale of "
+            f"{scales[best]:.3g} m per map unit is out of bounds",
+            hint="check that the `mount` of each camera in the job is correct",
         )
     return float(scales[best])
 

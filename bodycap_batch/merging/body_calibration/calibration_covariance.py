@@ -174,8 +174,8 @@ def variance_factors(
     """
     correlated = samples.correlated_samples
     map_error = _map_error_variance(samples, linearised, reduced)
-    # Errors of the map correlate the camera poses of successive samples. The joint gaps may be correlated in
-    # the same way.
+    # Because of errors of the map, the camera poses of successive samples are correlated. The joint gaps may
+    # be correlated in the same way.
     gap = correlated * linearised.variance_factor(reduced, RowType.JOINT_GAP, 1.0 / correlated)
     factors = {
         RowType.PRIOR: 1.0,

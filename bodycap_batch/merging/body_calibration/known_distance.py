@@ -59,23 +59,23 @@ def known_distance(
     gauge = ends[0].gauge
     if ends[1].gauge != gauge:
         raise JobError(
-            f"{first} and {second} are in maps that share no view",
+            f"the frames {first} and {second} are in different maps that have no place in common",
             field=_FIELD,
-            hint="name two frames of one camera",
+            hint="choose two frames of one camera",
         )
     if main_from_gauge is not None and gauge not in main_from_gauge:
         raise EstimationError(
-            f"{first} and {second} are in map {gauge}, which was not aligned with the main map",
-            hint="name two frames of a camera that is used; metrics.json lists the unused ones",
+            f"the frames {first} and {second} are in map {gauge}, which was not aligned with the main map",
+            hint="choose two frames of a camera that is used; metrics.json lists the unused cameras",
         )
     unit = 1.0 if main_from_gauge is None else main_from_gauge[gauge].scale
     variance = sum(end.centre_variance for end in ends)
     distance = float(np.linalg.norm(ends[1].centre - ends[0].centre))
     if distance**2 <= _MIN_SIGNAL_TO_NOISE**2 * variance:
         raise EstimationError(
-            f"{first} and {second} are too near to each other: "
-            f"{np.sqrt(variance) / max(distance, 1e-12):.0%} of their distance is uncertain",
-            hint="name two frames that are farther apart",
+            f"the camera positions in the frames {first} and {second} are too close to each other: the "
+            f"uncertainty is {np.sqrt(variance) / max(distance, 1e-12):.0%} of their distance",
+            hint="choose two frames in which the camera positions are farther apart",
         )
     sigma = np.sqrt(variance / distance**2 + 2.0 * (MIN_SIGMA_M / metres) ** 2 + _MIN_SIGMA**2)
     return ScaleSource(name="known distance", scale=metres / (unit * distance), sigma_log=float(sigma))
@@ -97,16 +97,20 @@ def _find_frame(trajectories: Sequence[Trajectory], name: str) -> _End:
         raise JobError(
             f"there is no camera {camera!r}",
             field=_FIELD,
-            hint=f"cameras: {', '.join(each.camera for each in trajectories)}",
+            hint=f"use one of the cameras {', '.join(each.camera for each in trajectories)}",
         )
     rows = np.flatnonzero(found.frame_numbers == int(number))
     if not len(rows):
-        raise JobError(f"{camera} has no frame {number}", field=_FIELD, hint="frames are counted from 0")
+        raise JobError(
+            f"camera {camera} has no frame {number}",
+            field=_FIELD,
+            hint="choose a frame of the video; the first frame is 0",
+        )
     row = int(rows[0])
     if not found.localised[row]:
         raise EstimationError(
             f"frame {name} of the known distance was not localised: {found.status[row].name}",
-            hint="name another frame; frames.csv lists the localised ones",
+            hint="choose a frame that was localised; frames.csv lists the status of each frame",
         )
     variance = float(np.trace(found.covariance[row, 3:, 3:])) / 3.0
     return _End(found.gauge, found.gauge_from_cam[row, :3, 3], variance)

@@ -143,9 +143,11 @@ def locate_board(
     sigma = float(np.hypot(spread, _MIN_SIGMA))
     if not sigma < _MAX_SIGMA:
         raise EstimationError(
-            f"the marker board gives the scale to {sigma:.0%} only: its {len(seen.map_from_cam)} views are "
-            "from nearly the same place, or their poses contradict each other",
-            hint="walk past it, so that it is seen from several sides; or leave merge.marker_board out",
+            f"the scale from the marker board has an uncertainty of {sigma:.0%}, which is too large: its "
+            f"{len(seen.map_from_cam)} views are from nearly the same place, or the poses of these views "
+            "contradict each other",
+            hint="walk past the board, so that the cameras see the board from several sides; or leave out "
+            "merge.marker_board",
         )
     unit, turn = 1.0, np.eye(3)
     if main_from_gauge is not None:
@@ -183,7 +185,8 @@ def _select_observations(
         gauge, selected = main, by_gauge[main]  # the scale of an aligned map is less certain
     if len(selected) < _MIN_VIEWS:
         raise EstimationError(
-            f"the marker board was found in {len(selected)} keyframes of one map, {_MIN_VIEWS} are needed",
+            f"the marker board was found in only {len(selected)} keyframes of one map, but {_MIN_VIEWS} "
+            "keyframes are needed",
             hint="check that merge.marker_board describes the filmed board (kind, columns, rows, dictionary, "
             "legacy), that this board is sharp in the video, and that its squares are at least 10 px wide; "
             "a chessboard must be completely visible",

@@ -102,7 +102,7 @@ class LinearisedCalibration:
             return self._reduced(common_jacobian)
         except np.linalg.LinAlgError as error:
             raise EstimationError(
-                f"the cameras do not determine how they sit on the body ({error})",
+                f"the data do not determine the poses of the cameras on the body ({error})",
                 hint="record a longer capture with more movement, or use fewer cameras",
             ) from error
 

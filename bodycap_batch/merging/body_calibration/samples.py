@@ -232,7 +232,9 @@ def _sample_times(tracks: Sequence[CameraTrack], count: int, t_pose_ns: tuple[in
         raise EstimationError(
             f"camera {tracks[0].camera!r} was localised together with another camera in only "
             f"{len(shared)} frames, and no two other cameras have enough common frames",
-            hint=f"{MIN_SAMPLES} frames are needed to find how the cameras sit on the body; see frames.csv",
+            hint=f"record a longer walk in which the cameras see the same places; {MIN_SAMPLES} common "
+            "frames are needed to find the poses of the cameras on the body (frames.csv lists why frames "
+            "were lost)",
         )
     return np.unique(np.concatenate([times_ns[picked], *further]))
 

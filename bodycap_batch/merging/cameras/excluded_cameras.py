@@ -23,7 +23,10 @@ def excluded_cameras(inputs: MergeInputs) -> dict[str, str]:
     """
     rare = rarely_localised(inputs.trajectories)
     still = stationary_cameras(inputs, [each for each in inputs.trajectories if each.camera not in rare])
-    reason = "it stands still while the other cameras move: nobody wears it, or its video is frozen"
+    reason = (
+        "this camera stands still while the other cameras move: nobody wears this camera, or its video is "
+        "frozen"
+    )
     return {**rare, **dict.fromkeys(still, reason)}
 
 
@@ -37,9 +40,9 @@ def rarely_localised(trajectories: Sequence[Trajectory]) -> dict[str, str]:
         By name of an excluded camera, the reason why the camera is excluded.
     """
     counts = {each.camera: int(each.localised.sum()) for each in trajectories}
-    needed = f"{MIN_LOCALISED_FRAMES} needed"
+    needed = f"but {MIN_LOCALISED_FRAMES} are needed"
     return {
-        each.camera: f"{counts[each.camera]} localised frames of {len(each.status)}, {needed}"
+        each.camera: f"only {counts[each.camera]} of {len(each.status)} frames were localised, {needed}"
         for each in trajectories
         if counts[each.camera] < MIN_LOCALISED_FRAMES
     }

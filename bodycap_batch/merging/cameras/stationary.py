@@ -29,7 +29,8 @@ of the noise. For Gaussian noise with the same sigma on all three axes, the 90th
 sigmas (chi distribution with three degrees of freedom)."""
 _MIN_DURATION_RATIO = 0.5
 """Minimum localised time of a stationary camera, as a ratio to the longest localised time of all cameras. A
-person who stands still for a second gives no evidence about the rest of the time. Evidence: none."""
+camera with a shorter localised time is not treated as stationary. In a short time, it may stand still only
+because the person stands still. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -226,8 +226,8 @@ def _align_all(
 def _exclusion_reason(gauge: str, trunk_camera: str, main_gauge: str, why: str) -> str:
     """Return the message for a camera whose map could not be aligned with the trunk's map."""
     return (
-        f"its map {gauge} shares no view with {trunk_camera}'s {main_gauge}, "
-        f"and the two maps could not be aligned through the body: {why}"
+        f"the map of this camera ({gauge}) has no place in common with the map of {trunk_camera} "
+        f"({main_gauge}), and the body's movement could not align the two maps: {why}"
     )
 
 
@@ -274,9 +274,9 @@ def _require_one_scale(strain: float, reach_sigma: float) -> None:
     """
     if strain > _MAX_STRAIN:
         raise EstimationError(
-            f"the limbs' reach and the way the cameras move disagree on the scale by "
-            f"{100 * strain * reach_sigma:.0f} %",
-            hint="a longer walk with turns helps",
+            "the scale from the length of the limbs and the scale from the movement of the cameras differ "
+            f"by {100 * strain * reach_sigma:.0f} %",
+            hint="record a longer walk with turns",
         )
 
 
@@ -339,9 +339,10 @@ def align_maps(
         why = None
         if not sigma.position_m <= MAX_SIGMA_M:
             why = (
-                f"the aligned camera positions have a sigma of {100 * sigma.position_m:.0f} cm; it helps to "
-                "bend forward and sideways, to turn while walking, to wear a camera on an upper arm, to film "
-                "one place with cameras of both maps, or to give a known distance or a marker board"
+                f"the uncertainty of the aligned camera positions is {100 * sigma.position_m:.0f} cm (1 "
+                "sigma), which is too large. To reduce this, bend forward and sideways, turn while "
+                "walking, wear a camera on an upper arm, film one place with cameras of both maps, or "
+                "give a known distance or a marker board"
             )
         out.append(
             AlignedMap(

@@ -74,9 +74,10 @@ def align_maps_initially(
     """Estimate the similarities of further maps and the metric scale in turn.
 
     Some distances between cameras in different maps contain no information about the scale. One example is
-    the distance between shoulder and hand. At every scale, the alignment places the hand at the length of the
-    arm in the rest pose. A smaller scale only makes the swing of the arm smaller. Another example is the
-    distance between trunk and head. At every scale, this distance equals the distance in the rest pose.
+    the distance between shoulder and hand. At every scale, the alignment places the hand as far from the
+    shoulder as it is in the rest pose: one arm length. A smaller scale only makes the swing of the arm
+    smaller. Another example is the distance between trunk and head. At every scale, this distance equals the
+    distance in the rest pose.
 
     Args:
         bones: The graph's bones.
@@ -162,9 +163,10 @@ def _scale_information(
             without_swing += [(track.camera, other.camera)] if constraint.reach_m == 0.0 else []
     if without_swing and not information:
         raise EstimationError(
-            "the distance of {!r} from {!r} in another map does not determine the scale, "
-            "and no other distance does".format(*without_swing[0]),
-            hint="an upper arm's camera helps, or two cameras of the body in one map",
+            "{!r} and {!r} are in different maps, so their distance does not determine the scale, and no "
+            "other distance determines the scale".format(*without_swing[0]),
+            hint="wear a camera on an upper arm, or let two cameras film the same places, so that both "
+            "cameras are in one map",
         )
     return _ScaleInformation(uninformative, 1.0 / np.sqrt(information) if information else np.inf)
 
@@ -230,8 +232,10 @@ def require_common_time(main: CameraTrack, group: Sequence[CameraTrack]) -> None
         if long and both_known.sum() >= _MIN_INSTANTS and valid.sum() >= _MIN_COMMON_FRAMES:
             return
     raise EstimationError(
-        f"{group[0].camera!r} and {main.camera!r} were localised together for less than {_MIN_COMMON_S:g} s",
-        hint="maps without a common view are aligned by the walk that both cameras record; see frames.csv",
+        f"the cameras {group[0].camera!r} and {main.camera!r} were localised at the same time for less "
+        f"than {_MIN_COMMON_S:g} s",
+        hint="record a longer walk with both cameras: maps without a common place are aligned by the walk "
+        "that both cameras record (frames.csv lists why frames were lost)",
     )
 
 

@@ -247,6 +247,7 @@ def _solve_normal_equations(normal: FloatArray, right: FloatArray) -> FloatArray
         return np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
     except np.linalg.LinAlgError as error:
         raise EstimationError(
-            "the body's movement does not determine where the map lies",
-            hint="bending, turns in the walk, an upper arm's camera or a common view help",
+            "the body's movement does not determine the position of this map relative to the main map",
+            hint="bend the body, turn while walking, wear a camera on an upper arm, or film one place "
+            "with cameras of both maps",
         ) from error

@@ -1,6 +1,6 @@
 """Write one sentence per estimated quantity: how well the quantity is known, and advice for a better capture.
 
-The sentences are part of the stored results. The report page splits each sentence at "; to know it better, ".
+The sentences are part of the stored results. The report page splits each sentence at "; to reduce this, ".
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ The report gives advice if the sigma of the scale is larger.
 """
 _MOVEMENTS = {
     "Spine1": "walk straight ahead, turn round, and lift both arms to the side",
-    "Spine": "walk straight ahead, turn round, and bend and twist the trunk",
+    "Spine": "walk straight ahead, turn round, then bend and twist the trunk",
     "Hips": "walk straight ahead, turn round, and lift each knee",
     "Neck": "nod and look over both shoulders",
     "Head": "nod and look over both shoulders",
-    "Shoulder": "shrug, and circle the {side} arm",
-    "Arm": "circle the {side} arm about the shoulder",
-    "ForeArm": "swing the {side} elbow through 90°, then turn the {side} palm up and down",
-    "Hand": "swing the {side} elbow through 90°, then bend and turn the {side} wrist",
-    "UpLeg": "lift and circle the {side} knee",
-    "Leg": "bend the {side} knee through 90°",
-    "Foot": "lift the {side} foot and circle the ankle",
-    "ToeBase": "roll over the toes of the {side} foot",
+    "Shoulder": "lift the shoulders, and move the {side} arm in circles",
+    "Arm": "move the {side} arm in circles about the shoulder",
+    "ForeArm": "bend the {side} elbow by 90°, then turn the {side} palm up and down",
+    "Hand": "bend the {side} elbow by 90°, then bend and turn the {side} wrist",
+    "UpLeg": "lift the {side} knee and move the knee in circles",
+    "Leg": "bend the {side} knee by 90°",
+    "Foot": "lift the {side} foot and move the foot in circles",
+    "ToeBase": "lift the heel of the {side} foot while the toes stay on the floor",
 }
 
 
@@ -61,9 +61,9 @@ def describe_clock(camera: str, shift_s: float, scatter_left: float, offset_s: f
     """
     direction = "behind" if shift_s > 0.0 else "ahead"
     return (
-        f"{camera} moves about the body as if its clock were {abs(shift_s):.1f} s {direction}; with "
-        f"an offset_s of about {offset_s:.1f} its position relative to the trunk would vary "
-        f"{1.0 - scatter_left:.0%} less"
+        f"the movement of {camera} relative to the body suggests that its clock is {abs(shift_s):.1f} s "
+        f"{direction}: with an offset_s of about {offset_s:.1f}, its position relative to the trunk would "
+        f"vary {1.0 - scatter_left:.0%} less"
     )
 
 
@@ -77,8 +77,9 @@ def describe_swapped_sides(swapped: Mapping[str, float]) -> str:
         A sentence for the report.
     """
     return (
-        f"{' and '.join(sorted(swapped))} stay on the other side of the body: left and right are "
-        "exchanged in the cameras' names, or the trunk's camera looks back and its mount is not torso_back"
+        f"{' and '.join(sorted(swapped))} stay on the wrong side of the body: left and right are exchanged "
+        "in the names of the cameras, or the camera on the trunk looks backward and its mount is not "
+        "torso_back"
     )
 
 
@@ -128,13 +129,15 @@ def describe_mount(mount: Mount, *, t_pose: bool) -> str:
         A sentence for the report. If the mount is not well known, the sentence contains advice.
     """
     degrees, metres = float(np.degrees(mount.sigma_rad)), mount.sigma_m
-    text = f"{mount.camera}'s mount is known to {degrees:.1f}° and {100.0 * metres:.1f} cm (1 sigma)"
+    text = (
+        f"the uncertainty of {mount.camera}'s mount is {degrees:.1f}° and {100.0 * metres:.1f} cm (1 sigma)"
+    )
     if degrees <= _WELL_KNOWN_MOUNT_DEG and metres <= _WELL_KNOWN_MOUNT_M:
         return text
     side, part = split_side(mount.role)
     movement = _MOVEMENTS[part].format(side=side.lower())
     stand = "" if t_pose else ", or stand in a T-pose for two seconds first"
-    return f"{text}; to know it better, {movement}{stand}"
+    return f"{text}; to reduce this, {movement}{stand}"
 
 
 def describe_hinge(role: str, off_m: float) -> str:
@@ -148,11 +151,13 @@ def describe_hinge(role: str, off_m: float) -> str:
         A sentence for the report, with advice.
     """
     side, part = split_side(role)
-    joint = f"{side.lower()} {'elbow' if part == 'ForeArm' else 'knee'}"
+    hinge = "elbow" if part == "ForeArm" else "knee"
+    joint = f"{side.lower()} {hinge}"
     return (
-        f"the {joint} bends {100.0 * off_m:.1f} cm (1 sigma) out of its plane, and the solver permits this; "
-        f"to know it better, strap the cameras above and below the {joint} so that no camera slides, and "
-        f"check the cameras' clocks (offset_s) and the direction of the {joint}'s axis in the skeleton"
+        f"the {joint} moves {100.0 * off_m:.1f} cm (1 sigma) out of its bending plane, which a real "
+        f"{hinge} cannot do; to reduce this, strap the cameras above and below the {joint} so "
+        "that no camera slides, and check the cameras' clocks (offset_s) and the direction of the "
+        f"{joint}'s axis in the skeleton"
     )
 
 
@@ -166,21 +171,22 @@ def describe_scale(calibration: BodyCalibration) -> str:
         A sentence for the report. If the scale is not well known, the sentence contains advice.
     """
     scale = calibration.scale
-    text = f"the metric scale is known to {100.0 * scale.sigma_log:.1f} % (1 sigma)"
+    text = f"the uncertainty of the metric scale is {100.0 * scale.sigma_log:.1f} % (1 sigma)"
     used = {source.name for source in scale.sources if source.used}
     if scale.sigma_log <= _WELL_KNOWN_SCALE or used & {"known distance", "marker board"}:
         return text
-    ways = ["name a known distance (merge.known_distance) or a board in the room (merge.marker_board)"]
+    ways = ["give a known distance (merge.known_distance) or a board in the room (merge.marker_board)"]
     if len({mount.role for mount in calibration.mounts}) == 1:
         return (
-            f"{text}: all cameras are on one bone, so only their distances determine the scale; to know it "
-            f"better, wear a camera on another bone as well (a hand, an upper arm or the head), or {ways[0]}"
+            f"{text}, because all cameras are on one bone and only their distances determine the scale; to "
+            "reduce this, wear a camera on another bone as well (a hand, an upper arm or the head), or "
+            f"{ways[0]}"
         )
     if "mean stature" in used:
         ways.insert(0, "give the subject's height (height_m)")
     if calibration.t_pose_ns is None:
         ways.append("stand in a T-pose for two seconds first")
-    return f"{text}; to know it better, {' or '.join(ways)}"
+    return f"{text}; to reduce this, {' or '.join(ways)}"
 
 
 def describe_vertical(vertical: Vertical, way_up: str = "") -> str:
@@ -197,17 +203,17 @@ def describe_vertical(vertical: Vertical, way_up: str = "") -> str:
     text = f"the vertical is known to {vertical.sigma_deg:.1f}° (1 sigma), from the {vertical.source}{way_up}"
     if vertical.rests_on_lean_only():
         text = (
-            f"{text}, but it is not certain: only the posture shows it, and a constant lean of the trunk "
-            "cannot be seen in the posture"
+            f"{text}; the true error may be larger, because only the posture shows the vertical, and a "
+            "constant lean of the trunk cannot be seen in the posture"
         )
     elif not vertical.is_determined():
         text = (
-            f"{text}, but it is not certain: another, clearly different direction explains the observations "
-            f"nearly as well"
+            f"{text}; the true error may be larger, because another, clearly different direction explains "
+            "the observations nearly as well"
         )
     elif vertical.source != "body":
         return text
     return (
-        f"{text}; to know it better, walk a few steps upright, film the floor and two walls, or lay a "
-        f"marker board on the floor (merge.marker_board.placed)"
+        f"{text}; to reduce this, walk a few steps upright, film the floor and two walls, or lay a marker "
+        "board on the floor (merge.marker_board.placed)"
     )

@@ -1,1 +1,1 @@
-"""The world: planes of the map, the vertical, the floor, and the transform from the solved frame."""
+"""The world: planes of the map, the vertical, the floor, and the transform to the world."""

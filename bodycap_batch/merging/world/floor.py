@@ -120,8 +120,8 @@ def floor_beside_path(
     """Find the floor among the map points near the walked path, where no furniture can be.
 
     Args:
-        points_m: (P,3) map points in the solved frame.
-        path_m: (N,3) positions of the trunk in the solved frame.
+        points_m: (P,3) map points in the solved frame of reference.
+        path_m: (N,3) positions of the trunk in the solved frame of reference.
         up: The vertical. It must come from the map, because a tilt of two degrees spreads the points of a
             floor over a decimetre.
         expected_m: Height of the soles according to the body, metres.

@@ -1,4 +1,4 @@
-"""The vertical in the solved frame, selected from hypotheses of the map, the walk, the body and the job.
+"""Select the vertical from hypotheses of the map, the walk, the body and the job (solved frame of reference).
 
 For each hypothesis, the module computes the negative log-likelihood (nats) of all observations, on the
 assumption that the hypothesis is right. The negative log-likelihood is a sum of terms. The constants of the
@@ -76,7 +76,7 @@ class VerticalHypothesis:
 
     Attributes:
         source: Origin of the direction: "map" (planes of the map), "walk", "body" or "marker board".
-        up: (3,) unit vector in the solved frame.
+        up: (3,) unit vector in the solved frame of reference.
         sigma_deg: Sigma (degrees) of the direction, if this hypothesis is the right one.
         share: Fraction of the planes' points that agree with the direction; 0 if the direction does not come
             from planes.
@@ -93,7 +93,7 @@ class VerticalHypothesis:
 
 @dataclass(frozen=True, slots=True)
 class Vertical:
-    """The vertical in the solved frame.
+    """The vertical in the solved frame of reference.
 
     Attributes:
         up: (3,) unit vector that points up.
@@ -141,8 +141,8 @@ class SceneContext:
     """The map around a trunk, and the path of the trunk.
 
     Attributes:
-        points_m: (P,3) map points in the solved frame.
-        path_m: (N,3) positions of the trunk's camera in the solved frame.
+        points_m: (P,3) map points in the solved frame of reference.
+        path_m: (N,3) positions of the trunk's camera in the solved frame of reference.
         standing_m: Height (metres) of the trunk's joint above the soles of the standing person.
         walks: Whether the person walks most of the time.
     """

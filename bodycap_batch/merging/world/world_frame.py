@@ -1,4 +1,4 @@
-"""The rigid transform from the solved frame (metres, arbitrary axes) to the world."""
+"""The rigid transform from the solved frame of reference (metres, arbitrary axes) to the world."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def initial_heading(forward: FloatArray, centre_m: FloatArray, fps: float) -> fl
 def world_from_solved_frame(
     rotation: FloatArray, hips_m: FloatArray, floor_m: float, heading_rad: float
 ) -> Similarity:
-    """Return the rigid transform from the solved frame to the world.
+    """Return the rigid transform from the solved frame of reference to the world.
 
     Args:
-        rotation: (3,3) rotation that takes the up direction of the solved frame to +z.
+        rotation: (3,3) rotation that takes the up direction of the solved frame of reference to +z.
         hips_m: (3,) position of the hips at tick 0, after `rotation`. In the world, this position is above
             the origin.
         floor_m: Height of the floor in metres, after `rotation`. In the world, the floor is at z = 0.

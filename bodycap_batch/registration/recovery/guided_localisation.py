@@ -250,7 +250,7 @@ class GuidedLocaliser:
         )
 
     def _search(self, view: PredictedView, level: SearchLevel) -> PoseEstimate | None:
-        """Search the points that should be visible in a view, and estimate the pose from the matches."""
+        """Search for the points that should be visible in a view, and estimate the pose from the matches."""
         rows = select_patches(self.patches, view)
         if len(rows) < _MIN_MATCHES:
             return None

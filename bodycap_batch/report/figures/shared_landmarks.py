@@ -51,8 +51,8 @@ def draw_shared_landmarks(inputs: ReportInputs) -> str:
             description = (
                 f"{name} sees {counts[row, row]:,} points"
                 if row == column
-                else f"{name} and {other} share {counts[row, column]:,} points, "
-                f"{format_percent(share)} of {name}'s"
+                else f"{name} and {other} both see {counts[row, column]:,} points, which are "
+                f"{format_percent(share)} of the points of {name}"
             )
             x = _LEFT + column * _CELL
             opacity = 0.06 + 0.9 * min(share / _FULL_SHADE_SHARE, 1.0)

@@ -28,7 +28,7 @@ bits. A random token of this length cannot be guessed."""
 _PORT = re.compile(r":[0-9]{1,5}$")
 """Pattern of the port in a Host header. Browsers omit the default port. A port has at most five digits."""
 _TOKEN = re.compile(rf"[A-Za-z0-9_\-]{{{_MIN_TOKEN_LENGTH},200}}")
-_TOKEN_HINT = "python3 -c 'import secrets; print(secrets.token_urlsafe())' makes one"  # noqa: S105 - a hint
+_TOKEN_HINT = "to create a token, run: python3 -c 'import secrets; print(secrets.token_urlsafe())'"  # noqa: S105 - a hint
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,17 +115,24 @@ def access_from_address(address: str, token: str) -> Access:
     host = host.strip("[]")
     if not host or not port.isdecimal() or not 0 <= int(port) < 1 << 16:
         raise JobError(
-            f"not an address: {address!r}", field="--web", hint="HOST:PORT, for example 127.0.0.1:8080"
+            f"{address!r} is not an address",
+            field="--web",
+            hint="write HOST:PORT, for example 127.0.0.1:8080",
         )
     if not is_loopback(host) and not token:
         raise JobError(
             f"{host} can be reached from other machines, so the page needs a token",
             field="--web",
-            hint=f"set BODYCAP_WEB_TOKEN ({_TOKEN_HINT}), or listen on 127.0.0.1 and use an SSH tunnel",
+            hint=f"set BODYCAP_WEB_TOKEN to a token ({_TOKEN_HINT}), or use --web 127.0.0.1:{port} and an "
+            "SSH tunnel",
         )
     if token and not _TOKEN.fullmatch(token):
-        hint = f"at least {_MIN_TOKEN_LENGTH} letters, digits, - or _; {_TOKEN_HINT}"
-        raise JobError("the token is too short or has other characters", field="BODYCAP_WEB_TOKEN", hint=hint)
+        hint = f"use at least {_MIN_TOKEN_LENGTH} letters, digits, - or _; {_TOKEN_HINT}"
+        raise JobError(
+            "the token is too short or contains characters that are not permitted",
+            field="BODYCAP_WEB_TOKEN",
+            hint=hint,
+        )
     return Access(host=host, port=int(port), token=token)
 
 

@@ -44,7 +44,7 @@ class LivePage:
     ) -> None:
         missing = [name for name in ("starlette", "uvicorn") if importlib.util.find_spec(name) is None]
         if missing:
-            hint = "pip install 'bodycap_batch[web]', or `make extras` in a clone"
+            hint = "run: pip install 'bodycap_batch[web]' (or `make extras` in a clone)"
             raise JobError(f"the live page needs {' and '.join(missing)}", field="--web", hint=hint)
         self._socket = _listen(access)
         self.access = replace(access, port=self._socket.getsockname()[1])
@@ -118,6 +118,6 @@ def _listen(access: Access) -> socket.socket:
         raise JobError(
             f"cannot listen on {access.host}:{access.port}: {error.strerror or error}",
             field="--web",
-            hint="another program uses the port, or the address belongs to another machine; "
-            "try --web 127.0.0.1:8081",
+            hint="try --web 127.0.0.1:8081; another program may use the port, or the address may belong "
+            "to another machine",
         ) from error

@@ -85,17 +85,19 @@ class Uploads:
 
         Raises:
             JobError: The name cannot be used, or too many folders are being uploaded.
+            StoreError: The folder of the upload cannot be created.
         """
         _require_short(name.strip())
         if not _NAME.fullmatch(name.strip()):
-            hint = "letters, digits, spaces; no / and no leading dot"
+            hint = "use letters, digits and spaces, but no / and no dot at the start"
             raise JobError(f"{name[:40]!r} cannot be the name of a job", hint=hint)
         self.remove_idle()
         with self._lock:
             if len(self._open) >= _MAX_OPEN_UPLOADS:
                 raise JobError(
                     f"{_MAX_OPEN_UPLOADS} folders are being sent already",
-                    hint="wait until one is complete; an upload without new data ends after 15 minutes",
+                    hint="wait until one of these folders is complete; an upload without new data ends after "
+                    "15 minutes",
                 )
             key = uuid.uuid4().hex
             folder = self._spool.inbox / f"{_PREFIX}{process_tag()}-{key}"
@@ -146,7 +148,10 @@ class Uploads:
             upload = self._get(key)
             if upload.coming:
                 some = ", ".join(sorted(upload.coming)[:3])
-                raise JobError(f"{some}: still being sent", hint="finish when every file is complete")
+                raise JobError(
+                    f"{some}: the browser is still sending this file",
+                    hint="wait until every file is complete",
+                )
             if not any(PurePosixPath(name).suffix.lower() in VIDEO_SUFFIXES for name in upload.files):
                 raise JobError(
                     "no video was sent", hint="name the videos torso.mp4, left_palm.mp4, right_palm.mp4"
@@ -228,20 +233,30 @@ class Uploads:
         if name.lower() in {other.lower() for other in sent} or (upload.folder / path).exists():
             raise JobError(f"{name} was sent twice", hint="give each file its own name")
         if any(str(path.parent) == other or str(PurePosixPath(other).parent) == name for other in sent):
-            raise JobError(f"{name} is both a file and a folder", hint="rename one of them")
+            raise JobError(f"{name} is both a file and a folder", hint="rename the file or the folder")
         if len(sent) >= self._limits.files:
-            raise CaptureError(f"more than {self._limits.files:g} files", hint="send one recording only")
+            raise CaptureError(
+                f"the folder contains more than {self._limits.files:g} files", hint="send one recording only"
+            )
         most = 1e9 * self._limits.video_gb if video else _MAX_OTHER_BYTES
         if size == 0:
             raise CaptureError("the file is empty", path=name, hint="copy it again from the camera")
         if size > most:
-            hint = "cut the recording, or ask the operator to raise --limit video_gb"
-            raise CaptureError(f"{size / 1e9:.3g} GB, the limit is {most / 1e9:.3g}", path=name, hint=hint)
+            hint = (
+                "shorten the recording, or ask the operator of the watched folder to raise --limit video_gb"
+            )
+            raise CaptureError(
+                f"the file has {size / 1e9:.3g} GB, but the limit is {most / 1e9:.3g} GB",
+                path=name,
+                hint=hint,
+            )
         # Subtract the bytes that are still to be received, so that several uploads do not fill the disk.
         coming = sum(sum(other.coming.values()) for other in self._open.values())
         if shutil.disk_usage(upload.folder).free - coming - size < _MIN_FREE_BYTES:
             raise StoreError(
-                "too little space on the disk", path=self._spool.inbox, hint="free some space, then try again"
+                "the disk has too little free space",
+                path=self._spool.inbox,
+                hint="free some space, then try again",
             )
         return path
 
@@ -292,8 +307,8 @@ async def _receive_file(target: Path, size: int, chunks: AsyncIterator[bytes]) -
     try:
         written = await _write_chunks(partial, size, chunks)
         if written != size:
-            message = f"received {written} bytes, the browser stated {size}"
-            raise CaptureError(message, path=target.name, hint="send it again")
+            message = f"{written} bytes of the file arrived, but the browser stated {size} bytes"
+            raise CaptureError(message, path=target.name, hint="send the file again")
         partial.rename(target)
     finally:
         partial.unlink(missing_ok=True)

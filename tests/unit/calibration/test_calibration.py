@@ -137,7 +137,9 @@ def test_the_preview_is_undistorted(result, tmp_path):
 
 def test_a_clip_without_the_board_is_refused_with_numbers(tmp_path):
     clip = _clip(tmp_path, PINHOLE_LENS, CHARUCO, views=4)
-    with pytest.raises(CaptureError, match=r"found in 0 of 4 inspected pictures; 8 are needed") as refused:
+    with pytest.raises(
+        CaptureError, match=r"found in 0 of 4 inspected pictures, but 8 pictures with the board are needed"
+    ) as refused:
         calibrate_clip(clip, CHESSBOARD, "auto", StageContext(work_dir=tmp_path))
     assert "inner corners" in refused.value.hint
 
@@ -155,11 +157,11 @@ def test_the_command_writes_calibration_and_preview(clip, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "name one board"),
-        (["--charuco", "9x6", "--chessboard", "9x6"], "name one board"),
-        (["--charuco", "nine"], "not a board size"),
+        ([], "exactly one board is needed"),
+        (["--charuco", "9x6", "--chessboard", "9x6"], "exactly one board is needed"),
+        (["--charuco", "nine"], "is not the size of a board"),
         (["--charuco", "2x2"], "too small"),
-        (["--charuco", "9x6", "--dictionary", "9X9"], "unknown markers"),
+        (["--charuco", "9x6", "--dictionary", "9X9"], "no family of markers"),
         (["--charuco", "9x6", "--marker", "1.5"], "cannot be 1.5 times as wide as a square"),
     ],
 )

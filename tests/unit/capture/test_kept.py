@@ -110,7 +110,7 @@ def test_copies_that_cannot_be_read_are_replaced_by_the_video_and_reported(
     copy = tmp_path / "kept.mp4"
     copy.write_bytes(copy.read_bytes()[:size])
     assert_same(both(kept, [0, 3, 4, 7, 11]), both(camera, [0, 3, 4, 7, 11]))
-    assert any("kept copy" in message and str(copy) in message for message in caplog.messages)
+    assert any("stored copy" in message and str(copy) in message for message in caplog.messages)
 
 
 def test_a_whole_video_is_not_decoded_twice(tmp_path: Path) -> None:

@@ -35,9 +35,9 @@ def test_a_mask_is_read_at_the_size_of_the_picture(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("image", "reason"),
     [
-        (np.full((480, 480), 255, np.uint8), "aspects differ"),
+        (np.full((480, 480), 255, np.uint8), "aspect ratios differ"),
         (np.zeros((480, 640), np.uint8), "inverted"),
-        (None, "not an image"),
+        (None, "cannot be read as a picture"),
     ],
 )
 def test_a_useless_mask_is_refused_with_its_reason(
@@ -45,7 +45,7 @@ def test_a_useless_mask_is_refused_with_its_reason(
 ) -> None:
     path = tmp_path / "mask.png"
     if image is None:
-        path.write_bytes(b"not an image")
+        path.write_bytes(b"cannot be read as a picture")
     else:
         _write(path, image)
     with pytest.raises(CaptureError) as caught:

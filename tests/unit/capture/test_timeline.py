@@ -139,7 +139,7 @@ def test_a_gap_between_chapters_is_reported_and_kept(tmp_path: Path) -> None:
     second = write_video(tmp_path / "a2.mp4", FRAMES, metadata={"creation_time": "2026-03-01T10:00:20Z"})
     camera = opened(first, second)
     assert camera.times_ns[12] == pytest.approx(20e9, abs=2)
-    assert camera.notes == ("a gap of 19.60 s between a1.mp4 and a2.mp4",)
+    assert camera.notes == ("there is a gap of 19.60 s between a1.mp4 and a2.mp4",)
 
 
 def test_the_same_creation_time_says_nothing(tmp_path: Path) -> None:

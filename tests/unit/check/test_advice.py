@@ -53,27 +53,27 @@ def test_a_guessed_lens_and_a_height_without_skeleton_give_advice(tmp_path: Path
     walk(tmp_path)
     assert "board" not in advice(tmp_path)
     (tmp_path / "calib.json").unlink()
-    assert "the lens of head and torso will be estimated" in advice(tmp_path)
+    assert "estimates the lens of head and torso" in advice(tmp_path)
     assert "--skeleton" in advice(tmp_path, height_m=1.75)
 
 
 def test_a_camera_that_ends_early_or_runs_slowly_is_named(tmp_path: Path) -> None:
     walk(tmp_path, frames=30, fps=15)
-    assert "head runs at 15 frames a second" in advice(tmp_path)
+    assert "head records 15 frames per second" in advice(tmp_path)
     write_video(tmp_path / "torso.mp4", [room(index // 25) for index in range(180)], gop=5)
     assert "head ends 4.0 s before the others" in advice(tmp_path)
 
 
 def test_the_duration_of_a_long_capture_is_estimated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bodycap_batch.check.recording_advice._LONG_CAPTURE_S", 4.0)
-    assert "5 s of video in all: expect 1 to 1 minutes" in advice(walk(tmp_path))
+    assert "the videos last 5 s in all: expect a run time of 1 to 1 minutes" in advice(walk(tmp_path))
 
 
 @pytest.mark.parametrize(
     ("pictures", "expected"),
     [
         (lambda seed: room(seed, texture=False), "show hardly any texture"),
-        (lambda seed: room(seed, brightness=0.25), "dark pictures (median grey 3"),
+        (lambda seed: room(seed, brightness=0.25), "the pictures are dark (median grey value 3"),
     ],
 )
 def test_untextured_and_dark_pictures_are_reported_for_that_camera_only(

@@ -48,8 +48,8 @@ def test_a_plain_file_gives_no_note(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"EISE": "Y", "EISA": "HS High"}, "stabilised in the camera (HS High)"),
-        ({"EISA": "Y"}, "stabilised in the camera:"),
+        ({"EISE": "Y", "EISA": "HS High"}, "the camera stabilised the video (HS High)"),
+        ({"EISA": "Y"}, "the camera stabilised the video:"),
         ({"FMWR": "HD9.01.01", "DZOM": "Y"}, "digital zoom"),
     ],
 )
@@ -95,8 +95,8 @@ def test_a_phone_gives_a_note_on_stabilisation(tmp_path):
 def test_a_variable_rate_is_reported_with_the_setting_to_change(tmp_path):
     steps = np.where(np.arange(74) // 20 % 2, 10, 20)
     (note,) = _notes(tmp_path, pts=np.concatenate([[0], np.cumsum(steps)]).tolist())
-    assert "varies between 15 and 30 per second" in note
-    assert "fixed rate" in note
+    assert "varies between 15 and 30 frames per second" in note
+    assert "fixed frame rate" in note
 
 
 def test_dropped_frames_and_jitter_are_not_a_variable_rate(tmp_path):

@@ -78,11 +78,11 @@ def test_chapters_are_one_camera_with_an_unknown_mount(
     for name in ("GX020042.mp4", "GX010042.mp4"):
         write_video(folder / name, FRAMES[:10])
     assert main(["init", str(folder)]) == 0
-    assert "fill in `mount:`, the place on the body, of 1 camera, then" in capsys.readouterr().out
+    assert "fill in `mount:` (the place on the body) of 1 camera in the file" in capsys.readouterr().out
     data = yaml.safe_load((folder / "job.yaml").read_text())
     (gopro,) = (camera for camera in data["capture"]["cameras"] if camera.get("mount"))
     assert gopro["video"] == ["GX010042.mp4", "GX020042.mp4"]
-    with pytest.raises(JobError, match="still to be filled in: where on the body") as caught:
+    with pytest.raises(JobError, match="on the body is not filled in") as caught:
         load_job(folder / "job.yaml")
     assert caught.value.line
     assert "left_palm" in str(caught.value.hint)
@@ -131,7 +131,7 @@ def test_a_calibration_that_is_made_after_init_is_used(folder: Path) -> None:
 
 def options_without_comment_signs(text: str) -> dict[str, Any]:
     """Return the options after the last heading, without their comment signs."""
-    lines = text.partition("change what you need, leave the rest.\n")[2].splitlines()
+    lines = text.partition("remove the # before it.\n")[2].splitlines()
     assert all(line.startswith("#") for line in lines)
     return dict(yaml.safe_load("\n".join(line.removeprefix("# ") for line in lines)))
 
@@ -154,6 +154,6 @@ def test_an_existing_job_file_is_kept_without_force(folder: Path, capsys: pytest
 
 
 def test_a_folder_without_videos_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="no video in this folder"):
+    with pytest.raises(CaptureError, match="the folder contains no video"):
         write_job_template(tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -165,20 +165,20 @@ def test_results_do_not_lie_among_what_they_are_made_from(tmp_path: Path) -> Non
 
 def test_a_camera_whose_videos_did_not_come_along(tmp_path: Path) -> None:
     root = folder(tmp_path, "torso.mp4", "left_palm.mp4", "gt/a.tum", "right_palm/notes.txt")
-    with pytest.raises(CaptureError, match="no video in this camera's folder"):
+    with pytest.raises(CaptureError, match="the folder of this camera contains no video"):
         load_job(root)
     folder(root, "right_palm/GX010001.MP4")
     (root / "head.mp4").symlink_to(tmp_path / "unplugged" / "head.mp4")
-    with pytest.raises(CaptureError, match="leads nowhere") as caught:
+    with pytest.raises(CaptureError, match="leads to a file that does not exist") as caught:
         load_job(root)
     assert caught.value.path == str(root / "head.mp4")
     (root / "job.yaml").write_text("height_m: 1.8\n")
-    with pytest.raises(CaptureError, match="leads nowhere"):
+    with pytest.raises(CaptureError, match="leads to a file that does not exist"):
         load_job(root)
 
 
 def test_a_video_is_no_job(tmp_path: Path) -> None:
-    with pytest.raises(JobError, match="a video is not a job") as caught:
+    with pytest.raises(JobError, match="this file is a video, not a job") as caught:
         load_job(folder(tmp_path, "torso.mp4") / "torso.mp4")
     assert str(tmp_path) in str(caught.value.hint)
 
@@ -226,7 +226,7 @@ def test_a_name_is_asked_for_instead_of_guessed(tmp_path: Path) -> None:
 
 
 def test_two_of_one_name(tmp_path: Path) -> None:
-    with pytest.raises(JobError, match="two cameras named") as caught:
+    with pytest.raises(JobError, match="two cameras would have the name") as caught:
         load_job(folder(tmp_path, "torso.mp4", "torso.mov"))
     assert "rename" in str(caught.value.hint)
 
@@ -254,7 +254,7 @@ def test_sidecars_of_some_chapters_only(tmp_path: Path) -> None:
         "torso/GX010001.timestamps.txt",
         "torso/GX020001.timestamps.txt",
     )
-    with pytest.raises(CaptureError, match="2 timestamp files for 3 chapters"):
+    with pytest.raises(CaptureError, match="2 files of timestamps for 3 chapters"):
         load_job(root)
 
 

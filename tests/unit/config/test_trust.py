@@ -46,7 +46,7 @@ def test_nothing_outside_is_read_before_it_is_refused(folder: Path, tmp_path: Pa
     with pytest.raises(JobError, match="outside") as refused:
         load_job(folder, policy=PathPolicy(folder=folder))
     assert "password" not in str(refused.value)
-    with pytest.raises(CaptureError, match="not JSON"):
+    with pytest.raises(CaptureError, match="not valid JSON"):
         load_job(folder)
 
 

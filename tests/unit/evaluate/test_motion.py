@@ -119,10 +119,10 @@ def test_only_the_selected_joints_are_compared() -> None:
 def test_errors_name_what_cannot_be_compared(tmp_path: Path) -> None:
     write_bvh(tmp_path / "a.bvh", swinging())
     np.savez(tmp_path / "b.npz", names=["root", "tail"], t=np.arange(3), world=np.zeros((3, 2, 3)))
-    with pytest.raises(JobError, match="share 1 joints"):
+    with pytest.raises(JobError, match="have 1 joints in common"):
         evaluate_motion(tmp_path / "a.bvh", tmp_path / "b.npz")
     (tmp_path / "c.npz").write_bytes(b"no zip")
-    with pytest.raises(JobError, match="not a joints file"):
+    with pytest.raises(JobError, match="cannot be read as a file of joint positions"):
         evaluate_motion(tmp_path / "a.bvh", tmp_path / "c.npz")
-    with pytest.raises(JobError, match="share no time"):
+    with pytest.raises(JobError, match="have no time in common"):
         evaluate_motion(tmp_path / "a.bvh", tmp_path / "a.bvh", MotionOptions(offset_s=100.0))

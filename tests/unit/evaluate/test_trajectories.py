@@ -220,15 +220,15 @@ def test_a_camera_without_poses_counts_against_coverage() -> None:
     assert (score.cameras["b"].coverage, score.total.coverage) == (0.0, 0.5)
     with pytest.raises(JobError, match="0 frames have estimated and true poses of both"):
         relative_camera_error({"a": walk(0), "b": nothing}, truths, "a", "b")
-    with pytest.raises(JobError, match="truth of camera b has no poses"):
+    with pytest.raises(JobError, match="true path of camera b has no poses"):
         score_trajectories({"b": walk(0)}, {"b": nothing})
 
 
 def test_missing_truth_and_other_clocks_are_named() -> None:
-    with pytest.raises(JobError, match="no truth for camera b"):
+    with pytest.raises(JobError, match="no true path for camera b"):
         score_trajectories({"a": walk(0), "b": walk(0)}, {"a": walk(0)})
     other = TimedPoses(times_ns=np.arange(5), world_from_cam=walk(0, 5).world_from_cam)
-    with pytest.raises(JobError, match="0 poses have a true pose"):
+    with pytest.raises(JobError, match="only 0 poses have a true pose"):
         score_trajectories({"a": walk(0)}, {"a": other})
 
 

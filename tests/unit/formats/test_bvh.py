@@ -291,20 +291,20 @@ def test_no_motion(tmp_path: Path, tail: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "line", "message"),
     [
-        ("HIERARCHY", "HIERACHY", 1, "begins with HIERARCHY"),
+        ("HIERARCHY", "HIERACHY", 1, "does not begin with HIERARCHY"),
         ("OFFSET 20 0 0", "OFFSET 20 0", 8, "3 numbers"),
         ("OFFSET 20 0 0", "OFFSET 20 0 x", 8, "not a number"),
         ("OFFSET 20 0 0", "OFFSET 20 0 nan", 8, "finite"),
         ("    OFFSET 20 0 0\n", "", 6, "no OFFSET"),
         ("CHANNELS 3 Z", "CHANNELS 4 Z", 9, "CHANNELS 4"),
-        ("CHANNELS 3 Zrot", "CHANNELS 3 Wrot", 9, "unknown channel"),
-        ("JOINT", "JIONT", 6, "unknown keyword"),
+        ("CHANNELS 3 Zrot", "CHANNELS 3 Wrot", 9, "the channel 'Wrotation' is unknown"),
+        ("JOINT", "JIONT", 6, "the keyword 'JIONT' is unknown"),
         ("JOINT", "ROOT", 6, "second ROOT"),
         ("  }\n}\nMOTION", "  }\n}\n}\nMOTION", 16, "closing brace"),
-        ("  }\n}\nMOTION", "  }\nMOTION", 15, "open block"),
+        ("  }\n}\nMOTION", "  }\nMOTION", 15, "before the hierarchy is complete"),
         ("Frames: 2", "Frames: two", 17, "not a number"),
-        ("Frames: 2", "Frames: 3", 20, "ends after"),
-        ("Frames: 2", "Frames: 2000000000", 18, "do not fit"),
+        ("Frames: 2", "Frames: 3", 20, "contains only"),
+        ("Frames: 2", "Frames: 2000000000", 18, "cannot contain"),
         ("Frame Time: 0.0333333", "Frame Time: 0", 18, "positive"),
         ("1 100 2 0 0 90 0 0 0", "1 100 2 0 0 90 0 0 -1.#IND", 20, "not a number"),
         ("1 100 2 0 0 90 0 0 0", "1 100 2 0 0 90 0 0 inf", 20, "infinity"),
@@ -319,7 +319,7 @@ def test_broken_files_are_named(tmp_path: Path, old: str, new: str, line: int, m
 
 
 def test_missing_binary_and_empty_files(tmp_path: Path, rng: np.random.Generator) -> None:
-    with pytest.raises(JobError, match="cannot read"):
+    with pytest.raises(JobError, match="cannot be read"):
         read_bvh(tmp_path / "none.bvh")
     (tmp_path / "noise.bvh").write_bytes(rng.bytes(100_000))
     with pytest.raises(JobError, match="HIERARCHY"):

@@ -48,7 +48,7 @@ def test_paths_keep_every_vertex_and_leave_gaps_open() -> None:
 def test_a_missing_folder_is_created_and_a_forbidden_one_is_an_error(tmp_path: Path) -> None:
     write_ply(tmp_path / "new" / "map.ply", cloud(1))
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match="cannot write"):
+    with pytest.raises(StoreError, match="cannot be written"):
         write_ply(tmp_path / "file" / "map.ply", cloud(1))
 
 

@@ -80,7 +80,7 @@ def test_broken_rows_are_named(tmp_path: Path, row: str, message: str) -> None:
 
 
 def test_missing_and_empty_files(tmp_path: Path) -> None:
-    with pytest.raises(JobError, match="cannot read"):
+    with pytest.raises(JobError, match="cannot be read"):
         read_tum(tmp_path / "none.tum")
     (tmp_path / "empty.tum").write_text("\n")
     with pytest.raises(JobError, match="no poses"):

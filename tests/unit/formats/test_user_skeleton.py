@@ -97,7 +97,7 @@ def test_overrides_move_roles(tmp_path: Path) -> None:
         (RigOptions(roles={"Neck": "Tentacle"}), "no role 'Tentacle'", "one of"),
         (RigOptions(roles={"Neck": "Head", "Spine": "Head"}), "two joints", "one joint"),
         (RigOptions(tpose_frame=2), "no frame 2", "the file has 2"),
-        (RigOptions(tpose_frame=-1), "no frame -1", "counted from 0"),
+        (RigOptions(tpose_frame=-1), "no frame -1", "the first frame is 0"),
     ],
 )
 def test_what_does_not_exist_is_named(tmp_path: Path, options: RigOptions, message: str, hint: str) -> None:
@@ -122,7 +122,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main(["skeleton", str(tmp_path / "rig.bvh"), "--tpose-frame", "1", "--map", "Neck=none"]) == 0
     out = capsys.readouterr().out
     assert "arms stretched out to the sides (T-pose)" in out
-    assert "missing: Neck" in out
+    assert "roles without a joint: Neck" in out
     assert 'skeleton_map: {"Neck": none}' in out
     assert "tpose_frame: 1" in out
     assert main(["skeleton", str(tmp_path / "rig.bvh"), "--json"]) == 0

@@ -172,9 +172,9 @@ def test_two_cameras_that_see_mirror_images_are_both_kept_and_named(tmp_path: Pa
     left, diagnostics = _remaining(tmp_path, _Pan("left", 0, mirrored=True), _Pan("torso", 150))
     assert (left, diagnostics) == (["left", "torso"], LEFT_OR_TORSO)
     (note,) = flip_notes(diagnostics)
-    assert note.startswith("cameras left and torso see mirror images of each other: that is right if")
+    assert note.startswith("cameras left and torso see mirror images of each other: the result is right if")
     assert note.count("wrong") == 1
-    assert note.endswith("flip it back: ffmpeg -i in -vf hflip out.mp4")
+    assert note.endswith("may have mirrored the picture")
     error = add_flip_hint(EstimationError("too few", hint="film more"), diagnostics)
     assert error is not None
     assert error.hint is not None
@@ -212,7 +212,7 @@ def test_an_initial_pair_of_an_excluded_camera_is_not_used(tmp_path: Path) -> No
     assert options.init_frames is None
     assert diagnostics.excluded_from_pair == ("left",)
     assert "left out" in diagnostics.to_log()["named_initial_pair"]["failed"]
-    note = "map.init_frames is not used, because it names camera left, which is left out"
+    note = "map.init_frames is not used, because one of its frames belongs to camera left, which is left out"
     assert note in flip_notes(diagnostics)
 
 

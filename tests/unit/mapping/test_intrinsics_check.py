@@ -80,14 +80,14 @@ def test_the_note_says_what_to_do():
     assert "12 % longer" in misfit_note("torso", 1.12)
     assert "12 % shorter" in misfit_note("torso", 0.88)
     assert "stabilisation" in misfit_note("torso", 0.88)
-    assert "another centre or distortion than" in misfit_note("torso", 1.002, freed=True)
+    assert "another image centre or another distortion than" in misfit_note("torso", 1.002, freed=True)
 
 
 @pytest.mark.parametrize("factor", [0.95, 1.0, 1.006, 1.05])
 def test_the_note_on_a_wrong_centre_does_not_name_the_focal_length(factor):
     note = misfit_note("torso", factor)
     assert "focal length" not in note
-    assert "another centre than" in note
+    assert "another image centre than" in note
     assert "cropped" in note
 
 

@@ -50,7 +50,7 @@ def test_a_known_distance_gives_the_scale(inputs):
         ("chest:0", "torso:80", JobError, "no camera 'chest'"),
         ("torso:0", "torso:8000", JobError, "no frame 8000"),
         ("torso:0", "left_palm:33", EstimationError, "not localised"),
-        ("torso:5", "torso:5", EstimationError, "too near"),
+        ("torso:5", "torso:5", EstimationError, "too close"),
     ],
 )
 def test_an_unusable_known_distance_is_refused_with_the_reason(inputs, first, second, error, says):
@@ -64,7 +64,7 @@ def test_a_known_distance_needs_one_map(inputs):
         for each in inputs[1].trajectories
     )
     apart = replace(inputs[1], trajectories=trajectories)
-    with pytest.raises(JobError, match="share no view"):
+    with pytest.raises(JobError, match="have no place in common"):
         known_distance(apart.trajectories, ("torso:0", "left_palm:0", 1.0))
 
 
@@ -74,13 +74,13 @@ def test_every_mount_has_a_movement_that_reduces_its_uncertainty():
         mount = nominal_mount("cam", role, skeleton)
         sentence = describe_mount(mount, t_pose=False)
         assert "15.0° and 2.9 cm" in sentence
-        assert "to know it better" in sentence
+        assert "to reduce this" in sentence
         assert "T-pose" in sentence
         side = "left" if role.startswith("Left") else "right"
         assert role in ("Hips", "Spine", "Spine1", "Neck", "Head") or side in sentence
         assert "T-pose" not in describe_mount(mount, t_pose=True)
         known = replace(mount, sigma_rad=0.03, sigma_m=0.01)
-        assert "better" not in describe_mount(known, t_pose=False)
+        assert "reduce" not in describe_mount(known, t_pose=False)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_the_advice_on_the_scale_depends_on_the_bones_with_cameras(roles, advice
         t_pose_ns=None,
     )
     sentence = describe_scale(calibrated)
-    assert "known to 27.0 % (1 sigma)" in sentence
+    assert "the uncertainty of the metric scale is 27.0 % (1 sigma)" in sentence
     assert advice in sentence
     assert "merge.known_distance" in sentence
 

@@ -73,7 +73,9 @@ def test_the_reference_camera_is_on_the_trunk_or_else_on_the_head(capture):
     assert _names(candidate_main_maps(capture.inputs)[0][0])[:2] == ["torso", "head"]
     lost = _lose(capture.inputs, "torso", 6)
     assert _names(candidate_main_maps(lost)[0][0])[0] == "head"
-    assert rarely_localised(lost.trajectories) == {"torso": f"6 localised frames of {6 * 30}, 15 needed"}
+    assert rarely_localised(lost.trajectories) == {
+        "torso": f"only 6 of {6 * 30} frames were localised, but 15 are needed"
+    }
 
 
 def _noise(rng, count, sigma_rad=NOISE_RAD, sigma_m=NOISE_M):
@@ -226,7 +228,8 @@ def test_hands_alone_do_not_determine_the_scale_and_the_error_names_what_is_miss
         ),
     )
     with pytest.raises(
-        EstimationError, match=r"no two cameras .*'left_palm', 'right_palm' can be used; 'torso'"
+        EstimationError,
+        match=r"no two cameras .*are 'left_palm', 'right_palm'; the unusable cameras are 'torso'",
     ):
         align_usable_cameras(_lose(hands, "torso", 6), lambda: None)
     nobody = replace(hands, trajectories=hands.trajectories[:1])

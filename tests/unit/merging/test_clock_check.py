@@ -61,7 +61,7 @@ def test_a_wrong_clock_is_reported_with_the_right_offset(late_s: float) -> None:
     assert doubt["shift_s"] == pytest.approx(-late_s, abs=0.1)
     assert doubt["scatter_left"] < 0.7
     way = "behind" if late_s < 0.0 else "ahead"
-    assert f"s {way}; with an offset_s of about 2.0 its position" in describe_clock(
+    assert f"s {way}: with an offset_s of about 2.0, its position" in describe_clock(
         "palm", **doubt, offset_s=2.0
     )
 

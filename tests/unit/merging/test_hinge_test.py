@@ -91,8 +91,8 @@ def test_only_cameras_on_both_sides_contradict_a_hinge(cameras, tested):
 
 def test_a_violated_hinge_is_described_with_advice():
     sentence = describe_hinge("LeftForeArm", FREE_SIGMA_M)
-    assert "left elbow bends 10.0 cm" in sentence
-    assert "; to know it better, strap" in sentence
+    assert "left elbow moves 10.0 cm" in sentence
+    assert "; to reduce this, strap" in sentence
     # A palm's clock that is 60 ms off looks like a violated hinge as well.
     assert "check the cameras' clocks (offset_s)" in sentence
     assert "right knee" in describe_hinge("RightLeg", 0.02)

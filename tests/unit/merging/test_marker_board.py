@@ -194,7 +194,7 @@ def test_a_board_without_enough_views_is_refused():
     rng = np.random.default_rng(0)
     asked = MergeOptions(marker_board=FLAT)
     assert locate_board(_inputs(_path(4)).trajectories, (), None) is None
-    with pytest.raises(EstimationError, match="found in 2 keyframes"):
+    with pytest.raises(EstimationError, match="found in only 2 keyframes"):
         _scale(_inputs(_path(2), _views(_path(2), rng)), asked)
     still = np.repeat(_path(1), 6, axis=0)
     still[:, :3, 3] += rng.normal(scale=1e-3, size=(6, 3))

@@ -192,7 +192,7 @@ def test_a_stated_scale_permits_an_alignment_with_inconsistent_scales(short, mon
         align_cameras(short.inputs, main, further[:1], lambda: None, options).unused
         for options in (MergeOptions(), _distance(short, "torso"))
     )
-    assert "disagree on the scale" in refused[further[0].camera]
+    assert "the scale from the movement of the cameras differ" in refused[further[0].camera]
     assert not placed
 
 

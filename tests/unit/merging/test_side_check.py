@@ -52,7 +52,7 @@ def _tracks(*sides: tuple[str, float], down_rad: float = 0.0, count: int = 90) -
 def test_swapped_sides_are_found() -> None:
     wrong = swapped_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3), ("head", 0.0)), MOUNTS, UP)
     assert wrong == {"left_palm": 1.0, "right_palm": 1.0}
-    assert describe_swapped_sides(wrong).startswith("left_palm and right_palm stay on the other side")
+    assert describe_swapped_sides(wrong).startswith("left_palm and right_palm stay on the wrong side")
 
 
 @pytest.mark.parametrize(

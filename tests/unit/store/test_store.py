@@ -372,7 +372,7 @@ def test_a_file_that_grows_while_it_is_read_is_refused(tmp_path: Path) -> None:
         with video.open("ab") as stream:
             stream.write(b"more" if video.stat().st_size < 1000 else b"")
 
-    with pytest.raises(CaptureError, match="changes while it is read"):
+    with pytest.raises(CaptureError, match="changed while the program read it"):
         FileDigests(tmp_path / "digests").sha256(video, grow)
 
 

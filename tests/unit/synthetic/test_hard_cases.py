@@ -86,8 +86,8 @@ def test_a_bare_room_has_pictures_on_its_walls_only():
     ("values", "message"),
     [
         ({"pressed_s": {"torso": (1.0, 2.0)}, "body_in_view": True}, "no camera torso on a hand"),
-        ({"pressed_s": {"left_palm": (2.0, 1.0)}, "body_in_view": True}, "before it gets there"),
-        ({"pressed_s": {"left_palm": (1.0, 2.0)}}, "needs body_in_view"),
+        ({"pressed_s": {"left_palm": (2.0, 1.0)}, "body_in_view": True}, "is not after its start"),
+        ({"pressed_s": {"left_palm": (1.0, 2.0)}}, "without body_in_view"),
     ],
 )
 def test_invalid_presses_are_refused(values, message):

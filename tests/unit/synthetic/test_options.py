@@ -22,10 +22,10 @@ def test_every_camera_model_has_default_parameters(model):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"cameras": ("elbow_x",)}, "no place on the body"),
-        ({"cameras": ("torso", "torso")}, "every name once"),
-        ({"lens": "MAGIC"}, "unknown model"),
-        ({"lens": "OPENCV", "lens_params": (1.0, 2.0)}, "takes 8 parameters"),
+        ({"cameras": ("elbow_x",)}, "not the name of a place on the body"),
+        ({"cameras": ("torso", "torso")}, "each name must occur only once"),
+        ({"lens": "MAGIC"}, "no camera model"),
+        ({"lens": "OPENCV", "lens_params": (1.0, 2.0)}, "needs 8 parameters"),
         ({"offsets_s": {"head": 0.1}}, "no camera head"),
         ({"offsets_s": {"torso": -5.0}}, "greater than or equal to -3"),
         ({"exposure_s": 0.05}, "frame interval"),
