@@ -39,6 +39,7 @@ class CameraSummary:
         lens: Description of the intrinsics for the user.
         notes: Notes for the user that are not errors.
         guessed_lens: True if the camera has no calibration.
+        is_static: True if the inspected pictures stand still throughout the recording.
     """
 
     name: str
@@ -56,6 +57,7 @@ class CameraSummary:
     lens: str
     notes: tuple[str, ...] = ()
     guessed_lens: bool = False
+    is_static: bool = False
 
     @property
     def large_frames(self) -> int:

@@ -14,14 +14,20 @@ from bodycap_batch.capture import CaptureCamera, open_camera
 from bodycap_batch.check.camera_settings import setting_notes
 from bodycap_batch.check.check_report import CameraSummary, CheckReport
 from bodycap_batch.check.file_mixups import require_distinct_videos
-from bodycap_batch.check.picture_quality import check_picture_quality
+from bodycap_batch.check.picture_quality import PictureQuality, check_picture_quality, stands_still
 from bodycap_batch.check.recording_advice import advise
 from bodycap_batch.config.folder import job_file_in
 from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
 from bodycap_batch.config.rules import named_frames
 from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.core.errors import BodycapError, CaptureError, JobError
+from bodycap_batch.core.errors import (
+    NO_MOTION_HINT,
+    BodycapError,
+    CaptureError,
+    EstimationError,
+    JobError,
+)
 from bodycap_batch.formats.bvh import RigOptions, read_rig
 from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.store.disk_space import require_room
@@ -114,7 +120,7 @@ def _check_camera(capture: CaptureConfig, config: CameraConfig) -> CameraSummary
     return _summarise_camera(camera, config, check_picture_quality(camera))
 
 
-def _summarise_camera(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> CameraSummary:
+def _summarise_camera(camera: CaptureCamera, config: CameraConfig, quality: PictureQuality) -> CameraSummary:
     times_s = camera.common_times_ns() / 1e9
     steps = np.diff(camera.times_ns)
     median_ns = float(np.median(steps)) if len(steps) else 0.0
@@ -135,9 +141,10 @@ def _summarise_camera(camera: CaptureCamera, config: CameraConfig, notes: list[s
         work_size_px=(camera.camera.width_px, camera.camera.height_px),
         lens=_intrinsics_text(camera),
         guessed_lens=not camera.calibrated,
+        is_static=quality.is_static,
         notes=(
             *camera.notes,
-            *notes,
+            *quality.notes,
             *_dropped_frame_notes(camera, median_ns),
             *setting_notes(camera),
             *_intrinsics_notes(camera),
@@ -324,6 +331,21 @@ def _check_files(job: Job, _findings: list[CameraSummary]) -> list[str]:
     return []
 
 
+def _check_motion(job: Job, summaries: list[CameraSummary]) -> list[str]:
+    """Check that at least one camera moves. A camera that seems to stand still is inspected more closely."""
+    if len(summaries) < len(job.capture.cameras) or not all(camera.is_static for camera in summaries):
+        return []
+    if not all(stands_still(open_camera(job.capture, config)) for config in job.capture.cameras):
+        return []
+    raise EstimationError(
+        "no camera moves: the pictures of "
+        + (f"all {len(summaries)} cameras stand" if len(summaries) > 1 else f"{summaries[0].name} stand")
+        + " still throughout, so there is no motion and no map",
+        field="capture.cameras",
+        hint=NO_MOTION_HINT,
+    )
+
+
 def _check_disk(job: Job, summaries: list[CameraSummary]) -> list[str]:
     """Check that the disk has space for results and intermediate files, and that files can be written."""
     frames, large = (
@@ -333,4 +355,4 @@ def _check_disk(job: Job, summaries: list[CameraSummary]) -> list[str]:
     return require_room(job.out or Path("out").resolve(), frames, large)
 
 
-_CHECKS = (_check_files, _check_clocks, _check_named_frames, _check_skeleton, _check_formats)
+_CHECKS = (_check_files, _check_motion, _check_clocks, _check_named_frames, _check_skeleton, _check_formats)

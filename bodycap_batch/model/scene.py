@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 
@@ -38,6 +38,7 @@ class FrameStatus(StrEnum):
     POSE_JUMP: Lost; the estimated pose was rejected as an outlier of the trajectory.
     UNCONFIRMED: Lost; few observations support the estimated pose, and no neighbouring frame confirms it.
     NO_MAP: Lost; no map contains this camera.
+    FROZEN: Lost; the recording repeats an earlier picture although the camera moves.
     """
 
     KEYFRAME = "KEYFRAME"
@@ -50,6 +51,7 @@ class FrameStatus(StrEnum):
     POSE_JUMP = "POSE_JUMP"
     UNCONFIRMED = "UNCONFIRMED"
     NO_MAP = "NO_MAP"
+    FROZEN = "FROZEN"
 
     @property
     def localised(self) -> bool:
@@ -68,6 +70,10 @@ class KeyframeSelection:
         sharpness: (N,) sharpness of each frame in an arbitrary unit; a larger value means a sharper frame.
         noise_px: Standard deviation, pixels, of the error of tracked positions. It is measured by tracking
             points forwards and back.
+        frozen: (N,) True for each frozen frame: a frame that repeats an earlier picture although the camera
+            moves. An empty array means that no frame is frozen.
+        motion_px: Largest median displacement of corners since a keyframe, pixels of an image with a long
+            side of 640 px. It is infinity if it is unknown.
     """
 
     camera: str
@@ -75,10 +81,15 @@ class KeyframeSelection:
     frame_count: int
     sharpness: FloatArray
     noise_px: float
+    frozen: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    motion_px: float = float("inf")
 
     def __post_init__(self) -> None:
         set_array(self, "frames", (None,), np.int64)
         set_array(self, "sharpness", (self.frame_count,))
+        if len(self.frozen) == 0:
+            object.__setattr__(self, "frozen", np.zeros(self.frame_count, dtype=bool))
+        set_array(self, "frozen", (self.frame_count,), np.bool_)
         if len(self.frames) and (
             self.frames[0] < 0 or self.frames[-1] >= self.frame_count or (np.diff(self.frames) <= 0).any()
         ):

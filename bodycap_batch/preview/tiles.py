@@ -32,6 +32,7 @@ _LOSS_REASONS = {
     FrameStatus.POSE_JUMP: "the pose jumped",
     FrameStatus.UNCONFIRMED: "no neighbour confirms it",
     FrameStatus.NO_MAP: "not in the map",
+    FrameStatus.FROZEN: "the recording is frozen",
 }
 _LOST_BRIGHTNESS = 0.45
 """Factor on the brightness of lost frames. Evidence: none."""

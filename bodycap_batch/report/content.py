@@ -84,6 +84,7 @@ _CAUSE_CRITERIA = {
     LossCause.SHALLOW: "the visible points did not determine the position",
     LossCause.UNKNOWN_PLACE: "the frame is sharp and textured, but it does not match the map",
     LossCause.NO_MAP: "there is no map for this camera",
+    LossCause.FROZEN: "the video repeats one picture, although the camera moves before or after it",
 }
 
 

@@ -44,6 +44,7 @@ class LossCause(StrEnum):
     SHALLOW = "points too far away or too close together"
     UNKNOWN_PLACE = "place not in the map"
     NO_MAP = "no map for this camera"
+    FROZEN = "frozen recording"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,6 +105,8 @@ def likely_cause(
     """
     if loss.reason is FrameStatus.NO_MAP:
         return LossCause.NO_MAP
+    if loss.reason is FrameStatus.FROZEN:
+        return LossCause.FROZEN
     if appearance is not None and appearance.is_dark:
         return LossCause.DARK
     if loss.turn_deg > _FAST_DEG:

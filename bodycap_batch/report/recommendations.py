@@ -63,6 +63,8 @@ _ACTIONS = {
     "out of the picture, and walk past each place more than once.",
     LossCause.NO_MAP: "Let every camera see the same places as the others: walk a loop and look around "
     "in each place.",
+    LossCause.FROZEN: "Use a fast memory card and a fully charged battery, close other apps, and play "
+    "the videos before the cameras are taken off.",
 }
 _OBSERVATIONS = {
     LossCause.DARK: "hardly any light reached the camera",
@@ -72,6 +74,7 @@ _OBSERVATIONS = {
     LossCause.SHALLOW: "the visible points did not determine the position (too far away, or close together)",
     LossCause.UNKNOWN_PLACE: "the picture was sharp and textured, but its content is not in the map",
     LossCause.NO_MAP: "the camera has no map",
+    LossCause.FROZEN: "the recording repeated one picture instead of new ones",
 }
 
 
