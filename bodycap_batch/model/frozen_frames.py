@@ -28,6 +28,21 @@ _MIN_COPIES, _MIN_FROZEN_S = 3, 0.2
 come from a conversion to a constant frame rate: it repeats single frames. Evidence: none."""
 
 
+def frozen_notes(camera: str, frozen: BoolArray, times_s: FloatArray) -> list[str]:
+    """Return a note for the user about each frozen part of a video.
+
+    Args:
+        camera: Camera name.
+        frozen: (N,) True for each frozen frame.
+        times_s: (N,) common times of the frames, seconds.
+    """
+    return [
+        f"{camera}: the recording repeats one picture from {times_s[start]:.2f} to {times_s[stop - 1]:.2f} s "
+        f"while the camera moves: these {stop - start} frames are lost (FROZEN)"
+        for start, stop in runs(frozen)
+    ]
+
+
 def picture_change_px(before: GreyImage, after: GreyImage) -> float:
     """Return the change between two successive reduced pictures, as a displacement in px.
 

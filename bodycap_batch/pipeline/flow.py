@@ -87,9 +87,9 @@ class Flow:
         self.runner.report_notes(artefact, "check")
 
     def keyframes(self) -> ByCamera:
-        """Select the keyframes of every camera and return the artefact of each camera."""
+        """Select the keyframes of every camera, report notes, and return the artefact of each camera."""
         capture = self._job.capture
-        return self.runner.run_all(
+        artefacts = self.runner.run_all(
             make_task(
                 KEYFRAMES,
                 KeyframesTask(
@@ -100,6 +100,9 @@ class Flow:
             )
             for camera, threads in zip(capture.cameras, self.runner.threads_per_camera(), strict=True)
         )
+        for artefact in artefacts.values():
+            self.runner.report_notes(artefact, "keyframes")
+        return artefacts
 
     def map(self, keyframes: ByCamera) -> Artefact:
         """Build the map of all keyframes and return its artefact."""

@@ -37,10 +37,17 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("case", FROZEN_S)
-def test_frozen_frames_are_lost_and_all_others_are_right(case: str, walk: Path, tmp_path: Path) -> None:
+def test_frozen_frames_are_lost_and_all_others_are_right(
+    case: str, walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     spans = FROZEN_S[case]
     capture = alter(walk, tmp_path / "capture", {name: frozen(span) for name, span in spans.items()})
     assert run(capture) == 0
+    said = capsys.readouterr().err
+    assert all(
+        f"{name}: the recording repeats one picture from {span[0]:.2f}" in said
+        for name, span in spans.items()
+    )
     for row in rows_of(capture):
         start, end = spans.get(row["camera"], (SECONDS, SECONDS))
         is_frozen = start <= float(row["time"]) < end
