@@ -14,6 +14,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.frozen_frames import find_frozen_frames, picture_change_px
 from bodycap_batch.model.optical_flow import (
     GreyImage,
     Pixels,
@@ -89,6 +90,12 @@ class _KeyframeTracker:
         round_trips: Distances (px of the full image) between the position of each corner and its position
             after forward and backward tracking; one array for each step.
         kept_samples: Total number of distances in `round_trips`.
+        start_px: (N,2) positions of the tracked corners in the last keyframe, px of the reduced image.
+        change_px: Change of the picture in the last step, px of the reduced image; NaN if it is unknown.
+        shift_px: Median displacement of the corners in the last step, px of the reduced image; NaN if it is
+            unknown.
+        largest_shift_px: Largest median displacement of the corners since a keyframe, px of the reduced
+            image.
     """
 
     camera: Camera
@@ -99,6 +106,10 @@ class _KeyframeTracker:
     started: int = 0
     round_trips: list[Pixels] = field(default_factory=list)
     kept_samples: int = 0
+    start_px: Pixels = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    change_px: float = float("nan")
+    shift_px: float = float("nan")
+    largest_shift_px: float = 0.0
 
     def restart(self, image: GreyImage) -> None:
         """Remove all tracks, and detect the corners of a new keyframe."""
@@ -107,12 +118,21 @@ class _KeyframeTracker:
         self.image = image
         self.start_rays = self._rays()
         self.started = len(self.px)
+        self.start_px = self.px
 
     def step(self, image: GreyImage) -> None:
         """Track the corners into the next frame."""
         before = image if self.image is None else self.image
         flow = track_points(before, image, self.px, window_px=_WINDOW_PX)
+        self.change_px = picture_change_px(before, image)
+        self.shift_px = _median_distance(self.px[flow.ok], flow.px[flow.ok])
         self.px, self.start_rays = flow.px[flow.ok], self.start_rays[flow.ok]
+        self.start_px = self.start_px[flow.ok]
+        since_keyframe = _median_distance(self.start_px, self.px)
+        # Without corners that are still tracked, the picture has changed.
+        self.largest_shift_px = max(
+            self.largest_shift_px, since_keyframe if np.isfinite(since_keyframe) else np.inf
+        )
         if self.kept_samples < _NOISE_SAMPLES:
             self.round_trips.append(flow.round_trip_px[flow.ok] * self._full_scale(image))
             self.kept_samples += int(flow.ok.sum())
@@ -148,6 +168,13 @@ class _KeyframeTracker:
         first, second = self.start_rays[usable], rays[usable]
         rotation = fit_rotation(first, second, iterations=_ROTATION_ROUNDS)
         return float(np.median(np.linalg.norm(second - first @ rotation.T, axis=1))) * self.camera.focal_px
+
+    def motion_px(self) -> float:
+        """Return the largest motion of the picture since a keyframe, px at a long side of 640 px."""
+        if self.image is None:
+            return 0.0
+        height, width = self.image.shape[:2]
+        return self.largest_shift_px / pixel_scale(width, height)
 
     def noise_px(self) -> float:
         """Return the tracking noise: the standard deviation along an image axis, px of the full image.
@@ -198,7 +225,7 @@ def select_keyframes(
             hint="check start_s and end_s",
         )
     limit_px = options.parallax_px * pixel_scale(camera.camera.width_px, camera.camera.height_px)
-    sharp = np.zeros(count)
+    sharp, change_px, shift_px = np.zeros(count), np.full(count, np.nan), np.full(count, np.nan)
     selected: list[int] = []
     novelty = [0.0]
     tracker = _KeyframeTracker(camera.camera, _coarse_mask(camera))
@@ -218,6 +245,7 @@ def select_keyframes(
             tracker.restart(image)
         else:
             tracker.step(image)
+            change_px[index], shift_px[index] = tracker.change_px, tracker.shift_px
             recent.append(_Candidate(index, image, sharp[index], tracker.survival(), shot))
             gap_s = times_s[index] - times_s[selected[-1]]
             if _is_due(tracker, gap_s, limit_px, options):
@@ -234,7 +262,10 @@ def select_keyframes(
             path=camera.chapters[0],
             hint=COPY_AGAIN,
         )
-    if selected[-1] != shot.index:
+    frozen = find_frozen_frames(change_px, shift_px, np.asarray(times_s, dtype=np.float64))
+    if frozen.any():
+        selected, novelty = _without_frozen(selected, novelty, frozen | is_damaged)
+    elif selected[-1] != shot.index:
         selected.append(shot.index)
         keep(shot)
         novelty.append(0.0)
@@ -249,7 +280,32 @@ def select_keyframes(
         sharpness=sharp,
         noise_px=tracker.noise_px(),
         damaged=np.flatnonzero(is_damaged),
+        frozen=frozen,
+        motion_px=tracker.motion_px(),
     )
+
+
+def _without_frozen(
+    selected: list[int], novelty: list[float], unusable: BoolArray
+) -> tuple[list[int], list[float]]:
+    """Replace each keyframe in a frozen part by the first frame with the same picture.
+
+    The last usable frame becomes a keyframe, too.
+
+    Args:
+        selected: Frame indices of the keyframes.
+        novelty: Novelty of each keyframe.
+        unusable: (N,) True for each repetition of an earlier picture, and for each damaged frame.
+
+    Returns:
+        Frame indices of the keyframes, and their novelty.
+    """
+    measured = np.flatnonzero(~unusable)
+    originals = measured[np.searchsorted(measured, selected, side="right") - 1].tolist()
+    kept: dict[int, float] = {}
+    for frame, value in zip([*originals, int(measured[-1])], [*novelty, 0.0], strict=True):
+        kept.setdefault(frame, value)
+    return list(kept), list(kept.values())
 
 
 def _is_due(tracker: _KeyframeTracker, gap_s: float, limit_px: float, options: KeyframeOptions) -> bool:
@@ -298,6 +354,13 @@ def _coarse_mask(camera: CaptureCamera) -> BoolArray | None:
     if camera.mask is None:
         return None
     return np.asarray(make_coarse_image(np.where(camera.mask, 255, 0).astype(np.uint8)) > 127)
+
+
+def _median_distance(before: Pixels, after: Pixels) -> float:
+    """Return the median distance between two positions (N,2) of each corner; NaN for too few corners."""
+    if len(after) < _MIN_TRACKS:
+        return float("nan")
+    return float(np.median(np.linalg.norm(after - before, axis=1)))
 
 
 def _ignore(_: FrameCandidate) -> None:

@@ -75,6 +75,34 @@ def covered(*spans_s: tuple[float, float]) -> Recording:
     return Recording(look=look)
 
 
+def frozen(*spans_s: tuple[float, float]) -> Recording:
+    """Return a recording that repeats its last picture during the given intervals."""
+    shown: list[Image] = []
+
+    def look(image: Image, time_s: float) -> Image:
+        if not shown or not any(start <= time_s < end for start, end in spans_s):
+            shown[:] = [image]
+        return shown[0]
+
+    return Recording(look=look)
+
+
+def on_a_tripod(sigma: float) -> Recording:
+    """Return a recording of the first picture with sensor noise: the camera stands still.
+
+    Args:
+        sigma: Standard deviation of the noise, grey levels.
+    """
+    shown: list[Image] = []
+
+    def look(image: Image, time_s: float) -> Image:
+        shown[:] = shown or [image]
+        rng = np.random.default_rng(round(1000 * time_s))
+        return np.clip(shown[0] + rng.normal(0.0, sigma, image.shape), 0, 255).astype(np.uint8)
+
+    return Recording(look=look)
+
+
 def zoomed(fraction: float) -> Recording:
     """Return a recording of the enlarged middle of the picture: a digital zoom that the calibration does not
     know.

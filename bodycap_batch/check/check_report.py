@@ -42,6 +42,7 @@ class CameraSummary:
         notes: Notes for the user that are not errors.
         guessed_lens: True if the camera has no calibration.
         origins: Where the settings of the camera come from; None if it is unknown.
+        is_static: True if the inspected pictures stand still throughout the recording.
     """
 
     name: str
@@ -60,6 +61,7 @@ class CameraSummary:
     notes: tuple[str, ...] = ()
     guessed_lens: bool = False
     origins: CameraOrigins | None = None
+    is_static: bool = False
 
     @property
     def large_frames(self) -> int:

@@ -5,17 +5,22 @@ Such pictures are black, dark or static, or they have low contrast or too few co
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.images import Image
 from bodycap_batch.capture.video import COPY_AGAIN
-from bodycap_batch.check.static_pictures import reduced_picture, static_notes
+from bodycap_batch.check.static_pictures import has_one_view, is_static, reduced_picture, static_notes
 from bodycap_batch.core.arrays import IntArray, evenly_spaced
 from bodycap_batch.core.errors import CaptureError
 
 _SAMPLES = 8
 """Number of evenly spaced frames to inspect. Evidence: none."""
+_CONFIRMING_SAMPLES = 64
+"""Number of evenly spaced frames that confirm that a camera stands still. A short movement of a person who
+stands for most of the time is then visible. Evidence: none."""
 _MAX_BLACK_GREY = 20.0
 """Maximum grey level (of 255) of a black picture, at the 99th percentile of the pixels.
 
@@ -49,11 +54,31 @@ _MIN_WIDTH_PX = 160
 """Minimum width (pixels) of a picture whose texture is judged. Evidence: none."""
 
 
-def check_picture_quality(camera: CaptureCamera) -> list[str]:
-    """Decode a few evenly spaced frames of a camera and inspect them.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PictureQuality:
+    """The result of inspecting a few frames of a camera.
 
-    Returns:
-        Notes about pictures that are hard to track.
+    Attributes:
+        notes: Notes about pictures that are hard to track.
+        is_static: True if the inspected pictures stand still throughout the recording.
+    """
+
+    notes: tuple[str, ...]
+    is_static: bool
+
+
+def stands_still(camera: CaptureCamera) -> bool:
+    """Return True if many evenly spaced frames of a camera show the same view.
+
+    Raises:
+        CaptureError: A frame cannot be decoded.
+    """
+    indices = sample_indices(camera, _CONFIRMING_SAMPLES)
+    return has_one_view(reduced_picture(image) for _, image in camera.read(indices))
+
+
+def check_picture_quality(camera: CaptureCamera) -> PictureQuality:
+    """Decode a few evenly spaced frames of a camera and inspect them.
 
     Raises:
         CaptureError: No inspected frame can be decoded, the video has fewer than two frames, or all inspected
@@ -97,7 +122,8 @@ def check_picture_quality(camera: CaptureCamera) -> list[str]:
             "(ffmpeg -i in -vf bwdif=send_frame out.mp4)"
         )
     times_s = camera.common_times_ns() / 1e9
-    notes += static_notes(reduced_pictures, times_s[indices], float(times_s[-1] - times_s[0]))
+    length_s = float(times_s[-1] - times_s[0])
+    notes += static_notes(reduced_pictures, times_s[indices], length_s)
     if black:
         notes.append(
             f"{black} of {len(bright)} inspected pictures are black; exclude the black part of the video "
@@ -110,7 +136,9 @@ def check_picture_quality(camera: CaptureCamera) -> list[str]:
             "the pictures have hardly any contrast, so few features can be tracked: use more light, and "
             "clean the lens"
         )
-    return notes
+    return PictureQuality(
+        notes=tuple(notes), is_static=is_static(reduced_pictures, times_s[indices], length_s)
+    )
 
 
 def _corner_count(image: Image) -> float:

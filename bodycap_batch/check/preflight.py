@@ -16,7 +16,7 @@ from bodycap_batch.check.camera_settings import setting_notes
 from bodycap_batch.check.check_report import CameraSummary, CheckReport
 from bodycap_batch.check.file_mixups import require_distinct_videos
 from bodycap_batch.check.overview import with_first_guess
-from bodycap_batch.check.picture_quality import check_picture_quality
+from bodycap_batch.check.picture_quality import PictureQuality, check_picture_quality, stands_still
 from bodycap_batch.check.recording_advice import advise
 from bodycap_batch.config.bounds import MAX_TICKS
 from bodycap_batch.config.job import Overrides, load_job_with_origins
@@ -25,7 +25,13 @@ from bodycap_batch.config.mounts import TRUNK_ROLES
 from bodycap_batch.config.origins import CameraOrigins
 from bodycap_batch.config.rules import named_frames
 from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.core.errors import BodycapError, CaptureError, JobError
+from bodycap_batch.core.errors import (
+    NO_MOTION_HINT,
+    BodycapError,
+    CaptureError,
+    EstimationError,
+    JobError,
+)
 from bodycap_batch.formats.bvh import RigOptions, read_rig
 from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.store.disk_space import require_room
@@ -140,16 +146,17 @@ def _check_camera(
     capture: CaptureConfig, config: CameraConfig, origins: CameraOrigins | None, *, decode_all: bool
 ) -> CameraSummary:
     camera = open_camera(capture, config)
-    notes = check_picture_quality(camera)
+    quality = check_picture_quality(camera)
     if decode_all:
-        notes += damage_notes(camera, find_damaged_frames(camera))
-    summary = _summarise_camera(camera, config, notes)
+        damage = damage_notes(camera, find_damaged_frames(camera))
+        quality = replace(quality, notes=(*quality.notes, *damage))
+    summary = _summarise_camera(camera, config, quality)
     if origins is None:
         return summary
     return replace(summary, origins=with_first_guess(origins, config, camera.videos[0]))
 
 
-def _summarise_camera(camera: CaptureCamera, config: CameraConfig, notes: list[str]) -> CameraSummary:
+def _summarise_camera(camera: CaptureCamera, config: CameraConfig, quality: PictureQuality) -> CameraSummary:
     times_s = camera.common_times_ns() / 1e9
     steps = np.diff(camera.times_ns)
     median_ns = float(np.median(steps)) if len(steps) else 0.0
@@ -170,9 +177,10 @@ def _summarise_camera(camera: CaptureCamera, config: CameraConfig, notes: list[s
         work_size_px=(camera.camera.width_px, camera.camera.height_px),
         lens=_intrinsics_text(camera),
         guessed_lens=not camera.calibrated,
+        is_static=quality.is_static,
         notes=(
             *camera.notes,
-            *notes,
+            *quality.notes,
             *_dropped_frame_notes(camera, median_ns),
             *setting_notes(camera),
             *_intrinsics_notes(camera),
@@ -389,6 +397,21 @@ def _check_files(job: Job, _findings: list[CameraSummary]) -> list[str]:
     return []
 
 
+def _check_motion(job: Job, summaries: list[CameraSummary]) -> list[str]:
+    """Check that at least one camera moves. A camera that seems to stand still is inspected more closely."""
+    if len(summaries) < len(job.capture.cameras) or not all(camera.is_static for camera in summaries):
+        return []
+    if not all(stands_still(open_camera(job.capture, config)) for config in job.capture.cameras):
+        return []
+    raise EstimationError(
+        "no camera moves: the pictures of "
+        + (f"all {len(summaries)} cameras stand" if len(summaries) > 1 else f"{summaries[0].name} stand")
+        + " still throughout, so there is no motion and no map",
+        field="capture.cameras",
+        hint=NO_MOTION_HINT,
+    )
+
+
 def _check_disk(job: Job, summaries: list[CameraSummary]) -> list[str]:
     """Check that the disk has space for results and intermediate files, and that files can be written."""
     frames, large = (
@@ -400,6 +423,7 @@ def _check_disk(job: Job, summaries: list[CameraSummary]) -> list[str]:
 
 _CHECKS = (
     _check_files,
+    _check_motion,
     _check_clocks,
     _check_rates,
     _check_named_frames,

@@ -14,6 +14,12 @@ EXIT_OK = 0
 EXIT_BUG = 70
 """Exit code after an unexpected exception. Source: EX_SOFTWARE of sysexits.h."""
 
+NO_MOTION_HINT = (
+    "did the recordings freeze, or were the cameras not worn? Record a person who walks about; a camera that "
+    "stands still can be left out"
+)
+"""Hint of the errors about a capture in which no camera moves."""
+
 EXIT_CANCELLED = 130
 """Exit code after the user stopped the program. Source: shells report 128 + SIGINT (2)."""
 

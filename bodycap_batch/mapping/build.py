@@ -11,7 +11,7 @@ import numpy as np
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.core.errors import NO_MOTION_HINT, EstimationError
 from bodycap_batch.mapping.initial_models import reconstruct_with_intrinsics
 from bodycap_batch.mapping.inputs import (
     calibrated_camera_ids,
@@ -40,6 +40,10 @@ from bodycap_batch.mapping.validation.remaining_keyframes import resect_remainin
 from bodycap_batch.mapping.validation.repair import repair_model
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.scene import KeyframeSelection, MapResult
+
+_MIN_MOTION_PX = 2.0
+"""Minimum motion of the picture of a camera that moves, px of an image with a long side of 640 px. Evidence:
+docs/decisions/mapping.md."""
 
 
 def build_map(
@@ -70,11 +74,12 @@ def build_map(
         The models, largest first, each in a separate gauge.
 
     Raises:
-        EstimationError: No initial pair succeeded, too few keyframes were registered, or the matches
-            contradict the map.
+        EstimationError: No camera moves, no initial pair succeeded, too few keyframes were registered, or the
+            matches contradict the map.
 
     Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016 (COLMAP).
     """
+    _require_motion(selections)
     result, refused = build_map_once(capture, selections, options, context, reach, skeletal_above)
     second_context = replace(context, work_dir=context.work_dir / "freed")
 
@@ -85,6 +90,17 @@ def build_map(
         return again
 
     return recalibrate_if_misfit(result, capture, build_again, refused)
+
+
+def _require_motion(selections: Sequence[KeyframeSelection]) -> None:
+    """Raise an error if the pictures of all cameras stand still: a map needs a camera that moves."""
+    motion_px = [item.motion_px for item in selections]
+    if motion_px and max(motion_px) < _MIN_MOTION_PX:
+        raise EstimationError(
+            "no camera moves: in the pictures of all cameras, nothing moves by more than "
+            f"{max(motion_px):.1f} px, so there is no motion and no map",
+            hint=NO_MOTION_HINT,
+        )
 
 
 def build_map_once(

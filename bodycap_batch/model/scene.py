@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 
@@ -39,6 +39,7 @@ class FrameStatus(StrEnum):
     UNCONFIRMED: Lost; few observations support the estimated pose, and no neighbouring frame confirms it.
     NO_MAP: Lost; no map contains this camera.
     DAMAGED: Lost; the frame cannot be decoded, or the decoder reports that its data are damaged.
+    FROZEN: Lost; the recording repeats an earlier picture although the camera moves.
     """
 
     KEYFRAME = "KEYFRAME"
@@ -52,6 +53,7 @@ class FrameStatus(StrEnum):
     UNCONFIRMED = "UNCONFIRMED"
     NO_MAP = "NO_MAP"
     DAMAGED = "DAMAGED"
+    FROZEN = "FROZEN"
 
     @property
     def localised(self) -> bool:
@@ -71,6 +73,10 @@ class KeyframeSelection:
         noise_px: Standard deviation, pixels, of the error of tracked positions. It is measured by tracking
             points forwards and back.
         damaged: (D,) indices of the frames that cannot be decoded, or whose data are damaged. They are lost.
+        frozen: (N,) True for each frozen frame: a frame that repeats an earlier picture although the camera
+            moves. An empty array means that no frame is frozen.
+        motion_px: Largest median displacement of corners since a keyframe, pixels of an image with a long
+            side of 640 px. It is infinity if it is unknown.
     """
 
     camera: str
@@ -79,11 +85,16 @@ class KeyframeSelection:
     sharpness: FloatArray
     noise_px: float
     damaged: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    frozen: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    motion_px: float = float("inf")
 
     def __post_init__(self) -> None:
         set_array(self, "frames", (None,), np.int64)
         set_array(self, "damaged", (None,), np.int64)
         set_array(self, "sharpness", (self.frame_count,))
+        if len(self.frozen) == 0:
+            object.__setattr__(self, "frozen", np.zeros(self.frame_count, dtype=bool))
+        set_array(self, "frozen", (self.frame_count,), np.bool_)
         if len(self.frames) and (
             self.frames[0] < 0 or self.frames[-1] >= self.frame_count or (np.diff(self.frames) <= 0).any()
         ):

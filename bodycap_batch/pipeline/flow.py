@@ -87,9 +87,9 @@ class Flow:
         self.runner.report_notes(artefact, "check")
 
     def keyframes(self) -> ByCamera:
-        """Select the keyframes of every camera and return the artefact of each camera.
+        """Select the keyframes of every camera, and return the artefact of each camera.
 
-        Damaged frames are reported to the user.
+        Damaged and frozen frames are reported to the user.
         """
         capture = self._job.capture
         selected = self.runner.run_all(

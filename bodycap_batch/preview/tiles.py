@@ -33,6 +33,7 @@ _LOSS_REASONS = {
     FrameStatus.UNCONFIRMED: "no neighbouring frame confirms the pose",
     FrameStatus.NO_MAP: "camera not in the map",
     FrameStatus.DAMAGED: "damaged in the video",
+    FrameStatus.FROZEN: "the recording is frozen",
 }
 _LOST_BRIGHTNESS = 0.45
 """Factor on the brightness of lost frames. Evidence: none."""

@@ -66,18 +66,20 @@ def register_frames(
     offered = _offered_keyframes(selection, previous)
     scene_map = _map_of_camera(maps, camera.name)
     if scene_map is None:
-        return _registration_without_map(camera, offered)
+        return _registration_without_map(camera, selection, offered)
     criteria = acceptance_criteria(camera, selection, options)
     points_by_keyframe = select_keyframe_points(scene_map, camera.name)
     tracks = track_all(camera, points_by_keyframe, TrackCache.from_registration(previous), context)
     context.progress(0, 0, "misplaced keyframes")
     scene_map, tracks, misplaced = _track_without_misplaced(camera, scene_map, tracks, criteria, context)
+    if selection.frozen.any():
+        tracks = tracks.select(~selection.frozen[tracks.frame])
     context.progress(0, 0, "poses")
     poses = solve_camera(camera, scene_map, tracks, criteria, context.threads)
-    trajectory = smooth_if_final(build_trajectory(camera, scene_map.gauge, poses, selection.sharpness))
+    trajectory = smooth_if_final(build_trajectory(camera, scene_map.gauge, poses, selection))
     already_requested = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes
-    requested = request_keyframes(trajectory.localised, selection.sharpness, offered)
-    requested = np.setdiff1d(requested, selection.damaged)
+    requested = request_keyframes(trajectory.localised | selection.frozen, selection.sharpness, offered)
+    requested = np.setdiff1d(requested[~selection.frozen[requested]], selection.damaged)
     return Registration(
         trajectory=trajectory,
         obs_frame=tracks.frame,
@@ -128,7 +130,7 @@ def register_in_rig(
         scene_map = map_without_keyframes(scene_map, misplaced)
     start = initial_rig_poses(own, others, members)
     poses = solve_rig(members, scene_map, start, criteria, threads)
-    trajectory = smooth_if_final(build_trajectory(own.camera, scene_map.gauge, poses, selection.sharpness))
+    trajectory = smooth_if_final(build_trajectory(own.camera, scene_map.gauge, poses, selection))
     return replace(own.registration, trajectory=trajectory), relative_poses
 
 
@@ -168,12 +170,14 @@ def _map_of_camera(maps: Sequence[Map], camera: str) -> Map | None:
     return maps[int(np.argmax(counts))] if counts and max(counts) > 0 else None
 
 
-def _registration_without_map(camera: CaptureCamera, offered: IntArray) -> Registration:
+def _registration_without_map(
+    camera: CaptureCamera, selection: KeyframeSelection, offered: IntArray
+) -> Registration:
     """Return a registration in which every frame has the status NO_MAP."""
     no_tracks = Tracks.join_and_clear([])
     poses = [FramePose(status=FrameStatus.NO_MAP)] * len(camera.times_ns)
     return Registration(
-        trajectory=build_trajectory(camera, "none", poses, np.zeros(len(poses))),
+        trajectory=build_trajectory(camera, "none", poses, selection),
         obs_frame=no_tracks.frame,
         obs_keyframe=no_tracks.keyframe,
         obs_feature=no_tracks.feature,

@@ -90,6 +90,7 @@ _CAUSE_CRITERIA = {
     LossCause.UNKNOWN_PLACE: "the frame is sharp and textured, but it does not match the map",
     LossCause.NO_MAP: "there is no map for this camera",
     LossCause.DAMAGED: "the decoder reports damaged data, or gives no picture for the frame",
+    LossCause.FROZEN: "the video repeats one picture, although the camera moves before or after it",
 }
 """Rule by which each cause of a loss is found. The limits are those of `frame_losses`."""
 

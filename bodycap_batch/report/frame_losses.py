@@ -45,6 +45,7 @@ class LossCause(StrEnum):
     UNKNOWN_PLACE = "place not in the map"
     NO_MAP = "no map for this camera"
     DAMAGED = "damaged video"
+    FROZEN = "frozen recording"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,6 +94,14 @@ def find_frame_losses(inputs: ReportInputs) -> list[FrameLoss]:
     ]
 
 
+_CAUSES_OF_REASONS = {
+    FrameStatus.NO_MAP: LossCause.NO_MAP,
+    FrameStatus.DAMAGED: LossCause.DAMAGED,
+    FrameStatus.FROZEN: LossCause.FROZEN,
+}
+"""Cause of a loss, for the reasons that determine the cause."""
+
+
 def likely_cause(
     loss: FrameLoss, appearance: FrameAppearance | None, usual_corners: float | None
 ) -> LossCause:
@@ -103,10 +112,8 @@ def likely_cause(
         appearance: Measurements of the interval's middle frame; None if this frame was not decoded.
         usual_corners: Median number of corners in the camera's registered frames; None if unknown.
     """
-    if loss.reason is FrameStatus.NO_MAP:
-        return LossCause.NO_MAP
-    if loss.reason is FrameStatus.DAMAGED:
-        return LossCause.DAMAGED
+    if loss.reason in _CAUSES_OF_REASONS:
+        return _CAUSES_OF_REASONS[loss.reason]
     if appearance is not None and appearance.is_dark:
         return LossCause.DARK
     if loss.turn_deg > FAST_DEG:

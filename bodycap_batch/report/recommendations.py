@@ -66,6 +66,8 @@ _ACTIONS = {
     LossCause.DAMAGED: "Copy the video again from the camera's card. If it is damaged there, too, use "
     "another card.",
     LossCause.NO_MAP: "Let all cameras see the same places: walk in a loop and look around in each place.",
+    LossCause.FROZEN: "Use a fast memory card and a fully charged battery, close other apps, and play "
+    "the videos before the cameras are taken off.",
 }
 _OBSERVATIONS = {
     LossCause.DARK: "hardly any light reached the camera",
@@ -79,6 +81,7 @@ _OBSERVATIONS = {
     LossCause.UNKNOWN_PLACE: "the picture was sharp and textured, but its content is not in the map",
     LossCause.NO_MAP: "no map contains the camera",
     LossCause.DAMAGED: "the video file is damaged there",
+    LossCause.FROZEN: "the recording repeated one picture instead of new ones",
 }
 """Observation that explains each cause of a loss. The limits are those of `frame_losses`."""
 

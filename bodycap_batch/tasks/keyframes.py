@@ -26,11 +26,12 @@ class KeyframesTask:
 
 
 def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> None:
-    """Select the keyframes; store them with copies of decoded frames."""
+    """Select the keyframes; store them with copies of decoded frames and notes for the user."""
     from bodycap_batch.capture.damage import damage_notes
     from bodycap_batch.capture.kept import KEPT_NAME, FrameKeeper
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.keyframes import select_keyframes
+    from bodycap_batch.model.frozen_frames import frozen_notes
 
     camera = load_capture(task.capture, threads=context.threads).cameras[0]
     size = camera.camera
@@ -39,12 +40,9 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     if (kept := keeper.kept_frames()) is not None:
         write_dataclass(kept, files, KEPT_NAME)
     write_dataclass(selection, files, "keyframes")
-    write_summary(
-        files,
-        frames=selection.frame_count,
-        keyframes=len(selection.frames),
-        notes=[f"{camera.name}: {note}" for note in damage_notes(camera, selection.damaged)],
-    )
+    notes = [f"{camera.name}: {note}" for note in damage_notes(camera, selection.damaged)]
+    notes += frozen_notes(camera.name, selection.frozen, camera.common_times_ns() / 1e9)
+    write_summary(files, frames=selection.frame_count, keyframes=len(selection.frames), notes=notes)
 
 
 KEYFRAMES = Stage(

@@ -214,6 +214,32 @@ def test_keyframes_avoid_blurred_frames(tmp_path: Path) -> None:
     assert (inner % 2 == 0).mean() > 0.8
 
 
+def test_no_keyframe_is_a_repetition_of_a_picture(tmp_path: Path) -> None:
+    from tests.videos import write_video
+
+    # The recording is frozen in frames 11 to 25, and from frame 34 on.
+    shown = [10 if 10 <= k < 26 else min(k, 33) for k in range(45)]
+    poses = np.array([make_transform(look(0.0), [0, 0.03 * k - 0.6, 0]) for k in shown])
+    capture = write_capture(tmp_path, {"torso": poses})
+    video = capture.cameras[0].chapters[0]
+    views = [image for _, image in capture.cameras[0].read(np.arange(45))]
+    write_video(video, [views[k] for k in shown])
+    (camera,) = open_capture(load_job(tmp_path).capture).cameras
+    selection = select_keyframes(camera, KeyframeOptions(max_gap_s=0.15), context(tmp_path))
+    assert np.flatnonzero(selection.frozen).tolist() == [*range(11, 26), *range(34, 45)]
+    assert not selection.frozen[selection.frames].any()
+    assert {0, 10, 33} <= set(selection.frames.tolist())
+    assert (selection.frames > 25).any()
+
+
+def test_cameras_that_stand_still_are_refused(estimated: Estimated, tmp_path: Path) -> None:
+    still = [replace(selection, motion_px=0.2) for selection in estimated.selections]
+    with pytest.raises(EstimationError, match="no camera moves") as caught:
+        build_map(estimated.capture, still, MapOptions(), context(tmp_path))
+    assert caught.value.hint
+    assert all(selection.motion_px > 20.0 for selection in estimated.selections)
+
+
 def test_no_texture_is_refused_with_numbers(tmp_path: Path) -> None:
     poses = np.array([make_transform(look(0.0), [0.02 * k, 0, 0]) for k in range(12)])
     capture = write_capture(tmp_path / "cap", {"torso": poses}, black={"torso": range(12)})

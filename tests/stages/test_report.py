@@ -587,6 +587,8 @@ def test_likely_causes_follow_the_measurements(inputs: ReportInputs) -> None:
     assert likely_cause(tracks, appearance(90.0, 10), 100.0) is LossCause.PLAIN
     assert likely_cause(tracks, appearance(90.0, 90), 100.0) is LossCause.UNKNOWN_PLACE
     assert likely_cause(replace(tracks, sharpness=0.4), None, None) is LossCause.BLUR
+    repeated = replace(loss, turn_deg=20.0, reason=FrameStatus.FROZEN)
+    assert likely_cause(repeated, appearance(10.0, 10), 100.0) is LossCause.FROZEN
 
 
 def test_recommendations_follow_from_measurements(inputs: ReportInputs) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -204,7 +204,7 @@ def pose_array(poses: Sequence[FramePose]) -> FloatArray:
 
 
 def build_trajectory(
-    camera: CaptureCamera, gauge: str, poses: Sequence[FramePose], sharpness: FloatArray
+    camera: CaptureCamera, gauge: str, poses: Sequence[FramePose], selection: KeyframeSelection
 ) -> Trajectory:
     """Return the trajectory of a camera with the status of each frame.
 
@@ -212,7 +212,8 @@ def build_trajectory(
         camera: The camera.
         gauge: Identifier of the gauge of the poses.
         poses: Pose of each frame.
-        sharpness: (F,) image sharpness of each frame.
+        selection: The keyframes of the camera. Only the sharpness of each frame, and the damaged and frozen
+            frames are used.
     """
     missing = np.full((6, 6), np.nan)
     return Trajectory(
@@ -224,25 +225,26 @@ def build_trajectory(
         covariance=np.array(
             [missing if pose.covariance is None else pose.covariance for pose in poses]
         ).reshape(-1, 6, 6),
-        status=tuple(_frame_statuses(poses, sharpness, frozenset(camera.damaged.tolist()))),
+        status=tuple(_frame_statuses(poses, selection)),
         inliers=np.array([pose.inliers for pose in poses], dtype=np.int64),
         error_px=np.array([pose.error_px for pose in poses]),
     )
 
 
-def _frame_statuses(
-    poses: Sequence[FramePose], sharpness: FloatArray, damaged: Collection[int]
-) -> list[FrameStatus]:
+def _frame_statuses(poses: Sequence[FramePose], selection: KeyframeSelection) -> list[FrameStatus]:
     """Return the status of each frame.
 
-    The status is DAMAGED if a frame without a pose is damaged. It is BLUR if a frame has too few tracks and
-    is much less sharp than the frames around it.
+    The status is DAMAGED if a frame without a pose is damaged, and FROZEN if it is frozen. It is BLUR if a
+    frame has too few tracks and is much less sharp than the frames around it.
     """
-    statuses = []
+    statuses, sharpness = [], selection.sharpness
+    damaged = frozenset(selection.damaged.tolist())
     for index, pose in enumerate(poses):
         status = pose.status
         if index in damaged and not status.localised:
             status = FrameStatus.DAMAGED
+        elif selection.frozen[index] and status not in (FrameStatus.NO_MAP, FrameStatus.RIG):
+            status = FrameStatus.FROZEN
         elif status is FrameStatus.FEW_TRACKS:
             nearby = sharpness[max(0, index - _BLUR_WINDOW_FRAMES) : index + _BLUR_WINDOW_FRAMES + 1]
             if sharpness[index] < BLUR_SHARPNESS_RATIO * np.median(nearby):

@@ -82,7 +82,7 @@ def prepare_recovery(
     refined_map = refine_points(scene_map, paths)
     criteria = acceptance_criteria(own.camera, selection, options)
     poses = solve_camera(own.camera, refined_map, own.tracks, criteria, threads)
-    path = build_trajectory(own.camera, scene_map.gauge, poses, selection.sharpness)
+    path = build_trajectory(own.camera, scene_map.gauge, poses, selection)
     path = remove_weak_boundary_poses(path, options.min_inliers)
     if motion_statistics(path) is None:
         return scene_map, own.registration

@@ -154,7 +154,8 @@ def find_lost_poses(
         seed_rows=_seed_keyframes(scene_map, camera.name, lost),
         tracked_frames=frozenset(np.flatnonzero(~lost).tolist()),
     )
-    intervals, position = lost_intervals(~lost), 0
+    frozen = np.array([status is FrameStatus.FROZEN for status in path.status], dtype=bool)
+    intervals, position = lost_intervals(~lost | frozen), 0
     for _ in range(_MAX_PASSES):
         if not intervals:
             break
@@ -166,7 +167,7 @@ def find_lost_poses(
             context.progress(position, len(lost), "lost frames searched")
             poses |= interval_search.recover_interval(start, stop, localised)
         before, path = path.localised, _merge_into(path, poses, localiser.criteria)
-        intervals = _extended_intervals(path.localised, before)
+        intervals = _extended_intervals(path.localised, before, frozen)
     return replace(registration, trajectory=smooth_weak_centres(path, ~lost))
 
 
@@ -241,15 +242,17 @@ class _IntervalSearch:
         return _accepted_poses(Propagation(self.localiser, interval), self.localiser.criteria)
 
 
-def _extended_intervals(has_pose: BoolArray, before: BoolArray) -> list[tuple[int, int]]:
+def _extended_intervals(has_pose: BoolArray, before: BoolArray, frozen: BoolArray) -> list[tuple[int, int]]:
     """Return the lost intervals [start, stop) that are adjacent to a pose found in the last pass.
 
     Args:
         has_pose: (N,) True for frames that have a pose now.
         before: (N,) True for frames that had a pose before the last pass.
+        frozen: (N,) True for frozen frames. They are not searched.
     """
     is_new = np.concatenate([[False], has_pose & ~before, [False]])
-    return [(start, stop) for start, stop in lost_intervals(has_pose) if is_new[start] or is_new[stop + 1]]
+    intervals = lost_intervals(has_pose | frozen)
+    return [(start, stop) for start, stop in intervals if is_new[start] or is_new[stop + 1]]
 
 
 def _smooth(estimates: Mapping[int, PoseEstimate], interval: LostInterval) -> SmoothedCentres:

@@ -78,7 +78,7 @@ def test_damaged_frames_are_named_and_the_others_are_used(video: Path, way: str,
     read = [index for index, _ in known.grey_frames()]
     assert read == np.setdiff1d(np.arange(COUNT), damaged).tolist()
     poses = [FramePose(status=FrameStatus.FEW_TRACKS)] * COUNT
-    path = build_trajectory(known, "map", poses, selection.sharpness)
+    path = build_trajectory(known, "map", poses, selection)
     assert [each is FrameStatus.DAMAGED for each in path.status] == np.isin(
         np.arange(COUNT), damaged
     ).tolist()

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from bodycap_batch.capture import open_capture
-from bodycap_batch.check import check_path, picture_quality
+from bodycap_batch.check import CheckReport, check_path, picture_quality
 from bodycap_batch.check.picture_quality import sample_indices
 from bodycap_batch.config.job import load_job
+from bodycap_batch.core.errors import EstimationError
 from tests.videos import Image, textured_frame, write_video
 
 RNG = np.random.default_rng(3)
@@ -42,6 +43,43 @@ def test_a_camera_on_a_table_is_reported_and_a_moving_one_is_not(tmp_path: Path,
     (note,) = _notes(tmp_path / "table", _still, gop)
     assert "in the whole video" in note
     assert not _notes(tmp_path / "worn", _moving, gop)
+
+
+def _two_cameras(root: Path, torso: Callable[[int], Image], palm: Callable[[int], Image]) -> CheckReport:
+    for name, picture in (("torso", torso), ("left_palm", palm)):
+        write_video(root / f"{name}.mp4", [picture(index) for index in range(COUNT)], gop=8)
+    return check_path(root)
+
+
+def test_a_capture_in_which_no_camera_moves_is_refused(tmp_path: Path) -> None:
+    # One recording is frozen, the other one is live, with sensor noise.
+    report = _two_cameras(tmp_path / "still", lambda index: ROOM[:, 160:320].astype(np.uint8), _still)
+    (error,) = report.errors
+    assert report.exit_code == EstimationError.exit_code
+    assert "no camera moves: the pictures of all 2 cameras stand still" in error.message
+    assert error.hint is not None
+    assert "freeze" in error.hint
+    assert _two_cameras(tmp_path / "worn", _still, _moving).ready
+
+
+def test_a_person_who_stands_for_most_of_the_time_is_not_refused(tmp_path: Path) -> None:
+    def standing(index: int) -> Image:
+        return _moving(0) if index % 10 < 6 else _moving(index % 10 - 5)
+
+    assert _two_cameras(tmp_path, standing, lambda index: standing(index)[::-1]).ready
+
+
+def test_a_movement_between_the_inspected_pictures_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(picture_quality, "_SAMPLES", 5)
+
+    def waving(index: int) -> Image:
+        return _moving(6) if 24 < index < 32 else _still(0)
+
+    report = _two_cameras(tmp_path, waving, waving)
+    assert all(camera.is_static for camera in report.cameras)
+    assert report.ready
 
 
 def test_the_time_of_the_static_part_is_reported(tmp_path: Path) -> None:

@@ -1,0 +1,154 @@
+"""Merging with wrong facts about a camera: a wrong clock, speed or place on the body.
+
+Each result must be right within its stated sigmas, or the report must name the camera. A test that is marked
+as an expected failure shows a fault that merging does not report yet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bodycap_batch.config.options import MergeOptions
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.merging import merge_trajectories
+from bodycap_batch.model.geometry import rotation_angle_rad
+from bodycap_batch.model.merge_data import MergeResult
+from bodycap_batch.model.nominal_mounts import nominal_mount
+from bodycap_batch.model.scene import Trajectory
+from tests.stages.walker import FPS, ROLES, Walk, make_inputs, make_walk, record
+
+pytestmark = pytest.mark.slow
+
+
+def _unreported(reason: str) -> pytest.MarkDecorator:
+    """Mark a wrong result without a warning. Only a failed assertion is expected."""
+    return pytest.mark.xfail(strict=True, raises=AssertionError, reason=reason)
+
+
+SECONDS = 5.0
+SIGMAS = 3.0
+"""Largest error in stated sigmas: 99.7 % of a normal distribution."""
+
+
+@pytest.fixture(scope="module")
+def walk() -> Walk:
+    return make_walk(np.random.default_rng(1), off_deg=6.0, off_m=0.015)
+
+
+def _recorded(walk: Walk, **shift_s: float) -> list[Trajectory]:
+    """Return the trajectories of a walk with turns, in metres, with clocks that are wrong by some seconds."""
+    rng = np.random.default_rng(7)
+    return [record(walk, name, rng, seconds=SECONDS, shift_s=shift_s.get(name, 0.0)) for name in ROLES]
+
+
+def _merged(walk: Walk, trajectories: list[Trajectory], folder) -> MergeResult | None:
+    """Return the result; None if merging refuses the capture."""
+    try:
+        return merge_trajectories(
+            make_inputs(walk, trajectories), MergeOptions(), StageContext(work_dir=folder)
+        )
+    except EstimationError:
+        return None
+
+
+def _require_honest_scale(result: MergeResult | None, cameras: tuple[str, ...]) -> None:
+    """Require that the metric scale is right, or that the report names one of the wrong cameras."""
+    if result is None or {*result.report.doubted_clocks, *result.report.unused_cameras} & set(cameras):
+        return
+    # The map is in metres.
+    scale, sigma = result.world_from_map["map-0"].scale, result.report.scale.relative_sigma
+    assert abs(np.log(scale)) < SIGMAS * sigma, (
+        f"scale {100 * (scale - 1):+.0f} %, {100 * sigma:.0f} % stated"
+    )
+
+
+def _changed(trajectories: list[Trajectory], camera: str, change) -> list[Trajectory]:
+    return [change(each) if each.camera == camera else each for each in trajectories]
+
+
+def _without_second(path: Trajectory) -> Trajectory:
+    """Cut one second out of the middle of a video; the later frames follow without a gap in time."""
+    number = np.arange(len(path.status))
+    kept = (number < 2 * FPS) | (number >= 3 * FPS)
+    count = int(kept.sum())
+    return replace(
+        path,
+        frame_numbers=path.frame_numbers[:count],
+        times_ns=path.times_ns[:count],
+        gauge_from_cam=path.gauge_from_cam[kept],
+        covariance=path.covariance[kept],
+        status=path.status[:count],
+        inliers=path.inliers[kept],
+        error_px=path.error_px[kept],
+    )
+
+
+def _at_half_speed(path: Trajectory) -> Trajectory:
+    return replace(path, times_ns=2 * path.times_ns)
+
+
+def test_right_facts_give_the_right_scale(walk: Walk, tmp_path) -> None:
+    result = _merged(walk, _recorded(walk), tmp_path)
+    assert result is not None
+    assert not result.report.doubted_clocks
+    _require_honest_scale(result, ())
+
+
+@pytest.mark.parametrize(
+    "shift_s",
+    [
+        pytest.param(
+            {"left_palm": 0.3, "right_palm": -0.3}, marks=_unreported("scale 25 % too small, 7 % stated")
+        ),
+        pytest.param(
+            {"left_palm": 0.4, "right_palm": -0.4}, marks=_unreported("scale 32 % too small, 7 % stated")
+        ),
+        pytest.param({"left_palm": 0.5}, marks=_unreported("scale 31 % too small, 10 % stated")),
+    ],
+    ids=["0.3 s", "0.4 s", "0.5 s"],
+)
+def test_wrong_clocks(shift_s: dict[str, float], walk: Walk, tmp_path) -> None:
+    _require_honest_scale(_merged(walk, _recorded(walk, **shift_s), tmp_path), tuple(shift_s))
+
+
+@_unreported("scale 76 % too small, 16 % stated")
+def test_a_palm_at_half_speed(walk: Walk, tmp_path) -> None:
+    paths = _changed(_recorded(walk), "left_palm", _at_half_speed)
+    _require_honest_scale(_merged(walk, paths, tmp_path), ("left_palm",))
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        pytest.param("torso", marks=_unreported("scale 59 % too small, 10 % stated")),
+        pytest.param("left_palm", marks=_unreported("scale 54 % too small, 12 % stated")),
+    ],
+)
+def test_a_video_with_a_second_cut_out(camera: str, walk: Walk, tmp_path) -> None:
+    paths = _changed(_recorded(walk), camera, _without_second)
+    # If the trunk's video is cut, the limbs' clocks disagree with it.
+    _require_honest_scale(_merged(walk, paths, tmp_path), tuple(ROLES))
+
+
+@_unreported("hand 83° off, 10° stated")
+def test_an_upper_arm_given_as_a_palm(walk: Walk, tmp_path) -> None:
+    on_arm = nominal_mount("left_upper_arm", "LeftArm", walk.skeleton)
+    worn = replace(walk, mounts={**walk.mounts, "left_palm": replace(on_arm, camera="left_palm")})
+    result = _merged(walk, _recorded(worn), tmp_path)
+    if result is None or {*result.report.doubted_clocks, *result.report.unused_cameras} & {"left_palm"}:
+        return
+    hand, trunk = (result.skeleton.roles.index(role) for role in ("LeftHand", "Spine1"))
+    truth = walk.joints(result.times_ns() * 1e-9)[..., :3, :3]
+    turns = [
+        np.swapaxes(poses[:, trunk], -1, -2) @ poses[:, hand]
+        for poses in (result.graph_world_from_joint[..., :3, :3], truth)
+    ]
+    error_deg = np.degrees(np.median(rotation_angle_rad(np.swapaxes(turns[0], -1, -2) @ turns[1])))
+    (mount,) = (each for each in result.mounts if each.camera == "left_palm")
+    # Three axes, each with the stated sigma of the mount.
+    limit_deg = SIGMAS * np.sqrt(3.0) * np.degrees(mount.sigma_rad)
+    assert error_deg < limit_deg, f"hand {error_deg:.0f}° off, {np.degrees(mount.sigma_rad):.0f}° stated"
