@@ -131,6 +131,9 @@ class _StoredMarks:
         else:
             if inputs.registrations:
                 return FrameOverlays(inputs)
-            reason = "the store no longer holds this job's camera paths (run it again)"
-        print_message(f"points and skeleton are drawn over the stored pictures only: {reason}")
+            reason = "the store no longer contains the camera paths of this job (run the job again)"
+        print_message(
+            "the points and the skeleton are not drawn over the videos, only over the pictures in the "
+            f"report: {reason}"
+        )
         return None

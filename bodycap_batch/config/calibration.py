@@ -127,7 +127,7 @@ class Calibration(BaseModel):
     def _check_params(self) -> Calibration:
         count = parameter_count(self.model)
         if len(self.params) != count:
-            raise ValueError(f"{self.model} takes {count} params, got {len(self.params)}")
+            raise ValueError(f"the model {self.model} needs {count} params, but {len(self.params)} are given")
         return self
 
     def implausible_parameter(self) -> ImplausibleParameter | None:

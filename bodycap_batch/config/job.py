@@ -442,7 +442,14 @@ def _with_resolved(job: Job, cameras: Sequence[ResolvedCamera], stated: _StatedJ
         skeleton = str((base / skeleton).resolve())
         if not Path(skeleton).is_file():
             raise job_error(
-                [Problem(("skeleton",), f"no such file: {skeleton}", "check the path")],
+                [
+                    Problem(
+                        ("skeleton",),
+                        f"there is no such skeleton file: {skeleton}",
+                        "correct the path of the skeleton; a relative path starts at the folder of "
+                        "the job file",
+                    )
+                ],
                 stated.path,
                 stated.source,
             )

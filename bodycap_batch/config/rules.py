@@ -81,10 +81,12 @@ def _camera_names(job: Job, index: int) -> Iterator[Problem]:
 def _mount(job: Job, camera: CameraConfig) -> Iterator[Problem]:
     if camera.segment is not None and camera.role is None:
         known = (*ROLES, *MOUNT_NAMES)
-        yield Problem(("segment",), f"unknown segment {camera.segment!r}", _nearest(camera.segment, known))
+        yield Problem(
+            ("segment",), f"there is no segment {camera.segment!r}", _nearest(camera.segment, known)
+        )
     elif camera.mount == UNKNOWN_MOUNT:
-        message = f"still to be filled in: where on the body was camera {camera.name!r}?"
-        yield Problem(("mount",), message, f"one of {', '.join(MOUNT_NAMES)}")
+        message = f"the place of camera {camera.name!r} on the body is not filled in"
+        yield Problem(("mount",), message, f"use one of {', '.join(MOUNT_NAMES)}")
     elif camera.segment is None and camera.mount is not None and camera.role is None:
         yield Problem(("mount",), f"there is no mount {camera.mount!r}", _nearest(camera.mount, MOUNT_NAMES))
     elif camera.role is None and skeleton_of(job) != NO_SKELETON:
@@ -130,7 +132,8 @@ def _pose(camera: CameraConfig) -> Iterator[Problem]:
 def _paths(camera: CameraConfig) -> Iterator[Problem]:
     for video in camera.video:
         if str(video) == _UNKNOWN_VIDEO:
-            yield Problem(("video",), f"still to be filled in: {video}", "put the path of your video here")
+            message = f"the path of the video is not filled in: {video}"
+            yield Problem(("video",), message, "write the path of your video here")
         yield from _unusable("video", video)
     for path in camera.timestamps:
         yield from _unusable("timestamps", path)

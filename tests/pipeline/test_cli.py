@@ -325,7 +325,7 @@ def test_a_bug_is_exit_code_70_with_a_traceback(bench: Bench) -> None:
         (["check", "{empty}"], 3, "no video"),
         (["synth", "{empty}/new", "--set", "fog=1"], 2, "fog"),
         (["synth", "{empty}/new", "--set", "nois=1"], 2, "did you mean 'noise'?"),
-        (["synth", "{empty}/new", "--cameras", "torso,elbow_x"], 2, "cameras: 'elbow_x' names no place"),
+        (["synth", "{empty}/new", "--cameras", "torso,elbow_x"], 2, "'elbow_x' is not the name of a place"),
         (["synth", "{empty}/new", "--set", "exposure_s=1"], 2, "`bodycap synth --help`"),
         (["synth", "{empty}/new", "--seconds", "0"], 2, "should be greater than 0"),
         (["synth", "{empty}/new", "--set", "noise"], 2, "KEY=VALUE"),

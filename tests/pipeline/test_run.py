@@ -251,11 +251,11 @@ def test_the_failure_of_one_camera_is_in_the_report(bench: Bench, stage: str) ->
 
 def test_a_missing_video_is_in_the_report(bench: Bench) -> None:
     (bench.folder / "torso.mp4").unlink()
-    with pytest.raises(CaptureError, match="no such file") as caught:
+    with pytest.raises(CaptureError, match="no such video file") as caught:
         bench.run()
     report = bench.out / "partial" / "report.html"
     assert str(report) in str(caught.value.hint)
-    assert report.read_text() == "check: there is no such file; "
+    assert report.read_text() == "check: there is no such video file; "
 
 
 @pytest.mark.parametrize("stage", ["report", "preview"])
@@ -264,7 +264,7 @@ def test_results_are_there_although_their_report_or_video_failed(bench: Bench, s
     with pytest.raises(EstimationError, match=f"{stage} does not work out") as caught:
         bench.run()
     assert {"metrics.json", "result.bvh"} <= set(bench.results())
-    assert caught.value.hint == f"film more; the other results are in {bench.out}"
+    assert caught.value.hint == f"film more; see {bench.out} for the other results"
     assert set(json.loads((bench.out / "run.json").read_text())["files"]) == set(bench.results())
 
 
@@ -442,7 +442,7 @@ def test_a_bug_in_a_stage_is_not_an_estimation_error(bench: Bench) -> None:
 
 def test_a_missing_video_is_named_before_anything_is_computed(bench: Bench) -> None:
     (bench.folder / "torso.mp4").unlink()
-    with pytest.raises(BodycapError, match="no such file") as caught:
+    with pytest.raises(BodycapError, match="no such video file") as caught:
         bench.run()
     assert caught.value.exit_code == 3
     assert str(caught.value.path).endswith("torso.mp4")

@@ -110,7 +110,7 @@ def test_names_in_the_lines_of_a_watcher_are_escaped(
     assert main(["watch", str(bench.spool.inbox), "--once", "--settle", "0"]) == 0
     err = capfd.readouterr().err
     assert is_clean(err)
-    assert len([line for line in err.split("\n") if "left in the inbox" in line]) == 2
+    assert len([line for line in err.split("\n") if "stays in the inbox" in line]) == 2
 
 
 def test_names_in_the_display_of_progress_are_escaped(

@@ -366,7 +366,7 @@ def test_a_motion_that_reads_back_differently_is_refused(
         write_bvh(path, replace(motion, local_rotation=local), **options)
 
     monkeypatch.setattr("bodycap_batch.export.motion_files.write_bvh", wrong)
-    with pytest.raises(StoreError, match="read back differs"):
+    with pytest.raises(StoreError, match="differs from the solved motion"):
         export_results(inputs, ExportOptions(formats=("bvh",)), StageContext(work_dir=tmp_path))
     assert not (inputs.out_dir / "motion.bvh").exists()
 

@@ -97,9 +97,9 @@ def describe_inverted_cameras(rolls_deg: Mapping[str, float], cameras: int) -> s
     measured = ", ".join(f"{abs(rolls_deg[name]):.0f}°" for name in names)
     every = " (all cameras)" if len(names) == cameras > 1 else ""
     return (
-        f"mounted upside down, as it seems: {' and '.join(names)}{every}; from the motion and from the "
-        f"position of the limbs, the roll from the usual mount is {measured}; the body is solved with this, "
-        "so if they are mounted upright, give their mounts (joint_from_cam)"
+        f"these cameras seem to be mounted upside down: {' and '.join(names)}{every}; from the motion and "
+        f"from the position of the limbs, the roll from the usual mount is {measured}; the body is solved with "
+        "this, so if they are mounted upright, give their mounts (joint_from_cam)"
     )
 
 
@@ -200,7 +200,10 @@ def describe_vertical(vertical: Vertical, way_up: str = "") -> str:
     Returns:
         A sentence for the report. If the vertical is not well known, the sentence contains advice.
     """
-    text = f"the vertical is known to {vertical.sigma_deg:.1f}° (1 sigma), from the {vertical.source}{way_up}"
+    text = (
+        f"the uncertainty of the vertical, estimated from the {vertical.source}, is "
+        f"{vertical.sigma_deg:.1f}° (1 sigma){way_up}"
+    )
     if vertical.rests_on_lean_only():
         text = (
             f"{text}; the true error may be larger, because only the posture shows the vertical, and a "

@@ -254,7 +254,7 @@ def test_sidecars_of_some_chapters_only(tmp_path: Path) -> None:
         "torso/GX010001.timestamps.txt",
         "torso/GX020001.timestamps.txt",
     )
-    with pytest.raises(CaptureError, match="2 files of timestamps for 3 chapters"):
+    with pytest.raises(CaptureError, match="2 timestamp files for 3 chapters"):
         load_job(root)
 
 

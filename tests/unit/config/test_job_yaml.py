@@ -100,7 +100,7 @@ def test_a_placeholder_is_a_whole_value_and_not_part_of_a_path(tmp_path: Path) -
     (walk / "<left>.mp4").rename(walk / "left_palm.mp4")
     assert len(load_job(walk).capture.cameras) == 2
     text = 'capture: {cameras: [{name: torso, video: torso.mp4}, {name: a, mount: "<left>", video: b.mp4}]}'
-    assert "unknown mount '<left>'" in refused(walk, text).message
+    assert "no mount '<left>'" in refused(walk, text).message
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def test_cameras_upside_down_are_named_with_the_measured_roll(upside_down, given
 
 def test_it_is_said_if_nothing_shows_which_way_up_a_camera_is_mounted():
     vertical = Vertical(UP, "map", 3.0, 0.9, sigma_deg=1.0)
-    assert describe_vertical(vertical).endswith("from the map")
+    assert describe_vertical(vertical).endswith("(1 sigma)")
     text = describe_vertical(vertical, describe_unknown_way_up("torso"))
     assert "torso is assumed to be mounted upright" in text
     assert "cannot be noticed" in text

@@ -233,7 +233,7 @@ def test_hands_alone_do_not_determine_the_scale_and_the_error_names_what_is_miss
     ):
         align_usable_cameras(_lose(hands, "torso", 6), lambda: None)
     nobody = replace(hands, trajectories=hands.trajectories[:1])
-    with pytest.raises(EstimationError, match="none can be used"):
+    with pytest.raises(EstimationError, match="usable cameras are none"):
         align_usable_cameras(_lose(nobody, "torso", 6), lambda: None)
 
 

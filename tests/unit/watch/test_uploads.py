@@ -129,4 +129,4 @@ def test_a_folder_can_be_finished_as_soon_as_its_file_is_complete(page: UploadFi
 
     page.uploads._lock = Lock()  # type: ignore[assignment]
     page.send(key, "torso.mp4", b"x")
-    assert answers == ["torso.mp4: still being sent", "walk"]
+    assert answers == ["torso.mp4: the browser is still sending this file", "walk"]
