@@ -98,8 +98,8 @@ def describe_inverted_cameras(rolls_deg: Mapping[str, float], cameras: int) -> s
     every = " (all cameras)" if len(names) == cameras > 1 else ""
     return (
         f"these cameras seem to be mounted upside down: {' and '.join(names)}{every}; from the motion and "
-        f"from the position of the limbs, the roll from the usual mount is {measured}; the body is solved with "
-        "this, so if they are mounted upright, give their mounts (joint_from_cam)"
+        f"from the position of the limbs, the roll from the usual mount is {measured}; the body is solved "
+        "with this roll, so if they are mounted upright, give their mounts (joint_from_cam)"
     )
 
 
