@@ -37,6 +37,11 @@ docs/decisions/clocks.md."""
 _PEAK_CORE_S = 0.004
 """Lag, seconds, before and after a peak, that does not count as noise. Origin: the peak itself and the echoes
 of the body."""
+_TAPER_S = 0.064
+"""Time, seconds, over which a window of sound starts and ends. Origin: a sudden cut is a sound by itself, and
+correlates with every other cut. Evidence: docs/decisions/clocks.md."""
+_TAPER = np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, round(_TAPER_S * RATE_HZ), dtype=np.float32)) ** 2
+"""Weights of the first samples of a window."""
 _MIN_MAGNITUDE = 1e-3
 """Magnitude, relative to the median of the spectrum, below which a frequency counts as empty. Its phase is
 that of rounding errors."""
@@ -76,6 +81,10 @@ def phase_spectrum(samples: Samples, size: int, top_hz: float = RATE_HZ / 2) -> 
         size: Size of the transform, samples.
         top_hz: Highest frequency that both recordings contain, Hz.
     """
+    samples = samples.copy()
+    count = min(len(_TAPER), len(samples) // 2)
+    samples[:count] *= _TAPER[:count]
+    samples[len(samples) - count :] *= _TAPER[:count][::-1]
     spectrum = scipy.fft.rfft(samples, size)
     low, high = (round(limit * size / RATE_HZ) for limit in (BAND_HZ[0], min(BAND_HZ[1], 0.9 * top_hz)))
     magnitude = np.abs(spectrum[low : high + 1])

@@ -317,8 +317,8 @@ def _syllable(length: int, rate_hz: int, rng: np.random.Generator) -> Samples:
         centre = round(rng.uniform(low, high), -2)
         voice += sosfilt(_filter(1, (centre * 0.88, centre * 1.12), rate_hz), source)
     if consonant:
-        high = sosfilt(_filter(1, (2500.0, min(7000.0, 0.45 * rate_hz)), rate_hz), source[:consonant])
-        voice[:consonant] += 0.7 * high
+        hiss = sosfilt(_filter(1, (2500.0, min(7000.0, 0.45 * rate_hz)), rate_hz), source[:consonant])
+        voice[:consonant] += 0.7 * hiss
     envelope = np.sin(np.pi * np.linspace(0, 1, length)) ** 0.5
     return (rng.uniform(0.4, 1.0) * envelope * voice).astype(np.float32)
 

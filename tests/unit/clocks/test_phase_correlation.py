@@ -13,6 +13,7 @@ from bodycap_batch.clocks.phase_correlation import (
     transform_size,
 )
 from bodycap_batch.clocks.sound_track import RATE_HZ
+from bodycap_batch.synthetic.sound import wind_noise
 
 
 def correlated(first, second):
@@ -59,6 +60,15 @@ def test_two_different_bursts_in_silence_are_no_peak():
         sound[at : at + 1600] += decay * rng.standard_normal(1600)
     (peak,) = find_peaks(*correlated(*sounds), 1)
     assert peak.height < 12.0
+
+
+def test_cuts_through_strong_low_sounds_are_no_common_sound():
+    """Both windows cut through wind. Without a taper the cuts are a peak of 20 sigma at lag 0."""
+    rng = np.random.default_rng(5)
+    winds = [20_000 * wind_noise(32_000, RATE_HZ, rng) + rng.standard_normal(32_000) for _ in range(2)]
+    correlation, start = correlated(*(wind.astype(np.float32) for wind in winds))
+    (peak,) = find_peaks(correlation, start, 1, (-20, 20))
+    assert peak.height < 6.0
 
 
 def test_peaks_within_limits():

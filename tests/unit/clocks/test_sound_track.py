@@ -8,6 +8,7 @@ import pytest
 from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.capture.timeline import join_chapters
 from bodycap_batch.clocks.sound_track import RATE_HZ, read_sound_file, read_sound_track
+from bodycap_batch.synthetic.sound import wind_noise
 from tests.sounds import burst, burst_time, write_video_with_sound
 
 TOLERANCE_S = 0.0015
@@ -102,3 +103,14 @@ def test_a_track_gives_samples_anywhere(tmp_path):
     assert len(around) == 3 * RATE_HZ
     assert not around[: RATE_HZ - 1].any()
     assert np.array_equal(around[RATE_HZ : RATE_HZ + 100], found.samples(0.0, 100))
+
+
+def test_wind_below_the_band_is_removed(tmp_path):
+    rng = np.random.default_rng(0)
+    loud = np.clip(0.5 * wind_noise(32_000, RATE_HZ, rng), -0.9, 0.9) + 0.01 * rng.standard_normal(32_000)
+    found = read(write_video_with_sound(tmp_path / "a.mp4", loud.astype(np.float32)))
+    samples = found.samples(0.0, 32_000)
+    power = np.abs(np.fft.rfft(samples)) ** 2
+    # 40 Hz lies below the limit, 1 kHz above it; each bin is 0.5 Hz wide.
+    assert power[40:160].mean() < 0.1 * power[300:600].mean() + power[1000:3000].mean()
+    assert abs(samples[:50]).max() < 200  # the sound starts gradually
