@@ -24,7 +24,7 @@ from bodycap_batch.clocks.phase_correlation import (
 from bodycap_batch.clocks.sound_track import RATE_HZ, Samples, SoundTrack
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 
-MIN_DRIFT_SPAN_S = 50.0
+MIN_DRIFT_SPAN_S = 40.0
 """Least time, seconds, between the first and the last window from which the drift is measured. Origin: about
 a minute of sound; the way of sound changes by 1 ms, which is 20 ppm of this time."""
 CRYSTAL_SIGMA_PPM = 40.0
@@ -67,7 +67,7 @@ _MIN_AGREEING = 0.6
 """Least fraction of the windows with a clear peak that must agree with the line. Evidence: none."""
 _SCATTER_FLOOR_S = 0.0003
 """Least standard deviation, seconds, of the offset of a window. Origin: the smoothing of the correlation."""
-_SLOW_S = 0.0007
+_SLOW_S = 0.0003
 """Standard deviation, seconds, of the change of the way of sound from the start to the end of a recording.
 Evidence: docs/decisions/clocks.md."""
 _CURVE_S = 0.03

@@ -31,6 +31,8 @@ timestamps; the shortest frame of common codecs that can be missing lasts 20 ms.
 _HIGH_PASS_HZ = 150.0
 """Frequency, Hz, below which wind and handling are removed. Origin: the correlation uses 200 Hz and above. A
 strong sound below leaks into all frequencies where a window cuts it off."""
+_FILTER_SAMPLES = RATE_HZ
+"""Number of samples that are filtered at once. Evidence: none."""
 _FADE_SAMPLES = RATE_HZ // 50
 """Number of samples over which a piece starts and ends: 20 ms. Origin: a sudden start would be a sound that
 all recordings have."""
@@ -283,6 +285,7 @@ class _PieceReader:
     def __init__(self) -> None:
         self._pieces: list[SoundPiece] = []
         self._parts: list[npt.NDArray[np.int16]] = []
+        self._waiting: list[npt.NDArray[np.int16]] = []
         self._resampler: Any = None
         self._state: Any = None
         self._format: tuple[object, ...] = ()
@@ -328,13 +331,19 @@ class _PieceReader:
         self._parts, self._resampler, self._state, self._format = [], None, None, ()
 
     def _keep(self, frame: AudioFrame | None) -> None:
-        for out in self._resampler.resample(frame):
-            samples = out.to_ndarray()[0].astype(np.float64)
-            if not len(samples):
-                continue
-            if self._state is None:
-                self._state = sosfilt_zi(_HIGH_PASS) * samples[0]
-            # The same filter delays the sound of all cameras alike. The constant prevents tiny numbers, which
-            # are slow.
-            filtered, self._state = sosfilt(_HIGH_PASS, samples + 1e-3, zi=self._state)
-            self._parts.append(np.clip(np.rint(filtered), -32768, 32767).astype(np.int16))
+        self._waiting += [out.to_ndarray()[0] for out in self._resampler.resample(frame)]
+        if frame is None or sum(map(len, self._waiting)) >= _FILTER_SAMPLES:
+            self._filter()
+
+    def _filter(self) -> None:
+        """Remove the low frequencies from the samples that wait. The filter is slow for short parts."""
+        samples = np.concatenate([np.zeros(0), *self._waiting])
+        self._waiting = []
+        if not len(samples):
+            return
+        if self._state is None:
+            self._state = sosfilt_zi(_HIGH_PASS) * samples[0]
+        # The same filter delays the sound of all cameras alike. The constant prevents tiny numbers, which are
+        # slow.
+        filtered, self._state = sosfilt(_HIGH_PASS, samples + 1e-3, zi=self._state)
+        self._parts.append(np.clip(np.rint(filtered), -32768, 32767).astype(np.int16))
