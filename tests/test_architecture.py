@@ -20,7 +20,7 @@ LAYERS = (
     {"capture"},
     {
         "keyframes", "mapping", "registration", "merging", "export", "report", "preview", "evaluate",
-        "synthetic", "check", "calibration",
+        "synthetic", "check", "calibration", "clocks",
     },
     {"tasks"},
     {"pipeline"},

@@ -17,6 +17,7 @@ from typing import Any
 
 from tests.bench import (
     batch,
+    clocks,
     field,
     joining,
     long,
@@ -39,6 +40,7 @@ _WITH_OPTIONS = {
     "solving": solving.main,
     "seeds": seeds.main,
     "long": long.main,
+    "clocks": clocks.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
 
@@ -55,7 +57,7 @@ def main() -> int:
         "`cameras`, `size` of it), `field` (rendered captures recorded as by phones), `batch`, "
         "`spool`, `viewer`; with options of their own: `simulation`, "
         "`uncertainty`, `joining` or `solving` (the merge stage on simulated poses), `seeds` (the map "
-        "with several seeds), and `long` (ten minutes of three cameras)",
+        "with several seeds), `clocks` (from generated sound), and `long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)

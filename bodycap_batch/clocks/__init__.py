@@ -1,0 +1,5 @@
+"""The clocks of the cameras: offsets and drifts between them, from the sound that all of them record."""
+
+from bodycap_batch.clocks.estimate import ClockEstimate, ClockEstimates, estimate_clocks
+
+__all__ = ["ClockEstimate", "ClockEstimates", "estimate_clocks"]

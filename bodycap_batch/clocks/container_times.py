@@ -1,0 +1,144 @@
+"""Read when a recording started from its container: the creation time and the timecode.
+
+The clocks of cameras are set by hand, so these times only tell where to search first, and whether two
+recordings can belong together.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from bodycap_batch.capture.video import VideoFile, open_container
+
+CLOCK_SIGMA_S = 2.0
+"""Standard deviation, seconds, of the difference between the clocks of two cameras that were set alike, and
+between the creation of a file and its first frame. Evidence: none."""
+_CREATION_RESOLUTION_S = 1.0
+"""Resolution of a creation time, seconds. Origin: the format of the container."""
+_RANGE_SIGMAS = 4.0
+"""Number of standard deviations of the offset that are searched first. Evidence: none."""
+_DAY_S = 86_400.0
+"""Seconds of a day."""
+_APART_S = 6 * 3600.0
+"""Difference, seconds, from which two recordings are reported as of different dates. Origin: longer than a
+session; shorter differences may be a wrong time zone."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContainerTime:
+    """When a recording started, according to its first file.
+
+    Attributes:
+        first_frame_s: Time of the first frame on the clock of the camera, seconds.
+        created_s: Creation time, Unix seconds; None if it is unknown.
+        timecode_s: Time of day from the timecode, seconds; None if it is unknown or was not set.
+        frame_s: Resolution of the timecode, seconds.
+    """
+
+    first_frame_s: float
+    created_s: float | None
+    timecode_s: float | None
+    frame_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedOffset:
+    """The offset between two cameras according to their containers.
+
+    Attributes:
+        offset_s: Time of the first camera − time of the second camera, seconds.
+        sigma_s: Standard deviation, seconds, if the clocks of both cameras were set.
+    """
+
+    offset_s: float
+    sigma_s: float
+
+    def limits(self) -> tuple[float, float]:
+        """Return the least and the greatest offset to search first, seconds."""
+        reach = _RANGE_SIGMAS * self.sigma_s
+        return self.offset_s - reach, self.offset_s + reach
+
+    def contradicts(self, offset_s: float) -> bool:
+        """Return True if a measured offset is outside the limits."""
+        low, high = self.limits()
+        return not low <= offset_s <= high
+
+
+def read_container_time(videos: Sequence[VideoFile], first_frame_s: float) -> ContainerTime:
+    """Read the start of a recording from its first file.
+
+    Args:
+        videos: The chapters of the camera.
+        first_frame_s: Time of the first frame on the clock of the camera, seconds.
+
+    Raises:
+        CaptureError: The file cannot be opened.
+    """
+    video = videos[0]
+    with open_container(video.path) as container:
+        texts = [container.metadata, *(stream.metadata for stream in container.streams)]
+        timecode = next((text["timecode"] for text in texts if text.get("timecode")), "")
+    fps = video.fps or 30.0
+    return ContainerTime(
+        first_frame_s=first_frame_s,
+        created_s=video.created_s,
+        timecode_s=timecode_seconds(timecode, fps),
+        frame_s=1.0 / fps,
+    )
+
+
+def timecode_seconds(text: str, fps: float) -> float | None:
+    """Return the time of day of a timecode ``HH:MM:SS:FF``, seconds; None if it is not one or is zero."""
+    match = re.fullmatch(r"(\d\d):(\d\d):(\d\d)[:;.](\d\d)", text.strip())
+    if match is None:
+        return None
+    hours, minutes, seconds, frames = (int(part) for part in match.groups())
+    total = 3600.0 * hours + 60.0 * minutes + seconds + frames / fps
+    return total if total > 0.0 else None
+
+
+def expected_offset(first: ContainerTime, second: ContainerTime) -> ExpectedOffset | None:
+    """Return the offset between two cameras according to their containers; None if it is unknown.
+
+    The timecode is used if it agrees with the creation times, or without these: it has no date.
+    """
+    frames = first.first_frame_s - second.first_frame_s
+    created = None
+    if first.created_s is not None and second.created_s is not None:
+        created = ExpectedOffset(
+            second.created_s - first.created_s + frames, CLOCK_SIGMA_S + _CREATION_RESOLUTION_S
+        )
+    if first.timecode_s is None or second.timecode_s is None:
+        return created
+    between = second.timecode_s - first.timecode_s
+    if created is None:
+        between = (between + 0.5 * _DAY_S) % _DAY_S - 0.5 * _DAY_S
+    coded = ExpectedOffset(between + frames, CLOCK_SIGMA_S + max(first.frame_s, second.frame_s))
+    return coded if created is None or not created.contradicts(coded.offset_s) else created
+
+
+def describe_difference(first: str, second: str, difference_s: float) -> str:
+    """Return a sentence about two recordings whose files give other times than their sound.
+
+    Args:
+        first: Name of the first camera.
+        second: Name of the second camera.
+        difference_s: Offset according to the files − offset according to the sound, or, without sound, the
+            time between the recordings, seconds.
+    """
+    return f"the files of {first} and {second} give times that are {duration_text(difference_s)} apart"
+
+
+def are_dates_apart(expected: ExpectedOffset) -> bool:
+    """Return True if two recordings are of different dates according to their files."""
+    return abs(expected.offset_s) > _APART_S
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration as text: days, hours or seconds."""
+    size = abs(seconds)
+    if size >= _DAY_S:
+        return f"{size / _DAY_S:.1f} days"
+    return f"{size / 3600:.1f} hours" if size >= 3600.0 else f"{size:.1f} s"

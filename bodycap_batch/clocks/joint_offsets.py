@@ -1,0 +1,215 @@
+"""Solve the clocks of all cameras together from the differences of pairs.
+
+The unknowns of each camera are the offset at the start of its sound and the drift. The reference camera has
+offset 0 and drift 0. Each pair gives one equation for the offset at its pivot and one for the drift. Pairs
+that contradict the others of a loop are dropped.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM, PairOffset
+from bodycap_batch.core.arrays import FloatArray
+
+WAY_SIGMA_S = 0.0015
+"""Standard deviation, seconds, of an offset due to the way of sound. Origin: the ways from a source to two
+cameras on a body differ by up to 1 m, which is 3 ms."""
+UNLIKE_SIGMA_S = 0.015
+"""Standard deviation, seconds, of the offset of a camera of another model. Origin: the delay of the sound
+relative to the picture differs between models by up to a frame."""
+_MIN_SIGMA_S = 1e-4
+"""Least standard deviation of the offset of a pair, seconds, so that no pair has an infinite weight."""
+_MAX_CLOSURE_SIGMAS = 4.0
+"""Maximum residual of a pair in a loop, in its standard deviations. Evidence: none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointClock:
+    """The clock of one camera: common time = camera time · (1 + drift_ppm · 1e-6) + offset_s.
+
+    Attributes:
+        offset_s: Offset at camera time 0, seconds.
+        drift_ppm: Drift, parts per million.
+        covariance: (2,2) covariance of offset (seconds) and drift (ppm).
+        drift_measured: True if the drift was measured, and not assumed to be 0.
+    """
+
+    offset_s: float
+    drift_ppm: float
+    covariance: FloatArray
+    drift_measured: bool
+
+    @property
+    def sigma_s(self) -> float:
+        """Standard deviation of the offset, seconds."""
+        return float(np.sqrt(self.covariance[0, 0]))
+
+    @property
+    def drift_sigma_ppm(self) -> float:
+        """Standard deviation of the drift, parts per million."""
+        return float(np.sqrt(self.covariance[1, 1]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointClocks:
+    """The clocks of all cameras that are connected to the reference camera.
+
+    Attributes:
+        clocks: Clock of each connected camera, with the reference camera.
+        dropped: Pairs that contradict a loop, with the residual in seconds.
+    """
+
+    clocks: dict[str, JointClock]
+    dropped: tuple[tuple[PairOffset, float], ...]
+
+
+def solve_clocks(
+    reference: str,
+    pairs: Sequence[PairOffset],
+    starts_s: Mapping[str, float],
+    floors_s: Mapping[str, float] | None = None,
+) -> JointClocks:
+    """Solve the clocks of all cameras from accepted pairs.
+
+    Args:
+        reference: Name of the reference camera.
+        pairs: The accepted pairs.
+        starts_s: Start of the sound of each camera on its own clock, seconds.
+        floors_s: Standard deviation, seconds, of the offset of each camera that more sound does not reduce:
+            `WAY_SIGMA_S` or `UNLIKE_SIGMA_S`. Default: `WAY_SIGMA_S`.
+    """
+    used = list(pairs)
+    dropped: list[tuple[PairOffset, float]] = []
+    while True:
+        names = connected_cameras(reference, used)
+        inside = [pair for pair in used if pair.first in names]
+        others = [name for name in names if name != reference]
+        solution, covariance, residuals = _solve(others, inside, starts_s, reference)
+        sigmas = np.array([np.hypot(pair.sigma_s, WAY_SIGMA_S) for pair in inside])
+        if not inside or np.abs(residuals / sigmas).max() <= _MAX_CLOSURE_SIGMAS:
+            break
+        worst = _worst_pair(reference, names, inside, starts_s)
+        dropped.append((worst, _closure_s(reference, worst, inside, starts_s)))
+        used.remove(worst)
+    clocks = {
+        reference: JointClock(offset_s=0.0, drift_ppm=0.0, covariance=np.zeros((2, 2)), drift_measured=True)
+    }
+    measured = connected_cameras(reference, [pair for pair in inside if pair.drift_measured])
+    for index, name in enumerate(others):
+        # From the offset at the start of the sound to that at camera time 0.
+        shift = np.array([[1.0, -1e-6 * starts_s[name]], [0.0, 1.0]])
+        own = covariance[2 * index : 2 * index + 2, 2 * index : 2 * index + 2]
+        offset_s, drift_ppm = shift @ solution[2 * index : 2 * index + 2]
+        floor = WAY_SIGMA_S if floors_s is None else floors_s[name]
+        clocks[name] = JointClock(
+            offset_s=float(offset_s),
+            drift_ppm=float(drift_ppm),
+            covariance=shift @ own @ shift.T + np.diag([floor**2, 0.0]),
+            drift_measured=name in measured,
+        )
+    return JointClocks(clocks=clocks, dropped=tuple(dropped))
+
+
+def connected_cameras(reference: str, pairs: Sequence[PairOffset]) -> list[str]:
+    """Return the cameras that pairs connect to the reference camera, which is the first."""
+    names = [reference]
+    for name in names:
+        for pair in pairs:
+            for near, far in ((pair.first, pair.second), (pair.second, pair.first)):
+                if near == name and far not in names:
+                    names.append(far)
+    return names
+
+
+def _solve(
+    others: Sequence[str], pairs: Sequence[PairOffset], starts_s: Mapping[str, float], reference: str
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Solve the weighted equations of the pairs. A drift that no pair measures is 0 ± `CRYSTAL_SIGMA_PPM`.
+
+    Returns:
+        (2n,) offset at the start of the sound (seconds) and drift (ppm) of each camera but the reference, its
+        covariance (2n,2n), and the residuals (P,) of the offsets of the pairs, seconds.
+    """
+    rows, values, weights = [], [], []
+    drift_rows, drifts, drift_weights = [], [], []
+    for pair in pairs:
+        offset, drift = np.zeros(2 * len(others)), np.zeros(2 * len(others))
+        second_s = pair.pivot_s
+        for name, time_s, sign in (
+            (pair.second, second_s, 1.0),
+            (pair.first, second_s + pair.offset_s, -1.0),
+        ):
+            if name in others:
+                column = 2 * others.index(name)
+                offset[column] = sign
+                offset[column + 1] = sign * 1e-6 * (time_s - starts_s[name])
+                drift[column + 1] = sign
+        rows.append(offset)
+        values.append(pair.offset_s)
+        weights.append(1.0 / max(pair.sigma_s, _MIN_SIGMA_S))
+        if pair.drift_measured:
+            drift_rows.append(drift)
+            drifts.append(pair.drift_ppm)
+            drift_weights.append(1.0 / pair.drift_sigma_ppm)
+    if not rows:
+        return np.zeros(0), np.zeros((0, 0)), np.zeros(0)
+    measured = connected_cameras(reference, [pair for pair in pairs if pair.drift_measured])
+    for index, name in enumerate(others):
+        if name not in measured:
+            drift_rows.append(np.eye(2 * len(others))[2 * index + 1])
+            drifts.append(0.0)
+            drift_weights.append(1.0 / CRYSTAL_SIGMA_PPM)
+    count = len(rows)
+    rows, values, weights = rows + drift_rows, values + drifts, weights + drift_weights
+    matrix, target, weight = np.array(rows), np.array(values), np.array(weights)
+    # The columns are scaled, because seconds and ppm have different sizes.
+    scale = np.tile([1e-3, 1.0], len(others))
+    weighted = matrix * weight[:, None] * scale
+    inverse = np.linalg.pinv(weighted.T @ weighted)
+    solution = scale * (inverse @ (weighted.T @ (target * weight)))
+    return solution, inverse * np.outer(scale, scale), (target - matrix @ solution)[:count]
+
+
+def _worst_pair(
+    reference: str, names: Sequence[str], pairs: Sequence[PairOffset], starts_s: Mapping[str, float]
+) -> PairOffset:
+    """Return the pair without which the others agree best; of equal ones, that with the least evidence."""
+    best: tuple[float, float, PairOffset] | None = None
+    for pair in pairs:
+        rest = [each for each in pairs if each is not pair]
+        if len(connected_cameras(reference, rest)) < len(names):
+            continue  # the pair is in no loop
+        _, _, residuals = _solve([name for name in names if name != reference], rest, starts_s, reference)
+        left = float(np.abs(residuals).max()) if len(residuals) else 0.0
+        # Residuals below the way of sound are equal.
+        key = (max(left, 2.0 * WAY_SIGMA_S), pair.evidence, pair)
+        if best is None or key[:2] < best[:2]:
+            best = key
+    assert best is not None, "residuals exist only in loops"
+    return best[2]
+
+
+def _closure_s(
+    reference: str, pair: PairOffset, pairs: Sequence[PairOffset], starts_s: Mapping[str, float]
+) -> float:
+    """Return the offset of a pair minus that which the other pairs give, seconds."""
+    rest = [each for each in pairs if each is not pair]
+    names = [name for name in connected_cameras(reference, rest) if name != reference]
+    solution, _, _ = _solve(names, rest, starts_s, reference)
+    common = []
+    for name, time_s in ((pair.second, pair.pivot_s), (pair.first, pair.pivot_s + pair.offset_s)):
+        offset, drift = (
+            (0.0, 0.0) if name == reference else solution[2 * names.index(name) : 2 * names.index(name) + 2]
+        )
+        common.append(time_s + offset + 1e-6 * drift * (time_s - starts_s.get(name, 0.0)))
+    return float(common[1] - common[0])
+
+
+def camera_pairs(cameras: Sequence[str]) -> list[tuple[str, str]]:
+    """Return all pairs of cameras."""
+    return list(itertools.combinations(cameras, 2))

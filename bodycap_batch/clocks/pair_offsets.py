@@ -1,0 +1,521 @@
+"""Measure the difference between the clocks of two cameras from their sound.
+
+Windows of one sound are searched for in all of the other. The best lags are then examined with windows along
+the whole common time: the offsets of these windows must lie on one line, whose slope is the drift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.clocks.phase_correlation import (
+    PEAK_WIDTH_S,
+    Peak,
+    find_peaks,
+    log_chance,
+    phase_correlation,
+    phase_spectrum,
+    smoothed_energy,
+    transform_size,
+)
+from bodycap_batch.clocks.sound_track import RATE_HZ, Samples, SoundTrack
+from bodycap_batch.core.arrays import BoolArray, FloatArray
+
+MIN_DRIFT_SPAN_S = 40.0
+"""Least time, seconds, between the first and the last window from which the drift is measured. Origin: about
+a minute of sound; the way of sound changes by 1 ms, which is 20 ppm of this time."""
+CRYSTAL_SIGMA_PPM = 40.0
+"""Standard deviation of the drift between two clocks, ppm, if it was not measured. Origin: crystals have a
+tolerance of ±50 ppm, about 29 ppm of standard deviation each."""
+_WINDOW_S = 6.0
+"""Duration of a window, seconds. Origin: at 50 ppm two clocks move by 0.3 ms in it, which is less than
+`SMOOTHING_S`. Evidence: docs/decisions/clocks.md."""
+_MIN_WINDOWS = 3
+"""Least number of windows into which the common time is divided. Evidence: none."""
+_MIN_WINDOW_S = 1.0
+"""Least duration of a window, seconds. Shorter windows hardly have a peak. Evidence: none."""
+_MAX_WINDOWS = 24
+"""Maximum number of windows along the common time. More windows hardly improve the line. Evidence: none."""
+_SEARCHES = (1, 3, 8, 12)
+"""Number of windows in each round of the search. The search ends as soon as a lag is accepted."""
+_CANDIDATES = 6
+"""Number of peaks of each searched window that are examined."""
+_MIN_CANDIDATE_RATIO = 0.5
+"""Least height of a peak, relative to the highest one of the same window, of which the windows are examined.
+Origin: the inverse of the ratio below which two offsets count as equally good."""
+_BLOCK = 1 << 19
+"""Size of the transform, samples, in which a window is searched for in a long sound; 33 s. Origin: limits the
+memory to some megabytes."""
+_AGREEMENT_S = 0.003
+"""Maximum difference, seconds, of a window's offset from the line of the others. Origin: between the ears of
+a body the way of sound differs by up to 3 ms, which changes as the arms move."""
+_MAX_DRIFT_PPM = 150.0
+"""Maximum drift, ppm. Origin: twice the tolerance of crystals, with some room for cold and heat."""
+_CLEAR_LOG_CHANCE = float(np.log(0.01))
+"""Logarithm of the probability below which the peak of a window counts. At most one of a hundred windows of
+unrelated sounds has such a peak."""
+_MAX_LOG_CHANCE = float(np.log(1e-3))
+"""Logarithm of the maximum probability that unrelated sounds give the peaks of an accepted offset. The other
+conditions reduce the probability further. Evidence: docs/decisions/clocks.md."""
+_MIN_RIVAL_RATIO = 2.0
+"""Least ratio of the summed heights of the accepted lag to those of any other lag. Evidence:
+docs/decisions/clocks.md."""
+_MIN_AGREEING = 0.6
+"""Least fraction of the windows with a clear peak that must agree with the line. Evidence: none."""
+_SCATTER_FLOOR_S = 0.0003
+"""Least standard deviation, seconds, of the offset of a window. Origin: the smoothing of the correlation."""
+_SLOW_S = 0.0003
+"""Standard deviation, seconds, of the change of the way of sound from the start to the end of a recording.
+Evidence: docs/decisions/clocks.md."""
+_CURVE_S = 0.03
+"""Lag, seconds, before and after the peak, in the curve for the picture."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChunkOffset:
+    """The offset that one window of sound gives.
+
+    Attributes:
+        time_s: Middle of the window on the second camera's clock, seconds.
+        offset_s: Time on the first camera's clock − time on the second camera's clock, seconds.
+        height: Height of the peak, in σ of the noise.
+        agrees: True if the peak is clear and the offset is on the line of the pair.
+    """
+
+    time_s: float
+    offset_s: float
+    height: float
+    agrees: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairOffset:
+    """What the sound of two cameras says about their clocks.
+
+    Time of the first camera = time of the second camera · (1 + drift_ppm · 1e-6) + constant, where the
+    constant is such that the difference is `offset_s` at the time `pivot_s` of the second camera.
+
+    Attributes:
+        first: Name of the first camera.
+        second: Name of the second camera.
+        accepted: True if both heard the same.
+        reason: Why the pair was not accepted; empty if it was.
+        pivot_s: Time on the second camera's clock, seconds, at which offset and drift are not correlated.
+        offset_s: Difference of the clocks at the pivot, seconds.
+        sigma_s: Standard deviation of the offset without the way of sound, seconds.
+        drift_ppm: Drift, parts per million; 0 if it was not measured.
+        drift_sigma_ppm: Standard deviation of the drift.
+        drift_measured: True if the common time is long enough to measure the drift.
+        evidence: Summed heights of the windows that agree, σ.
+        rival_ratio: `evidence` over that of the best other lag.
+        log_chance: Logarithm of the probability that unrelated sounds give this result.
+        chunks: The offsets of the windows.
+        curve_lags_s: (N,) offsets of the curve, seconds.
+        curve: (N,) mean energy of the correlations of the windows, relative to its mean.
+    """
+
+    first: str
+    second: str
+    accepted: bool = False
+    reason: str = ""
+    pivot_s: float = 0.0
+    offset_s: float = 0.0
+    sigma_s: float = float("inf")
+    drift_ppm: float = 0.0
+    drift_sigma_ppm: float = CRYSTAL_SIGMA_PPM
+    drift_measured: bool = False
+    evidence: float = 0.0
+    rival_ratio: float = 0.0
+    log_chance: float = 0.0
+    chunks: tuple[ChunkOffset, ...] = ()
+    curve_lags_s: FloatArray | None = None
+    curve: FloatArray | None = None
+
+
+def measure_pair(
+    first: SoundTrack, second: SoundTrack, expected_s: tuple[float, float] | None = None
+) -> PairOffset:
+    """Measure the difference between the clocks of two cameras.
+
+    Args:
+        first: Sound of the first camera, without a problem.
+        second: Sound of the second camera, without a problem.
+        expected_s: Least and greatest offset that is searched first, seconds. If nothing is found there, all
+            offsets are searched.
+    """
+    # Windows are taken from the shorter sound, because most of the longer one may be alone.
+    if second.end_s - second.start_s < first.end_s - first.start_s:
+        swapped = None if expected_s is None else (-expected_s[1], -expected_s[0])
+        return _turned(measure_pair(second, first, swapped))
+    best: PairOffset | None = None
+    for limits in [expected_s, None] if expected_s is not None else [None]:
+        found = _measure(first, second, limits)
+        if found.accepted:
+            return found
+        if best is None or found.log_chance < best.log_chance:
+            best = found
+    assert best is not None
+    return best
+
+
+def _turned(pair: PairOffset) -> PairOffset:
+    """Return the same result with the cameras exchanged."""
+    chunks = tuple(
+        ChunkOffset(
+            time_s=chunk.time_s + chunk.offset_s,
+            offset_s=-chunk.offset_s,
+            height=chunk.height,
+            agrees=chunk.agrees,
+        )
+        for chunk in pair.chunks
+    )
+    return PairOffset(
+        first=pair.second,
+        second=pair.first,
+        accepted=pair.accepted,
+        reason=pair.reason,
+        pivot_s=pair.pivot_s + pair.offset_s,
+        offset_s=-pair.offset_s,
+        sigma_s=pair.sigma_s,
+        drift_ppm=-pair.drift_ppm / (1.0 + 1e-6 * pair.drift_ppm),
+        drift_sigma_ppm=pair.drift_sigma_ppm,
+        drift_measured=pair.drift_measured,
+        evidence=pair.evidence,
+        rival_ratio=pair.rival_ratio,
+        log_chance=pair.log_chance,
+        chunks=chunks,
+        curve_lags_s=None if pair.curve_lags_s is None else -pair.curve_lags_s[::-1],
+        curve=None if pair.curve is None else pair.curve[::-1].copy(),
+    )
+
+
+def _measure(first: SoundTrack, second: SoundTrack, limits: tuple[float, float] | None) -> PairOffset:
+    starts = _search_starts(first)
+    examined: list[_Candidate] = []
+    done = 0
+    outcome = PairOffset(
+        first=first.camera, second=second.camera, reason="no window of the sound has a clear peak"
+    )
+    for size in _SEARCHES:
+        batch, done = starts[done : done + size], done + size
+        if not batch:
+            break
+        for start_s, (peaks, lags) in zip(batch, _search(first, batch, second, limits), strict=True):
+            for peak in peaks:
+                is_high = peak.height >= _MIN_CANDIDATE_RATIO * peaks[0].height
+                if is_high and not _is_known(examined, peak.lag_s):
+                    examined.append(_examine(first, second, start_s, peak, lags * len(starts)))
+        if examined:
+            outcome = _decide(first, second, examined)
+            if outcome.accepted:
+                break
+    return outcome
+
+
+def _search_starts(track: SoundTrack) -> list[float]:
+    """Return the starts of the windows for the search, seconds: the loudest of each part of the sound.
+
+    Windows that are far from each other come first.
+    """
+    times, levels = track.levels()
+    duration = track.end_s - track.start_s
+    if duration <= 1.5 * _WINDOW_S or len(times) < 2:
+        return [track.start_s]
+    parts = min(sum(_SEARCHES), max(1, int(duration / _WINDOW_S)))
+    loudness = np.convolve(levels, np.ones(round(_WINDOW_S / 0.1)), "full")[round(_WINDOW_S / 0.1) - 1 :]
+    starts = []
+    for low, high in _edges(track.start_s, track.end_s - _WINDOW_S, parts):
+        inside = np.flatnonzero((times >= low) & (times <= high))
+        if len(inside) and loudness[inside].max() > 0:
+            starts.append(float(times[inside[loudness[inside].argmax()]]))
+    order = sorted(range(len(starts)), key=lambda index: (index * 0.618034 + 0.5) % 1.0)
+    return [starts[index] for index in order]
+
+
+def _edges(start: float, end: float, parts: int) -> list[tuple[float, float]]:
+    edges = np.linspace(start, end, parts + 1)
+    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+def _search(
+    first: SoundTrack, starts_s: Sequence[float], second: SoundTrack, limits: tuple[float, float] | None
+) -> list[tuple[list[Peak], int]]:
+    """Search windows of the first sound in all of the second.
+
+    Returns:
+        For each window: the highest peaks, whose lag is the offset of the pair, and the number of lags.
+    """
+    count = min(round(1.5 * _WINDOW_S * RATE_HZ), round((first.end_s - first.start_s) * RATE_HZ))
+    count = count if len(starts_s) == 1 and count < 1.5 * _WINDOW_S * RATE_HZ else round(_WINDOW_S * RATE_HZ)
+    margin = count - round(_MIN_WINDOW_S * RATE_HZ)
+    begin_s, end_s = second.start_s - margin / RATE_HZ, second.end_s + margin / RATE_HZ
+    if limits is not None:
+        begin_s = max(begin_s, min(starts_s) - limits[1])
+        end_s = min(end_s, max(starts_s) - limits[0] + count / RATE_HZ)
+    total = round((end_s - begin_s) * RATE_HZ)
+    found: list[tuple[list[Peak], int]] = [([], 0) for _ in starts_s]
+    if total <= count:
+        return found
+    size = transform_size(total) if total <= _BLOCK else _BLOCK
+    top_hz = min(first.top_hz, second.top_hz)
+    windows = [phase_spectrum(first.samples(start, count), size, top_hz) for start in starts_s]
+    times = [first.sample_time(start) for start in starts_s]
+    step = size - count
+    for block in range(0, total - count, step):
+        block_s = begin_s + block / RATE_HZ
+        spectrum = phase_spectrum(second.samples(block_s, size), size, top_hz)
+        if not spectrum.any():
+            continue
+        block_s = second.sample_time(block_s)
+        for index, window in enumerate(windows):
+            lags = min(step, total - count - block)
+            correlation = phase_correlation(window, spectrum, size)[:lags]
+            peaks = [
+                Peak(times[index] - block_s - peak.lag_s, peak.height)
+                for peak in find_peaks(correlation, 0, _CANDIDATES)
+            ]
+            if limits is not None:
+                peaks = [peak for peak in peaks if limits[0] <= peak.lag_s <= limits[1]]
+            best = sorted([*found[index][0], *peaks], key=lambda each: -each.height)[:_CANDIDATES]
+            found[index] = best, found[index][1] + lags
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """An offset of the search, examined along the whole common time.
+
+    Attributes:
+        lag_s: Offset in the window of the search, seconds.
+        height: Height of the peak in the search, σ.
+        lags: Number of lags of the search.
+        times_s: (W,) middles of the windows on the second camera's clock, seconds.
+        offsets_s: (W,) their offsets, seconds.
+        heights: (W,) heights of their peaks, σ.
+        log_chances: (W,) logarithms of the probabilities of these peaks for unrelated sounds.
+        agrees: (W,) True if the window has a clear peak on the line.
+    """
+
+    lag_s: float
+    height: float
+    lags: float
+    times_s: FloatArray
+    offsets_s: FloatArray
+    heights: FloatArray
+    log_chances: FloatArray
+    agrees: BoolArray
+
+    @property
+    def evidence(self) -> float:
+        """Summed heights of the windows that agree."""
+        return float(self.heights[self.agrees].sum())
+
+    @property
+    def log_chance(self) -> float:
+        """Logarithm of the probability that the windows of unrelated sounds have such heights together.
+
+        The sum of the heights of W windows has a standard deviation of √W. A single window counts at most
+        twice as much as the next one.
+        """
+        heights = np.sort(self.heights[self.agrees])
+        if len(heights) < 2:
+            return 0.0
+        summed = float(np.minimum(heights, 2.0 * heights[-2]).sum())
+        return log_chance(summed / float(np.sqrt(len(self.heights))), self.lags)
+
+
+def _is_known(examined: Sequence[_Candidate], lag_s: float) -> bool:
+    """Return True if an examined candidate has this offset."""
+    for candidate in examined:
+        near = np.abs(candidate.offsets_s[candidate.agrees] - lag_s) < PEAK_WIDTH_S
+        if abs(candidate.lag_s - lag_s) < PEAK_WIDTH_S or near.any():
+            return True
+    return False
+
+
+def _examine(first: SoundTrack, second: SoundTrack, start_s: float, peak: Peak, lags: float) -> _Candidate:
+    """Examine an offset with windows along the common time."""
+    offset = peak.lag_s
+    begin, end = max(first.start_s, second.start_s + offset), min(first.end_s, second.end_s + offset)
+    searched = min(_WINDOW_S, first.end_s - first.start_s)
+    anchor = start_s + 0.5 * searched
+    length = min(_WINDOW_S, max((end - begin) / _MIN_WINDOWS, _MIN_WINDOW_S))
+    middles = _middles(begin, end, length, anchor)
+    rows = []
+    for middle in middles:
+        reach_s = 0.006 + 1e-6 * _MAX_DRIFT_PPM * abs(middle - anchor)
+        found = _window_peak(first, second, middle, length, offset, reach_s)
+        # Most of the reach serves to find the drift: on a given line only ±_AGREEMENT_S remains.
+        near = 2 * _AGREEMENT_S * RATE_HZ
+        rows.append((middle - found.lag_s, found.lag_s, found.height, log_chance(found.height, near)))
+    times, offsets, heights, chances = np.array(rows).T
+    clear = chances < _CLEAR_LOG_CHANCE
+    agrees = clear & _on_best_line(times, offsets, heights * clear)
+    return _Candidate(offset, peak.height, lags, times, offsets, heights, chances, agrees)
+
+
+def _middles(begin: float, end: float, length: float, anchor: float) -> list[float]:
+    """Return the middles of windows that do not overlap the window of the search, nor each other, seconds.
+
+    If the common time is shorter than three windows of full length, its thirds are used instead.
+    """
+    if end - begin <= _MIN_WINDOWS * _WINDOW_S:
+        count = max(1, int((end - begin) / length + 1e-6))
+        return [begin + (index + 0.5) * (end - begin) / count for index in range(count)]
+    step = max(length, (end - begin) / _MAX_WINDOWS)
+    # A window may protrude from the common time by a third of its length.
+    low = int(np.ceil((begin + length / 6 - anchor) / step))
+    high = int(np.floor((end - length / 6 - anchor) / step))
+    return [anchor + index * step for index in range(low, high + 1)]
+
+
+def _window_peak(
+    first: SoundTrack, second: SoundTrack, middle_s: float, length_s: float, offset_s: float, reach_s: float
+) -> Peak:
+    """Return the highest peak of a window near an offset; its lag is the offset of the pair."""
+    correlation, zero_s = _window_correlation(first, second, middle_s, length_s, offset_s)
+    half = len(correlation) // 2
+    shift = round((offset_s - zero_s) * RATE_HZ)
+    reach = round(reach_s * RATE_HZ)
+    peaks = find_peaks(correlation, -half, 1, (-shift - reach, -shift + reach))
+    return Peak(zero_s - peaks[0].lag_s, peaks[0].height) if peaks else Peak(offset_s, 0.0)
+
+
+def _window_correlation(
+    first: SoundTrack, second: SoundTrack, middle_s: float, length_s: float, offset_s: float
+) -> tuple[Samples, float]:
+    """Return the correlation of two windows at lags around 0, and the offset at which the lag is 0."""
+    count = round(length_s * RATE_HZ)
+    start = middle_s - 0.5 * length_s
+    top_hz = min(first.top_hz, second.top_hz)
+    size = transform_size(2 * count)
+    one = phase_spectrum(first.samples(start, count), size, top_hz)
+    two = phase_spectrum(second.samples(start - offset_s, count), size, top_hz)
+    zero_s = first.sample_time(start) - second.sample_time(start - offset_s)
+    half = count // 2
+    correlation = phase_correlation(one, two, size)
+    return np.concatenate([correlation[-half:], correlation[: half + 1]]), zero_s
+
+
+def _on_best_line(times: FloatArray, offsets: FloatArray, weights: FloatArray) -> BoolArray:
+    """Return which windows (W,) lie on the line that the greatest weight of windows lies on."""
+    if not weights.any():
+        return np.zeros(len(times), bool)
+    span = float(np.ptp(times))
+    slopes = np.arange(0.0, _MAX_DRIFT_PPM * 1e-6 + 1e-12, max(0.5 * _AGREEMENT_S / max(span, 1.0), 2e-6))
+    if span < MIN_DRIFT_SPAN_S:
+        slopes = slopes[:1]
+    best, most = np.zeros(len(times), bool), 0.0
+    limited = np.minimum(weights, 3.0 * float(np.median(weights[weights > 0])))
+    for slope in np.concatenate([-slopes[:0:-1], slopes]).tolist():
+        rest = offsets - slope * times
+        for centre in rest[weights > 0].tolist():
+            on = np.abs(rest - centre) < _AGREEMENT_S
+            support = float(limited[on].sum())
+            if support > most:
+                best, most = on, support
+    return best
+
+
+def _decide(first: SoundTrack, second: SoundTrack, examined: Sequence[_Candidate]) -> PairOffset:
+    """Accept or refuse the best candidate."""
+    best = max(examined, key=lambda each: each.evidence)
+    others = [each.evidence for each in examined if each is not best]
+    ratio = best.evidence / max([*others, 1.0])
+    clear = best.log_chances < _CLEAR_LOG_CHANCE
+    reason = ""
+    if best.agrees.sum() < 2:
+        reason = "fewer than two windows of the sound agree on an offset"
+    elif best.agrees.sum() < _MIN_AGREEING * clear.sum():
+        reason = f"only {best.agrees.sum()} of {clear.sum()} windows of the sound agree on an offset"
+    elif ratio < _MIN_RIVAL_RATIO:
+        reason = "several offsets suit the sound equally well: it repeats"
+    elif best.log_chance > _MAX_LOG_CHANCE:
+        reason = "the sounds resemble each other no more than unrelated sounds do"
+    chunks = tuple(
+        ChunkOffset(time_s=time, offset_s=offset, height=height, agrees=bool(agrees))
+        for time, offset, height, agrees in zip(
+            best.times_s.tolist(), best.offsets_s.tolist(), best.heights.tolist(), best.agrees, strict=True
+        )
+    )
+    line = _fit_line(best)
+    lags, curve = _mean_curve(first, second, best, line)
+    return PairOffset(
+        first=first.camera,
+        second=second.camera,
+        accepted=not reason,
+        reason=reason,
+        pivot_s=line.pivot_s,
+        offset_s=line.offset_s,
+        sigma_s=line.sigma_s,
+        drift_ppm=line.drift_ppm,
+        drift_sigma_ppm=line.drift_sigma_ppm,
+        drift_measured=line.drift_measured,
+        evidence=best.evidence,
+        rival_ratio=ratio,
+        log_chance=best.log_chance,
+        chunks=chunks,
+        curve_lags_s=lags,
+        curve=curve,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """Offset and drift of a pair; the attributes are those of `PairOffset`."""
+
+    pivot_s: float
+    offset_s: float
+    sigma_s: float = float("inf")
+    drift_ppm: float = 0.0
+    drift_sigma_ppm: float = CRYSTAL_SIGMA_PPM
+    drift_measured: bool = False
+
+
+def _fit_line(candidate: _Candidate) -> _Line:
+    """Fit offset and drift to the windows that agree."""
+    if not candidate.agrees.any():
+        return _Line(float(candidate.times_s.mean()), candidate.lag_s)
+    times, offsets = candidate.times_s[candidate.agrees], candidate.offsets_s[candidate.agrees]
+    pivot = float(times.mean())
+    span = float(np.ptp(times))
+    is_long = span >= MIN_DRIFT_SPAN_S and len(times) >= 4
+    weights = np.ones(len(times))
+    slope, constant = 0.0, float(np.median(offsets))
+    for _ in range(5):
+        if is_long:
+            slope, constant = (float(v) for v in np.polyfit(times - pivot, offsets, 1, w=np.sqrt(weights)))
+        else:
+            constant = float(np.average(offsets, weights=weights))
+        rest = offsets - constant - slope * (times - pivot)
+        scale = max(1.4826 * float(np.median(np.abs(rest))), _SCATTER_FLOOR_S)
+        weights = 1.0 / (1.0 + (rest / (2.0 * scale)) ** 2)
+    lever = float(np.sqrt((weights * (times - pivot) ** 2).sum()))
+    sigma_s = scale / float(np.sqrt(weights.sum()))
+    if not is_long:
+        return _Line(pivot, constant, sigma_s)
+    drift_sigma = float(np.hypot(scale / lever, _SLOW_S / span))
+    return _Line(pivot, constant, sigma_s, 1e6 * slope, 1e6 * drift_sigma, drift_measured=True)
+
+
+def _mean_curve(
+    first: SoundTrack, second: SoundTrack, candidate: _Candidate, line: _Line
+) -> tuple[FloatArray, FloatArray]:
+    """Return offsets (N,) and the mean energy (N,) of some windows' correlations, for the picture."""
+    reach = round(_CURVE_S * RATE_HZ)
+    chosen = np.flatnonzero(candidate.agrees if candidate.agrees.any() else candidate.heights >= 0)[:8]
+    length = min(_WINDOW_S, first.end_s - first.start_s)
+    total = np.zeros(2 * reach + 1)
+    for index in chosen.tolist():
+        time = float(candidate.times_s[index])
+        offset = line.offset_s + 1e-6 * line.drift_ppm * (time - line.pivot_s)
+        correlation, zero_s = _window_correlation(first, second, time + offset, length, offset)
+        at = len(correlation) // 2 + round((zero_s - offset) * RATE_HZ)
+        energy = smoothed_energy(correlation**2) / max(float((correlation**2).mean()), 1e-20)
+        part = energy[max(0, at - reach) : at + reach + 1][::-1]
+        if len(part) == len(total):
+            total += part / len(chosen)
+    return line.offset_s + (np.arange(2 * reach + 1) - reach) / RATE_HZ, total

@@ -1,0 +1,150 @@
+"""Clocks of whole captures from videos, and the command that prints them."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+
+import pytest
+
+from bodycap_batch.cli import main
+from bodycap_batch.clocks import estimate_clocks
+from bodycap_batch.clocks.estimate import reference_camera
+from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from tests.sounds import heard, scene, write_video_with_sound
+
+SECONDS = 8.0
+WAY_S = 0.004
+"""The way of sound to two cameras on one body differs by up to 1.3 m."""
+PALM_S, HEAD_S = 0.731, -0.42
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Three cameras of one take, one of another take, and one without sound."""
+    path = tmp_path_factory.mktemp("take")
+    room = scene(21, SECONDS)
+    dates = {"creation_time": "2024-05-01T10:00:00Z"}
+    write_video_with_sound(path / "torso.mp4", heard(room, 1, SECONDS), metadata=dates)
+    frames = [0, *range(40, int(1000 * SECONDS), 110)]
+    write_video_with_sound(
+        path / "left_palm.mp4", heard(room, 2, SECONDS, PALM_S), frame_times=frames, metadata=dates
+    )
+    write_video_with_sound(
+        path / "head.mp4",
+        heard(room, 3, SECONDS, HEAD_S),
+        metadata={"creation_time": "2024-05-04T10:00:00Z"},
+    )
+    write_video_with_sound(
+        path / "right_palm.mp4",
+        heard(scene(22, SECONDS), 4, SECONDS),
+        metadata={"creation_time": "2024-05-03T22:00:00Z"},
+    )
+    write_video_with_sound(path / "left_thigh.mp4", None)
+    return path
+
+
+def capture(folder, *names, **offsets):
+    cameras = [
+        CameraConfig(name=name, video=(folder / f"{name}.mp4",), offset_s=offsets.get(name, 0.0))
+        for name in names
+    ]
+    return CaptureConfig(cameras=tuple(cameras))
+
+
+@pytest.fixture(scope="module")
+def estimates(folder):
+    return estimate_clocks(capture(folder, "left_palm", "torso", "head", "right_palm", "left_thigh"))
+
+
+def test_offsets_are_relative_to_the_torso(estimates):
+    assert estimates.reference == "torso"
+    assert estimates.camera("torso").source == "common"
+    assert estimates.camera("torso").offset_s == 0.0
+    for name, true_s in (("left_palm", PALM_S), ("head", HEAD_S)):
+        clock = estimates.camera(name)
+        assert clock.source == "sound"
+        assert clock.offset_s == pytest.approx(true_s, abs=WAY_S)
+        assert 0.0015 <= clock.sigma_s < 0.003
+        assert clock.sigma_at(SECONDS) == pytest.approx(clock.sigma_s, abs=0.001)
+        assert (clock.drift_ppm, clock.drift_sigma_ppm) == (0.0, pytest.approx(40.0, rel=0.01))
+
+
+def test_a_second_take_and_a_silent_camera_have_no_clock(estimates):
+    other = estimates.camera("right_palm")
+    assert (other.source, other.offset_s, other.sigma_s) == ("none", None, None)
+    assert any("with torso" in reason for reason in other.reasons)
+    assert any("2.5 days apart" in reason for reason in other.reasons)
+    assert estimates.camera("left_thigh").reasons == ("the video has no sound",)
+    with pytest.raises(KeyError):
+        estimates.camera("nobody")
+
+
+def test_dates_days_apart_are_reported_and_do_not_decide(estimates):
+    contradictions = estimates.camera("head").contradictions
+    assert any("3.0 days apart" in text for text in contradictions)
+    assert not estimates.camera("left_palm").contradictions
+
+
+def test_a_stated_offset_is_compared(folder):
+    right = estimate_clocks(capture(folder, "torso", "left_palm", left_palm=PALM_S)).camera("left_palm")
+    assert not right.contradictions
+    turned = estimate_clocks(capture(folder, "torso", "left_palm", left_palm=-0.73)).camera("left_palm")
+    assert turned.source == "sound"
+    assert "with the sign turned the sound agrees" in turned.contradictions[0]
+    wrong = estimate_clocks(capture(folder, "torso", "left_palm", left_palm=0.2)).camera("left_palm")
+    assert "0.2000 s" in wrong.contradictions[0]
+    assert "sign" not in wrong.contradictions[0]
+
+
+def test_a_stated_offset_is_kept_where_there_is_no_sound(folder):
+    clock = estimate_clocks(capture(folder, "torso", "left_thigh", left_thigh=0.5)).camera("left_thigh")
+    assert (clock.source, clock.offset_s) == ("stated", 0.5)
+    assert clock.sigma_s > 0.01
+
+
+def test_the_first_camera_is_the_reference_without_a_torso(folder):
+    assert reference_camera(capture(folder, "head", "left_palm")) == "head"
+    assert reference_camera(capture(folder, "left_palm", "torso")) == "torso"
+
+
+def write_job(folder, tmp_path, *names):
+    job = tmp_path / "job.yaml"
+    cameras = "".join(f"    - {{name: {name}, video: {folder / name}.mp4}}\n" for name in names)
+    job.write_text(f"capture:\n  cameras:\n{cameras}", encoding="utf-8")
+    return str(job)
+
+
+def test_the_command_prints_a_table_and_lines_for_the_job(folder, tmp_path, capsys):
+    picture = tmp_path / "clocks.svg"
+    assert main(["sync", write_job(folder, tmp_path, "torso", "head"), "--picture", str(picture)]) == 0
+    out = capsys.readouterr().out
+    assert "common time = time of torso" in out
+    assert "contradiction: head:" in out
+    assert "    - name: head\n      offset_s: -0.4" in out
+    drawing = ET.fromstring(picture.read_text(encoding="utf-8"))  # noqa: S314 - our own file
+    assert drawing.tag.endswith("svg")
+    assert len(list(drawing.iter("{http://www.w3.org/2000/svg}circle"))) >= 3
+
+
+def test_the_command_prints_json(folder, tmp_path, capsys):
+    assert main(["sync", write_job(folder, tmp_path, "torso", "left_palm", "left_thigh"), "--json"]) == 0
+    clocks = json.loads(capsys.readouterr().out)["clocks"]
+    assert set(clocks) == {"torso", "left_palm", "left_thigh"}
+    keys = {"offset_s", "sigma_s", "drift_ppm", "drift_sigma_ppm", "source"}
+    assert all(set(clock) == keys for clock in clocks.values())
+    assert clocks["left_palm"]["offset_s"] == pytest.approx(PALM_S, abs=WAY_S)
+    assert clocks["left_thigh"]["source"] == "none"
+
+
+def test_recordings_that_share_no_moment_are_refused(folder, tmp_path, capsys):
+    assert main(["sync", write_job(folder, tmp_path, "torso", "right_palm")]) == 4
+    error = capsys.readouterr().err
+    assert "matches that of torso" in error
+    assert "2.5 days apart" in error
+    assert "hint:" in error
+
+
+def test_one_camera_has_nothing_to_compare(folder, tmp_path, capsys):
+    assert main(["sync", write_job(folder, tmp_path, "torso")]) == 2
+    assert "only one camera" in capsys.readouterr().err
