@@ -71,8 +71,9 @@ def _clock_advice(job: Job, cameras: Sequence[CameraSummary]) -> Iterator[str]:
     if len(cameras) > 1 and not stated:
         yield (
             "no camera states an offset_s, so all videos are assumed to start at the same instant. If the "
-            "cameras were started by hand, read the time of a clap in every video, and set the offset_s "
-            "of each camera: offset_s = time in the first video - time in the video of this camera"
+            "cameras were started by hand, run `bodycap sync`, which finds the offset_s of each camera from "
+            "the sound. If the videos have no common sound, read the time of a clap in every video: offset_s "
+            "= time in the first video - time in the video of this camera"
         )
 
 

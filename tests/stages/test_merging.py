@@ -252,7 +252,7 @@ def test_a_camera_of_another_map_is_named_not_used(walk, context):
 
 def test_a_lost_torso_is_refused_with_numbers(walk, context):
     recorded = _recorded(walk, torso={"lost": (0.2, 9.0)})
-    with pytest.raises(EstimationError, match=r"'torso': 6 localised frames of 90"):
+    with pytest.raises(EstimationError, match=r"'torso': only 6 of 90 frames were localised"):
         merge_trajectories(make_inputs(walk, recorded), MergeOptions(), context)
 
 

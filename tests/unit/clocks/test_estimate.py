@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from bodycap_batch.cli import main
-from bodycap_batch.clocks import estimate_clocks
+from bodycap_batch.clocks import estimate_clocks, offset_notes
 from bodycap_batch.clocks.estimate import reference_camera
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from tests.sounds import heard, scene, write_video_with_sound
@@ -148,3 +148,22 @@ def test_recordings_that_share_no_moment_are_refused(folder, tmp_path, capsys):
 def test_one_camera_has_nothing_to_compare(folder, tmp_path, capsys):
     assert main(["sync", write_job(folder, tmp_path, "torso")]) == 2
     assert "only one camera" in capsys.readouterr().err
+
+
+def test_offsets_that_the_sound_contradicts_are_noted(folder):
+    names = ("torso", "left_palm", "head", "right_palm", "left_thigh")
+    (note,) = offset_notes(capture(folder, *names, left_palm=PALM_S))
+    assert "head -0.4" in note
+    assert "the job uses +0.000 s" in note
+    assert not any(name in note for name in ("left_palm", "right_palm", "left_thigh"))
+    assert offset_notes(capture(folder, *names, left_palm=PALM_S, head=HEAD_S)) == []
+    (turned,) = offset_notes(capture(folder, *names, left_palm=-PALM_S, head=HEAD_S))
+    assert "left_palm +0.7" in turned
+    assert offset_notes(capture(folder, "torso")) == []
+
+
+def test_check_and_run_report_offsets_that_the_sound_contradicts(folder, tmp_path, capfd):
+    for name in ("torso", "left_palm"):
+        (tmp_path / f"{name}.mp4").symlink_to(folder / f"{name}.mp4")
+    main(["check", str(tmp_path)])
+    assert "the sound contradicts the clock offsets of the job" in capfd.readouterr().out

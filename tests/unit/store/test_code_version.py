@@ -103,7 +103,7 @@ CAMERAS = READ_BY_ALL | {"capture"}
 BODY = CAMERAS | {"presets"}
 HASHED = {
     "synth": BODY | {"synthetic"},
-    "check": BODY | {"check", "store"},
+    "check": BODY | {"check", "clocks", "store"},
     "keyframes": CAMERAS | {"keyframes"},
     **dict.fromkeys(("map", "extend", "refine"), CAMERAS | {"mapping"}),
     **dict.fromkeys(("registration", "rig", "recover"), CAMERAS | {"registration"}),
