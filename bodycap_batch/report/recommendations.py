@@ -368,8 +368,8 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
         )
         yield Recommendation(
             action="Run `bodycap sync`, which finds the `offset_s` of each camera from the sound. If the "
-            "videos have no common sound, clap once in view of all cameras; `offset_s` is the time of the clap in "
-            "the first video minus the time of the clap in the camera's own video. Or try an "
+            "videos have no common sound, clap once in view of all cameras; `offset_s` is the time of the "
+            "clap in the first video minus the time of the clap in the camera's own video. Or try an "
             f"`offset_s` of {offsets}.",
             reason="; ".join(clock.says for _, clock in sorted(clocks.items())),
             priority=2.5,
