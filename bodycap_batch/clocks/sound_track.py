@@ -118,7 +118,10 @@ class SoundTrack:
         return piece.start_s + round((time_s - piece.start_s) * RATE_HZ) / RATE_HZ
 
     def levels(self) -> tuple[FloatArray, FloatArray]:
-        """Return the times (N,) of successive tenths of a second, seconds, and their RMS amplitudes (N,)."""
+        """Return the start time (N,), in seconds, and the sound level (N,) of successive blocks of 0.1 s.
+
+        The level is the standard deviation of the differences between successive samples.
+        """
         times, levels = [], []
         for piece in self.pieces:
             count = len(piece.samples) // _LEVEL_SAMPLES

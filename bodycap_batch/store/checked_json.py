@@ -12,7 +12,7 @@ CHECKSUM = "checksum"
 
 
 def checked_json(document: Mapping[str, Any]) -> str:
-    """Return a JSON object with its checksum as indented text."""
+    """Return an object as indented JSON text, with a field that holds the checksum of the object."""
     values = json.loads(json.dumps(document))
     return json.dumps({**values, CHECKSUM: _digest(values)}, indent=1) + "\n"
 

@@ -29,7 +29,7 @@ class ArtefactRef:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileRef:
-    """A file of the user's that a task reads.
+    """A user's file that a task reads.
 
     Attributes:
         path: Path of the file.

@@ -81,7 +81,7 @@ LIMB_CHAINS = {
     "UpLeg": LimbChain("Leg", "Foot"),
     "Leg": LimbChain(None, "Foot"),
 }
-"""By limb bone, the bones of the limb below it."""
+"""The bones of the limb below each limb bone. The key is the role of the limb bone, without its side."""
 _REST_ABDUCTION_DEG = {"Arm": 10.0, "UpLeg": 0.0}
 """Abduction (degrees) of limbs that hang in the rest pose. Evidence: none."""
 

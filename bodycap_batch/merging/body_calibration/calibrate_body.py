@@ -71,10 +71,10 @@ class CalibrationInput:
         tracks: Tracks without gross errors, in the gauge of the main map. The track of the reference camera
             is the first.
         provisional: Approximate scale, metres per map unit.
-        alignment: By camera, uncertainty of the pose of this camera's map in the main map. It contains only
-            cameras whose map was aligned to the main map.
-        main_from_gauge: By gauge of each used map, similarity from this map to the main map. None if all
-            cameras are in one map.
+        alignment: Uncertainty of the pose of each camera's map in the main map. The key is the camera's
+            name. It contains only cameras whose map was aligned to the main map.
+        main_from_gauge: Similarity from each used map to the main map. The key is the gauge of the used map.
+            None if all cameras are in one map.
     """
 
     tracks: Sequence[CameraTrack]

@@ -55,7 +55,7 @@ class LocatedBoard:
     """The marker board in the map.
 
     Attributes:
-        scale: The scale of the main map from the board.
+        scale: The scale of the main map, estimated from the board.
         axes: (3,3) matrix with three unit vectors as columns, in the main map's gauge. The first two are
             along the edges of the board. The third is the normal of the board towards the cameras.
     """

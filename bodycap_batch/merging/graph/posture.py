@@ -18,8 +18,8 @@ _HIGHEST_PERCENTILE, _LOW_PERCENTILE = 95.0, 25.0
 """Percentiles of the trunk's height that are used as its highest position and as a low position. Evidence:
 none."""
 _STANDING_DROP_M = 0.02
-"""Maximum distance (metres) of the chest of a standing person below its highest position. A chest half a
-metre above the hips is 2 cm lower if the trunk bends by 16 degrees."""
+"""While a person stands, the chest is at most this far (metres) below the highest position of the chest. A
+chest half a metre above the hips is 2 cm lower if the trunk bends by 16 degrees."""
 _MIN_WALKING_SHARE = 0.125
 """A capture with a smaller fraction of walking ticks is treated as a capture without walking. The person then
 only steps aside during other work, mostly with a bent trunk. Unit: 1. Evidence: none."""

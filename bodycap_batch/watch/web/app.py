@@ -172,7 +172,8 @@ class _Routes:
         return FileResponse(
             path,
             headers={**_COMMON_HEADERS, "content-security-policy": _RESULT_POLICY},
-            # With the state of the file, the response raises `FileNotFoundError` if the job moves meanwhile.
+            # Because `stat_result` is given, the response raises `FileNotFoundError` if the job's folder is
+            # moved before the file is opened.
             stat_result=await run_in_threadpool(path.stat),
         )
 
