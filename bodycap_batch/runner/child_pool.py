@@ -17,7 +17,6 @@ from bodycap_batch.runner.child_process import CHILD_COMMAND, Child, crash_hint,
 from bodycap_batch.runner.memory_limit import default_limit_mb, log_says_out_of_memory, out_of_memory
 from bodycap_batch.runner.task import Task
 from bodycap_batch.store.artefacts import Store, disk_errors
-from bodycap_batch.store.digests import write_atomically
 
 CHILDREN_LOG = "children.log"
 """Name of the log file for the output that children print while they have no task."""
@@ -118,7 +117,7 @@ class Children:
         with disk_errors(environment.logs):
             environment.logs.mkdir(parents=True, exist_ok=True)
             # The child does not read this file: another run of the same job may write it at any moment.
-            write_atomically(log.with_suffix(".task.json"), json.dumps(document, indent=1).encode())
+            log.with_suffix(".task.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
             log.write_bytes(b"")
         child, last = self._run_in_child(task, environment, {"task": document, "log": str(log)})
         stopped = environment.cancelled()

@@ -170,7 +170,7 @@ class JobWorker:
         claim.lost.set()
         name = claim.job.name
         if not self._is_deleted(claim):
-            return JobOutcome(name=name, state="lost", message="another watcher has taken it over")
+            return JobOutcome(name=name, state="lost", message="another watcher runs this job now")
         if not claim.job.input.exists():  # remove log files that were written after the deletion
             shutil.rmtree(claim.job.path, ignore_errors=True)
         return JobOutcome(name=name, state="deleted", message=f"its folder was deleted from {RUNNING}/")

@@ -155,7 +155,7 @@ def test_stages_are_repeated_skipped_explained_and_removed(bench: Bench) -> None
     code, out, _ = bench.run("gc")
     assert code == 0
     assert "would remove" in out
-    assert "(--delete removes them)" in out
+    assert "(use --delete to remove these artefacts)" in out
     assert out.replace("would remove", "removed").partition(" (")[0] in bench.run("gc", "--delete")[1]
     assert json.loads(bench.run("gc", "--json")[1])["artefacts"] == []
 

@@ -54,7 +54,7 @@ def test_every_constant_has_its_sentence_and_its_sources(merged):
     assert report.scale.limbs.degrees_of_freedom == 1
     assert "1 sigma" in report.scale.known_to
     for camera, mount in report.mounts.items():
-        assert mount.known_to.startswith(camera)
+        assert mount.known_to.startswith(f"the uncertainty of {camera}'s mount is")
         assert "T-pose" not in mount.known_to
     for camera in ("left_palm", "right_palm"):
         assert report.mounts[camera].roll_deg == 0.0

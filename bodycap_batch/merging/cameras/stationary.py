@@ -54,7 +54,7 @@ class _CameraPath:
     sigma_map: float
 
     def deviations_during(self, first_ns: int, last_ns: int) -> FloatArray:
-        """Return the distances (M,), map units, of the centres in a time span to the median of the centres."""
+        """Return the distances (M,), map units, of the centres in a time span to their median position."""
         inside = self.centres[(self.times_ns >= first_ns) & (self.times_ns <= last_ns)]
         return (
             np.asarray(np.linalg.norm(inside - np.median(inside, axis=0), axis=1)) if len(inside) else inside

@@ -418,7 +418,7 @@ def test_the_users_initial_pair_is_used(built: tuple[Any, FloatArray, MappingCon
     assert models[0].num_reg_images() == _KEYFRAMES
     assert _rms(models[0], poses) < 0.01
     assert find_user_pair(mapping.workspace, ("cam:30", "cam:45"), _INTRINSICS, _NUMBERS) is None
-    with pytest.raises(JobError, match="one keyframe"):
+    with pytest.raises(JobError, match="same nearest keyframe"):
         find_user_pair(mapping.workspace, ("cam:33", "cam:33"), _INTRINSICS, _NUMBERS)
     with pytest.raises(JobError, match="camera 'hat'"):
         find_user_pair(mapping.workspace, ("hat:33", "cam:33"), _INTRINSICS, _NUMBERS)
