@@ -26,6 +26,6 @@ def damage_notes(camera: CaptureCamera, damaged: IntArray) -> list[str]:
     times_s = camera.common_times_ns()[damaged] / 1e9
     return [
         f"{len(damaged)} of {len(camera.frame_numbers)} frames are damaged in the video (the decoder reports "
-        f"errors or gives no picture), {times_s[0]:.2f} to {times_s[-1]:.2f} s on the common clock; they are "
-        "left out: copy the video again from the camera's card"
+        f"errors or gives no picture); they are between {times_s[0]:.2f} and {times_s[-1]:.2f} s on the "
+        "common clock, and they are left out: to get them, copy the video again from the camera's card"
     ]

@@ -110,7 +110,7 @@ def _body_lines(folder: Path) -> list[str]:
     else:
         lines += [
             "# height_m: 1.75",
-            "# skeleton: subject.bvh     # or none, if you need only the map and the camera paths",
+            "# skeleton: subject.bvh     # write `skeleton: none` to compute only map and camera paths",
         ]
     return [
         *lines,

@@ -48,7 +48,8 @@ def evaluate(
     align: Annotated[
         Align,
         typer.Option(
-            help="Alignment with the truth, one for all cameras together: similarity, rigid, or none."
+            help="How the estimate is aligned with the truth: sim3 (rotation, translation and scale), se3 "
+            "(rotation and translation) or none. All cameras get the same alignment."
         ),
     ] = Align.SIM3,
     reference: Annotated[

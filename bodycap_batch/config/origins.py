@@ -192,13 +192,13 @@ class LoadedJob:
         if name in JOB_FILES:
             return f"the job file is {self.job_file.name}" if self.job_file else "the folder holds results"
         if name.endswith((".yaml", ".yml")):
-            return f"a job file in a folder is called {JOB_FILES[0]}"
+            return f"a job file in a folder must have the name {JOB_FILES[0]}"
         if name == CALIBRATION_FILE:
             if any(origins.calibration.source == "default" for origins in self.origins.values()):
                 return f"only a {JOB_FILES[0]} uses it without `calibration:`"
             return "the calibration of every camera comes from elsewhere"
         if name.endswith(".timestamps.txt"):
-            return "no camera and no video has this name"
+            return "the part before .timestamps.txt is not the name of a camera or a video"
         return _NOT_NAMED
 
     def _folder_reason(self, folder: Path) -> str:

@@ -80,7 +80,7 @@ def resolved_camera(index: int, capture: CaptureConfig, stated: CaptureConfig, b
             f"camera {camera.name} has {len(sidecars)} timestamp files for {len(videos)} chapters",
             path=sidecars[0],
             field=f"capture.cameras.{index}.timestamps",
-            hint="one for the whole camera, or one beside every chapter",
+            hint="give one timestamp file for the whole camera, or put one beside every chapter",
         )
     calibration = camera.calibration if camera.calibration is not None else capture.calibration
     entry: CalibrationEntry | None = None

@@ -129,7 +129,7 @@ def _candidates(folder: Path, listed: Sequence[CameraConfig], found: VideosBesid
                 found.leave_out(
                     [path],
                     f"cannot be read ({error.strerror})",
-                    "let the user who runs this enter it (chmod)",
+                    "give the user who runs bodycap the permission to read and open this folder (chmod)",
                 )
                 continue
             if has_video:

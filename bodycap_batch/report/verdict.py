@@ -372,9 +372,9 @@ def _mount_criteria(mounts: Mapping[str, Any]) -> Iterator[Criterion]:
         grade=grade_value(sigma, GOOD_MOUNT_DEG, _FAIR_MOUNT_DEG),
         finding=f"the worst mount ({name}) has an uncertainty of {sigma:.1f}° and "
         f"{100 * worst['sigma_m']:.1f} cm",
-        rationale="An error of the mount is a constant error of the bone with the camera. By eye, an "
-        "animator turns a hand into the right direction with an error of about 4°. Above 12°, a palm "
-        "visibly faces the wrong way.",
+        rationale="If a mount is wrong, the bone that carries the camera is wrong by the same angle all the "
+        "time. For comparison: an animator who turns a hand by eye makes an error of about 4°. Above 12°, a "
+        "palm visibly faces the wrong way.",
         metric=metric_path("merge", "mounts", name, "sigma_deg"),
         value=sigma,
     )

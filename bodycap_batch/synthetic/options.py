@@ -236,8 +236,8 @@ class SynthOptions(Options):
         for key in ("t_pose_s", "on_the_spot"):
             if self.motion is not None and getattr(self, key):
                 raise ValueError(
-                    f"{key} cannot be used with motion, because a BVH motion is not changed; leave out one "
-                    "of the two"
+                    f"{key} cannot be used with motion, because the program does not change the motion of "
+                    "the BVH file; leave out one of the two"
                 )
         self._check_pressed()
         return self
@@ -285,8 +285,8 @@ class SynthOptions(Options):
             )
         if self.pressed_s and self.motion is not None:
             raise ValueError(
-                "pressed_s cannot be used with motion, because a BVH motion is not changed; leave out one "
-                "of the two"
+                "pressed_s cannot be used with motion, because the program does not change the motion of the "
+                "BVH file; leave out one of the two"
             )
 
     @property

@@ -150,7 +150,7 @@ def check_consistency(ratio: float, reach: Mapping[str, object] | None) -> Estim
             f"in {reach.get('keyframes_out_of_reach')} keyframes, a camera is farther from the other "
             "cameras than the body reaches",
         )
-        body = f"; check of the distances between cameras: {found}"
+        body = f"; the distances between the cameras were also checked: {found}"
     return EstimationError(
         f"{ratio:.0%} of the matches between keyframes contradict the map: different places that look the "
         f"same (repeated pictures, tiles, windows) were mapped as one place{body}",

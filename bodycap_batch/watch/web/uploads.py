@@ -218,7 +218,8 @@ class Uploads:
             _require_short(part)
         if not 1 <= len(path.parts) <= 2 or not all(map(_NAME.fullmatch, name.split("/"))):
             raise JobError(
-                f"{name[:80]!r} cannot be the name of a file", hint="send files at most one folder deep"
+                f"{name[:80]!r} cannot be the name of a file",
+                hint="send a file directly or in one folder; a name has no dot at its start and no backslash",
             )
         if len(path.parts) == 2 and path.parts[0].lower() in _RESERVED_NAMES:
             raise JobError(

@@ -67,7 +67,7 @@ def test_damaged_frames_are_named_and_the_others_are_used(video: Path, way: str,
     assert damaged[-1] <= 45
     (note,) = damage_notes(camera, damaged)
     assert f"{len(damaged)} of {COUNT} frames are damaged" in note
-    assert f"{damaged[0] / 30:.2f} to {damaged[-1] / 30:.2f} s" in note
+    assert f"between {damaged[0] / 30:.2f} and {damaged[-1] / 30:.2f} s" in note
 
     selection = select_keyframes(camera, KeyframeOptions(), StageContext(work_dir=tmp_path))
     assert selection.damaged.tolist() == damaged.tolist()
