@@ -8,8 +8,9 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.projection.project import Projection, project_motion
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
-from bodycap_batch.model.merge_data import CameraClock, MergeResult, SolvedBody
+from bodycap_batch.model.merge_data import MergeResult, SolvedBody
 from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import FrameStatus, Trajectory

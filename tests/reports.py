@@ -11,8 +11,8 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.metrics import collect_metrics
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import Similarity, invert, transform_points
-from bodycap_batch.model.merge_data import CameraClock
 from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.report import ReportInputs, write_report

@@ -23,6 +23,7 @@ from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.camera_clock import ClockRelation
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
@@ -49,13 +50,14 @@ class CaptureCamera:
         frame_numbers: (N,) numbers of the frames in use, counted from 0 in the joined video.
         times_ns: (N,) time of each frame in use on the clock of the camera, nanoseconds, increasing.
         nominal_fps: Frame rate given by the container, frames per second.
-        offset_s: Seconds to add to the camera time to get the common time.
         rolling_shutter_s: Readout time: seconds from the exposure of the first row to the exposure of the
             last row.
         rolling_shutter_known: False if the readout time is not given in the job. Mapping then estimates the
             readout time.
         may_be_sideways: True if the rows of the sensor may be the columns of the image. If the readout time
             is known, `camera.sideways` is already correct. Otherwise mapping determines the direction.
+        clock: Relation of the camera's clock to the common clock. Until the clocks are known, the common time
+            is the time of the camera.
         notes: Notes for the user about gaps and overlaps between chapters.
         videos: Video file of each chapter, with the list of its frames.
         mask: (H,W) mask at the work size, True where the room is visible; None if the room is visible
@@ -75,10 +77,10 @@ class CaptureCamera:
     frame_numbers: IntArray
     times_ns: IntArray
     nominal_fps: float
-    offset_s: float
     rolling_shutter_s: float
     rolling_shutter_known: bool = True
     may_be_sideways: bool = False
+    clock: ClockRelation = field(default_factory=ClockRelation)
     notes: tuple[str, ...] = ()
     videos: tuple[VideoFile, ...] = field(default=(), repr=False)
     mask: BoolArray | None = field(default=None, repr=False)
@@ -96,7 +98,7 @@ class CaptureCamera:
 
     def common_times_ns(self) -> IntArray:
         """Return the frame times (N,) on the common clock, nanoseconds."""
-        return np.asarray(self.times_ns + round(self.offset_s * 1e9), dtype=np.int64)
+        return self.clock.common_ns(self.times_ns)
 
     def is_unmasked(self, px: npt.NDArray[Any]) -> BoolArray:
         """Find the pixels at which the room is visible.

@@ -47,10 +47,12 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
     videos = tuple(index_video(path, threads) for path in config.video)
     _check_one_format(videos)
     timeline = join_chapters(videos, config.timestamps)
-    offset_s = config.offset_s or 0.0
-    used = timeline.usable & _in_time_range(timeline.times_ns, offset_s, spec)
-    if not used.any():
-        raise _no_frames_error(spec, config, timeline.times_ns, offset_s)
+    used = timeline.usable
+    # Without a known clock, nothing says which frames are between start_s and end_s, so all are used.
+    if config.offset_s is not None:
+        used = used & _in_time_range(timeline.times_ns, config.offset_s, spec)
+        if not used.any():
+            raise _no_frames_error(spec, config, timeline.times_ns, config.offset_s)
     calibration = config.calibration if isinstance(config.calibration, Calibration) else None
     camera = (
         guessed_camera(videos[0], spec.work_px, config.fov_deg)
@@ -67,7 +69,6 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         frame_numbers=np.flatnonzero(used),
         times_ns=timeline.times_ns[used],
         nominal_fps=videos[0].fps,
-        offset_s=offset_s,
         rolling_shutter_s=_shown_rolling_shutter_s(config.rolling_shutter_s or 0.0, videos[0]),
         rolling_shutter_known=config.rolling_shutter_s is not None,
         # Sensors are wider than they are high. Therefore a picture that is higher than wide was rotated by

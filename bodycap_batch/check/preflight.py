@@ -20,7 +20,14 @@ from bodycap_batch.check.picture_quality import PictureQuality, check_picture_qu
 from bodycap_batch.check.recording_advice import advise
 from bodycap_batch.config.bounds import MAX_TICKS
 from bodycap_batch.config.job import Overrides, load_job_with_origins
-from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, CaptureConfig, Job
+from bodycap_batch.config.models import (
+    NO_SKELETON,
+    SKELETON_PRESETS,
+    CameraConfig,
+    CaptureConfig,
+    Job,
+    is_clock_stated,
+)
 from bodycap_batch.config.mounts import TRUNK_ROLES
 from bodycap_batch.config.origins import CameraOrigins
 from bodycap_batch.config.rules import named_frames
@@ -34,6 +41,7 @@ from bodycap_batch.core.errors import (
 )
 from bodycap_batch.formats.bvh import RigOptions, read_rig
 from bodycap_batch.formats.optional_libraries import require_libraries
+from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.store.disk_space import require_room
 
 _RATE_TOLERANCE = 0.2
@@ -146,6 +154,7 @@ def _check_camera(
     capture: CaptureConfig, config: CameraConfig, origins: CameraOrigins | None, *, decode_all: bool
 ) -> CameraSummary:
     camera = open_camera(capture, config)
+    camera = replace(camera, clock=ClockRelation(offset_s=config.offset_s or 0.0))
     quality = check_picture_quality(camera)
     if decode_all:
         damage = damage_notes(camera, find_damaged_frames(camera))
@@ -280,7 +289,12 @@ def _body_notes(job: Job) -> list[str]:
 
 
 def _check_clocks(job: Job, summaries: list[CameraSummary]) -> list[str]:
-    """Check that each camera ran at the same time as at least one other camera."""
+    """Check that each camera ran at the same time as at least one other camera.
+
+    Cameras whose clock is to be estimated are not checked.
+    """
+    stated = {camera.name for camera in job.capture.cameras if is_clock_stated(job.capture, camera)}
+    summaries = [camera for camera in summaries if camera.name in stated]
     if len(summaries) < 2:
         return []
     for camera in summaries:

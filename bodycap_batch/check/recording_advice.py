@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from bodycap_batch.check.check_report import CameraSummary
-from bodycap_batch.config.models import SKELETON_PRESETS, Job
+from bodycap_batch.config.models import SKELETON_PRESETS, Job, is_clock_stated
 
 _LOW_FPS = 24.0
 """Minimum number of frames per second that needs no advice.
@@ -48,8 +48,8 @@ def advise(job: Job, cameras: Sequence[CameraSummary]) -> list[str]:
         return []
     return [
         *_intrinsics_advice(cameras),
-        *_clock_advice(job, cameras),
-        *_length_advice(cameras),
+        *_missing_time_advice(job, cameras),
+        *_frame_rate_advice(cameras),
         *_scale_advice(job),
         *_duration_advice(cameras),
     ]
@@ -65,19 +65,9 @@ def _intrinsics_advice(cameras: Sequence[CameraSummary]) -> Iterator[str]:
         )
 
 
-def _clock_advice(job: Job, cameras: Sequence[CameraSummary]) -> Iterator[str]:
-    configs = job.capture.cameras
-    stated = any(config.offset_s for config in configs) or any(config.timestamps for config in configs)
-    if len(cameras) > 1 and not stated:
-        yield (
-            "no camera states an offset_s, so all videos are assumed to start at the same instant. If the "
-            "cameras were started by hand, run `bodycap sync`, which finds the offset_s of each camera from "
-            "the sound. If the videos have no common sound, read the time of a clap in every video: offset_s "
-            "= time in the first video - time in the video of this camera"
-        )
-
-
-def _length_advice(cameras: Sequence[CameraSummary]) -> Iterator[str]:
+def _missing_time_advice(job: Job, cameras: Sequence[CameraSummary]) -> Iterator[str]:
+    if not all(is_clock_stated(job.capture, config) for config in job.capture.cameras):
+        return
     start, end = (
         min(camera.start_s for camera in cameras),
         max(camera.end_s for camera in cameras),
@@ -93,6 +83,9 @@ def _length_advice(cameras: Sequence[CameraSummary]) -> Iterator[str]:
                 "of its bone is only inferred. To use only the time in which all cameras recorded, set "
                 "start_s and end_s"
             )
+
+
+def _frame_rate_advice(cameras: Sequence[CameraSummary]) -> Iterator[str]:
     for camera in cameras:
         if camera.fps < _LOW_FPS:
             yield (

@@ -30,12 +30,12 @@ def check(
       bodycap check my_walk/ --height 1.75
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.check import check_path
-    from bodycap_batch.clocks import offset_notes
+    from bodycap_batch.clocks import describe_clocks
     from bodycap_batch.config.job import Overrides
 
     report = check_path(job, Overrides(out=out, skeleton=skeleton, height_m=height))
     if report.ready and report.job is not None:
-        report = replace(report, notes=(*report.notes, *offset_notes(report.job.capture)))
+        report = replace(report, notes=(*report.notes, *describe_clocks(report.job.capture)))
     if as_json:
         print_json(report.to_dict(), indent=1)
     else:

@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 
@@ -30,11 +29,11 @@ from bodycap_batch.clocks.joint_offsets import (
     solve_clocks,
 )
 from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM, PairOffset, measure_pair
+from bodycap_batch.clocks.recorders import Recorder
 from bodycap_batch.clocks.sound_track import SoundTrack, read_sound_track
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.arrays import FloatArray
-
-ClockSource = Literal["sound", "stated", "common", "none"]
+from bodycap_batch.model.camera_clock import ClockSource
 
 STATED_SIGMA_S = 1.0 / 30.0
 """Standard deviation of a stated offset, seconds. Origin: a clap is found to a frame or so in each video."""
@@ -111,12 +110,73 @@ class ClockEstimates:
         raise KeyError(name)
 
 
-@dataclass(frozen=True, slots=True)
-class _Recording:
-    """What is read from the files of one camera."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """What the files of one camera say about its clock.
 
-    track: SoundTrack
+    Attributes:
+        camera: Name of the camera.
+        sound_start_s: Start of the sound on the clock of the camera, seconds; None without usable sound.
+        problem: Reason why the sound cannot be used; empty if it can be used.
+        notes: Notes for the user about the sound.
+        recorder: Device and encoder of the sound; None without sound.
+        start: Start of the recording according to the container.
+        first_frame_s: Time of the first frame on the clock of the camera, seconds.
+        frames: Number of frames.
+    """
+
+    camera: str
+    sound_start_s: float | None
+    problem: str
+    notes: tuple[str, ...]
+    recorder: Recorder | None
     start: ContainerTime
+    first_frame_s: float
+    frames: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SoundEvidence:
+    """What the sound of all cameras says about their clocks.
+
+    Attributes:
+        recordings: The recording of each camera, in the order of the capture.
+        pairs: What the sound of each pair of cameras gives, with the correlation curve and the offsets of the
+            windows.
+    """
+
+    recordings: tuple[Recording, ...] = ()
+    pairs: tuple[PairOffset, ...] = ()
+
+    def expected(self) -> dict[tuple[str, str], ExpectedOffset | None]:
+        """Return the offset of each pair of cameras according to the containers."""
+        start = {recording.camera: recording.start for recording in self.recordings}
+        return {pair: expected_offset(start[pair[0]], start[pair[1]]) for pair in camera_pairs(list(start))}
+
+
+def measure_sound(spec: CaptureConfig, threads: int | None = None) -> SoundEvidence:
+    """Compare the sound of all pairs of cameras.
+
+    Args:
+        spec: The capture block of a job, as returned by `load_job`.
+        threads: Number of cameras or pairs that are worked on at the same time; None for all processors.
+
+    Raises:
+        CaptureError: A video or its timestamps cannot be used.
+    """
+    with ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool:
+        read = list(pool.map(_read_recording, spec.cameras))
+        tracks = {track.camera: track for _, track in read}
+        found = SoundEvidence(recordings=tuple(recording for recording, _ in read))
+        expected = found.expected()
+
+        def measure(pair: tuple[str, str]) -> PairOffset:
+            prior = expected[pair]
+            limits = None if prior is None else prior.limits()
+            return measure_pair(tracks[pair[0]], tracks[pair[1]], limits)
+
+        usable = [name for name, track in tracks.items() if not track.problem]
+        return replace(found, pairs=tuple(pool.map(measure, camera_pairs(usable))))
 
 
 def estimate_clocks(spec: CaptureConfig, threads: int | None = None) -> ClockEstimates:
@@ -129,22 +189,7 @@ def estimate_clocks(spec: CaptureConfig, threads: int | None = None) -> ClockEst
     Raises:
         CaptureError: A video or its timestamps cannot be used.
     """
-    names = [camera.name for camera in spec.cameras]
-    with ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool:
-        recordings = dict(zip(names, pool.map(_read_recording, spec.cameras), strict=True))
-        usable = [name for name in names if not recordings[name].track.problem]
-        expected = {
-            pair: expected_offset(recordings[pair[0]].start, recordings[pair[1]].start)
-            for pair in camera_pairs(names)
-        }
-
-        def measure(pair: tuple[str, str]) -> PairOffset:
-            prior = expected[pair]
-            limits = None if prior is None else prior.limits()
-            return measure_pair(recordings[pair[0]].track, recordings[pair[1]].track, limits)
-
-        pairs = tuple(pool.map(measure, camera_pairs(usable)))
-    return _combine(spec, recordings, expected, pairs)
+    return combine_evidence(spec, measure_sound(spec, threads))
 
 
 def reference_camera(spec: CaptureConfig) -> str:
@@ -156,34 +201,55 @@ def reference_camera(spec: CaptureConfig) -> str:
     return spec.cameras[0].name
 
 
-def _read_recording(config: CameraConfig) -> _Recording:
+def _read_recording(config: CameraConfig) -> tuple[Recording, SoundTrack]:
     videos = tuple(index_video(path, 1) for path in config.video)
     times_ns = join_chapters(videos, config.timestamps).times_ns
-    return _Recording(
-        read_sound_track(config.name, videos, times_ns), read_container_time(videos, int(times_ns[0]) / 1e9)
+    track = read_sound_track(config.name, videos, times_ns)
+    first_frame_s = int(times_ns[0]) / 1e9
+    recording = Recording(
+        camera=config.name,
+        sound_start_s=track.start_s if track.pieces else None,
+        problem=track.problem,
+        notes=track.notes,
+        recorder=track.recorder,
+        start=read_container_time(videos, first_frame_s),
+        first_frame_s=first_frame_s,
+        frames=len(times_ns),
     )
+    return recording, track
 
 
-def _combine(
-    spec: CaptureConfig,
-    recordings: Mapping[str, _Recording],
-    expected: Mapping[tuple[str, str], ExpectedOffset | None],
-    pairs: tuple[PairOffset, ...],
-) -> ClockEstimates:
-    """Solve the clocks from the pairs, and compare them with all that is stated."""
+def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstimates:
+    """Solve the clocks from the pairs of cameras, and compare them with all that is stated.
+
+    Args:
+        spec: The capture block of a job, as returned by `load_job`.
+        evidence: What the sound says; empty for a capture with one camera.
+    """
     reference = reference_camera(spec)
+    if not evidence.recordings:
+        only = ClockEstimate(
+            camera=reference, offset_s=0.0, sigma_s=0.0, drift_sigma_ppm=0.0, source="common"
+        )
+        return ClockEstimates(reference=reference, cameras=(only,))
+    recordings = {recording.camera: recording for recording in evidence.recordings}
+    pairs, expected = evidence.pairs, evidence.expected()
     accepted = [pair for pair in pairs if pair.accepted]
-    tracks = {name: recording.track for name, recording in recordings.items() if recording.track.pieces}
+    starts_s = {
+        name: recording.sound_start_s
+        for name, recording in recordings.items()
+        if recording.sound_start_s is not None
+    }
     joint = solve_clocks(
         reference,
         accepted,
-        {name: track.start_s for name, track in tracks.items()},
-        {name: _floor_s(tracks.get(reference), track) for name, track in tracks.items()},
+        starts_s,
+        {name: _floor_s(recordings[reference], recordings[name]) for name in starts_s},
     )
     stated = _stated_offsets(spec, reference)
     triggered = _triggered_with(spec, reference)
     clocks = []
-    for name in recordings:
+    for name, recording in recordings.items():
         contradictions = [
             f"the sound of {pair.first} and {pair.second} contradicts that of the other pairs by "
             f"{1e3 * residual:+.1f} ms; it is not used"
@@ -195,15 +261,15 @@ def _combine(
             clocks.append(
                 ClockEstimate(
                     camera=name, offset_s=0.0, sigma_s=0.0, drift_sigma_ppm=0.0, source="common",
-                    covariance=np.zeros((2, 2)), reasons=recordings[name].track.notes,
+                    covariance=np.zeros((2, 2)), reasons=recording.notes,
                     contradictions=tuple(contradictions),
                 )
             )  # fmt: skip
             continue
         dates = _date_contradictions(name, accepted, expected)
         if clock is not None:
-            contradictions += [*_stated_contradictions(stated.get(name), clock), *dates]
-        reasons = recordings[name].track.notes
+            contradictions += _stated_contradictions(stated.get(name), clock) + dates
+        reasons = recording.notes
         if clock is None:
             reasons = (*_why_none(name, reference, recordings, pairs, expected), *reasons)
         clocks.append(
@@ -246,44 +312,60 @@ def _camera_clock(
     return unknown
 
 
-def _floor_s(reference: SoundTrack | None, track: SoundTrack) -> float:
+def _floor_s(reference: Recording, recording: Recording) -> float:
     """Return the standard deviation of an offset that more sound does not reduce, seconds."""
-    if reference is None or reference.recorder is None or track.recorder is None:
+    if reference.recorder is None or recording.recorder is None:
         return UNLIKE_SIGMA_S
-    return WAY_SIGMA_S if track.recorder.is_like(reference.recorder) else UNLIKE_SIGMA_S
+    return WAY_SIGMA_S if recording.recorder.is_like(reference.recorder) else UNLIKE_SIGMA_S
 
 
 def _stated_offsets(spec: CaptureConfig, reference: str) -> dict[str, float]:
-    """Return the stated offset of each camera relative to the reference camera, seconds.
+    """Return the stated offset of each camera relative to the reference camera, seconds."""
+    stated = {camera.name: camera.offset_s for camera in spec.cameras}
+    base = stated.pop(reference) or 0.0
+    return {name: offset - base for name, offset in stated.items() if offset is not None}
 
-    A loaded job has the offset 0 for a camera without a stated one. Therefore only differences from 0 count.
-    """
-    stated = {camera.name: camera.offset_s or 0.0 for camera in spec.cameras}
-    return {
-        name: offset - stated[reference]
-        for name, offset in stated.items()
-        if name != reference and offset != stated[reference]
-    }
+
+def triggered_groups(spec: CaptureConfig) -> list[list[str]]:
+    """Return the names of the cameras that one trigger exposes, one list for each trigger."""
+    if spec.rig != "synced":
+        return []
+    return [[camera.name for camera in group] for group in spec.segments()]
 
 
 def _triggered_with(spec: CaptureConfig, reference: str) -> set[str]:
     """Return the cameras that the trigger of the reference camera exposes, too."""
-    if spec.rig != "synced":
-        return set()
-    groups = [[camera.name for camera in group] for group in spec.segments()]
+    groups = triggered_groups(spec)
     return {name for group in groups if reference in group for name in group if name != reference}
 
 
+def describe_contradiction(
+    stated_s: float, source: ClockSource, found_s: float, sigma_s: float, tolerance_s: float = 0.0
+) -> str:
+    """Return how an estimate contradicts a stated offset; "" if it does not.
+
+    Args:
+        stated_s: The stated offset relative to the reference camera, seconds.
+        source: Source of the estimate.
+        found_s: The estimated offset, seconds.
+        sigma_s: Standard deviation of the estimate, seconds.
+        tolerance_s: Difference that is no contradiction, seconds.
+    """
+    allowed_s = max(_MAX_SIGMAS * sigma_s, tolerance_s)
+    if abs(stated_s - found_s) <= allowed_s:
+        return ""
+    text = f"offset_s is stated as {stated_s:.4f} s, but the {source} gives {found_s:.4f} ± {sigma_s:.4f} s"
+    turned = abs(stated_s + found_s)
+    if turned <= max(allowed_s, _TURNED_TOLERANCE_S) < abs(stated_s - found_s):
+        text += f"; with the sign turned the {source} agrees"
+    return text
+
+
 def _stated_contradictions(stated_s: float | None, clock: JointClock) -> list[str]:
-    """Return how a stated offset contradicts the sound; nothing if it does not."""
-    if stated_s is None or abs(stated_s - clock.offset_s) <= _MAX_SIGMAS * clock.sigma_s:
+    if stated_s is None:
         return []
-    found = f"{clock.offset_s:.4f} ± {clock.sigma_s:.4f} s"
-    text = f"offset_s is stated as {stated_s:.4f} s, the sound gives {found}"
-    turned = abs(stated_s + clock.offset_s)
-    if turned <= max(_MAX_SIGMAS * clock.sigma_s, _TURNED_TOLERANCE_S) < abs(stated_s - clock.offset_s):
-        text += "; with the sign turned the sound agrees"
-    return [text]
+    text = describe_contradiction(stated_s, "sound", clock.offset_s, clock.sigma_s)
+    return [text] if text else []
 
 
 def _date_contradictions(
@@ -304,17 +386,17 @@ def _date_contradictions(
 def _why_none(
     name: str,
     reference: str,
-    recordings: Mapping[str, _Recording],
+    recordings: Mapping[str, Recording],
     pairs: Sequence[PairOffset],
     expected: Mapping[tuple[str, str], ExpectedOffset | None],
 ) -> list[str]:
     """Return why the sound gives no clock for a camera."""
-    own = recordings[name].track.problem
+    own = recordings[name].problem
     if own:
         return [own]
     reasons = []
-    if recordings[reference].track.problem:
-        reasons.append(f"{reference}, the reference camera: {recordings[reference].track.problem}")
+    if recordings[reference].problem:
+        reasons.append(f"{reference}, the reference camera: {recordings[reference].problem}")
     connected = connected_cameras(reference, [pair for pair in pairs if pair.accepted])
     for pair in pairs:
         other = {pair.first: pair.second, pair.second: pair.first}.get(name)

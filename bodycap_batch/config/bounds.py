@@ -37,3 +37,6 @@ with a field of view of 4 degrees has a focal length of 940,000 pixels."""
 MAX_ROLLING_SHUTTER_S = 1.0
 """Maximum time (seconds) from the exposure of the first row to the exposure of the last row. Sensors take
 less than a tenth of this time. Evidence: none."""
+MAX_DRIFT_PPM = 1e5
+"""Maximum absolute drift (parts per million) of a clock. Crystals drift by less than 100 ppm, and software
+clocks of webcams by less than a tenth. Evidence: none."""

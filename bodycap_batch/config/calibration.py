@@ -180,15 +180,14 @@ class CalibrationEntry:
 
     Attributes:
         calibration: Intrinsics of the camera.
-        offset_s: Clock offset (seconds): common time = camera time + offset; 0 if the file does not give it.
-        has_offset: True if the file gives the clock offset.
+        offset_s: Clock offset (seconds): common time = camera time + offset; None if the file does not give
+            it.
         rolling_shutter_s: Time (seconds) from the exposure of the first row to the exposure of the last row;
             None if the file does not give it.
     """
 
     calibration: Calibration
-    offset_s: float
-    has_offset: bool
+    offset_s: float | None
     rolling_shutter_s: float | None
 
 
@@ -232,14 +231,12 @@ def read_calibration(path: Path, camera: str) -> CalibrationEntry:
     if (implausible := calibration.implausible_parameter()) is not None:
         raise implausible_calibration(implausible, path, f"{field}params")
     offsets = data.get("offsets_s", {})
-    if "offset_s" in data or not isinstance(offsets, dict):
-        has_offset, offset = True, data.get("offset_s", offsets)
-    else:
-        has_offset, offset = camera in offsets, offsets.get(camera, 0.0)
+    by_camera = isinstance(offsets, dict)
+    offset = data.get("offset_s", offsets.get(camera) if by_camera else offsets)
+    has_offset = "offset_s" in data or not by_camera or camera in offsets
     return CalibrationEntry(
         calibration=calibration,
-        offset_s=_seconds(offset, MAX_TIME_S, path, f"{field}offsets_s"),
-        has_offset=has_offset,
+        offset_s=_seconds(offset, MAX_TIME_S, path, f"{field}offsets_s") if has_offset else None,
         rolling_shutter_s=None
         if data.get("rolling_shutter_s") is None
         else _seconds(data["rolling_shutter_s"], MAX_ROLLING_SHUTTER_S, path, f"{field}rolling_shutter_s"),

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
 
 from bodycap_batch.config.bounds import (
     MAX_ANGLE_DEG,
+    MAX_DRIFT_PPM,
     MAX_REACH_M,
     MAX_ROLLING_SHUTTER_S,
     MAX_TIME_S,
@@ -54,6 +55,10 @@ def _pose_kind(value: object) -> str:
     return "matrix" if isinstance(value, list | tuple) else "parts"
 
 
+def _none_if_auto(value: object) -> object:
+    return None if value == "auto" else value
+
+
 AnyCalibration = Annotated[
     Annotated[Calibration, Tag("inline")]
     | Annotated[Literal["auto"], Tag("auto")]
@@ -61,6 +66,7 @@ AnyCalibration = Annotated[
     Discriminator(_calibration_kind),
 ]
 Seconds = Annotated[float, Field(ge=-MAX_TIME_S, le=MAX_TIME_S)]
+_Drift = Annotated[float, Field(ge=-MAX_DRIFT_PPM, le=MAX_DRIFT_PPM)]
 _Component = Annotated[float, Field(ge=-_MAX_ROTATION, le=_MAX_ROTATION)]
 _Metres = Annotated[float, Field(ge=-MAX_REACH_M, le=MAX_REACH_M)]
 Row = tuple[_Component, _Component, _Component, _Metres]
@@ -132,8 +138,15 @@ class CameraConfig(_Block):
         description="PNG picture with the aspect ratio of the video: white where the room is visible, "
         "black where the wearer is visible",
     )
-    offset_s: Seconds | None = Field(
-        None, description="offset of the camera's clock in seconds: common time = camera time + offset_s"
+    offset_s: Annotated[Seconds | None, BeforeValidator(_none_if_auto)] = Field(
+        None,
+        description="offset of the camera's clock in seconds: common time = camera time · (1 + drift_ppm · "
+        "1e-6) + offset_s; default: auto, which means estimated from the sound or from the motion",
+    )
+    drift_ppm: Annotated[_Drift | None, BeforeValidator(_none_if_auto)] = Field(
+        None,
+        description="drift of the camera's clock in parts per million; default: auto, which means estimated "
+        "if the recording is long enough, else 0",
     )
     rolling_shutter_s: float | None = Field(
         None,
@@ -185,6 +198,11 @@ class CaptureConfig(_Block):
         description="synced: the cameras on one segment are fixed rigidly to each other, and one hardware "
         "trigger exposes all of these cameras",
     )
+    clocks: Literal["auto", "common"] = Field(
+        "auto",
+        description="common: the clocks of all cameras agree, except for stated offsets; auto: clocks that "
+        "are not stated are estimated",
+    )
     start_s: Seconds | None = Field(None, description="first moment to use, in seconds on the common clock")
     end_s: Seconds | None = Field(None, description="last moment to use, in seconds on the common clock")
     work_px: int = Field(
@@ -206,6 +224,11 @@ class CaptureConfig(_Block):
             if camera.role is not None:
                 by_role.setdefault(camera.role, []).append(camera)
         return [cameras for cameras in by_role.values() if len(cameras) > 1]
+
+
+def is_clock_stated(capture: CaptureConfig, camera: CameraConfig) -> bool:
+    """Return True if the clock offset of a camera of a loaded capture is stated, and not to be estimated."""
+    return camera.offset_s is not None or len(capture.cameras) == 1
 
 
 class Job(_Block):

@@ -93,7 +93,9 @@ def resolved_camera(index: int, capture: CaptureConfig, stated: CaptureConfig, b
     if camera.mask is not None:
         update["mask"] = real_path(base / camera.mask)
     if camera.offset_s is None:
-        update["offset_s"] = entry.offset_s if entry else 0.0
+        is_common = capture.clocks == "common" or len(capture.cameras) == 1
+        in_file = entry.offset_s if entry else None
+        update["offset_s"] = 0.0 if in_file is None and is_common else in_file
     if camera.rolling_shutter_s is None:
         update["rolling_shutter_s"] = entry.rolling_shutter_s if entry else None
     config = camera.model_copy(update=update)
@@ -104,8 +106,8 @@ def resolved_camera(index: int, capture: CaptureConfig, stated: CaptureConfig, b
         timestamps=_timestamps_origin(config, is_stated=bool(camera.timestamps)),
         clock_offset=Origin(source="job file", value=f"{camera.offset_s:g} s")
         if camera.offset_s is not None
-        else _offset_origin(entry, file, is_stated=is_stated),
-        clock_drift=Origin(source="default", value="0, not corrected"),
+        else _offset_origin(entry, file, capture, is_stated=is_stated),
+        clock_drift=_drift_origin(camera, capture),
         mount=_mount_origin(config),
         mount_pose=Origin(source="default", value="typical of the place")
         if camera.joint_from_cam is None
@@ -138,19 +140,33 @@ def _timestamps_origin(config: CameraConfig, *, is_stated: bool) -> Origin:
     return Origin(source=source, value=_file_names(config.timestamps))
 
 
-def _offset_origin(entry: CalibrationEntry | None, file: Path | None, *, is_stated: bool) -> Origin:
+def _offset_origin(
+    entry: CalibrationEntry | None, file: Path | None, capture: CaptureConfig, *, is_stated: bool
+) -> Origin:
     """Return the origin of a clock offset that the job file does not give.
 
     Args:
         entry: The entry of the camera in the calibration file; None without such a file.
         file: The calibration file.
+        capture: The capture, which says whether all clocks agree.
         is_stated: True if the job file names this file.
     """
-    if entry is None or file is None or not entry.has_offset:
-        return Origin(source="default", value="0 s")
+    if entry is None or file is None or entry.offset_s is None:
+        if capture.clocks == "common":
+            return Origin(source="job file", value="0 s, common clocks")
+        return Origin(source="default", value="auto" if len(capture.cameras) > 1 else "0 s")
     if is_stated:
         return Origin(source="job file", value=f"{entry.offset_s:g} s in {file.name}")
     return Origin(source="calib.json", value=f"{entry.offset_s:g} s")
+
+
+def _drift_origin(camera: CameraConfig, capture: CaptureConfig) -> Origin:
+    """Return the origin of the drift of a camera's clock."""
+    if camera.drift_ppm is not None:
+        return Origin(source="job file", value=f"{camera.drift_ppm:g} ppm")
+    if capture.clocks == "common":
+        return Origin(source="job file", value="0 ppm, common clocks")
+    return Origin(source="default", value="auto" if len(capture.cameras) > 1 else "0 ppm")
 
 
 def _mount_origin(config: CameraConfig) -> Origin:

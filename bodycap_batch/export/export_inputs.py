@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.camera_clock import CameraClock
+from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.relative_pose import RelativePose
 from bodycap_batch.model.scene import KeyframeSelection, Map, Trajectory
 
@@ -22,6 +23,8 @@ class ExportInputs:
         maps: The maps, largest first, each in its own gauge.
         trajectories: One trajectory for each camera, in the gauge of the camera's map.
         clocks: The clock of each camera, by camera name.
+        reference_camera: Name of the camera to which clock offsets are relative; "" if they are relative to
+            the common clock.
         selections: One keyframe selection for each camera.
         merge: The result of merging, with the body in the world; None for ``skeleton: none``, or if merging
             failed.
@@ -39,6 +42,7 @@ class ExportInputs:
     maps: tuple[Map, ...]
     trajectories: tuple[Trajectory, ...]
     clocks: Mapping[str, CameraClock]
+    reference_camera: str = ""
     selections: tuple[KeyframeSelection, ...] = ()
     merge: MergeResult | None = None
     partial_reason: str | None = None

@@ -15,7 +15,7 @@ from bodycap_batch.core.errors import NO_MOTION_HINT, EstimationError
 from bodycap_batch.mapping.initial_models import reconstruct_with_intrinsics
 from bodycap_batch.mapping.inputs import (
     calibrated_camera_ids,
-    common_times_ns,
+    frame_times_ns,
     intrinsics_of,
     make_mapping_context,
 )
@@ -34,7 +34,6 @@ from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_k
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.model_files import write_models
 from bodycap_batch.mapping.results import finalise_models, make_result
-from bodycap_batch.mapping.validation.camera_distance_check import Reach, check_distances
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
 from bodycap_batch.mapping.validation.repair import repair_model
@@ -51,7 +50,6 @@ def build_map(
     selections: Sequence[KeyframeSelection],
     options: MapOptions,
     context: StageContext,
-    reach: Reach | None = None,
     *,
     skeletal_above: int = SKELETAL_ABOVE,
 ) -> MapResult:
@@ -64,8 +62,6 @@ def build_map(
         selections: Keyframes of each camera.
         options: The stage's options.
         context: Work folder, threads, progress. The database and the models are written to the work folder.
-        reach: Minimum and maximum distance (metres) that the body permits between two cameras, for each pair
-            of cameras; None: the distances are not checked.
         skeletal_above: Maximum number of keyframes of a map that is built from all keyframes at once. A
             larger map is built from skeletal keyframes (the reduced set of keyframes, Snavely's skeletal
             set), and the other keyframes are resected.
@@ -80,11 +76,11 @@ def build_map(
     Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016 (COLMAP).
     """
     _require_motion(selections)
-    result, refused = build_map_once(capture, selections, options, context, reach, skeletal_above)
+    result, refused = build_map_once(capture, selections, options, context, skeletal_above)
     second_context = replace(context, work_dir=context.work_dir / "freed")
 
     def build_again(other: Capture) -> MapResult:
-        again, unusable = build_map_once(other, selections, options, second_context, reach, skeletal_above)
+        again, unusable = build_map_once(other, selections, options, second_context, skeletal_above)
         if unusable is not None:
             raise unusable
         return again
@@ -108,7 +104,6 @@ def build_map_once(
     selections: Sequence[KeyframeSelection],
     options: MapOptions,
     context: StageContext,
-    reach: Reach | None,
     skeletal_above: int,
 ) -> tuple[MapResult, EstimationError | None]:
     """Build a map with the capture's intrinsics: calibrated intrinsics stay constant, others are refined.
@@ -139,7 +134,7 @@ def build_map_once(
     refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
     calibrated_ids = calibrated_camera_ids(capture, ids)
     mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, skeletal_above)
-    generator = PairGenerator(workspace, refs, common_times_ns(capture), options, context)
+    generator = PairGenerator(workspace, refs, frame_times_ns(capture), options, context)
     skeletal = generator.reduced() if mapping.is_large(len(refs)) else generator
     tried, match_log = match_keyframes(skeletal, workspace, intrinsics_of(capture), context)
     uncalibrated = {number: name for name, number in ids.items() if capture.camera(name).camera.refine}
@@ -160,7 +155,6 @@ def build_map_once(
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
     log = MapDiagnostics(misfit_factors=misfits, details=log).to_log()
     result = make_result(models, workspace, log)
-    reach_log = check_distances(result.maps[0], common_times_ns(capture), reach).to_log() if reach else None
     ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
-    refused = refused or add_flip_hint(check_consistency(max(ratios), reach_log), flips)
-    return replace(result, log={**result.log, "reach": reach_log}), refused
+    refused = refused or add_flip_hint(check_consistency(max(ratios)), flips)
+    return result, refused

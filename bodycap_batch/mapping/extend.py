@@ -14,7 +14,7 @@ from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.inputs import (
     calibrated_camera_ids,
-    common_times_ns,
+    frame_times_ns,
     intrinsics_of,
     make_mapping_context,
 )
@@ -79,7 +79,7 @@ def extend_map(
         for name in sorted({ref.camera for ref in new})
     ]
     add_keyframes(workspace, keyframes, options, context)
-    generator = PairGenerator(workspace, new, common_times_ns(capture), options, context)
+    generator = PairGenerator(workspace, new, frame_times_ns(capture), options, context)
     _, match_log = match_keyframes(generator, workspace, intrinsics_of(capture), context)
     calibrated_ids = calibrated_camera_ids(capture, ids)
     again = {existing[ref] for ref in _image_refs(extra_frames) if ref in existing}

@@ -45,9 +45,13 @@ def make_mapping_context(
     )
 
 
-def common_times_ns(capture: Capture) -> dict[str, IntArray]:
-    """Return the times (N,) of all frames of each camera on the common clock, nanoseconds, by camera name."""
-    return {camera.name: camera.common_times_ns() for camera in capture.cameras}
+def frame_times_ns(capture: Capture) -> dict[str, IntArray]:
+    """Return the times (N,) of all frames of each camera on its own clock, nanoseconds, by camera name.
+
+    The clocks are not yet known. Times of different cameras are compared only to choose pairs of keyframes
+    that are likely to see the same place. Therefore a new clock does not change the map.
+    """
+    return {camera.name: camera.times_ns for camera in capture.cameras}
 
 
 def intrinsics_of(capture: Capture) -> dict[str, CameraIntrinsics]:

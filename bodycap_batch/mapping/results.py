@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.capture import Capture
-from bodycap_batch.mapping.inputs import common_times_ns
+from bodycap_batch.mapping.inputs import frame_times_ns
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robustly
 from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction
@@ -31,7 +31,7 @@ def finalise_models(
     Returns:
         Number of points removed from all models.
     """
-    times_ns = common_times_ns(capture)
+    times_ns = frame_times_ns(capture)
     total = 0
     for number, (model, image_ids) in enumerate(zip(models, resected, strict=True)):
         context.stage.progress(number, len(models), "maps adjusted")

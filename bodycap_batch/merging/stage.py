@@ -46,8 +46,9 @@ from bodycap_batch.merging.world.floor import (
     standing_height,
 )
 from bodycap_batch.merging.world.world_frame import initial_heading, rotation_to_z_up, world_from_solved_frame
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import Similarity
-from bodycap_batch.model.merge_data import CameraClock, MergeInputs, MergeResult, SolvedBody
+from bodycap_batch.model.merge_data import MergeInputs, MergeResult, SolvedBody
 from bodycap_batch.model.merge_report import AlignedCameraReport
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import SkeletonModel

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import Trajectory
@@ -42,40 +43,6 @@ def standing_sigma_m(fps: float) -> float:
         fps: Ticks per second of the timeline.
     """
     return _STANDING_SPEED_M_PER_S / math.sqrt(_STANDING_RATE_HZ * fps)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraClock:
-    """The relation between a camera's timestamps and the common clock, for converting camera times.
-
-    Attributes:
-        nominal_fps: Nominal frame rate of the camera, frames per second. Dropped frames do not change the
-            nominal frame rate.
-        offset_s: Seconds to add to the camera time to get the common time.
-        rolling_shutter_s: Seconds from the exposure of the first image row to the exposure of the last row.
-    """
-
-    nominal_fps: float
-    offset_s: float = 0.0
-    rolling_shutter_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not self.nominal_fps > 0.0:
-            raise ValueError(f"nominal_fps must be positive, not {self.nominal_fps}")
-
-    def common_times_ns(self, times_ns: IntArray, row_fraction: FloatArray | None = None) -> IntArray:
-        """Return the common time (N,), nanoseconds, at which the pose of each frame is valid.
-
-        Args:
-            times_ns: (N,) camera time of each frame, nanoseconds. The middle row is exposed at this time.
-            row_fraction: (N,) mean image row of the observations that each pose was estimated from, as a
-                fraction of the image height. The pose is valid at the exposure of this row. None if each pose
-                is valid at the exposure of the middle row.
-        """
-        shift_s = np.full(len(times_ns), self.offset_s)
-        if row_fraction is not None:
-            shift_s += (row_fraction - 0.5) * self.rolling_shutter_s
-        return np.asarray(times_ns + np.round(shift_s * 1e9), dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

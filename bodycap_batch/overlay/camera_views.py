@@ -9,8 +9,9 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import invert, transform_points
-from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.scene import FrameStatus, Map, Registration
 
 _MAX_INLIER_ERROR_PX = 4.0

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_POSED
 from bodycap_batch.config.models import CameraConfig, Job
-from bodycap_batch.core.errors import BodycapError, CaptureError, EstimationError, JobError
+from bodycap_batch.core.errors import BodycapError, CaptureError, JobError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.pipeline.inputs import (
@@ -31,16 +32,23 @@ from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.tasks.body import camera_distances
 from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.check import CHECK, CheckTask
+from bodycap_batch.tasks.clocks import (
+    CLOCKS,
+    CameraDistance,
+    ClocksTask,
+    stated_clocks,
+)
 from bodycap_batch.tasks.export import EXPORT, ExportTask
 from bodycap_batch.tasks.inputs import BodyInput
 from bodycap_batch.tasks.keyframes import KEYFRAMES, KeyframesTask
-from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE, CameraDistance, ExtendTask, MapTask, RefineTask
+from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE, ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import MERGE, BoardFootage, MergeTask
 from bodycap_batch.tasks.preview import PREVIEW
 from bodycap_batch.tasks.recover import RECOVER
 from bodycap_batch.tasks.registration import REGISTRATION, RegistrationTask
 from bodycap_batch.tasks.report import REPORT
 from bodycap_batch.tasks.rig import RIG
+from bodycap_batch.tasks.sound import SOUND, SoundTask, known_from_sound
 from bodycap_batch.tasks.stage import Stage, read_summary
 
 ByCamera = Mapping[str, Artefact]
@@ -58,6 +66,8 @@ class Flow:
     def __init__(self, job: Job, settings: Settings, *, logs: Path) -> None:
         self.runner = StageRunner(settings, logs=logs, cameras=len(job.capture.cameras))
         self._job = job
+        self._capture = job.capture
+        self._sound: Future[Artefact] | None = None
         self._settings = settings
         self._threads = settings.threads
         self._cameras: dict[str, str] = {}
@@ -85,13 +95,19 @@ class Flow:
         summary = read_summary(artefact.path)
         self.runner.expect_frames(int(summary["frames"]), int(summary.get("large_frames", 0)))
         self.runner.report_notes(artefact, "check")
+        if len(self._capture.cameras) > 1:
+            self._sound = self.runner.start(
+                make_task(SOUND, SoundTask(capture=capture_ref(self._capture, self._cameras)))
+            )
+        if self._capture.start_s is not None or self._capture.end_s is not None:
+            self._apply_sound_offsets()
 
     def keyframes(self) -> ByCamera:
         """Select the keyframes of every camera, and return the artefact of each camera.
 
         Damaged and frozen frames are reported to the user.
         """
-        capture = self._job.capture
+        capture = self._capture
         selected = self.runner.run_all(
             make_task(
                 KEYFRAMES,
@@ -109,15 +125,10 @@ class Flow:
 
     def map(self, keyframes: ByCamera) -> Artefact:
         """Build the map of all keyframes and return its artefact."""
-        distances = [] if self._body is None else camera_distances(self._body)
         task = MapTask(
             options=self._job.map,
-            capture=capture_ref(self._job.capture, self._cameras),
+            capture=capture_ref(self._capture, self._cameras),
             keyframes=refs_by_camera(keyframes),
-            reach=tuple(
-                CameraDistance(first=first, second=second, least_m=least_m, most_m=most_m)
-                for first, second, least_m, most_m in distances
-            ),
         )
         later: list[Stage[Any]] = [*([MERGE] if has_body(self._job) else []), EXPORT, REPORT]
         # Mapping keeps one core busy. Meanwhile, another core loads the libraries of the last stages.
@@ -137,13 +148,13 @@ class Flow:
             previous: The artefact of each camera's registration against an earlier round of the map, by
                 camera name. The tracks of these registrations are reused. None in the first round.
         """
-        cameras = self._job.capture.cameras
+        cameras = self._capture.cameras
         return self.runner.run_all(
             make_task(
                 REGISTRATION,
                 RegistrationTask(
                     options=self._job.registration,
-                    capture=capture_ref(self._job.capture, self._cameras, [camera]),
+                    capture=capture_ref(self._capture, self._cameras, [camera]),
                     keyframes=refs_by_camera({camera.name: keyframes[camera.name]}),
                     map=artefact_ref(scene_map),
                     previous=optional_ref(None if previous is None else previous[camera.name]),
@@ -192,7 +203,7 @@ class Flow:
             return scene_map, registrations
         task = RefineTask(
             options=self._job.map,
-            capture=capture_ref(self._job.capture, self._cameras),
+            capture=capture_ref(self._capture, self._cameras),
             map=artefact_ref(scene_map),
             registrations=refs_by_camera(registrations),
         )
@@ -212,7 +223,30 @@ class Flow:
         recovered = self.runner.run_all(self._recovery_tasks(scene_map, registrations, keyframes))
         return {**registrations, **recovered}
 
-    def merge(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> Artefact:
+    def clocks(self, scene_map: Artefact, registrations: ByCamera) -> Artefact:
+        """Decide which clock each camera has, and report unknown and contradicted clocks to the user."""
+        distances = [] if self._body is None else camera_distances(self._body)
+        capture = self._job.capture
+        task = ClocksTask(
+            capture=capture_ref(capture, self._cameras),
+            stated=stated_clocks(capture),
+            common=capture.clocks,
+            rig=capture.rig,
+            sound=optional_ref(None if self._sound is None else self._sound.result()),
+            map=artefact_ref(scene_map),
+            registrations=refs_by_camera(registrations),
+            reach=tuple(
+                CameraDistance(first=first, second=second, least_m=least_m, most_m=most_m)
+                for first, second, least_m, most_m in distances
+            ),
+        )
+        artefact = self.runner.run(make_task(CLOCKS, task))
+        self.runner.report_notes(artefact, "clocks")
+        return artefact
+
+    def merge(
+        self, scene_map: Artefact, registrations: ByCamera, clocks: Artefact, keyframes: ByCamera
+    ) -> Artefact:
         """Solve the motion of the skeleton in the world.
 
         Raises:
@@ -220,12 +254,13 @@ class Flow:
         """
         assert self._body is not None
         footage = BoardFootage(
-            capture=capture_ref(self._job.capture, self._cameras), keyframes=refs_by_camera(keyframes)
+            capture=capture_ref(self._capture, self._cameras), keyframes=refs_by_camera(keyframes)
         )
         task = MergeTask(
             options=self._job.merge,
             map=artefact_ref(scene_map),
             registrations=refs_by_camera(registrations),
+            clocks=artefact_ref(clocks),
             body=self._body,
             footage=None if self._job.merge.marker_board is None else footage,
         )
@@ -234,31 +269,23 @@ class Flow:
         self.runner.report_notes(artefact, "merge")
         return artefact
 
-    def export(
-        self,
-        keyframes: ByCamera,
-        scene_map: Artefact,
-        registrations: ByCamera,
-        merged: Artefact | None,
-        failure: EstimationError | None,
-    ) -> Artefact:
+    def export(self, results: StageResults) -> Artefact:
         """Write the result files and return their artefact.
 
         Args:
-            keyframes: The artefact with the keyframes of each camera, by camera name.
-            scene_map: The artefact of the map.
-            registrations: The artefact of each camera's registration, by camera name.
-            merged: The artefact of the skeleton's motion; None if there is no motion.
-            failure: The reason why the motion that the job asks for is missing; None if no motion is missing.
+            results: The results of the stages up to the merge.
         """
-        segments = self._job.capture.segments()
+        assert results.map is not None
+        assert results.clocks is not None
+        segments = self._capture.segments()
         task = ExportTask(
             options=self._job.export,
-            map=artefact_ref(scene_map),
-            registrations=refs_by_camera(registrations),
-            keyframes=refs_by_camera(keyframes),
-            merge=optional_ref(merged),
-            failure=None if failure is None else failure.message,
+            map=artefact_ref(results.map),
+            registrations=refs_by_camera(results.registrations),
+            clocks=artefact_ref(results.clocks),
+            keyframes=refs_by_camera(results.keyframes),
+            merge=optional_ref(results.merged),
+            failure=None if results.failure is None else results.failure.message,
             segments=tuple(tuple(camera.name for camera in cameras) for cameras in segments),
         )
         return self.runner.run(make_task(EXPORT, task, threads=self._threads))
@@ -271,7 +298,8 @@ class Flow:
         """
         if self._settings.until not in ("", "preview") or results.map is None:
             return None
-        task = preview_task(self._job, results, results.map, self._cameras)
+        assert results.clocks is not None
+        task = preview_task(self._job, results, results.map, results.clocks, self._cameras)
         return self.runner.start(make_task(PREVIEW, task, threads=self._threads))
 
     def report(self, results: StageResults, stopped_by: BodycapError | None = None) -> Artefact:
@@ -286,6 +314,24 @@ class Flow:
         task = report_task(self._job, results, self._cameras, digests, failure)
         return self.runner.run(make_task(REPORT, task))
 
+    def _apply_sound_offsets(self) -> None:
+        """Select the frames between start_s and end_s with the clocks that the sound determines.
+
+        All frames of a camera with an unknown clock are used. A note says so.
+        """
+        sound = None if self._sound is None else self._sound.result()
+        self._capture = known_from_sound(self._job.capture, None if sound is None else sound.path)
+        for camera in self._capture.cameras:
+            if camera.offset_s is None:
+                note = (
+                    f"{camera.name}: neither the job nor the sound gives its clock, so start_s and end_s do "
+                    "not apply to it and all its frames are used; state offset_s to use a part of its video"
+                )
+                self._settings.listener(Event(kind="note", stage="clocks", what=f"note: {note}"))
+        self._cameras = camera_digests(
+            self._capture, self._settings.store.digests, self._settings.listener, self._settings.cancelled
+        )
+
     @cached_property
     def _body(self) -> BodyInput | None:
         """The body of the job; None if the job asks for no skeleton."""
@@ -293,7 +339,7 @@ class Flow:
 
     def _check_task(self) -> Task:
         self._cameras = camera_digests(
-            self._job.capture, self._settings.store.digests, self._settings.listener, self._settings.cancelled
+            self._capture, self._settings.store.digests, self._settings.listener, self._settings.cancelled
         )
         if has_body(self._job):
             # Each run checks the installed libraries: they can change after the check stage is stored.
@@ -315,7 +361,7 @@ class Flow:
         self._map_round += 1
         task = ExtendTask(
             options=self._job.map,
-            capture=capture_ref(self._job.capture, self._cameras),
+            capture=capture_ref(self._capture, self._cameras),
             keyframes=refs_by_camera(keyframes),
             map=artefact_ref(scene_map),
             extra={name: tuple(frames) for name, frames in wanted.items()},
@@ -324,20 +370,21 @@ class Flow:
 
     def _rig_tasks(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> Iterator[Task]:
         """Yield one task for every camera of a synchronised rig."""
-        rigs = self._job.capture.segments() if self._job.capture.rig == "synced" else []
+        rigs = self._capture.segments() if self._capture.rig == "synced" else []
         for own, cameras in ((own, rig) for rig in rigs for own in rig):
             task = self._group_task(own, cameras, scene_map, registrations, keyframes)
-            yield make_task(RIG, task, camera=own.name)
+            offsets_s = {camera.name: camera.offset_s or 0.0 for camera in cameras}
+            yield make_task(RIG, replace(task, offsets_s=offsets_s), camera=own.name)
 
     def _recovery_tasks(
         self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
     ) -> Iterator[Task]:
         """Yield one task for every camera with enough lost frames and enough localised frames."""
-        for own in self._job.capture.cameras:
+        for own in self._capture.cameras:
             summary = read_summary(registrations[own.name].path)
             if not LEAST_POSED <= summary["localised"] <= summary["frames"] - LEAST_LOST:
                 continue
-            task = self._group_task(own, self._job.capture.cameras, scene_map, registrations, keyframes)
+            task = self._group_task(own, self._capture.cameras, scene_map, registrations, keyframes)
             yield make_task(RECOVER, task, camera=own.name)
 
     def _group_task(
@@ -354,10 +401,11 @@ class Flow:
         return CameraGroupTask(
             options=self._job.registration,
             cameras=tuple(names),
-            capture=capture_ref(self._job.capture, self._cameras, ordered),
+            capture=capture_ref(self._capture, self._cameras, ordered),
             keyframes=refs_by_camera({name: keyframes[name] for name in names}),
             map=artefact_ref(scene_map),
             registrations=refs_by_camera({name: registrations[name] for name in names}),
+            offsets_s={},
         )
 
 

@@ -14,6 +14,9 @@ from bodycap_batch.store.digests import FileDigests, json_digest
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, FileRef, MountInput
 
 _FILE_FIELDS = ("video", "timestamps", "mask")
+_CLOCK_FIELDS = ("offset_s", "drift_ppm")
+"""Fields that describe a camera's clock. The frames of a camera depend on them only if start_s or end_s
+selects frames; a new offset then changes the selected frames."""
 _MOUNT_FIELDS = ("mount", "segment", "joint_from_cam", "sigma_deg", "sigma_m")
 """Fields that describe a camera's mount on the body. Only the skeleton depends on them, so they are not part
 of a camera's digest."""
@@ -37,7 +40,10 @@ def camera_digest(
         CaptureError: A file cannot be read.
         StoreError: The disk fails (`DiskAway` if the disk does not answer).
     """
-    settings = camera.model_dump(mode="json", exclude=set(_FILE_FIELDS + _MOUNT_FIELDS))
+    omitted = {*_FILE_FIELDS, *_MOUNT_FIELDS}
+    if capture.start_s is None and capture.end_s is None:
+        omitted |= {*_CLOCK_FIELDS}
+    settings = camera.model_dump(mode="json", exclude=omitted)
     shared = capture.model_dump(mode="json", include={"start_s", "end_s", "work_px"})
     content = [_footage_digest(path, digests, on_bytes) for path in camera.input_files()]
     return json_digest(

@@ -110,14 +110,13 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     results.map, found = flow.refine_map(scene_map, found, keyframes)
     found = flow.solve_rigs(results.map, found, keyframes)
     results.registrations = flow.recover(results.map, found, keyframes)
+    results.clocks = flow.clocks(results.map, results.registrations)
     yield "registration"
     results.stage = "merge"
     results.merged, results.failure = _merge(job, flow, results)
     yield "merge"
     results.preview = flow.start_preview(results) if job.export.preview else None
-    results.exported = flow.export(
-        keyframes, results.map, results.registrations, results.merged, results.failure
-    )
+    results.exported = flow.export(results)
     yield "export"
     results.reported = flow.report(results)
     yield "report"
@@ -223,10 +222,10 @@ def _merge(job: Job, flow: Flow, results: StageResults) -> tuple[Artefact | None
 
     Both values are None if the job asks for no skeleton.
     """
-    if not has_body(job) or results.map is None:
+    if not has_body(job) or results.map is None or results.clocks is None:
         return None, None
     try:
-        return flow.merge(results.map, results.registrations, results.keyframes), None
+        return flow.merge(results.map, results.registrations, results.clocks, results.keyframes), None
     except EstimationError as error:
         return None, error
 

@@ -32,6 +32,7 @@ class StageResults:
         keyframes: The artefact of each camera's keyframes, by camera name.
         map: The artefact of the map.
         registrations: The registration of each camera, by camera name.
+        clocks: The artefact of the clocks of all cameras.
         merged: The artefact of the skeleton's motion.
         exported: The artefact of the result files.
         reported: The artefact of the report.
@@ -45,6 +46,7 @@ class StageResults:
     keyframes: Mapping[str, Artefact] = field(default_factory=dict)
     map: Artefact | None = None
     registrations: Mapping[str, Artefact] = field(default_factory=dict)
+    clocks: Artefact | None = None
     merged: Artefact | None = None
     exported: Artefact | None = None
     reported: Artefact | None = None
@@ -81,6 +83,7 @@ def report_task(
         capture=capture_ref(job.capture, cameras),
         keyframes=refs_by_camera(results.keyframes),
         registrations=refs_by_camera(results.registrations),
+        clocks=optional_ref(results.clocks),
         map=optional_ref(results.map),
         merge=optional_ref(results.merged),
         export=optional_ref(results.exported),
@@ -89,7 +92,7 @@ def report_task(
 
 
 def preview_task(
-    job: Job, results: StageResults, scene_map: Artefact, cameras: Mapping[str, str]
+    job: Job, results: StageResults, scene_map: Artefact, clocks: Artefact, cameras: Mapping[str, str]
 ) -> PreviewTask:
     """Return the task that renders the results as a video.
 
@@ -97,6 +100,7 @@ def preview_task(
         job: The job.
         results: The results of the job's stages up to the merge.
         scene_map: The artefact of the map.
+        clocks: The artefact of the clocks of all cameras.
         cameras: The digest of each camera, by camera name.
     """
     return PreviewTask(
@@ -104,6 +108,7 @@ def preview_task(
         keyframes=refs_by_camera(results.keyframes),
         registrations=refs_by_camera(results.registrations),
         map=artefact_ref(scene_map),
+        clocks=artefact_ref(clocks),
         merge=optional_ref(results.merged),
         failure=None if results.failure is None else results.failure.message,
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.scene import Map, Trajectory
 from bodycap_batch.report.report_inputs import ReportInputs
@@ -85,8 +86,8 @@ def make_drawn_scene(inputs: ReportInputs) -> DrawnScene:
 def common_times_s(inputs: ReportInputs, camera: str, times_ns: IntArray) -> FloatArray:
     """Convert a camera's timestamps into common times.
 
-    A camera that is not registered has no estimated clock. The camera's
-    `offset_s` in the capture is used for this camera; the offset is 0 without a capture.
+    The clock of a camera that is not registered comes from the capture. Without a capture, the common time
+    is the time of the camera.
 
     Args:
         inputs: The results of the job.
@@ -99,8 +100,8 @@ def common_times_s(inputs: ReportInputs, camera: str, times_ns: IntArray) -> Flo
     clock = inputs.clocks.get(camera)
     if clock is not None:
         return np.asarray(clock.common_times_ns(times_ns) * 1e-9, dtype=np.float64)
-    offset_s = 0.0 if inputs.capture is None else inputs.capture.camera(camera).offset_s
-    return np.asarray(times_ns * 1e-9 + offset_s, dtype=np.float64)
+    relation = ClockRelation() if inputs.capture is None else inputs.capture.camera(camera).clock
+    return np.asarray(relation.common_ns(times_ns) * 1e-9, dtype=np.float64)
 
 
 def _draw_path(inputs: ReportInputs, path: Trajectory, drawn_from_gauge: Similarity | None) -> DrawnPath:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bodycap_batch.capture import Capture
-from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.camera_clock import CameraClock
+from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.scene import KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.model.skeleton import Mount
 
@@ -22,6 +23,7 @@ class ReportInputs:
         maps: The maps, largest first, each in its own gauge.
         registrations: One registration for each registered camera, in the gauge of the camera's map.
         clocks: Clock of each registered camera, by camera name.
+        reference_camera: Name of the camera to which clock offsets are relative; "" if no clock is known.
         selections: The keyframe selection of each camera.
         merge: The result of merging: the body in the world; None if there is no body.
         mounts: The mounts that were assumed before the body was solved.
@@ -38,6 +40,7 @@ class ReportInputs:
     maps: tuple[Map, ...] = ()
     registrations: tuple[Registration, ...] = ()
     clocks: Mapping[str, CameraClock] = field(default_factory=dict)
+    reference_camera: str = ""
     selections: tuple[KeyframeSelection, ...] = ()
     merge: MergeResult | None = None
     mounts: tuple[Mount, ...] = ()

@@ -21,6 +21,8 @@ class CameraGroupTask:
         keyframes: The selected keyframes of each camera, by camera name.
         map: The map.
         registrations: The registration of each camera, by camera name, in the order of `cameras`.
+        offsets_s: Stated clock offset of each camera that shares a trigger, seconds, by camera name. Empty if
+            the cameras share no trigger.
     """
 
     options: RegistrationOptions = field(metadata=NOT_ROUNDS)
@@ -29,3 +31,4 @@ class CameraGroupTask:
     keyframes: Mapping[str, ArtefactRef]
     map: ArtefactRef
     registrations: Mapping[str, ArtefactRef]
+    offsets_s: Mapping[str, float]

@@ -39,7 +39,6 @@ class CheckTask:
 def run_check(task: CheckTask, context: StageContext, files: Path) -> None:
     """Check the job; store the notes for the user and the numbers of frames."""
     from bodycap_batch.check import require_ready, require_within_limits
-    from bodycap_batch.clocks import offset_notes
 
     context.check_cancelled()
     if task.limits is not None:
@@ -48,7 +47,7 @@ def run_check(task: CheckTask, context: StageContext, files: Path) -> None:
     notes = [f"{camera.name}: {note}" for camera in report.cameras for note in camera.notes]
     frames = sum(camera.used_frames for camera in report.cameras)
     large = sum(camera.large_frames for camera in report.cameras)
-    notes += [*report.notes, *offset_notes(task.job.capture, context.threads)]
+    notes += report.notes
     write_summary(files, notes=notes, frames=frames, large_frames=large)
 
 

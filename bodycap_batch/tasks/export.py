@@ -9,9 +9,9 @@ from pathlib import Path
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, paths_of
-from bodycap_batch.tasks.loading import load_keyframes, load_map
+from bodycap_batch.tasks.loading import load_clocks, load_keyframes, load_map
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
-from bodycap_batch.tasks.stage import RESULTS_FOLDER, Stage
+from bodycap_batch.tasks.stage import RESULTS_FOLDER, Stage, read_summary
 from bodycap_batch.tasks.typed_json import omitted_from_key
 
 
@@ -24,6 +24,7 @@ class ExportTask:
             separate stage renders the preview.
         map: The map.
         registrations: The registration of each camera, by camera name.
+        clocks: The clocks of all cameras.
         keyframes: The selected keyframes of each camera, by camera name.
         merge: The skeleton's motion; None if there is no motion.
         failure: The reason why the skeleton that the job asks for is missing; None if no skeleton is missing.
@@ -33,6 +34,7 @@ class ExportTask:
     options: ExportOptions = field(metadata=omitted_from_key("preview"))
     map: ArtefactRef
     registrations: Mapping[str, ArtefactRef]
+    clocks: ArtefactRef
     keyframes: Mapping[str, ArtefactRef]
     merge: ArtefactRef | None
     failure: str | None
@@ -47,18 +49,20 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
 
     scene = load_map(task.map.path)
     paths = paths_of(task.registrations.values())
-    found = RegisteredCameras.load(paths, scene.maps)
+    clocks = load_clocks(task.clocks)
+    found = RegisteredCameras.load(paths, scene.maps, clocks)
     inputs = ExportInputs(
         out_dir=files / RESULTS_FOLDER,
         maps=scene.maps,
         trajectories=found.trajectories,
         clocks=found.clocks,
+        reference_camera=clocks.reference,
         selections=tuple(load_keyframes(artefact.path) for artefact in task.keyframes.values()),
         merge=None if task.merge is None else read_dataclass(MergeResult, task.merge.path, "merge"),
         partial_reason=task.failure,
         row_fraction=found.row_fraction,
         relative_poses=found.relative_poses(paths, task.segments),
-        log=scene.log,
+        log={**scene.log, "reach": read_summary(task.clocks.path)["distances"]},
     )
     export_results(inputs, task.options, context)
 

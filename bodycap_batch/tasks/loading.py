@@ -11,11 +11,19 @@ from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import Capture, KeptFrames
+    from bodycap_batch.model.camera_clock import CaptureClocks
     from bodycap_batch.model.scene import KeyframeSelection, MapResult, Registration
+
+CLOCKS_NAME = "clocks"
+"""Name of the file, without suffix, that holds the clocks of a capture."""
 
 
 def load_capture(
-    capture: CaptureRef, keyframes: Mapping[str, ArtefactRef] | None = None, *, threads: int = 0
+    capture: CaptureRef,
+    keyframes: Mapping[str, ArtefactRef] | None = None,
+    *,
+    clocks: CaptureClocks | None = None,
+    threads: int = 0,
 ) -> Capture:
     """Open the videos of a task.
 
@@ -24,6 +32,7 @@ def load_capture(
         keyframes: The artefact with the keyframes of each camera, by camera name. It lists the damaged
             frames. If an artefact holds copies of decoded frames, the copies are read instead of the video.
             None to read all frames from the videos.
+        clocks: The clocks of all cameras; None for a task that does not relate times of different cameras.
         threads: Number of threads of each video decoder; 0 lets the decoder choose.
     """
     from bodycap_batch.capture import open_capture
@@ -34,7 +43,8 @@ def load_capture(
     for camera in opened.cameras:
         artefact = stored.get(camera.name)
         damaged = camera.damaged if artefact is None else load_keyframes(artefact.path).damaged
-        cameras.append(replace(camera, kept=_kept_frames(artefact), damaged=damaged))
+        clock = camera.clock if clocks is None else clocks.cameras.get(camera.name, camera.clock)
+        cameras.append(replace(camera, kept=_kept_frames(artefact), damaged=damaged, clock=clock))
     return replace(opened, cameras=tuple(cameras))
 
 
@@ -61,6 +71,14 @@ def load_map(path: Path) -> MapResult:
     from bodycap_batch.model.scene import MapResult
 
     return read_dataclass(MapResult, path, "map")
+
+
+def load_clocks(artefact: ArtefactRef) -> CaptureClocks:
+    """Read the clocks of all cameras from an artefact."""
+    from bodycap_batch.formats.dataclass_files import read_dataclass
+    from bodycap_batch.model.camera_clock import CaptureClocks
+
+    return read_dataclass(CaptureClocks, artefact.path, CLOCKS_NAME)
 
 
 def load_registration(path: Path) -> Registration:

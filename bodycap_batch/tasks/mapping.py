@@ -20,23 +20,6 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CameraDistance:
-    """The smallest and largest distance that the body permits between two cameras.
-
-    Attributes:
-        first: Name of the first camera.
-        second: Name of the second camera.
-        least_m: Smallest distance (metres), for a body of the skeleton's nominal size.
-        most_m: Largest distance (metres), for a body of the skeleton's nominal size.
-    """
-
-    first: str
-    second: str
-    least_m: float
-    most_m: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class MapTask:
     """Build the map of all keyframes.
 
@@ -44,14 +27,11 @@ class MapTask:
         options: The stage's options.
         capture: The videos of all cameras.
         keyframes: The selected keyframes of each camera, by camera name.
-        reach: The distances that the body permits between the cameras of each pair, rounded. The task does
-            not hold the body itself. A small change of a mount in the job therefore does not change the map.
     """
 
     options: MapOptions
     capture: CaptureRef
     keyframes: Mapping[str, ArtefactRef]
-    reach: tuple[CameraDistance, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,9 +75,8 @@ def run_map(task: MapTask, context: StageContext, files: Path) -> None:
     from bodycap_batch.mapping import build_map
 
     selections = [load_keyframes(artefact.path) for artefact in task.keyframes.values()]
-    reach = {(pair.first, pair.second): (pair.least_m, pair.most_m) for pair in task.reach}
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
-    result = build_map(capture, selections, task.options, context, reach or None)
+    result = build_map(capture, selections, task.options, context)
     _save_map(result, files)
 
 

@@ -12,7 +12,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, paths_of
-from bodycap_batch.tasks.loading import load_capture, load_map
+from bodycap_batch.tasks.loading import load_capture, load_clocks, load_map
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, Stage, write_summary
 
@@ -41,6 +41,7 @@ class MergeTask:
         options: The stage's options.
         map: The map.
         registrations: The registration of each camera, by camera name.
+        clocks: The clocks of all cameras.
         body: The body.
         footage: The images in which the marker board is searched for; None if the job names no marker board.
     """
@@ -48,6 +49,7 @@ class MergeTask:
     options: MergeOptions
     map: ArtefactRef
     registrations: Mapping[str, ArtefactRef]
+    clocks: ArtefactRef
     body: BodyInput
     footage: BoardFootage | None
 
@@ -79,7 +81,9 @@ def _merge_inputs(task: MergeTask) -> MergeInputs:
     from bodycap_batch.model.merge_data import MergeInputs
 
     scene = load_map(task.map.path)
-    found = RegisteredCameras.load(paths_of(task.registrations.values()), scene.maps)
+    found = RegisteredCameras.load(
+        paths_of(task.registrations.values()), scene.maps, load_clocks(task.clocks)
+    )
     skeleton, mounts = load_body(task.body)
     return MergeInputs(
         trajectories=found.trajectories,

@@ -7,9 +7,9 @@ from typing import Literal, get_args
 StageName = Literal["check", "keyframes", "map", "registration", "merge", "export", "report", "preview"]
 STAGE_ORDER: tuple[StageName, ...] = get_args(StageName)
 """The stages of a job in the order in which they run."""
-_DURING_REGISTRATION = frozenset({"extend", "refine", "rig", "recover"})
-"""Further stages that may run between registration and merge. They extend and refine the map, solve the
-cameras of a rig together, and recover lost frames."""
+_DURING_REGISTRATION = frozenset({"extend", "refine", "rig", "recover", "sound", "clocks"})
+"""Further stages that may run up to the merge. They extend and refine the map, solve the cameras of a rig
+together, recover lost frames, and determine the clocks from the sound and from the paths."""
 
 
 def stages_from(stage: StageName) -> frozenset[str]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
-from bodycap_batch.tasks.loading import load_capture, load_map, load_registration
+from bodycap_batch.tasks.loading import load_capture, load_clocks, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
 from bodycap_batch.tasks.stage import RESULTS_FOLDER, VISION_LIBRARIES, VISION_MODULES, Stage
 
@@ -32,6 +32,7 @@ class PreviewTask:
         keyframes: The selected keyframes of each camera, by camera name.
         registrations: The registration of each camera, by camera name.
         map: The map.
+        clocks: The clocks of all cameras.
         merge: The skeleton's motion; None if there is no motion.
         failure: The reason why the skeleton that the job asks for is missing; None if no skeleton is missing.
     """
@@ -40,6 +41,7 @@ class PreviewTask:
     keyframes: Mapping[str, ArtefactRef]
     registrations: Mapping[str, ArtefactRef]
     map: ArtefactRef
+    clocks: ArtefactRef
     merge: ArtefactRef | None
     failure: str | None
 
@@ -61,7 +63,9 @@ def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInput
 
     scene = load_map(task.map.path)
     paths = paths_of(task.registrations.values())
-    found = RegisteredCameras.load(paths, scene.maps)
+    clocks = load_clocks(task.clocks)
+    capture = load_capture(task.capture, task.keyframes, clocks=clocks, threads=threads)
+    found = RegisteredCameras.load(paths, scene.maps, clocks)
     merge = None if task.merge is None else read_dataclass(MergeResult, task.merge.path, "merge")
     registrations = [load_registration(artefact) for artefact in paths]
     transforms = _transforms_of(scene.maps, merge)
@@ -69,7 +73,7 @@ def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInput
     colours = [item.colors for item in scene.maps if item.gauge in transforms]
     return PreviewInputs(
         path=path,
-        capture=_trunk_first(load_capture(task.capture, task.keyframes, threads=threads), merge),
+        capture=_trunk_first(capture, merge),
         views=make_camera_views(registrations, scene.maps, found.clocks, merge),
         reference_frame="world" if merge is not None else scene.maps[0].gauge,
         points=np.concatenate(points),

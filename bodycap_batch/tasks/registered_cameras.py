@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ from bodycap_batch.tasks.loading import load_registration
 
 if TYPE_CHECKING:
     from bodycap_batch.core.arrays import FloatArray
-    from bodycap_batch.model.merge_data import CameraClock
+    from bodycap_batch.model.camera_clock import CameraClock, CaptureClocks
     from bodycap_batch.model.relative_pose import RelativePose
     from bodycap_batch.model.scene import Map, Trajectory
 
@@ -37,31 +37,34 @@ class RegisteredCameras:
     row_fraction: Mapping[str, FloatArray]
 
     @staticmethod
-    def load(paths: Sequence[Path], maps: Sequence[Map]) -> RegisteredCameras:
+    def load(paths: Sequence[Path], maps: Sequence[Map], clocks: CaptureClocks) -> RegisteredCameras:
         """Read the registrations of all cameras.
 
         Args:
             paths: The folder of each camera's registration artefact.
             maps: The maps. They name the cameras whose rolling shutter was corrected.
+            clocks: The clocks of all cameras.
         """
         from bodycap_batch.formats.dataclass_files import read_dataclass
         from bodycap_batch.model.camera import Camera
-        from bodycap_batch.model.merge_data import CameraClock
+        from bodycap_batch.model.camera_clock import FrameTiming
         from bodycap_batch.model.rolling_shutter import mean_row_fraction
 
         corrected = {name for each in maps for name in each.readout_s}
         trajectories: list[Trajectory] = []
-        clocks: dict[str, CameraClock] = {}
+        timings: dict[str, FrameTiming] = {}
         rows: dict[str, FloatArray] = {}
         for path in paths:
             # Only one registration is in memory at a time: the tracks of a long video need much memory.
             found = load_registration(path)
             name = found.trajectory.camera
             trajectories.append(found.trajectory)
-            clocks[name] = read_dataclass(CameraClock, path, "clock")
-            if clocks[name].rolling_shutter_s and name not in corrected:
+            timings[name] = read_dataclass(FrameTiming, path, "timing")
+            if timings[name].rolling_shutter_s and name not in corrected:
                 rows[name] = mean_row_fraction(found, read_dataclass(Camera, path, "camera"))
-        return RegisteredCameras(trajectories=tuple(trajectories), clocks=clocks, row_fraction=rows)
+        return RegisteredCameras(
+            trajectories=tuple(trajectories), clocks=clocks.with_timing(timings), row_fraction=rows
+        )
 
     def relative_poses(
         self, paths: Sequence[Path], segments: Sequence[Sequence[str]]
@@ -72,6 +75,9 @@ class RegisteredCameras:
             paths: The folder of each camera's registration artefact. If a rig was solved, its artefacts hold
                 relative poses that were estimated before. These stored poses are preferred.
             segments: For each body segment with several cameras, the names of these cameras.
+
+        Returns:
+            The relative poses. A pair with an unknown clock has none.
         """
         from bodycap_batch.formats.dataclass_files import read_dataclass
         from bodycap_batch.model.relative_pose import RigPoses, estimate_relative_pose
@@ -85,7 +91,13 @@ class RegisteredCameras:
         }
         out = []
         for pair in (pair for names in segments for pair in combinations(sorted(names), 2)):
-            offset_s = self.clocks[pair[1]].offset_s - self.clocks[pair[0]].offset_s
-            first, second = (trajectory_of[name] for name in pair)
-            out.append(stored.get(pair) or estimate_relative_pose(first, second, round(1e9 * offset_s)))
+            if pair in stored:
+                out.append(stored[pair])
+            elif all(self.clocks[name].is_known for name in pair):
+                first, second = (self._on_common_clock(trajectory_of[name]) for name in pair)
+                out.append(estimate_relative_pose(first, second, 0))
         return tuple(out)
+
+    def _on_common_clock(self, trajectory: Trajectory) -> Trajectory:
+        """Return a trajectory with common times instead of the camera's times."""
+        return replace(trajectory, times_ns=self.clocks[trajectory.camera].common_ns(trajectory.times_ns))

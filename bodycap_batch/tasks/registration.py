@@ -70,7 +70,7 @@ def save_registration(
     rolling: bool,
     notes: Sequence[str] = (),
 ) -> None:
-    """Store the poses of a camera, its clock and its camera model.
+    """Store the poses of a camera, the timing of its frames and its camera model.
 
     Args:
         found: Poses and observations of the camera.
@@ -80,15 +80,11 @@ def save_registration(
         notes: Notes for the user.
     """
     from bodycap_batch.formats.dataclass_files import write_dataclass
-    from bodycap_batch.model.merge_data import CameraClock
+    from bodycap_batch.model.camera_clock import FrameTiming
 
     write_dataclass(found, files, "registration")
-    clock = CameraClock(
-        nominal_fps=camera.nominal_fps,
-        offset_s=camera.offset_s,
-        rolling_shutter_s=camera.rolling_shutter_s,
-    )
-    write_dataclass(clock, files, "clock")
+    timing = FrameTiming(nominal_fps=camera.nominal_fps, rolling_shutter_s=camera.rolling_shutter_s)
+    write_dataclass(timing, files, "timing")
     write_dataclass(camera.camera, files, "camera")
     write_summary(
         files,

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, paths_of
-from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
+from bodycap_batch.tasks.loading import load_capture, load_clocks, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.stage import RESULTS_FOLDER, VISION_LIBRARIES, VISION_MODULES, Stage
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import Capture
+    from bodycap_batch.model.camera_clock import CaptureClocks
     from bodycap_batch.model.merge_data import MergeResult
     from bodycap_batch.report import ReportInputs
 
@@ -35,6 +36,7 @@ class ReportTask:
             not finish.
         registrations: The registration of each camera, by camera name; empty if the stage `registration` did
             not finish.
+        clocks: The clocks of all cameras; None if they are not determined.
         map: The map; None if mapping did not finish.
         merge: The skeleton's motion; None if there is no motion.
         export: The result files; None if the export did not finish.
@@ -47,6 +49,7 @@ class ReportTask:
     capture: CaptureRef
     keyframes: Mapping[str, ArtefactRef]
     registrations: Mapping[str, ArtefactRef]
+    clocks: ArtefactRef | None
     map: ArtefactRef | None
     merge: ArtefactRef | None
     export: ArtefactRef | None
@@ -68,27 +71,30 @@ def load_inputs(task: ReportTask, threads: int = 0) -> ReportInputs:
         threads: Number of threads of each video decoder; 0 lets the decoder choose.
     """
     from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.merge_data import CameraClock
+    from bodycap_batch.model.camera_clock import CaptureClocks, FrameTiming
     from bodycap_batch.report import ReportInputs
 
     paths = paths_of(task.registrations.values())
     registrations = [load_registration(path) for path in paths]
+    timings = {
+        found.trajectory.camera: read_dataclass(FrameTiming, path, "timing")
+        for path, found in zip(paths, registrations, strict=True)
+    }
+    clocks = CaptureClocks(reference="") if task.clocks is None else load_clocks(task.clocks)
     return ReportInputs(
         name=task.name,
         cameras=tuple(camera.name for camera in task.capture.config.cameras),
         maps=() if task.map is None else load_map(task.map.path).maps,
         registrations=tuple(registrations),
-        clocks={
-            found.trajectory.camera: read_dataclass(CameraClock, path, "clock")
-            for path, found in zip(paths, registrations, strict=True)
-        },
+        clocks=clocks.with_timing(timings),
+        reference_camera=clocks.reference,
         selections=tuple(load_keyframes(artefact.path) for artefact in task.keyframes.values()),
         merge=_load_merge(task.merge),
         mounts=() if task.body is None else load_body(task.body)[1],
         metrics=None
         if task.export is None
         else json.loads((task.export.path / RESULTS_FOLDER / "metrics.json").read_text(encoding="utf-8")),
-        capture=_open_capture(task, threads),
+        capture=_open_capture(task, clocks, threads),
         failure=task.failure,
         max_gap_s=task.max_gap_s,
     )
@@ -101,7 +107,7 @@ def _load_merge(merge: ArtefactRef | None) -> MergeResult | None:
     return None if merge is None else read_dataclass(MergeResult, merge.path, "merge")
 
 
-def _open_capture(task: ReportTask, threads: int) -> Capture | None:
+def _open_capture(task: ReportTask, clocks: CaptureClocks, threads: int) -> Capture | None:
     """Open the videos of a job.
 
     Returns:
@@ -114,7 +120,7 @@ def _open_capture(task: ReportTask, threads: int) -> Capture | None:
     from bodycap_batch.core.errors import CaptureError
 
     try:
-        return load_capture(task.capture, task.keyframes, threads=threads)
+        return load_capture(task.capture, task.keyframes, clocks=clocks, threads=threads)
     except CaptureError:
         if task.failure is None:
             raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from bodycap_batch.core.context import StageContext
@@ -18,12 +19,16 @@ def run_rig(task: CameraGroupTask, context: StageContext, files: Path) -> None:
     The artefact holds the camera's poses and the relative poses of the rig's cameras.
     """
     from bodycap_batch.formats.dataclass_files import write_dataclass
+    from bodycap_batch.model.camera_clock import ClockRelation
     from bodycap_batch.model.relative_pose import RigPoses, not_rigid_note
     from bodycap_batch.registration import RegisteredCamera, register_in_rig
 
     context.check_cancelled()
     own, *others = (
-        RegisteredCamera(camera=camera, registration=load_registration(task.registrations[camera.name].path))
+        RegisteredCamera(
+            camera=replace(camera, clock=ClockRelation(offset_s=task.offsets_s[camera.name])),
+            registration=load_registration(task.registrations[camera.name].path),
+        )
         for camera in load_capture(task.capture, task.keyframes, threads=context.threads).cameras
     )
     selection = load_keyframes(task.keyframes[own.camera.name].path)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from bodycap_batch.tasks.check import CHECK
+from bodycap_batch.tasks.clocks import CLOCKS
 from bodycap_batch.tasks.export import EXPORT
 from bodycap_batch.tasks.keyframes import KEYFRAMES
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE
@@ -15,6 +16,7 @@ from bodycap_batch.tasks.recover import RECOVER
 from bodycap_batch.tasks.registration import REGISTRATION
 from bodycap_batch.tasks.report import REPORT
 from bodycap_batch.tasks.rig import RIG
+from bodycap_batch.tasks.sound import SOUND
 from bodycap_batch.tasks.stage import Stage
 from bodycap_batch.tasks.synth import SYNTH
 
@@ -30,6 +32,8 @@ STAGES: Mapping[str, Stage[Any]] = {
         REGISTRATION,
         RIG,
         RECOVER,
+        SOUND,
+        CLOCKS,
         MERGE,
         EXPORT,
         REPORT,

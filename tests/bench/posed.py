@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import Similarity, so3_exp
-from bodycap_batch.model.merge_data import CameraClock, MergeInputs
+from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Mount

@@ -29,8 +29,9 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.tum import read_tum
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import rotation_angle_rad
-from bodycap_batch.model.merge_data import CameraClock, MergeInputs, MergeResult
+from bodycap_batch.model.merge_data import MergeInputs, MergeResult
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Mount, SkeletonModel

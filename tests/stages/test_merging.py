@@ -17,8 +17,9 @@ from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
 from bodycap_batch.merging.graph.windows import solve_windows, split_timeline
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import Similarity, align_points
-from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.posed import posed

@@ -11,7 +11,7 @@ import pytest
 
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import Cancelled, StoreError
-from bodycap_batch.model.merge_data import CameraClock
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.overlay import BoneMotion, bones_from_motion, make_camera_views
 from bodycap_batch.preview import PreviewInputs, render_preview
 from bodycap_batch.preview.layout import lay_out_videos

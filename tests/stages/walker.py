@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
-from bodycap_batch.model.merge_data import CameraClock, MergeInputs
+from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Mount, SkeletonModel, forward_kinematics

@@ -93,11 +93,13 @@ def check_distances(scene: Map, common_ns: Mapping[str, IntArray], reach: Reach)
 
     Args:
         scene: The map to check.
-        common_ns: Common time (nanoseconds) of every frame, by camera name.
+        common_ns: Common time (nanoseconds) of every frame, by camera name. Cameras without an entry have an
+            unknown clock and are not compared.
         reach: Minimum and maximum distance (metres) between the two cameras of each pair.
     """
     none = np.zeros(len(scene.keyframe_camera), dtype=bool)
-    parts = [_distances_both_ways(scene, common_ns, pair) for pair in combinations(sorted(scene.cameras), 2)]
+    names = sorted(name for name in scene.cameras if name in common_ns)
+    parts = [_distances_both_ways(scene, common_ns, pair) for pair in combinations(names, 2)]
     parts = [part for part in parts if part.pair in reach and len(part.distance)]
     count = sum(len(part.distance) for part in parts)
     if count < _MIN_DISTANCES:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -129,31 +129,22 @@ def inconsistent_match_ratio(pairs: Sequence[PairConsistency]) -> float:
     return wrong / max(1, sum(pair.matches for pair in pairs))
 
 
-def check_consistency(ratio: float, reach: Mapping[str, object] | None) -> EstimationError | None:
+def check_consistency(ratio: float) -> EstimationError | None:
     """Return an error if a map contradicts many of its verified matches.
 
     The usual cause is a room with several parts that look the same.
 
     Args:
         ratio: `inconsistent_match_ratio` of the map.
-        reach: Log of the check of the distances between cameras; None if no body is given.
 
     Returns:
         The error; None if the map is consistent enough.
     """
     if ratio <= MAX_INCONSISTENT_RATIO:
         return None
-    body = ""
-    if reach is not None:
-        found = reach.get(
-            "reason",
-            f"in {reach.get('keyframes_out_of_reach')} keyframes, a camera is farther from the other "
-            "cameras than the body reaches",
-        )
-        body = f"; the distances between the cameras were also checked: {found}"
     return EstimationError(
         f"{ratio:.0%} of the matches between keyframes contradict the map: different places that look the "
-        f"same (repeated pictures, tiles, windows) were mapped as one place{body}",
+        f"same (repeated pictures, tiles, windows) were mapped as one place",
         hint="film objects that are different in each place, or cover repeated pictures; check the "
         "calibration",
     )

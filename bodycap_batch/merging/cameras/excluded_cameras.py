@@ -22,12 +22,18 @@ def excluded_cameras(inputs: MergeInputs) -> dict[str, str]:
         By name of an excluded camera, the reason why the camera is excluded.
     """
     rare = rarely_localised(inputs.trajectories)
-    still = stationary_cameras(inputs, [each for each in inputs.trajectories if each.camera not in rare])
+    unknown = {
+        name: "; ".join(clock.notes) or "its clock is unknown"
+        for name, clock in inputs.clocks.items()
+        if not clock.is_known
+    }
+    rest = [each for each in inputs.trajectories if each.camera not in {*rare, *unknown}]
+    still = stationary_cameras(inputs, rest)
     reason = (
         "this camera stands still while the other cameras move: nobody wears this camera, or its video is "
         "frozen"
     )
-    return {**rare, **dict.fromkeys(still, reason)}
+    return {**unknown, **rare, **dict.fromkeys(still, reason)}
 
 
 def rarely_localised(trajectories: Sequence[Trajectory]) -> dict[str, str]:

@@ -22,8 +22,9 @@ from bodycap_batch.merging.projection.rigid_motion_solver import (
     StandingJoint,
     solve_rigid_motion,
 )
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import invert, poses_at, rotation_angle_rad
-from bodycap_batch.model.merge_data import CameraClock, SolvedBody, standing_sigma_m
+from bodycap_batch.model.merge_data import SolvedBody, standing_sigma_m
 from bodycap_batch.model.skeleton import Motion, forward_kinematics
 
 _MAX_GAP_INTERVALS = 1.6

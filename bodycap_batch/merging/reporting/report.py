@@ -27,8 +27,9 @@ from bodycap_batch.merging.reporting.advice import (
 )
 from bodycap_batch.merging.world.floor import Floor
 from bodycap_batch.merging.world.vertical import angle_deg
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import rotation_angle_rad
-from bodycap_batch.model.merge_data import Activity, CameraClock, MergeInputs
+from bodycap_batch.model.merge_data import Activity, MergeInputs
 from bodycap_batch.model.merge_report import (
     ActivityReport,
     AlignedCameraReport,

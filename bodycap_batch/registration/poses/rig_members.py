@@ -52,7 +52,7 @@ def estimate_relative_poses(own: RegisteredCamera, others: Sequence[RegisteredCa
     out = []
     for other in others:
         first, second = sorted((own, other), key=lambda each: each.camera.name)
-        offset_ns = round((second.camera.offset_s - first.camera.offset_s) * 1e9)
+        offset_ns = round((second.camera.clock.offset_s - first.camera.clock.offset_s) * 1e9)
         out.append(
             estimate_relative_pose(first.registration.trajectory, second.registration.trajectory, offset_ns)
         )

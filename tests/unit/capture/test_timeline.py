@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from bodycap_batch.config.folder import natural_key
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.rolling_shutter import row_delay
 from tests.videos import textured_frame, write_video
 
@@ -28,9 +30,12 @@ def opened(*videos: Path, camera: dict[str, object] | None = None, **capture: ob
 
 
 def test_common_time_is_camera_time_plus_offset(tmp_path: Path) -> None:
-    camera = opened(write_video(tmp_path / "a.mp4", FRAMES), camera={"offset_s": 0.12})
+    camera = opened(write_video(tmp_path / "a.mp4", FRAMES))
     assert camera.times_ns[0] == 0
-    assert (camera.common_times_ns() - camera.times_ns == 120_000_000).all()
+    assert (camera.common_times_ns() == camera.times_ns).all()
+    camera = replace(camera, clock=ClockRelation(offset_s=0.12, drift_ppm=100.0))
+    shift_ns = camera.common_times_ns() - camera.times_ns
+    np.testing.assert_allclose(shift_ns, 120_000_000 + 1e-4 * camera.times_ns, atol=1.0)
 
 
 def test_rows_are_exposed_one_after_the_other(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ FRAMES = [textured_frame(index) for index in range(40)]
 
 
 def opened(*videos: Path, **capture: object) -> CaptureCamera:
-    config = CameraConfig(name="torso", video=videos, calibration="auto")
+    config = CameraConfig(name="torso", video=videos, calibration="auto", offset_s=0.0)
     return open_camera(CaptureConfig(cameras=(config,), **capture), config)
 
 

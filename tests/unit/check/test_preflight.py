@@ -36,7 +36,7 @@ def walk(tmp_path: Path) -> Path:
     root = tmp_path / "walk"
     write_video(root / "torso.mp4", FRAMES)
     write_video(root / "left_palm.mp4", [frame[:, ::-1] for frame in FRAMES])
-    (root / "calib.json").write_text(json.dumps(LENS))
+    (root / "calib.json").write_text(json.dumps({**LENS, "offset_s": 0.0}))
     return root
 
 
@@ -283,7 +283,7 @@ def test_the_check_says_where_settings_come_from_and_what_is_not_used(
         "  calibration: PINHOLE (from calib.json)",
         "  calibration: auto (from the job file), starting at 65° (from the video metadata)",
         "  timestamps: left_palm.timestamps.txt (from the sidecar file)",
-        "  clock: offset 0.2 s (from the job file); drift 0, not corrected (default)",
+        "  clock: offset 0.2 s (from the job file); drift auto (default)",
         "  mount: Spine1 (from the camera name); pose on the bone: typical of the place (default)",
         "  video: left_palm.mp4 (from the folder)",
         "not used (the name is not a known place on the body): board.mp4",

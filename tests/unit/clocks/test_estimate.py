@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from bodycap_batch.cli import main
-from bodycap_batch.clocks import estimate_clocks, offset_notes
+from bodycap_batch.clocks import decide_clocks, describe_clocks, estimate_clocks
 from bodycap_batch.clocks.estimate import reference_camera
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from tests.sounds import heard, scene, write_video_with_sound
@@ -46,8 +46,7 @@ def folder(tmp_path_factory):
 
 def capture(folder, *names, **offsets):
     cameras = [
-        CameraConfig(name=name, video=(folder / f"{name}.mp4",), offset_s=offsets.get(name, 0.0))
-        for name in names
+        CameraConfig(name=name, video=(folder / f"{name}.mp4",), offset_s=offsets.get(name)) for name in names
     ]
     return CaptureConfig(cameras=tuple(cameras))
 
@@ -150,20 +149,71 @@ def test_one_camera_has_nothing_to_compare(folder, tmp_path, capsys):
     assert "only one camera" in capsys.readouterr().err
 
 
-def test_offsets_that_the_sound_contradicts_are_noted(folder):
-    names = ("torso", "left_palm", "head", "right_palm", "left_thigh")
-    (note,) = offset_notes(capture(folder, *names, left_palm=PALM_S))
-    assert "head -0.4" in note
-    assert "the job uses +0.000 s" in note
-    assert not any(name in note for name in ("left_palm", "right_palm", "left_thigh"))
-    assert offset_notes(capture(folder, *names, left_palm=PALM_S, head=HEAD_S)) == []
-    (turned,) = offset_notes(capture(folder, *names, left_palm=-PALM_S, head=HEAD_S))
-    assert "left_palm +0.7" in turned
-    assert offset_notes(capture(folder, "torso")) == []
+NAMES = ("torso", "left_palm", "head", "right_palm", "left_thigh")
 
 
-def test_check_and_run_report_offsets_that_the_sound_contradicts(folder, tmp_path, capfd):
+def decided(spec):
+    return decide_clocks(spec, estimate_clocks(spec)).cameras
+
+
+def test_an_unstated_clock_comes_from_the_sound_or_is_unknown(folder):
+    clocks = decided(capture(folder, *NAMES))
+    assert clocks["left_palm"].source == "sound"
+    assert clocks["left_palm"].offset_s == pytest.approx(PALM_S, abs=WAY_S)
+    for name in ("right_palm", "left_thigh"):
+        assert not clocks[name].is_known
+        assert "clap once" in clocks[name].notes[0]
+
+
+def test_offsets_are_on_the_clock_that_the_reference_camera_states(folder):
+    clocks = decided(capture(folder, *NAMES, torso=100.0))
+    assert clocks["torso"].offset_s == 100.0
+    assert clocks["left_palm"].offset_s == pytest.approx(100.0 + PALM_S, abs=WAY_S)
+
+
+def test_a_stated_clock_is_used_and_its_contradiction_noted(folder):
+    clocks = decided(capture(folder, *NAMES, left_palm=-PALM_S, head=HEAD_S + 0.01, left_thigh=0.3))
+    assert (clocks["left_palm"].source, clocks["left_palm"].offset_s) == ("stated", -PALM_S)
+    assert clocks["left_palm"].is_contradicted
+    assert "with the sign turned the sound agrees" in clocks["left_palm"].notes[0]
+    assert not clocks["head"].is_contradicted
+    assert (clocks["left_thigh"].source, clocks["left_thigh"].offset_s) == ("stated", 0.3)
+
+
+def test_common_clocks_need_no_sound(folder):
+    spec = capture(folder, *NAMES, **dict.fromkeys(NAMES, 0.0)).model_copy(update={"clocks": "common"})
+    clocks = decided(spec)
+    assert {clock.source for clock in clocks.values()} == {"common"}
+    assert clocks["left_palm"].is_contradicted
+    assert clocks["left_thigh"].sigma_s == 0.0
+
+
+def test_cameras_with_one_trigger_share_a_clock(folder):
+    cameras = (
+        CameraConfig(name="torso", video=(folder / "torso.mp4",)),
+        CameraConfig(name="left_palm", video=(folder / "left_palm.mp4",)),
+        CameraConfig(name="left_palm_2", mount="left_palm", video=(folder / "left_thigh.mp4",)),
+    )
+    clocks = decided(CaptureConfig(cameras=cameras, rig="synced"))
+    assert clocks["left_palm_2"].source == "common"
+    assert clocks["left_palm_2"].offset_s == clocks["left_palm"].offset_s
+
+
+def test_each_camera_has_a_line_about_its_clock(folder):
+    lines = describe_clocks(capture(folder, *NAMES, head=-HEAD_S))
+    by_name = {line.partition(":")[0]: line for line in lines}
+    assert "reference clock" in by_name["torso"]
+    assert "+0.73" in by_name["left_palm"]
+    assert "(sound)" in by_name["left_palm"]
+    assert "the run estimates the offset from the motion" in by_name["left_thigh"]
+    assert "with the sign turned the sound agrees" in by_name["head"]
+    assert describe_clocks(capture(folder, "torso")) == []
+
+
+def test_check_prints_the_clock_of_each_camera(folder, tmp_path, capfd):
     for name in ("torso", "left_palm"):
         (tmp_path / f"{name}.mp4").symlink_to(folder / f"{name}.mp4")
     main(["check", str(tmp_path)])
-    assert "the sound contradicts the clock offsets of the job" in capfd.readouterr().out
+    out = capfd.readouterr().out
+    assert "left_palm: clock offset +0.73" in out
+    assert "auto" in out

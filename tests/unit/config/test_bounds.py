@@ -34,6 +34,7 @@ JOB: dict[str, Any] = {
                 "calibration": CALIBRATION,
                 "fov_deg": 90,
                 "offset_s": 0,
+                "drift_ppm": 0,
                 "rolling_shutter_s": 0,
             },
             {"name": "left_palm", "video": ["left.mp4"], "joint_from_cam": IDENTITY},

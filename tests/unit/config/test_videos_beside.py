@@ -310,7 +310,7 @@ def test_where_the_settings_of_a_camera_come_from(tmp_path: Path) -> None:
         "video: a.mp4 to b.mp4, 2 files (from the job file)",
         "calibration: PINHOLE in lens.json (from the job file)",
         "timestamps: t.txt (from the job file)",
-        "clock: offset 2 s (from the job file); drift 0, not corrected (default)",
+        "clock: offset 2 s (from the job file); drift auto (default)",
         "mount: torso (from the job file); pose on the bone: measured (from the job file)",
     ]
     assert origins["head"].clock_offset.text() == "-0.5 s in lens.json (from the job file)"
@@ -318,7 +318,7 @@ def test_where_the_settings_of_a_camera_come_from(tmp_path: Path) -> None:
         "video: left_palm.mp4 (from the folder)",
         "calibration: auto (default)",
         "timestamps: left_palm.timestamps.txt (from the sidecar file)",
-        "clock: offset 0 s (default); drift 0, not corrected (default)",
+        "clock: offset auto (default); drift auto (default)",
         "mount: LeftHand (from the camera name); pose on the bone: typical of the place (default)",
     ]
 

@@ -15,8 +15,9 @@ import pytest
 from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.dataclass_files import read_dataclass, read_npz, write_dataclass, write_npz
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import Similarity
-from bodycap_batch.model.merge_data import CameraClock, MergeResult
+from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import (
     FrameStatus,

@@ -196,6 +196,7 @@ def test_the_hint_of_a_failed_merge_names_the_mirror_images(
         options=MergeOptions(),
         map=ArtefactRef(path=tmp_path, digest=""),
         registrations={},
+        clocks=ArtefactRef(path=tmp_path, digest=""),
         body=cast(Any, None),
         footage=None,
     )

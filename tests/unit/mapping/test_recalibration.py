@@ -32,7 +32,6 @@ CAPTURE = Capture(
             frame_numbers=np.arange(9),
             times_ns=np.arange(9) * 33_000_000,
             nominal_fps=30.0,
-            offset_s=0.0,
             rolling_shutter_s=0.0,
         )
         for name, lens in small_map().cameras.items()

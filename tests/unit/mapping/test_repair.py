@@ -87,7 +87,6 @@ def _workspace(folder: Path) -> FloatArray:
         frame_numbers=np.arange(99),
         times_ns=np.arange(99) * 10**8,
         nominal_fps=10.0,
-        offset_s=0.0,
         rolling_shutter_s=0.0,
     )
     poses = _poses()

@@ -21,8 +21,9 @@ from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body_calibration.marker_board import LocatedBoard, locate_board
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import Similarity, invert, make_transform, so3_exp, transform_points
-from bodycap_batch.model.merge_data import BoardView, CameraClock, MergeInputs
+from bodycap_batch.model.merge_data import BoardView, MergeInputs
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton_presets import load_skeleton

@@ -46,8 +46,8 @@ from bodycap_batch.merging.world.planes import (
 )
 from bodycap_batch.merging.world.vertical import Vertical
 from bodycap_batch.merging.world.world_frame import initial_heading, rotation_to_z_up, world_from_solved_frame
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp, so3_log
-from bodycap_batch.model.merge_data import CameraClock
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions
 

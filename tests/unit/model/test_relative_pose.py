@@ -15,6 +15,7 @@ from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.geometry import invert, make_transform, rotation_angle_rad, so3_exp
 from bodycap_batch.model.relative_pose import RigPoses, estimate_relative_pose, match_instants, mean_rotation
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
@@ -56,7 +57,6 @@ def _camera(name: str) -> CaptureCamera:
         frame_numbers=np.arange(COUNT),
         times_ns=np.arange(COUNT) * FRAME_NS,
         nominal_fps=30.0,
-        offset_s=0.0,
         rolling_shutter_s=0.0,
     )
 
@@ -202,6 +202,7 @@ def test_relative_poses_of_the_rig_survive_recovery(tmp_path: Path, monkeypatch:
         keyframes=stored,
         map=ArtefactRef(path=tmp_path, digest=""),
         registrations=stored,
+        offsets_s={},
     )
     recover.run_recover(task, StageContext(work_dir=tmp_path, threads=1), out)
     (kept,) = read_dataclass(RigPoses, out, RIG_POSES).relative
@@ -220,7 +221,7 @@ def test_both_cameras_of_a_rig_get_poses_that_fit_together() -> None:
 
 def test_cameras_out_of_step_are_left_as_they_are() -> None:
     scene_map, (first, second) = _rig()
-    late = replace(second, camera=replace(second.camera, offset_s=0.2))
+    late = replace(second, camera=replace(second.camera, clock=ClockRelation(offset_s=0.2)))
     assert _solved(scene_map, first, late) is first.registration
 
 

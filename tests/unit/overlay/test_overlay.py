@@ -9,8 +9,8 @@ import pytest
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
-from bodycap_batch.model.merge_data import CameraClock
 from bodycap_batch.model.scene import FrameStatus, Map, Registration, Trajectory
 from bodycap_batch.overlay import Bones, bones_from_motion, draw_overlay, make_camera_views, project_bones
 from bodycap_batch.overlay.lens_field import max_field_angle_rad

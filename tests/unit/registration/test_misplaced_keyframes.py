@@ -135,7 +135,6 @@ def _registered(tracks: Tracks, gauge: str) -> RegisteredCamera:
         frame_numbers=np.arange(count),
         times_ns=times_ns,
         nominal_fps=30.0,
-        offset_s=0.0,
         rolling_shutter_s=0.0,
     )
     path = Trajectory(

@@ -103,7 +103,10 @@ CAMERAS = READ_BY_ALL | {"capture"}
 BODY = CAMERAS | {"presets"}
 HASHED = {
     "synth": BODY | {"synthetic"},
-    "check": BODY | {"check", "clocks", "store"},
+    "check": BODY | {"check", "store"},
+    "sound": CAMERAS | {"clocks"},
+    # The clocks stage compares the distances between the cameras with the reach of the body.
+    "clocks": CAMERAS | {"clocks", "mapping"},
     "keyframes": CAMERAS | {"keyframes"},
     **dict.fromkeys(("map", "extend", "refine"), CAMERAS | {"mapping"}),
     **dict.fromkeys(("registration", "rig", "recover"), CAMERAS | {"registration"}),

@@ -121,7 +121,8 @@ def test_the_mean_row_follows_the_observations() -> None:
 @pytest.mark.parametrize(
     ("change", "counts"),
     [
-        ({"offset_s": 0.1}, True),
+        ({"offset_s": 0.1}, False),
+        ({"drift_ppm": 10.0}, False),
         ({"rolling_shutter_s": 0.02}, True),
         ({"fov_deg": 90.0}, True),
         ({"mount": "head"}, False),

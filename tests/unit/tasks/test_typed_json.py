@@ -23,14 +23,16 @@ from bodycap_batch.pipeline.task_keys import artefact_key, make_task
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.check import CheckTask
+from bodycap_batch.tasks.clocks import CameraDistance, ClocksTask, StatedClock
 from bodycap_batch.tasks.export import ExportTask
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, FileRef, MountInput
 from bodycap_batch.tasks.keyframes import KeyframesTask
-from bodycap_batch.tasks.mapping import CameraDistance, ExtendTask, MapTask, RefineTask
+from bodycap_batch.tasks.mapping import ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import BoardFootage, MergeTask
 from bodycap_batch.tasks.preview import PreviewTask
 from bodycap_batch.tasks.registration import RegistrationTask
 from bodycap_batch.tasks.report import ReportTask
+from bodycap_batch.tasks.sound import SoundTask
 from bodycap_batch.tasks.stages import STAGES
 from bodycap_batch.tasks.synth import SynthTask
 from bodycap_batch.tasks.typed_json import from_json, key_inputs, key_options, to_json
@@ -66,7 +68,12 @@ def tasks(folder: Path) -> dict[str, Any]:
         mounts=(mount,),
     )
     together = {"capture": capture, "keyframes": stored, "map": scene_map, "registrations": stored}
-    poses = {**together, "options": RegistrationOptions(rounds=2), "cameras": ("torso", "head")}
+    poses = {
+        **together,
+        "options": RegistrationOptions(rounds=2),
+        "cameras": ("torso", "head"),
+        "offsets_s": {"torso": 0.1},
+    }
     return {
         "synth": SynthTask(
             options=SynthOptions(motion=folder / "walk.bvh"),
@@ -81,7 +88,6 @@ def tasks(folder: Path) -> dict[str, Any]:
             options=MapOptions(init_frames=("torso:1", "head:2")),
             capture=capture,
             keyframes=stored,
-            reach=(CameraDistance(first="head", second="torso", least_m=0.1, most_m=0.9),),
         ),
         "extend": ExtendTask(
             options=MapOptions(), capture=capture, keyframes=stored, map=scene_map, extra={"torso": (3, 7)}
@@ -96,10 +102,22 @@ def tasks(folder: Path) -> dict[str, Any]:
         ),
         "rig": CameraGroupTask(**poses),
         "recover": CameraGroupTask(**poses),
+        "sound": SoundTask(capture=capture),
+        "clocks": ClocksTask(
+            capture=capture,
+            stated={"torso": StatedClock(offset_s=0.1, drift_ppm=None, role="Spine1")},
+            common="auto",
+            rig="free",
+            sound=scene_map,
+            map=scene_map,
+            registrations=stored,
+            reach=(CameraDistance(first="head", second="torso", least_m=0.1, most_m=0.9),),
+        ),
         "merge": MergeTask(
             options=MergeOptions(known_distance=("torso:1", "head:2", 1.5)),
             map=scene_map,
             registrations=stored,
+            clocks=scene_map,
             body=body,
             footage=BoardFootage(capture=capture, keyframes=stored),
         ),
@@ -107,6 +125,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             options=ExportOptions(formats=("bvh", "ply")),
             map=scene_map,
             registrations=stored,
+            clocks=scene_map,
             keyframes=stored,
             merge=None,
             failure="too few frames",
@@ -117,11 +136,12 @@ def tasks(folder: Path) -> dict[str, Any]:
             name="walk",
             failure={"stage": "merge", "line": 3},
             max_gap_s=0.5,
+            clocks=None,
             merge=None,
             export=scene_map,
             body=body,
         ),
-        "preview": PreviewTask(**together, merge=scene_map, failure=None),
+        "preview": PreviewTask(**together, clocks=scene_map, merge=scene_map, failure=None),
     }
 
 

@@ -1,0 +1,112 @@
+"""The task that decides which clock each camera has."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from bodycap_batch.config.models import CaptureConfig
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
+from bodycap_batch.tasks.loading import CLOCKS_NAME, load_map, load_registration
+from bodycap_batch.tasks.sound import load_sound
+from bodycap_batch.tasks.stage import Stage, write_summary
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraDistance:
+    """The smallest and largest distance that the body permits between two cameras.
+
+    Attributes:
+        first: Name of the first camera.
+        second: Name of the second camera.
+        least_m: Smallest distance (metres), for a body of the skeleton's nominal size.
+        most_m: Largest distance (metres), for a body of the skeleton's nominal size.
+    """
+
+    first: str
+    second: str
+    least_m: float
+    most_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatedClock:
+    """What the job and the calibration file state about the clock of one camera.
+
+    Attributes:
+        offset_s: Stated offset, seconds; None if it is to be estimated.
+        drift_ppm: Stated drift, parts per million; None if it is to be estimated.
+        role: Role of the bone that the camera is mounted on; None if it is unknown.
+    """
+
+    offset_s: float | None
+    drift_ppm: float | None
+    role: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClocksTask:
+    """Decide which clock each camera has.
+
+    Attributes:
+        capture: The videos of all cameras.
+        stated: What is stated about the clock of each camera, by camera name.
+        common: Whether the job says that all clocks agree (`capture.clocks`).
+        rig: Whether cameras on one segment share a trigger (`capture.rig`).
+        sound: What the sound says; None if there is only one camera.
+        map: The map.
+        registrations: The registration of each camera, by camera name.
+        reach: Distances between cameras that the body permits.
+    """
+
+    capture: CaptureRef
+    stated: Mapping[str, StatedClock]
+    common: str
+    rig: str
+    sound: ArtefactRef | None
+    map: ArtefactRef
+    registrations: Mapping[str, ArtefactRef]
+    reach: tuple[CameraDistance, ...]
+
+
+def stated_clocks(capture: CaptureConfig) -> dict[str, StatedClock]:
+    """Return what is stated about the clock of each camera, by camera name."""
+    return {
+        camera.name: StatedClock(offset_s=camera.offset_s, drift_ppm=camera.drift_ppm, role=camera.role)
+        for camera in capture.cameras
+    }
+
+
+def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
+    """Decide which clock each camera has, and store the clocks."""
+    from bodycap_batch.clocks import clock_notes, combine_evidence, decide_clocks
+    from bodycap_batch.formats.dataclass_files import write_dataclass
+    from bodycap_batch.mapping.validation.camera_distance_check import check_distances
+
+    context.check_cancelled()
+    capture = task.capture.config
+    evidence = load_sound(None if task.sound is None else task.sound.path)
+    clocks = decide_clocks(capture, combine_evidence(capture, evidence))
+    write_dataclass(clocks, files, CLOCKS_NAME)
+    reach = {(pair.first, pair.second): (pair.least_m, pair.most_m) for pair in task.reach}
+    distances = None
+    if reach:
+        times_ns = {
+            name: load_registration(artefact.path).trajectory.times_ns
+            for name, artefact in task.registrations.items()
+        }
+        known = {name: clock for name, clock in clocks.cameras.items() if clock.is_known}
+        common_ns = {name: clock.common_ns(times_ns[name]) for name, clock in known.items()}
+        distances = check_distances(load_map(task.map.path).maps[0], common_ns, reach).to_log()
+    write_summary(files, notes=clock_notes(clocks), distances=distances)
+
+
+CLOCKS = Stage(
+    name="clocks",
+    task=ClocksTask,
+    function=run_clocks,
+    libraries=("numpy", "scipy"),
+    modules=("bodycap_batch.clocks",),
+)
