@@ -35,7 +35,9 @@ def sound(root: Path) -> Path:
     write_video(root / "head.mp4", MIRRORED)
     cameras = "".join(f"    - {{name: {name}, video: {name}.mp4}}\n" for name in ("torso", "head"))
     (root / "calib.json").write_text(json.dumps(LENS))
-    (root / "job.yaml").write_text(f"capture:\n  calibration: calib.json\n  cameras:\n{cameras}")
+    (root / "job.yaml").write_text(
+        f"capture:\n  clocks: common\n  calibration: calib.json\n  cameras:\n{cameras}"
+    )
     return root / "job.yaml"
 
 

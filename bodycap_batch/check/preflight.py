@@ -26,7 +26,6 @@ from bodycap_batch.config.models import (
     CameraConfig,
     CaptureConfig,
     Job,
-    is_clock_stated,
 )
 from bodycap_batch.config.mounts import TRUNK_ROLES
 from bodycap_batch.config.origins import CameraOrigins
@@ -293,7 +292,7 @@ def _check_clocks(job: Job, summaries: list[CameraSummary]) -> list[str]:
 
     Cameras whose clock is to be estimated are not checked.
     """
-    stated = {camera.name for camera in job.capture.cameras if is_clock_stated(job.capture, camera)}
+    stated = {camera.name for camera in job.capture.cameras if camera.offset_s is not None}
     summaries = [camera for camera in summaries if camera.name in stated]
     if len(summaries) < 2:
         return []

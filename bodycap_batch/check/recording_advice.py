@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from bodycap_batch.check.check_report import CameraSummary
-from bodycap_batch.config.models import SKELETON_PRESETS, Job, is_clock_stated
+from bodycap_batch.config.models import SKELETON_PRESETS, Job
 
 _LOW_FPS = 24.0
 """Minimum number of frames per second that needs no advice.
@@ -66,7 +66,7 @@ def _intrinsics_advice(cameras: Sequence[CameraSummary]) -> Iterator[str]:
 
 
 def _missing_time_advice(job: Job, cameras: Sequence[CameraSummary]) -> Iterator[str]:
-    if not all(is_clock_stated(job.capture, config) for config in job.capture.cameras):
+    if not all(config.offset_s is not None for config in job.capture.cameras):
         return
     start, end = (
         min(camera.start_s for camera in cameras),

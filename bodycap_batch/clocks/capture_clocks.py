@@ -33,7 +33,7 @@ def decide_clocks(spec: CaptureConfig, estimates: ClockEstimates) -> CaptureCloc
     configs = {camera.name: camera for camera in spec.cameras}
     base_s = configs[estimates.reference].offset_s or 0.0
     clocks = {
-        name: _reference_clock(config, spec)
+        name: _reference_clock(config)
         if name == estimates.reference
         else _clock_of(config, spec, estimates.camera(name), base_s)
         for name, config in configs.items()
@@ -115,12 +115,11 @@ def describe_clock(clock: ClockRelation, reference_offset_s: float = 0.0) -> str
     return f"{text} ({clock.source})"
 
 
-def _reference_clock(config: CameraConfig, spec: CaptureConfig) -> ClockRelation:
-    is_stated = config.offset_s is not None and spec.clocks == "auto"
+def _reference_clock(config: CameraConfig) -> ClockRelation:
     return ClockRelation(
         offset_s=config.offset_s or 0.0,
         drift_ppm=config.drift_ppm or 0.0,
-        source="stated" if is_stated else "common",
+        source="stated" if config.offset_s else "common",
     )
 
 

@@ -37,8 +37,6 @@ from bodycap_batch.model.camera_clock import ClockSource
 
 STATED_SIGMA_S = 1.0 / 30.0
 """Standard deviation of a stated offset, seconds. Origin: a clap is found to a frame or so in each video."""
-_TRUNK_ROLES = ("Spine1", "Spine", "Hips")
-"""Roles of the bones of a torso camera, the preferred one first."""
 _MAX_SIGMAS = 3.0
 """Maximum difference of a stated offset from that of the sound, in standard deviations of the latter."""
 _TURNED_TOLERANCE_S = 0.05
@@ -192,15 +190,6 @@ def estimate_clocks(spec: CaptureConfig, threads: int | None = None) -> ClockEst
     return combine_evidence(spec, measure_sound(spec, threads))
 
 
-def reference_camera(spec: CaptureConfig) -> str:
-    """Return the name of the torso's camera; of the first camera if there is none on the torso."""
-    for role in _TRUNK_ROLES:
-        for camera in spec.cameras:
-            if camera.role == role:
-                return camera.name
-    return spec.cameras[0].name
-
-
 def _read_recording(config: CameraConfig) -> tuple[Recording, SoundTrack]:
     videos = tuple(index_video(path, 1) for path in config.video)
     times_ns = join_chapters(videos, config.timestamps).times_ns
@@ -226,7 +215,7 @@ def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstim
         spec: The capture block of a job, as returned by `load_job`.
         evidence: What the sound says; empty for a capture with one camera.
     """
-    reference = reference_camera(spec)
+    reference = spec.reference_camera().name
     if not evidence.recordings:
         only = ClockEstimate(
             camera=reference, offset_s=0.0, sigma_s=0.0, drift_sigma_ppm=0.0, source="common"

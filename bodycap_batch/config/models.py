@@ -32,6 +32,8 @@ from bodycap_batch.model.geometry import make_transform, rotation_from_quat_xyzw
 NO_SKELETON = "none"
 """Value of ``skeleton`` for a job that computes the camera paths and the map, but no body."""
 SKELETON_PRESETS = (NO_SKELETON, "upper_body", "full_body")
+_REFERENCE_ROLES = ("Spine1", "Spine", "Hips")
+"""Roles of the bones of a torso camera, the preferred one first."""
 _MAX_ROTATION = 10.0
 """Maximum absolute value (no unit) of a component of a rotation that the job gives, as a quaternion or as a
 matrix. The bound keeps products finite; `rules` checks that the components are a rotation. Evidence: none."""
@@ -217,6 +219,17 @@ class CaptureConfig(_Block):
         "for the first time",
     )
 
+    def reference_camera(self) -> CameraConfig:
+        """Return the camera whose clock is the common clock, unless another offset is stated for it.
+
+        It is the torso's camera; without one, the first camera.
+        """
+        for role in _REFERENCE_ROLES:
+            for camera in self.cameras:
+                if camera.role == role:
+                    return camera
+        return self.cameras[0]
+
     def segments(self) -> list[list[CameraConfig]]:
         """Return the cameras of each body segment on which two or more cameras are mounted."""
         by_role: dict[str, list[CameraConfig]] = {}
@@ -224,11 +237,6 @@ class CaptureConfig(_Block):
             if camera.role is not None:
                 by_role.setdefault(camera.role, []).append(camera)
         return [cameras for cameras in by_role.values() if len(cameras) > 1]
-
-
-def is_clock_stated(capture: CaptureConfig, camera: CameraConfig) -> bool:
-    """Return True if the clock offset of a camera of a loaded capture is stated, and not to be estimated."""
-    return camera.offset_s is not None or len(capture.cameras) == 1
 
 
 class Job(_Block):

@@ -93,7 +93,7 @@ def resolved_camera(index: int, capture: CaptureConfig, stated: CaptureConfig, b
     if camera.mask is not None:
         update["mask"] = real_path(base / camera.mask)
     if camera.offset_s is None:
-        is_common = capture.clocks == "common" or len(capture.cameras) == 1
+        is_common = capture.clocks == "common" or capture.reference_camera().name == camera.name
         in_file = entry.offset_s if entry else None
         update["offset_s"] = 0.0 if in_file is None and is_common else in_file
     if camera.rolling_shutter_s is None:
@@ -106,7 +106,7 @@ def resolved_camera(index: int, capture: CaptureConfig, stated: CaptureConfig, b
         timestamps=_timestamps_origin(config, is_stated=bool(camera.timestamps)),
         clock_offset=Origin(source="job file", value=f"{camera.offset_s:g} s")
         if camera.offset_s is not None
-        else _offset_origin(entry, file, capture, is_stated=is_stated),
+        else _offset_origin(camera, entry, file, capture, is_stated=is_stated),
         clock_drift=_drift_origin(camera, capture),
         mount=_mount_origin(config),
         mount_pose=Origin(source="default", value="typical of the place")
@@ -141,11 +141,17 @@ def _timestamps_origin(config: CameraConfig, *, is_stated: bool) -> Origin:
 
 
 def _offset_origin(
-    entry: CalibrationEntry | None, file: Path | None, capture: CaptureConfig, *, is_stated: bool
+    camera: CameraConfig,
+    entry: CalibrationEntry | None,
+    file: Path | None,
+    capture: CaptureConfig,
+    *,
+    is_stated: bool,
 ) -> Origin:
     """Return the origin of a clock offset that the job file does not give.
 
     Args:
+        camera: The camera as the job states it.
         entry: The entry of the camera in the calibration file; None without such a file.
         file: The calibration file.
         capture: The capture, which says whether all clocks agree.
@@ -154,7 +160,8 @@ def _offset_origin(
     if entry is None or file is None or entry.offset_s is None:
         if capture.clocks == "common":
             return Origin(source="job file", value="0 s, common clocks")
-        return Origin(source="default", value="auto" if len(capture.cameras) > 1 else "0 s")
+        is_reference = capture.reference_camera().name == camera.name
+        return Origin(source="default", value="0 s, the reference clock" if is_reference else "auto")
     if is_stated:
         return Origin(source="job file", value=f"{entry.offset_s:g} s in {file.name}")
     return Origin(source="calib.json", value=f"{entry.offset_s:g} s")
@@ -166,7 +173,8 @@ def _drift_origin(camera: CameraConfig, capture: CaptureConfig) -> Origin:
         return Origin(source="job file", value=f"{camera.drift_ppm:g} ppm")
     if capture.clocks == "common":
         return Origin(source="job file", value="0 ppm, common clocks")
-    return Origin(source="default", value="auto" if len(capture.cameras) > 1 else "0 ppm")
+    is_reference = capture.reference_camera().name == camera.name
+    return Origin(source="default", value="0 ppm" if is_reference else "auto")
 
 
 def _mount_origin(config: CameraConfig) -> Origin:

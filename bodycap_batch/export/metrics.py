@@ -55,7 +55,13 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
             for exported in maps_in_target_frames(inputs)
         ],
         "mapping": dict(inputs.log),
+        "clocks": {name: _clock_metrics(inputs, name) for name in inputs.clocks},
     }
+    notes = {name: list(clock.notes) for name, clock in inputs.clocks.items() if clock.notes}
+    if notes:
+        out["clock_notes"] = notes
+        contradicted = [name for name, clock in inputs.clocks.items() if clock.is_contradicted]
+        out["contradicted_clocks"] = contradicted
     if inputs.relative_poses:
         out["relative_poses"] = [_relative_pose_metrics(inputs, item) for item in inputs.relative_poses]
     if inputs.merge is not None:
@@ -66,6 +72,20 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
     if motion is not None:
         out["motion"] = _motion_metrics(motion, gap)
     return dict(_json_value(out))
+
+
+def _clock_metrics(inputs: ExportInputs, camera: str) -> dict[str, Any]:
+    """Return the clock of one camera, relative to the reference camera."""
+    clock = inputs.clocks[camera]
+    reference = inputs.clocks.get(inputs.reference_camera)
+    base_s = 0.0 if reference is None else reference.offset_s
+    return {
+        "offset_s": clock.offset_s - base_s if clock.is_known else None,
+        "sigma_s": clock.sigma_s if clock.is_known else None,
+        "drift_ppm": clock.drift_ppm,
+        "drift_sigma_ppm": clock.drift_sigma_ppm,
+        "source": clock.source,
+    }
 
 
 def _map_index(maps: Sequence[Map], scene: Map) -> int:

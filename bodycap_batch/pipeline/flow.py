@@ -36,10 +36,9 @@ from bodycap_batch.tasks.clocks import (
     CLOCKS,
     CameraDistance,
     ClocksTask,
-    stated_clocks,
 )
 from bodycap_batch.tasks.export import EXPORT, ExportTask
-from bodycap_batch.tasks.inputs import BodyInput
+from bodycap_batch.tasks.inputs import BodyInput, stated_clocks
 from bodycap_batch.tasks.keyframes import KEYFRAMES, KeyframesTask
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE, ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import MERGE, BoardFootage, MergeTask
@@ -347,6 +346,7 @@ class Flow:
         task = CheckTask(
             job=self._job,
             cameras=self._cameras,
+            clocks=stated_clocks(self._job.capture),
             body=self._body,
             formats=self._job.export.formats,
             names=self._job.export.names,

@@ -20,8 +20,10 @@ from bodycap_batch.store.artefacts import MANIFEST, Store
 from bodycap_batch.tasks.order import STAGE_ORDER
 
 _INPUTS = {
-    "capture": "the video, the calibration, the clock, start_s or end_s of {}",
-    "cameras": "the video, the calibration, the clock, start_s or end_s of {}",
+    "capture": "the video, the calibration, start_s or end_s of {}",
+    "cameras": "the video, the calibration, start_s or end_s of {}",
+    "clocks": "the clock of {}",
+    "stated": "the clock of {}",
     "keyframes": "the keyframes of {}",
     "registrations": "the poses of {}",
     "body": "the body: {}",
@@ -31,6 +33,7 @@ _INPUTS = {
 is replaced by the name of the part."""
 _WHOLE_INPUTS = {
     "footage": "the search for the marker board",
+    "common": "capture.clocks",
     "merge": "the motion",
     "previous": "the result of the previous round",
     "reach": "the distances between the cameras",

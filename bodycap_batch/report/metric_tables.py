@@ -56,7 +56,11 @@ def make_tables(inputs: ReportInputs) -> dict[str, Table]:
     metrics = inputs.metrics
     if metrics is None:
         return {}
-    tables = {"frames": _frames_table(metrics), "map": _map_table(metrics)}
+    tables = {
+        "frames": _frames_table(metrics),
+        "clocks": _clocks_table(metrics),
+        "map": _map_table(metrics),
+    }
     if "merge" in metrics:
         merge = metrics["merge"]
         tables |= {
@@ -119,6 +123,39 @@ def _frames_table(metrics: Mapping[str, Any]) -> Table:
         )
     heads = ("Camera", "Frames", "Registered", "Share", "Keyframes", "Median inliers")
     return Table(caption="Table 1. Frames registered", heads=heads, rows=tuple(rows))
+
+
+_CLOCK_SOURCES = {
+    "sound": "sound",
+    "motion": "motion",
+    "stated": "stated in the job or the calibration",
+    "common": "common clock",
+    "none": "unknown",
+}
+"""Text for the user, by the source of a clock."""
+
+
+def _clocks_table(metrics: Mapping[str, Any]) -> Table:
+    rows = []
+    for name, clock in metrics.get("clocks", {}).items():
+        path = metric_path("clocks", name)
+        rows.append(
+            (
+                Cell(text=name),
+                metric_cell(metrics, f"{path}.offset_s", "{:+.4f} s"),
+                metric_cell(metrics, f"{path}.sigma_s", "{:.1f} ms", 1000.0),
+                metric_cell(metrics, f"{path}.drift_ppm", "{:+.1f} ppm"),
+                metric_cell(metrics, f"{path}.drift_sigma_ppm", "{:.1f} ppm"),
+                Cell(text=_CLOCK_SOURCES.get(clock["source"], str(clock["source"]))),
+            )
+        )
+    return Table(
+        caption="Clocks of the cameras",
+        heads=("Camera", "Offset", "Sigma", "Drift", "Sigma of the drift", "Source"),
+        rows=tuple(rows) if len(rows) > 1 else (),
+        note="Common time = camera time · (1 + drift) + offset. The offset is relative to the reference "
+        "camera, whose offset is 0.",
+    )
 
 
 def _map_table(metrics: Mapping[str, Any]) -> Table:

@@ -361,6 +361,15 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
             reason=report.exchanged_sides.says,
             priority=2.8,
         )
+    unknown = sorted(name for name, clock in inputs.clocks.items() if not clock.is_known)
+    if unknown:
+        yield Recommendation(
+            action="Clap once, or hop once, while all cameras record with sound. For this recording, read "
+            "the time of an event in two videos and state `offset_s`: the time in the video of "
+            f"{inputs.reference_camera} minus the time in the camera's own video.",
+            reason="; ".join(f"{name}: {note}" for name in unknown for note in inputs.clocks[name].notes),
+            priority=2.9,
+        )
     clocks = report.doubted_clocks
     if clocks:
         offsets = ", ".join(

@@ -53,6 +53,11 @@ GOOD_MOUNT_DEG, _FAIR_MOUNT_DEG = 4.0, 12.0
 
 The `rationale` of the criterion gives the reason.
 """
+_GOOD_CLOCK_S, _FAIR_CLOCK_S = 0.010, 0.040
+"""Maximum sigma (seconds) of an estimated clock offset for the grades "good" and "usable with care".
+
+The `rationale` of the criterion gives the reason.
+"""
 _GOOD_OBSERVED_SHARE, _FAIR_OBSERVED_SHARE = 0.95, 0.8
 """Minimum fraction of the time in which a joint is measured for the grades "good" and "usable with care".
 
@@ -119,6 +124,15 @@ def _headline(
         "are not tracked",
     )
     first = f"The cameras {camera_phrases[cameras]}"
+    unknown = unknown_clocks(metrics)
+    if unknown:
+        names = " and ".join(unknown)
+        clocks = "clock" if len(unknown) == 1 else "clocks"
+        first = (
+            f"The {clocks} of {names} {'is' if len(unknown) == 1 else 'are'} unknown, so the body is solved "
+            f"without {'it' if len(unknown) == 1 else 'them'}: clap once, or hop once, while all cameras "
+            f"record. {first}"
+        )
     if failure is not None:
         return f"{first}; the body could not be solved."
     if body is None:
@@ -133,11 +147,22 @@ def _headline(
     return f"{first}, {conjunction} {body_phrases[body]}."
 
 
+def unknown_clocks(metrics: Mapping[str, Any]) -> list[str]:
+    """Return the names of the cameras with an unknown clock.
+
+    Args:
+        metrics: The content of ``metrics.json``.
+    """
+    clocks = metrics.get("clocks", {})
+    return sorted(name for name, clock in clocks.items() if clock["source"] == "none")
+
+
 def _criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
     yield from _frame_criteria(metrics)
     yield from _map_criteria(metrics)
     if "merge" in metrics:
         yield from _body_criteria(metrics["merge"])
+        yield from _clock_criteria(metrics)
         yield from _observed_time_criteria(metrics.get("motion", {}).get("joints", {}))
 
 
@@ -307,7 +332,6 @@ def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
             "percentile)",
             rationale="If bones do not meet at their joint, a bone length, a mount or the scale is wrong.",
         )
-    yield from _clock_criteria(merge.get("doubted_clocks", {}))
     if merge.get("exchanged_sides"):
         yield Criterion(
             subject="body",
@@ -348,16 +372,40 @@ def _gap_criteria(cameras: Mapping[str, Any]) -> Iterator[Criterion]:
     )
 
 
-def _clock_criteria(doubted: Mapping[str, Any]) -> Iterator[Criterion]:
-    if doubted:
+def _clock_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
+    """Yield the criterion about the clocks: unknown, contradicted, or estimated with an uncertainty."""
+    clocks, doubted = metrics.get("clocks", {}), metrics["merge"].get("doubted_clocks", {})
+    notes = metrics.get("clock_notes", {})
+    names = (*unknown_clocks(metrics), *metrics.get("contradicted_clocks", ()))
+    wrong = [f"{name}: {note}" for name in names for note in notes.get(name, ())]
+    wrong += [str(doubt["says"]) for _, doubt in sorted(doubted.items())]
+    rationale = (
+        "Half a second is half a step. If a camera's clock is wrong by half a second, the limb with this "
+        "camera is half a step too early or too late. The metric scale is wrong too: by 28 % on a walk with "
+        "two clocks that were wrong by 0.5 and 0.2 s. A hand that moves at 1 m/s is 1 cm off if its clock is "
+        "10 ms off. Up to 10 ms is good; more than 40 ms, a frame of a cinema camera, is poor."
+    )
+    if wrong:
         yield Criterion(
             subject="body",
             name="One clock",
             grade=Grade.POOR,
-            finding="; ".join(str(doubt["says"]) for _, doubt in sorted(doubted.items())),
-            rationale="Half a second is half a step. If a camera's clock is wrong by half a second, the "
-            "limb with this camera is half a step too early or too late. The metric scale is wrong too: "
-            "by 28 % on a walk with two clocks that were wrong by 0.5 and 0.2 s.",
+            finding="; ".join(wrong),
+            rationale=rationale,
+        )
+        return
+    estimated = {name: clock for name, clock in clocks.items() if clock["source"] in ("sound", "motion")}
+    name, worst = max(estimated.items(), key=lambda item: item[1]["sigma_s"], default=("", None))
+    if worst is not None:
+        sigma_s = float(worst["sigma_s"])
+        yield Criterion(
+            subject="body",
+            name="One clock",
+            grade=grade_value(sigma_s, _GOOD_CLOCK_S, _FAIR_CLOCK_S),
+            finding=f"the clock of {name} is known to {1000 * sigma_s:.0f} ms, from the {worst['source']}",
+            rationale=rationale,
+            metric=metric_path("clocks", name, "sigma_s"),
+            value=sigma_s,
         )
 
 

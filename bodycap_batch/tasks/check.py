@@ -9,7 +9,7 @@ from pathlib import Path
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.tasks.inputs import BodyInput
+from bodycap_batch.tasks.inputs import BodyInput, StatedClock
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
 from bodycap_batch.tasks.typed_json import omitted_from_key
 
@@ -22,6 +22,7 @@ class CheckTask:
         job: The resolved job. The job is not part of the artefact's key, because the other fields hold
             everything that the check depends on.
         cameras: For each camera name, the digest of everything that the camera's frames depend on.
+        clocks: What is stated about the clock of each camera, by camera name.
         body: The body; None for a job without a skeleton.
         formats: Formats of the files to export.
         names: The convention for the joint names in the exported files.
@@ -30,6 +31,7 @@ class CheckTask:
 
     job: Job = field(metadata=omitted_from_key())
     cameras: Mapping[str, str]
+    clocks: Mapping[str, StatedClock]
     body: BodyInput | None
     formats: tuple[str, ...]
     names: str

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from bodycap_batch.config.models import CaptureConfig
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, StatedClock
 from bodycap_batch.tasks.loading import CLOCKS_NAME, load_map, load_registration
 from bodycap_batch.tasks.sound import load_sound
 from bodycap_batch.tasks.stage import Stage, write_summary
@@ -29,21 +28,6 @@ class CameraDistance:
     second: str
     least_m: float
     most_m: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatedClock:
-    """What the job and the calibration file state about the clock of one camera.
-
-    Attributes:
-        offset_s: Stated offset, seconds; None if it is to be estimated.
-        drift_ppm: Stated drift, parts per million; None if it is to be estimated.
-        role: Role of the bone that the camera is mounted on; None if it is unknown.
-    """
-
-    offset_s: float | None
-    drift_ppm: float | None
-    role: str | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,14 +53,6 @@ class ClocksTask:
     map: ArtefactRef
     registrations: Mapping[str, ArtefactRef]
     reach: tuple[CameraDistance, ...]
-
-
-def stated_clocks(capture: CaptureConfig) -> dict[str, StatedClock]:
-    """Return what is stated about the clock of each camera, by camera name."""
-    return {
-        camera.name: StatedClock(offset_s=camera.offset_s, drift_ppm=camera.drift_ppm, role=camera.role)
-        for camera in capture.cameras
-    }
 
 
 def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:

@@ -63,6 +63,21 @@ class CaptureRef:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StatedClock:
+    """What the job and the calibration file state about the clock of one camera.
+
+    Attributes:
+        offset_s: Stated offset, seconds; None if it is to be estimated.
+        drift_ppm: Stated drift, parts per million; None if it is to be estimated.
+        role: Role of the bone that the camera is mounted on; None if it is unknown.
+    """
+
+    offset_s: float | None
+    drift_ppm: float | None
+    role: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MountInput:
     """The place on the body at which a camera is mounted, as the job gives it.
 
@@ -108,6 +123,14 @@ class BodyInput:
     height_m: float | None
     activity: Activity
     mounts: tuple[MountInput, ...]
+
+
+def stated_clocks(capture: CaptureConfig) -> dict[str, StatedClock]:
+    """Return what is stated about the clock of each camera, by camera name."""
+    return {
+        camera.name: StatedClock(offset_s=camera.offset_s, drift_ppm=camera.drift_ppm, role=camera.role)
+        for camera in capture.cameras
+    }
 
 
 def paths_of(artefacts: Iterable[ArtefactRef]) -> list[Path]:

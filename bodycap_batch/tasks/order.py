@@ -7,12 +7,18 @@ from typing import Literal, get_args
 StageName = Literal["check", "keyframes", "map", "registration", "merge", "export", "report", "preview"]
 STAGE_ORDER: tuple[StageName, ...] = get_args(StageName)
 """The stages of a job in the order in which they run."""
-_DURING_REGISTRATION = frozenset({"extend", "refine", "rig", "recover", "sound", "clocks"})
+_BESIDE_KEYFRAMES = frozenset({"sound"})
+"""Further stages that run at the same time as the keyframes."""
+_DURING_REGISTRATION = frozenset({"extend", "refine", "rig", "recover", "clocks"})
 """Further stages that may run up to the merge. They extend and refine the map, solve the cameras of a rig
-together, recover lost frames, and determine the clocks from the sound and from the paths."""
+together, recover lost frames, and determine the clocks."""
 
 
 def stages_from(stage: StageName) -> frozenset[str]:
     """Return the name of a given stage of `STAGE_ORDER`, and the names of all stages that run after it."""
     later = set[str](STAGE_ORDER[STAGE_ORDER.index(stage) :])
-    return frozenset(later | (_DURING_REGISTRATION if "registration" in later else set()))
+    if "keyframes" in later:
+        later |= _BESIDE_KEYFRAMES
+    if "registration" in later:
+        later |= _DURING_REGISTRATION
+    return frozenset(later)

@@ -13,6 +13,7 @@ import pytest
 from bodycap_batch.capture import Capture, open_capture
 from bodycap_batch.config.models import CaptureConfig
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.report import write_report
 from bodycap_batch.report.frame_overlays import FrameOverlays
 from bodycap_batch.report.serving import FRAMES_PER_PART, LOOPBACK, make_served_content, make_server
@@ -71,11 +72,12 @@ def make_capture(folder: Path, cameras: tuple[str, ...]) -> Capture:
                 "name": name,
                 "video": list(map(str, chapters)),
                 "calibration": lens,
-                "offset_s": START_S,
                 "mount": "torso",
             }
         )
-    return open_capture(CaptureConfig.model_validate({"cameras": cameras_config}))
+    opened = open_capture(CaptureConfig.model_validate({"cameras": cameras_config}))
+    clock = ClockRelation(offset_s=START_S)
+    return Capture(cameras=tuple(replace(camera, clock=clock) for camera in opened.cameras))
 
 
 @pytest.fixture(scope="module")

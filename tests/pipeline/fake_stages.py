@@ -151,6 +151,8 @@ NAMES = (
     "refine",
     "registration",
     "recover",
+    "sound",
+    "clocks",
     "merge",
     "export",
     "preview",

@@ -22,7 +22,7 @@ from bodycap_batch.store.digests import _entry_text
 from bodycap_batch.store.garbage_collection import collect_garbage
 from bodycap_batch.store.references import References, in_use, moving
 from bodycap_batch.tasks.order import StageName, stages_from
-from tests.pipeline.test_run import ALL, CHILD, PER_CAMERA, REGISTERED, Bench, bench, done, done_once
+from tests.pipeline.test_run import ALL, CHILD, CLOCKED, PER_CAMERA, REGISTERED, Bench, bench, done, done_once
 
 __all__ = ["bench", "done", "done_once"]
 
@@ -60,7 +60,7 @@ def artefacts(bench: Bench) -> set[str]:
     [
         ("check", ALL),
         ("keyframes", sorted(set(ALL) - {"check"})),
-        ("registration", ["export", "merge", "preview", "report", *REGISTERED]),
+        ("registration", [*CLOCKED, *REGISTERED]),
         ("export", ["export", "preview", "report"]),
         ("preview", ["preview"]),
     ],
@@ -76,9 +76,9 @@ def test_from_a_stage_it_and_all_after_it_are_done_again(
 
 
 def test_until_a_stage_nothing_after_it_is_done_and_no_result_is_written(bench: Bench) -> None:
-    assert executed(bench, until="map") == sorted(["check", *PER_CAMERA, "map"])
+    assert executed(bench, until="map") == sorted(["check", "sound", *PER_CAMERA, "map"])
     assert bench.results() == {}
-    assert bench.executed() == sorted(["export", "merge", "preview", "report", *REGISTERED])
+    assert bench.executed() == sorted([*CLOCKED, *REGISTERED])
 
 
 @pytest.mark.parametrize("stage", ["export", "report"])
@@ -109,7 +109,7 @@ def test_a_job_is_taken_over_while_it_runs(bench: Bench) -> None:
 
     with pytest.raises(Cancelled, match="another process runs it now"):
         executed(bench, may_commit=until_the_map)
-    assert {name.split("/")[0] for name in artefacts(bench)} == {"check", "keyframes"}
+    assert {name.split("/")[0] for name in artefacts(bench)} == {"check", "keyframes", "sound"}
     assert bench.results() == {}
 
 
@@ -131,7 +131,7 @@ def test_why_a_finished_job_would_do_nothing(done: Bench) -> None:
         (
             {"torso": {"offset_s": 0.1}},
             "check",
-            "the video, the calibration, the clock, start_s or end_s of torso",
+            "the clock of torso",
             None,
         ),
     ],
@@ -231,6 +231,7 @@ def test_garbage_is_what_no_finished_job_used(alone: Bench) -> None:
     assert {name.split("/")[1] for name in dry.artefacts} == {
         "map",
         "registration",
+        "clocks",
         "merge",
         "export",
         "preview",

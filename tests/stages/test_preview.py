@@ -22,7 +22,7 @@ from tests.stages.conftest import DARK, Estimated, context
 def preview_inputs(estimated: Estimated, path: Path, bone_motion: BoneMotion | None = None) -> PreviewInputs:
     scene = estimated.result.maps[0]
     clocks = {
-        camera.name: CameraClock(nominal_fps=camera.nominal_fps, offset_s=camera.offset_s)
+        camera.name: CameraClock(nominal_fps=camera.nominal_fps, offset_s=camera.clock.offset_s)
         for camera in estimated.capture.cameras
     }
     return PreviewInputs(

@@ -16,6 +16,7 @@ import pytest
 
 from bodycap_batch.capture import Capture, CaptureCamera, open_capture
 from bodycap_batch.config.models import CaptureConfig, Job
+from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.geometry import interpolate_pose
 from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
@@ -228,6 +229,43 @@ def test_contradictions_of_the_body_are_recommended_first(
     assert "0.5 s behind" in written(contradicted, tmp_path)
 
 
+def test_an_unknown_clock_is_in_the_first_line_and_poor(inputs: ReportInputs, tmp_path: Path) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    note = "the clock is unknown: the video has no sound"
+    metrics["clocks"]["left_palm"] |= {"source": "none", "offset_s": None, "sigma_s": None}
+    metrics["clock_notes"] = {"left_palm": [note]}
+    verdict = judge(metrics, None)
+    assert verdict.headline.startswith("The clock of left_palm is unknown, so the body is solved without it")
+    (clock,) = (each for each in verdict.criteria if each.name == "One clock")
+    assert clock.grade is Grade.POOR
+    assert note in clock.finding
+    clocks = {**inputs.clocks, "left_palm": replace(inputs.clocks["left_palm"], source="none", notes=(note,))}
+    unknown = replace(inputs, metrics=metrics, clocks=clocks, reference_camera="torso")
+    assert "the video of torso minus" in recommend_changes(unknown, {})[0].action
+    page = written(unknown, tmp_path)
+    assert "Clocks of the cameras" in page
+    assert note in page
+
+
+@pytest.mark.parametrize(("sigma_s", "grade"), [(0.002, Grade.GOOD), (0.025, Grade.FAIR), (0.06, Grade.POOR)])
+def test_the_sigma_of_an_estimated_clock_is_graded(
+    inputs: ReportInputs, sigma_s: float, grade: Grade
+) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    metrics["clocks"]["left_palm"] |= {"source": "motion", "sigma_s": sigma_s}
+    (clock,) = (each for each in judge(metrics, None).criteria if each.name == "One clock")
+    assert (clock.grade, clock.value) == (grade, sigma_s)
+    assert "from the motion" in clock.finding
+
+
+def test_a_contradicted_clock_is_poor(inputs: ReportInputs) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    metrics["clock_notes"] = {"torso": ["the dates are wrong"], "left_palm": ["the sound gives 0.8 s"]}
+    metrics["contradicted_clocks"] = ["left_palm"]
+    (clock,) = (each for each in judge(metrics, None).criteria if each.name == "One clock")
+    assert (clock.grade, clock.finding) == (Grade.POOR, "left_palm: the sound gives 0.8 s")
+
+
 def test_cameras_that_start_late_or_end_early_get_the_advice_to_cut(inputs: ReportInputs) -> None:
     assert inputs.merge is not None
     assert not any("start_s" in each.action for each in recommend_changes(inputs, {}))
@@ -264,11 +302,12 @@ def test_cameras_that_start_late_or_end_early_get_the_advice_to_cut(inputs: Repo
     assert f"{right.camera} has no measurement after" in ends.reason
 
 
-def test_a_camera_without_a_clock_uses_its_stated_offset(inputs: ReportInputs, tmp_path: Path) -> None:
+def test_a_camera_without_poses_uses_the_clock_of_the_capture(inputs: ReportInputs, tmp_path: Path) -> None:
     write_video(tmp_path / "torso.mp4", [textured_frame(index) for index in range(12)])
     lens = {"model": "PINHOLE", "params": [60.0, 60.0, 32.0, 24.0], "width": 64, "height": 48}
-    camera = {"name": "torso", "video": [str(tmp_path / "torso.mp4")], "calibration": lens, "offset_s": 2.5}
-    capture = open_capture(CaptureConfig.model_validate({"cameras": [camera]}))
+    camera = {"name": "torso", "video": [str(tmp_path / "torso.mp4")], "calibration": lens}
+    opened = open_capture(CaptureConfig.model_validate({"cameras": [camera]}))
+    capture = Capture(cameras=(replace(opened.cameras[0], clock=ClockRelation(offset_s=2.5)),))
     stopped = ReportInputs(name="x", cameras=("torso",), capture=capture, failure={"stage": "map"})
     times = common_times_s(stopped, "torso", capture.camera("torso").times_ns)
     np.testing.assert_allclose(times, capture.camera("torso").common_times_ns() * 1e-9)
@@ -492,7 +531,7 @@ def test_the_sharpness_of_a_camera_without_a_trajectory_is_drawn_at_its_own_time
         frame_numbers=path.frame_numbers,
         times_ns=path.times_ns,
         nominal_fps=30.0,
-        offset_s=0.5,
+        clock=ClockRelation(offset_s=0.5),
         rolling_shutter_s=0.0,
     )
     times = camera.common_times_ns() * 1e-9

@@ -8,13 +8,15 @@ import socket
 import struct
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bodycap_batch.capture import open_capture
+from bodycap_batch.capture import Capture, open_capture
 from bodycap_batch.config.models import CaptureConfig
+from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.report.frame_overlays import FrameOverlays
 from bodycap_batch.report.serving import (
     FRAMES_PER_PART,
@@ -40,9 +42,9 @@ def port(tmp_path: Path) -> Iterator[int]:
         "name": "torso",
         "video": [str(tmp_path / "a.mp4"), str(tmp_path / "b.mp4")],
         "calibration": lens,
-        "offset_s": OFFSET_S,
     }
-    capture = open_capture(CaptureConfig.model_validate({"cameras": [camera]}))
+    (opened,) = open_capture(CaptureConfig.model_validate({"cameras": [camera]})).cameras
+    capture = Capture(cameras=(replace(opened, clock=ClockRelation(offset_s=OFFSET_S)),))
     server = make_server(make_served_content(tmp_path / "report.html", capture))
     thread = threading.Thread(target=server.serve_forever)
     thread.start()

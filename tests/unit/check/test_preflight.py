@@ -283,7 +283,7 @@ def test_the_check_says_where_settings_come_from_and_what_is_not_used(
         "  calibration: PINHOLE (from calib.json)",
         "  calibration: auto (from the job file), starting at 65° (from the video metadata)",
         "  timestamps: left_palm.timestamps.txt (from the sidecar file)",
-        "  clock: offset 0.2 s (from the job file); drift auto (default)",
+        "  clock: offset 0.2 s (from the job file); drift 0 ppm (default)",
         "  mount: Spine1 (from the camera name); pose on the bone: typical of the place (default)",
         "  video: left_palm.mp4 (from the folder)",
         "not used (the name is not a known place on the body): board.mp4",

@@ -9,7 +9,6 @@ import pytest
 
 from bodycap_batch.cli import main
 from bodycap_batch.clocks import decide_clocks, describe_clocks, estimate_clocks
-from bodycap_batch.clocks.estimate import reference_camera
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from tests.sounds import heard, scene, write_video_with_sound
 
@@ -103,8 +102,8 @@ def test_a_stated_offset_is_kept_where_there_is_no_sound(folder):
 
 
 def test_the_first_camera_is_the_reference_without_a_torso(folder):
-    assert reference_camera(capture(folder, "head", "left_palm")) == "head"
-    assert reference_camera(capture(folder, "left_palm", "torso")) == "torso"
+    assert capture(folder, "head", "left_palm").reference_camera().name == "head"
+    assert capture(folder, "left_palm", "torso").reference_camera().name == "torso"
 
 
 def write_job(folder, tmp_path, *names):

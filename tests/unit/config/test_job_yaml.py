@@ -54,13 +54,13 @@ def test_only_the_capture_is_needed(tmp_path: Path) -> None:
     assert palm.video == (tmp_path / "left/a.mp4", tmp_path / "left/b.mp4")
     assert (torso.role, palm.role) == ("Spine1", "LeftHand")
     assert torso.calibration == "auto"
-    assert (torso.offset_s, torso.drift_ppm, torso.rolling_shutter_s) == (None, None, None)
+    assert (torso.offset_s, torso.drift_ppm, torso.rolling_shutter_s) == (0.0, None, None)
 
 
 def test_clocks_are_stated_or_estimated(tmp_path: Path) -> None:
     cameras = "cameras: [{name: torso, video: torso.mp4, offset_s: %s}, {name: head, video: head.mp4}]"
     for stated, clocks, expected in (
-        ("auto", "auto", (None, None)),
+        ("auto", "auto", (0.0, None)),
         ("0.12", "auto", (0.12, None)),
         ("0.12", "common", (0.12, 0.0)),
     ):

@@ -310,7 +310,7 @@ def test_where_the_settings_of_a_camera_come_from(tmp_path: Path) -> None:
         "video: a.mp4 to b.mp4, 2 files (from the job file)",
         "calibration: PINHOLE in lens.json (from the job file)",
         "timestamps: t.txt (from the job file)",
-        "clock: offset 2 s (from the job file); drift auto (default)",
+        "clock: offset 2 s (from the job file); drift 0 ppm (default)",
         "mount: torso (from the job file); pose on the bone: measured (from the job file)",
     ]
     assert origins["head"].clock_offset.text() == "-0.5 s in lens.json (from the job file)"

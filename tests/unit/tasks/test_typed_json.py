@@ -23,9 +23,9 @@ from bodycap_batch.pipeline.task_keys import artefact_key, make_task
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.check import CheckTask
-from bodycap_batch.tasks.clocks import CameraDistance, ClocksTask, StatedClock
+from bodycap_batch.tasks.clocks import CameraDistance, ClocksTask
 from bodycap_batch.tasks.export import ExportTask
-from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, FileRef, MountInput
+from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, FileRef, MountInput, StatedClock
 from bodycap_batch.tasks.keyframes import KeyframesTask
 from bodycap_batch.tasks.mapping import ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import BoardFootage, MergeTask
@@ -67,6 +67,7 @@ def tasks(folder: Path) -> dict[str, Any]:
         activity="walk",
         mounts=(mount,),
     )
+    clocks = {"torso": StatedClock(offset_s=0.1, drift_ppm=None, role="Spine1")}
     together = {"capture": capture, "keyframes": stored, "map": scene_map, "registrations": stored}
     poses = {
         **together,
@@ -81,7 +82,13 @@ def tasks(folder: Path) -> dict[str, Any]:
             motion_name="walk.bvh",
         ),
         "check": CheckTask(
-            job=job, cameras=capture.digests, body=body, formats=("bvh",), names="hik", limits=Limits()
+            job=job,
+            cameras=capture.digests,
+            clocks=clocks,
+            body=body,
+            formats=("bvh",),
+            names="hik",
+            limits=Limits(),
         ),
         "keyframes": KeyframesTask(options=KeyframeOptions(window=3), capture=capture),
         "map": MapTask(
@@ -105,7 +112,7 @@ def tasks(folder: Path) -> dict[str, Any]:
         "sound": SoundTask(capture=capture),
         "clocks": ClocksTask(
             capture=capture,
-            stated={"torso": StatedClock(offset_s=0.1, drift_ppm=None, role="Spine1")},
+            stated=clocks,
             common="auto",
             rig="free",
             sound=scene_map,
