@@ -148,7 +148,7 @@ def _camera_lines(safe: str, name: str, files: Sequence[Path], folder: Path) -> 
     if found is None or mount_of(safe) != found:
         lines.append(f"      mount: {_yaml_text(UNKNOWN_MOUNT if found is None else found[0])}")
     if not list(folder.glob(f"{name}.timestamps.txt")):
-        lines.append("      # offset_s: 0.0          # common time = camera time + offset_s, from a clap")
+        lines.append("      # offset_s: auto         # or seconds: common time = camera time + offset_s")
     return lines
 
 
