@@ -30,12 +30,12 @@ _MIN_COMMON_SHARE = 0.25
 """Least common time, as a share of the shorter path. Evidence: none."""
 _NEAR_S = 0.25
 """Maximum difference, seconds, of offsets that belong to one peak. Origin: half of a quick step."""
-_MIN_LOG_ODDS = 6.0
+_MIN_LOG_ODDS = 10.0
 """Least logarithm of the likelihood of the peak over that of all other offsets. Evidence:
 docs/decisions/clocks.md."""
 _MIN_SCORE = 10.0
 """Least score of an accepted offset. Evidence: docs/decisions/clocks.md."""
-_MAX_SIGMA_S = 0.045
+_MAX_SIGMA_S = 0.040
 """Maximum standard deviation of an accepted offset, seconds. Evidence: docs/decisions/clocks.md."""
 _MIN_EDGE_S = 0.1
 """Least difference, seconds, of an accepted offset from the end of those that are possible. Nearer to it, the
