@@ -10,10 +10,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM, PairOffset
+from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM
 from bodycap_batch.core.arrays import FloatArray
 
 WAY_SIGMA_S = 0.0015
@@ -26,6 +27,58 @@ _MIN_SIGMA_S = 1e-4
 """Least standard deviation of the offset of a pair, seconds, so that no pair has an infinite weight."""
 _MAX_CLOSURE_SIGMAS = 4.0
 """Maximum residual of a pair in a loop, in its standard deviations. Evidence: none."""
+
+
+class ClockPair(Protocol):
+    """What two cameras say about their clocks: the attributes of `PairOffset` that are solved together."""
+
+    @property
+    def first(self) -> str:
+        """Name of the first camera."""
+        ...
+
+    @property
+    def second(self) -> str:
+        """Name of the second camera."""
+        ...
+
+    @property
+    def pivot_s(self) -> float:
+        """Time on the second camera's clock, seconds."""
+        ...
+
+    @property
+    def offset_s(self) -> float:
+        """Difference of the clocks at the pivot, seconds."""
+        ...
+
+    @property
+    def sigma_s(self) -> float:
+        """Standard deviation of the offset, seconds."""
+        ...
+
+    @property
+    def drift_ppm(self) -> float:
+        """Drift, parts per million."""
+        ...
+
+    @property
+    def drift_sigma_ppm(self) -> float:
+        """Standard deviation of the drift."""
+        ...
+
+    @property
+    def drift_measured(self) -> bool:
+        """True if the drift was measured."""
+        ...
+
+    @property
+    def evidence(self) -> float:
+        """How clear the offset is."""
+        ...
+
+
+Pair = TypeVar("Pair", bound=ClockPair)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +102,11 @@ class JointClock:
         """Standard deviation of the offset, seconds."""
         return float(np.sqrt(self.covariance[0, 0]))
 
+    def sigma_at(self, camera_s: float) -> float:
+        """Return the standard deviation of the common time at a camera time, seconds."""
+        row = np.array([1.0, 1e-6 * camera_s])
+        return float(np.sqrt(row @ self.covariance @ row))
+
     @property
     def drift_sigma_ppm(self) -> float:
         """Standard deviation of the drift, parts per million."""
@@ -56,7 +114,7 @@ class JointClock:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JointClocks:
+class JointClocks(Generic[Pair]):
     """The clocks of all cameras that are connected to the reference camera.
 
     Attributes:
@@ -65,15 +123,15 @@ class JointClocks:
     """
 
     clocks: dict[str, JointClock]
-    dropped: tuple[tuple[PairOffset, float], ...]
+    dropped: tuple[tuple[Pair, float], ...]
 
 
 def solve_clocks(
     reference: str,
-    pairs: Sequence[PairOffset],
+    pairs: Sequence[Pair],
     starts_s: Mapping[str, float],
     floors_s: Mapping[str, float] | None = None,
-) -> JointClocks:
+) -> JointClocks[Pair]:
     """Solve the clocks of all cameras from accepted pairs.
 
     Args:
@@ -84,7 +142,7 @@ def solve_clocks(
             `WAY_SIGMA_S` or `UNLIKE_SIGMA_S`. Default: `WAY_SIGMA_S`.
     """
     used = list(pairs)
-    dropped: list[tuple[PairOffset, float]] = []
+    dropped: list[tuple[Pair, float]] = []
     while True:
         names = connected_cameras(reference, used)
         inside = [pair for pair in used if pair.first in names]
@@ -115,7 +173,7 @@ def solve_clocks(
     return JointClocks(clocks=clocks, dropped=tuple(dropped))
 
 
-def connected_cameras(reference: str, pairs: Sequence[PairOffset]) -> list[str]:
+def connected_cameras(reference: str, pairs: Sequence[ClockPair]) -> list[str]:
     """Return the cameras that pairs connect to the reference camera, which is the first."""
     names = [reference]
     for name in names:
@@ -127,7 +185,7 @@ def connected_cameras(reference: str, pairs: Sequence[PairOffset]) -> list[str]:
 
 
 def _solve(
-    others: Sequence[str], pairs: Sequence[PairOffset], starts_s: Mapping[str, float], reference: str
+    others: Sequence[str], pairs: Sequence[ClockPair], starts_s: Mapping[str, float], reference: str
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Solve the weighted equations of the pairs. A drift that no pair measures is 0 ± `CRYSTAL_SIGMA_PPM`.
 
@@ -176,10 +234,10 @@ def _solve(
 
 
 def _worst_pair(
-    reference: str, names: Sequence[str], pairs: Sequence[PairOffset], starts_s: Mapping[str, float]
-) -> PairOffset:
+    reference: str, names: Sequence[str], pairs: Sequence[Pair], starts_s: Mapping[str, float]
+) -> Pair:
     """Return the pair without which the others agree best; of equal ones, that with the least evidence."""
-    best: tuple[float, float, PairOffset] | None = None
+    best: tuple[float, float, Pair] | None = None
     for pair in pairs:
         rest = [each for each in pairs if each is not pair]
         if len(connected_cameras(reference, rest)) < len(names):
@@ -194,9 +252,7 @@ def _worst_pair(
     return best[2]
 
 
-def _closure_s(
-    reference: str, pair: PairOffset, pairs: Sequence[PairOffset], starts_s: Mapping[str, float]
-) -> float:
+def _closure_s(reference: str, pair: Pair, pairs: Sequence[Pair], starts_s: Mapping[str, float]) -> float:
     """Return the offset of a pair minus that which the other pairs give, seconds."""
     rest = [each for each in pairs if each is not pair]
     names = [name for name in connected_cameras(reference, rest) if name != reference]

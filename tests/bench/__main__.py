@@ -57,7 +57,8 @@ def main() -> int:
         "`cameras`, `size` of it), `field` (rendered captures recorded as by phones), `batch`, "
         "`spool`, `viewer`; with options of their own: `simulation`, "
         "`uncertainty`, `joining` or `solving` (the merge stage on simulated poses), `seeds` (the map "
-        "with several seeds), `clocks` (from generated sound), and `long` (ten minutes of three cameras)",
+        "with several seeds), `clocks` (from generated sound and motion), and `long` "
+        "(ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)
