@@ -172,6 +172,7 @@ def _estimated_clock(estimate: ClockEstimate, base_s: float) -> ClockRelation:
         correlation=correlation,
         source=estimate.source,
         notes=estimate.contradictions,
+        is_contradicted=estimate.is_contradicted,
     )
 
 

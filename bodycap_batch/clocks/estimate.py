@@ -56,11 +56,12 @@ class ClockEstimate:
         sigma_s: Standard deviation of the offset, seconds; None if it is unknown.
         drift_ppm: Drift, parts per million; 0 if it was not measured.
         drift_sigma_ppm: Standard deviation of the drift.
-        source: ``sound``; ``stated``: in the job or the calibration; ``common``: the reference camera, and
-            cameras with the same trigger; ``none``: unknown.
+        source: ``sound``; ``motion``; ``stated``: in the job or the calibration; ``common``: the reference
+            camera, and cameras with the same trigger; ``none``: unknown.
         covariance: (2,2) covariance of offset (seconds) and drift (ppm); None if it is unknown.
         reasons: Why the sound gives no clock, and notes about the sound.
         contradictions: What contradicts the clock.
+        is_contradicted: True if the motion contradicts the sound.
     """
 
     camera: str
@@ -72,6 +73,7 @@ class ClockEstimate:
     covariance: FloatArray | None = None
     reasons: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()
+    is_contradicted: bool = False
 
     def sigma_at(self, camera_s: float) -> float | None:
         """Return the standard deviation of the common time at a camera time, seconds; None if unknown."""

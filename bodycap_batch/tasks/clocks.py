@@ -57,22 +57,31 @@ class ClocksTask:
 
 def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
     """Decide which clock each camera has, and store the clocks."""
-    from bodycap_batch.clocks import clock_notes, combine_evidence, decide_clocks
+    from bodycap_batch.clocks import (
+        add_motion,
+        clock_notes,
+        clocks_from_paths,
+        combine_evidence,
+        decide_clocks,
+    )
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.validation.camera_distance_check import check_distances
 
     context.check_cancelled()
     capture = task.capture.config
     evidence = load_sound(None if task.sound is None else task.sound.path)
-    clocks = decide_clocks(capture, combine_evidence(capture, evidence))
+    paths = [load_registration(artefact.path).trajectory for artefact in task.registrations.values()]
+    estimates = combine_evidence(capture, evidence)
+    if len(paths) > 1:
+        roles = {name: stated.role or "" for name, stated in task.stated.items()}
+        motion = clocks_from_paths(paths, roles, estimates.reference)
+        estimates = add_motion(estimates, motion, evidence)
+    clocks = decide_clocks(capture, estimates)
     write_dataclass(clocks, files, CLOCKS_NAME)
     reach = {(pair.first, pair.second): (pair.least_m, pair.most_m) for pair in task.reach}
     distances = None
     if reach:
-        times_ns = {
-            name: load_registration(artefact.path).trajectory.times_ns
-            for name, artefact in task.registrations.items()
-        }
+        times_ns = {path.camera: path.times_ns for path in paths}
         known = {name: clock for name, clock in clocks.cameras.items() if clock.is_known}
         common_ns = {name: clock.common_ns(times_ns[name]) for name, clock in known.items()}
         distances = check_distances(load_map(task.map.path).maps[0], common_ns, reach).to_log()

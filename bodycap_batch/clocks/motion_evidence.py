@@ -1,0 +1,178 @@
+"""Add what the motion says about the clocks to what the sound says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from bodycap_batch.clocks.estimate import ClockEstimate, ClockEstimates, Recording, SoundEvidence
+from bodycap_batch.clocks.joint_offsets import WAY_SIGMA_S, JointClock
+from bodycap_batch.clocks.motion_offsets import MotionClocks
+from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM, PairOffset
+
+_MAX_SIGMAS = 3.0
+"""Maximum difference of sound and motion, in standard deviations."""
+_MAX_DIFFERENCE_S = 1.0 / 30.0
+"""Difference, seconds, of sound and motion that is no contradiction. Origin: one frame at 30 fps."""
+_EQUAL_COUNT_PRIOR, _OTHER_PRIOR = 0.5, 0.02
+"""Probability that the first frames of two videos show the same instant, before the motion is looked at: if
+the videos have the same number of frames, and otherwise. Cameras that were started by hand hardly ever record
+the same number of frames. Evidence: none."""
+_MIN_POSTERIOR = 0.9
+"""Minimum probability with which a common start is accepted. Evidence: none."""
+_START_RANGE_S = 20.0
+"""Range, seconds, in which the offsets of cameras that were started by hand lie. Evidence: none."""
+
+
+def add_motion(estimates: ClockEstimates, motion: MotionClocks, evidence: SoundEvidence) -> ClockEstimates:
+    """Return the clocks from the sound, completed and checked by the motion.
+
+    - A clock that the sound does not determine is taken from the motion.
+    - A clock that is related by sound only to cameras with a clock from the motion is taken from both.
+    - If the sound is known only as well as the motion (unlike cameras), the mean of both is used.
+    - A contradiction between sound and motion is noted.
+
+    Args:
+        estimates: The clocks that were estimated from the sound.
+        motion: The clocks that were estimated from the motion, with the same reference camera.
+        evidence: What the sound says, with the numbers of frames of the videos.
+    """
+    recordings = {recording.camera: recording for recording in evidence.recordings}
+    found = {}
+    for estimate in estimates.cameras:
+        clock = motion.clocks.get(estimate.camera)
+        if estimate.camera == estimates.reference or estimate.source == "common":
+            found[estimate.camera] = estimate
+        elif estimate.source == "sound":
+            found[estimate.camera] = _compared(estimate, clock)
+        elif clock is not None:
+            reference = recordings.get(estimates.reference)
+            found[estimate.camera] = _from_motion(estimate, clock, reference, recordings.get(estimate.camera))
+        else:
+            reason = motion.reasons.get(estimate.camera, "the motion does not determine the offset")
+            found[estimate.camera] = replace(estimate, reasons=(*estimate.reasons, f"motion: {reason}"))
+    _complete_from_sound(found, estimates.pairs)
+    return replace(estimates, cameras=tuple(found[each.camera] for each in estimates.cameras))
+
+
+def _compared(estimate: ClockEstimate, clock: JointClock | None) -> ClockEstimate:
+    """Return the clock from the sound, compared with the clock from the motion."""
+    if clock is None or estimate.offset_s is None or estimate.sigma_s is None:
+        return estimate
+    difference_s = clock.offset_s - estimate.offset_s
+    sigma_s = float(np.hypot(clock.sigma_s, estimate.sigma_s))
+    if abs(difference_s) > max(_MAX_SIGMAS * sigma_s, _MAX_DIFFERENCE_S):
+        text = (
+            f"the motion gives an offset of {clock.offset_s:.3f} ± {clock.sigma_s:.3f} s, but the sound "
+            f"gives {estimate.offset_s:.3f} ± {estimate.sigma_s:.3f} s"
+        )
+        return replace(estimate, contradictions=(*estimate.contradictions, text), is_contradicted=True)
+    if estimate.sigma_s < 0.5 * clock.sigma_s:
+        return estimate
+    weight = estimate.sigma_s**2 / (estimate.sigma_s**2 + clock.sigma_s**2)
+    mean_sigma_s = estimate.sigma_s * clock.sigma_s / sigma_s
+    return replace(
+        estimate,
+        offset_s=estimate.offset_s + weight * difference_s,
+        sigma_s=mean_sigma_s,
+        covariance=None if estimate.covariance is None else _with_sigma(estimate.covariance, mean_sigma_s),
+    )
+
+
+def _with_sigma(covariance: np.ndarray, sigma_s: float) -> np.ndarray:
+    """Return a covariance (2,2) of offset and drift with another sigma of the offset."""
+    factor = np.diag([sigma_s / np.sqrt(covariance[0, 0]), 1.0])
+    return np.asarray(factor @ covariance @ factor)
+
+
+def _from_motion(
+    estimate: ClockEstimate, clock: JointClock, reference: Recording | None, recording: Recording | None
+) -> ClockEstimate:
+    """Return the clock from the motion, or a common start if that is much more probable."""
+    found = replace(
+        estimate,
+        offset_s=clock.offset_s,
+        sigma_s=clock.sigma_s,
+        drift_ppm=clock.drift_ppm if clock.drift_measured else 0.0,
+        drift_sigma_ppm=clock.drift_sigma_ppm,
+        source="motion",
+        covariance=clock.covariance,
+    )
+    if reference is None or recording is None or clock.drift_measured:
+        return found
+    start_s = reference.first_frame_s - recording.first_frame_s
+    prior = _EQUAL_COUNT_PRIOR if recording.frames == reference.frames else _OTHER_PRIOR
+    posterior = _common_start_probability(clock.offset_s - start_s, clock.sigma_s, prior)
+    if posterior < _MIN_POSTERIOR:
+        return found
+    sigma_s = float(np.sqrt(1.0 - posterior) * np.hypot(clock.offset_s - start_s, clock.sigma_s))
+    return replace(
+        found, offset_s=start_s, sigma_s=sigma_s, covariance=_with_sigma(clock.covariance, sigma_s)
+    )
+
+
+def _common_start_probability(difference_s: float, sigma_s: float, prior: float) -> float:
+    """Return the probability that two videos start at the same instant.
+
+    The alternative is that the difference has any value within `_START_RANGE_S` with the same probability.
+
+    Args:
+        difference_s: Offset from the motion minus the offset for a common start, seconds.
+        sigma_s: Standard deviation of the offset from the motion, seconds.
+        prior: Probability of a common start without the motion.
+    """
+    density = np.exp(-0.5 * (difference_s / sigma_s) ** 2) / (np.sqrt(2.0 * np.pi) * sigma_s)
+    odds = prior / (1.0 - prior) * density * _START_RANGE_S
+    return float(odds / (1.0 + odds))
+
+
+def _complete_from_sound(found: dict[str, ClockEstimate], pairs: tuple[PairOffset, ...]) -> None:
+    """Determine unknown clocks from the sound of cameras whose clocks are known from the motion, in place."""
+    accepted: Mapping[tuple[str, str], PairOffset] = {
+        (pair.first, pair.second): pair for pair in pairs if pair.accepted
+    }
+    while True:
+        news = {}
+        for (first, second), pair in accepted.items():
+            one, two = found[first], found[second]
+            if one.offset_s is not None and two.offset_s is None:
+                news[second] = _through_pair(two, one, pair, is_second=True)
+            elif two.offset_s is not None and one.offset_s is None:
+                news[first] = _through_pair(one, two, pair, is_second=False)
+        if not news:
+            return
+        found.update(news)
+
+
+def _through_pair(
+    unknown: ClockEstimate, known: ClockEstimate, pair: PairOffset, *, is_second: bool
+) -> ClockEstimate:
+    """Return a clock from the clock of another camera and the sound of both.
+
+    Args:
+        unknown: The estimate of the camera without a clock.
+        known: The clock of the other camera.
+        pair: What the sound of both says.
+        is_second: True if the camera without a clock is the second of the pair.
+    """
+    assert known.offset_s is not None
+    assert known.sigma_s is not None
+    first_s, second_s = pair.pivot_s + pair.offset_s, pair.pivot_s
+    own_s, other_s = (second_s, first_s) if is_second else (first_s, second_s)
+    drift_ppm = known.drift_ppm + (pair.drift_ppm if is_second else -pair.drift_ppm)
+    common_s = other_s * (1.0 + 1e-6 * known.drift_ppm) + known.offset_s
+    sigma_s = float(np.linalg.norm([known.sigma_s, pair.sigma_s, WAY_SIGMA_S]))
+    drift_sigma_ppm = min(
+        float(np.hypot(known.drift_sigma_ppm, pair.drift_sigma_ppm)), float(np.sqrt(2)) * CRYSTAL_SIGMA_PPM
+    )
+    return replace(
+        unknown,
+        offset_s=common_s - own_s * (1.0 + 1e-6 * drift_ppm),
+        sigma_s=sigma_s,
+        drift_ppm=drift_ppm,
+        drift_sigma_ppm=drift_sigma_ppm,
+        source="motion",
+        covariance=np.diag([sigma_s**2, drift_sigma_ppm**2]),
+    )
