@@ -32,14 +32,13 @@ from bodycap_batch.clocks.joint_offsets import (
 from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM, PairOffset, measure_pair
 from bodycap_batch.clocks.sound_track import SoundTrack, read_sound_track
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from bodycap_batch.config.mounts import REFERENCE_ROLES
 from bodycap_batch.core.arrays import FloatArray
 
 ClockSource = Literal["sound", "stated", "common", "none"]
 
 STATED_SIGMA_S = 1.0 / 30.0
 """Standard deviation of a stated offset, seconds. Origin: a clap is found to a frame or so in each video."""
-_TRUNK_ROLES = ("Spine1", "Spine", "Hips")
-"""Roles of the bones of a torso camera, the preferred one first."""
 _MAX_SIGMAS = 3.0
 """Maximum difference of a stated offset from that of the sound, in standard deviations of the latter."""
 _TURNED_TOLERANCE_S = 0.05
@@ -149,7 +148,7 @@ def estimate_clocks(spec: CaptureConfig, threads: int | None = None) -> ClockEst
 
 def reference_camera(spec: CaptureConfig) -> str:
     """Return the name of the torso's camera; of the first camera if there is none on the torso."""
-    for role in _TRUNK_ROLES:
+    for role in REFERENCE_ROLES:
         for camera in spec.cameras:
             if camera.role == role:
                 return camera.name
