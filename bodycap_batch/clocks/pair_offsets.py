@@ -33,10 +33,9 @@ tolerance of ±50 ppm, about 29 ppm of standard deviation each."""
 _WINDOW_S = 6.0
 """Duration of a window, seconds. Origin: at 50 ppm two clocks move by 0.3 ms in it, which is less than
 `SMOOTHING_S`. Evidence: docs/decisions/clocks.md."""
-_MIN_WINDOWS = 3
-"""Least number of windows into which the common time is divided. Evidence: none."""
 _MIN_WINDOW_S = 1.0
-"""Least duration of a window, seconds. Shorter windows hardly have a peak. Evidence: none."""
+"""Least duration of a window, seconds. With cloth noise, many short windows, of which some lie between the
+bursts of the noise, show more than a few long ones. Evidence: docs/decisions/clocks.md."""
 _MAX_WINDOWS = 24
 """Maximum number of windows along the common time. More windows hardly improve the line. Evidence: none."""
 _SEARCHES = (1, 3, 8, 12)
@@ -342,7 +341,7 @@ def _examine(first: SoundTrack, second: SoundTrack, start_s: float, peak: Peak, 
     begin, end = max(first.start_s, second.start_s + offset), min(first.end_s, second.end_s + offset)
     searched = min(_WINDOW_S, first.end_s - first.start_s)
     anchor = start_s + 0.5 * searched
-    length = min(_WINDOW_S, max((end - begin) / _MIN_WINDOWS, _MIN_WINDOW_S))
+    length = min(_WINDOW_S, max((end - begin) / _MAX_WINDOWS, _MIN_WINDOW_S))
     middles = _middles(begin, end, length, anchor)
     rows = []
     for middle in middles:
@@ -360,9 +359,9 @@ def _examine(first: SoundTrack, second: SoundTrack, start_s: float, peak: Peak, 
 def _middles(begin: float, end: float, length: float, anchor: float) -> list[float]:
     """Return the middles of windows that do not overlap the window of the search, nor each other, seconds.
 
-    If the common time is shorter than three windows of full length, its thirds are used instead.
+    If the common time is shorter than all windows of full length together, it is divided evenly instead.
     """
-    if end - begin <= _MIN_WINDOWS * _WINDOW_S:
+    if end - begin <= _MAX_WINDOWS * _WINDOW_S:
         count = max(1, int((end - begin) / length + 1e-6))
         return [begin + (index + 0.5) * (end - begin) / count for index in range(count)]
     step = max(length, (end - begin) / _MAX_WINDOWS)
