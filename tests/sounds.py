@@ -10,7 +10,8 @@ import av
 import numpy as np
 
 from bodycap_batch.clocks.sound_track import RATE_HZ, SoundPiece, SoundTrack
-from bodycap_batch.synthetic.sound import Microphone, Samples, Scene, make_scene, record, sound_frames
+from bodycap_batch.formats.sound_frames import sound_frames
+from bodycap_batch.synthetic.sound import Microphone, Samples, Scene, make_scene, record
 from tests.videos import textured_frame
 
 FPS = 10

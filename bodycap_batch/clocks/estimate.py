@@ -374,6 +374,16 @@ def _date_contradictions(
     return out
 
 
+def _gap_s(expected: ExpectedOffset, first: SoundTrack, second: SoundTrack) -> float:
+    """Return the time between two recordings according to their files, seconds; 0 if they may overlap."""
+    low_s, high_s = expected.limits()
+    if second.start_s + low_s > first.end_s:
+        return second.start_s + expected.offset_s - first.end_s
+    if first.start_s > second.end_s + high_s:
+        return first.start_s - second.end_s - expected.offset_s
+    return 0.0
+
+
 def _why_none(
     name: str,
     reference: str,
@@ -399,4 +409,11 @@ def _why_none(
             reasons.append(
                 f"according to the files, {other} was recorded {duration_text(prior.offset_s)} apart"
             )
+        elif prior is not None:
+            gap_s = _gap_s(prior, recordings[pair.first].track, recordings[pair.second].track)
+            if gap_s > 0.0:
+                reasons.append(
+                    f"according to the files, the recordings of {name} and {other} do not overlap: there are "
+                    f"{duration_text(gap_s)} between them"
+                )
     return reasons

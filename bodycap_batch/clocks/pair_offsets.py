@@ -33,10 +33,11 @@ tolerance of ±50 ppm, about 29 ppm of standard deviation each."""
 _WINDOW_S = 6.0
 """Duration of a window, seconds. Origin: at 50 ppm two clocks move by 0.3 ms in it, which is less than
 `SMOOTHING_S`. Evidence: docs/decisions/clocks.md."""
-_MIN_WINDOWS = 3
-"""Least number of windows into which the common time is divided. Evidence: none."""
+_FEW_WINDOWS = 3
+"""Least number of windows into which the common time is divided at first. Evidence: none."""
 _MIN_WINDOW_S = 1.0
-"""Least duration of a window, seconds. Shorter windows hardly have a peak. Evidence: none."""
+"""Least duration of a window, seconds. With cloth noise, many short windows, of which some lie between the
+bursts of the noise, show more than a few long ones. Evidence: docs/decisions/clocks.md."""
 _MAX_WINDOWS = 24
 """Maximum number of windows along the common time. More windows hardly improve the line. Evidence: none."""
 _SEARCHES = (1, 3, 8, 12)
@@ -195,6 +196,7 @@ def _turned(pair: PairOffset) -> PairOffset:
 def _measure(first: SoundTrack, second: SoundTrack, limits: tuple[float, float] | None) -> PairOffset:
     starts = _search_starts(first)
     examined: list[_Candidate] = []
+    searched: list[tuple[float, Peak, float]] = []
     done = 0
     outcome = PairOffset(
         first=first.camera, second=second.camera, reason="no window of the sound has a clear peak"
@@ -207,11 +209,20 @@ def _measure(first: SoundTrack, second: SoundTrack, limits: tuple[float, float] 
             for peak in peaks:
                 is_high = peak.height >= _MIN_CANDIDATE_RATIO * peaks[0].height
                 if is_high and not _is_known(examined, peak.lag_s):
-                    examined.append(_examine(first, second, start_s, peak, lags * len(starts)))
+                    searched.append((start_s, peak, lags * len(starts)))
+                    examined.append(_examine(first, second, *searched[-1], _FEW_WINDOWS))
         if examined:
             outcome = _decide(first, second, examined)
-            if outcome.accepted:
-                break
+        if examined and not outcome.accepted:
+            # The second examination counts as twice the number of lags.
+            finer = [
+                _examine(first, second, start_s, peak, 2 * lags, _MAX_WINDOWS)
+                for start_s, peak, lags in searched
+            ]
+            found = _decide(first, second, finer)
+            outcome = found if found.accepted else outcome
+        if outcome.accepted:
+            break
     return outcome
 
 
@@ -336,14 +347,16 @@ def _is_known(examined: Sequence[_Candidate], lag_s: float) -> bool:
     return False
 
 
-def _examine(first: SoundTrack, second: SoundTrack, start_s: float, peak: Peak, lags: float) -> _Candidate:
-    """Examine an offset with windows along the common time."""
+def _examine(
+    first: SoundTrack, second: SoundTrack, start_s: float, peak: Peak, lags: float, windows: int
+) -> _Candidate:
+    """Examine an offset with at least a number of windows along the common time, if it is long enough."""
     offset = peak.lag_s
     begin, end = max(first.start_s, second.start_s + offset), min(first.end_s, second.end_s + offset)
     searched = min(_WINDOW_S, first.end_s - first.start_s)
     anchor = start_s + 0.5 * searched
-    length = min(_WINDOW_S, max((end - begin) / _MIN_WINDOWS, _MIN_WINDOW_S))
-    middles = _middles(begin, end, length, anchor)
+    length = min(_WINDOW_S, max((end - begin) / windows, _MIN_WINDOW_S))
+    middles = _middles((begin, end), length, anchor, windows)
     rows = []
     for middle in middles:
         reach_s = 0.006 + 1e-6 * _MAX_DRIFT_PPM * abs(middle - anchor)
@@ -357,12 +370,14 @@ def _examine(first: SoundTrack, second: SoundTrack, start_s: float, peak: Peak, 
     return _Candidate(offset, peak.height, lags, times, offsets, heights, chances, agrees)
 
 
-def _middles(begin: float, end: float, length: float, anchor: float) -> list[float]:
+def _middles(common: tuple[float, float], length: float, anchor: float, windows: int) -> list[float]:
     """Return the middles of windows that do not overlap the window of the search, nor each other, seconds.
 
-    If the common time is shorter than three windows of full length, its thirds are used instead.
+    If the common time is shorter than the least number of windows of full length, it is divided evenly
+    instead.
     """
-    if end - begin <= _MIN_WINDOWS * _WINDOW_S:
+    begin, end = common
+    if end - begin <= windows * _WINDOW_S:
         count = max(1, int((end - begin) / length + 1e-6))
         return [begin + (index + 0.5) * (end - begin) / count for index in range(count)]
     step = max(length, (end - begin) / _MAX_WINDOWS)

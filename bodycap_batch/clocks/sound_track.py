@@ -41,6 +41,8 @@ _SILENCE_LSB = 3.0
 samples alone has 0.3 to 1."""
 _LEVEL_SAMPLES = RATE_HZ // 10
 """Number of samples from which a level is computed."""
+_LEVEL_BLOCKS = 256
+"""Number of levels that are computed at once. Origin: limits the memory to some megabytes."""
 _BATCH_SAMPLES = 10 * RATE_HZ
 """Number of samples of a piece of a track, if the clock of the frames runs faster or slower than that of the
 sound. Within a piece the difference is ignored: 0.5 ms at 50 ppm."""
@@ -127,7 +129,9 @@ class SoundTrack:
             count = len(piece.samples) // _LEVEL_SAMPLES
             blocks = piece.samples[: count * _LEVEL_SAMPLES].reshape(count, _LEVEL_SAMPLES)
             # The mean of a block is no sound; the difference of neighbours suppresses wind and handling.
-            levels += [float(np.diff(block.astype(np.float32)).std()) for block in blocks]
+            for first in range(0, count, _LEVEL_BLOCKS):
+                part = blocks[first : first + _LEVEL_BLOCKS].astype(np.float32)
+                levels += np.diff(part, axis=1).std(axis=1).tolist()
             times += [piece.start_s + index * _LEVEL_SAMPLES / RATE_HZ for index in range(count)]
         return np.array(times), np.array(levels)
 

@@ -18,7 +18,7 @@ from bodycap_batch.config.bounds import (
     MIN_SIGMA_M,
 )
 from bodycap_batch.config.calibration import Calibration
-from bodycap_batch.config.mounts import mount_of, role_of_segment
+from bodycap_batch.config.mounts import REFERENCE_ROLES, mount_of, role_of_segment
 from bodycap_batch.config.options import (
     ExportOptions,
     KeyframeOptions,
@@ -32,8 +32,6 @@ from bodycap_batch.model.geometry import make_transform, rotation_from_quat_xyzw
 NO_SKELETON = "none"
 """Value of ``skeleton`` for a job that computes the camera paths and the map, but no body."""
 SKELETON_PRESETS = (NO_SKELETON, "upper_body", "full_body")
-_REFERENCE_ROLES = ("Spine1", "Spine", "Hips")
-"""Roles of the bones of a torso camera, the preferred one first."""
 _MAX_ROTATION = 10.0
 """Maximum absolute value (no unit) of a component of a rotation that the job gives, as a quaternion or as a
 matrix. The bound keeps products finite; `rules` checks that the components are a rotation. Evidence: none."""
@@ -224,7 +222,7 @@ class CaptureConfig(_Block):
 
         It is the torso's camera; without one, the first camera.
         """
-        for role in _REFERENCE_ROLES:
+        for role in REFERENCE_ROLES:
             for camera in self.cameras:
                 if camera.role == role:
                     return camera

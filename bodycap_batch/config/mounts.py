@@ -57,6 +57,9 @@ MOUNT_NAMES = tuple(dict.fromkeys(mount for mount, _ in _MOUNT_BY_SPELLING.value
 TRUNK_ROLES = ("Hips", "Spine", "Spine1", "Neck", "Head")
 """Roles of the bones of the trunk and the head."""
 
+REFERENCE_ROLES = ("Spine1", "Spine", "Hips")
+"""Roles of the bones of a torso camera, the preferred one first. The common clock is that of this camera."""
+
 _QUALIFIER = re.compile(r"[_\- ]?(back|front|top|bottom|upper|lower|inner|outer|[0-9]+|[a-c])$")
 
 

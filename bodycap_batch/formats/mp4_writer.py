@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.atomic_files import store_error_from_os_error
+from bodycap_batch.formats.sound_frames import sound_frames
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
@@ -43,6 +45,19 @@ _STUDIO_RANGE_CHROMA = np.round((np.arange(256) - 128.0) * (224.0 / 255.0) + 128
 """Look-up table from chroma in full range to chroma in studio range. Source: ITU-R BT.601."""
 
 
+@dataclass(frozen=True, slots=True)
+class Sound:
+    """Mono sound.
+
+    Attributes:
+        samples: (N,) samples, full scale −1 to 1.
+        rate_hz: Samples per second.
+    """
+
+    samples: npt.NDArray[np.float32]
+    rate_hz: int
+
+
 class VideoWriter:
     """Writer of an MP4 file with H.264 video.
 
@@ -57,6 +72,7 @@ class VideoWriter:
             frames. "near": hardly visible losses. "small": small file.
         colours: Colour range and colour matrix of the images given to `add_planes`, as FFmpeg's numbers, to
             be stored in the file. None to store neither.
+        sound: Mono sound that starts with the first image, to be stored as AAC. None for no sound.
 
     Raises:
         StoreError: The file cannot be written.
@@ -69,6 +85,7 @@ class VideoWriter:
         size: tuple[int, int],
         quality: Quality,
         colours: tuple[int, int] | None = None,
+        sound: Sound | None = None,
     ) -> None:
         import av
 
@@ -79,8 +96,12 @@ class VideoWriter:
         try:
             self._container = av.open(str(path), "w", options=_CONTAINER_OPTIONS.get(quality, {}))
             self._stream = self._container.add_stream("libx264", rate=rate)
+            self._sound_stream = sound and self._container.add_stream(
+                "aac", rate=sound.rate_hz, layout="mono"
+            )
         except (OSError, av.error.FFmpegError) as error:
             raise self._failure(error) from error
+        self._sound = iter(()) if sound is None else sound_frames(sound.samples, sound.rate_hz)
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
         self._stream.options = _ENCODER_OPTIONS[quality]
@@ -89,6 +110,7 @@ class VideoWriter:
             self._stream.codec_context.color_range, self._stream.codec_context.colorspace = colours
         self._frame_duration = Fraction(1) / rate
         self._count = 0
+        self._sound_s = 0.0
 
     def add(self, image: npt.NDArray[np.uint8]) -> None:
         """Append an RGB image (H,W,3) to the video."""
@@ -110,11 +132,18 @@ class VideoWriter:
         frame.pts = round(self._count * self._frame_duration * TIME_BASE_HZ)
         frame.time_base = Fraction(1, TIME_BASE_HZ)
         self._count += 1
-        self._send(frame)
+        self._send(self._stream, frame)
+        self._send_sound(float(self._count * self._frame_duration))
 
-    def _send(self, frame: object) -> None:
+    def _send_sound(self, until_s: float) -> None:
+        """Encode the sound up to a time in the file, seconds, so that the file holds it beside the images."""
+        while self._sound_s < until_s and (frame := next(self._sound, None)) is not None:
+            self._sound_s += frame.samples / frame.sample_rate
+            self._send(self._sound_stream, frame)
+
+    def _send(self, stream: Any, frame: object) -> None:
         try:
-            for packet in self._stream.encode(frame):
+            for packet in stream.encode(frame):
                 self._container.mux(packet)
         except (OSError, self._av.error.FFmpegError) as error:
             raise self._failure(error) from error
@@ -134,7 +163,10 @@ class VideoWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is None:
-            self._send(None)
+            self._send(self._stream, None)
+            self._send_sound(float("inf"))
+            if self._sound_stream is not None:
+                self._send(self._sound_stream, None)
         try:
             self._container.close()
         except (OSError, self._av.error.FFmpegError) as problem:

@@ -22,7 +22,9 @@ from bodycap_batch.formats.mp4_writer import VideoWriter
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.camera_renderer import CameraRenderer, MovingBody, Sensor, camera_poses_at
+from bodycap_batch.synthetic.camera_sounds import CameraSounds
 from bodycap_batch.synthetic.clip import load_clip
+from bodycap_batch.synthetic.clocks import first_and_last_s, true_clocks
 from bodycap_batch.synthetic.gait import Walk, WalkStyle
 from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
 from bodycap_batch.synthetic.measured import disturb_poses
@@ -73,12 +75,17 @@ def draw_subject(options: SynthOptions) -> Subject:
     names = ("body", "walk", "mounts", "room", "clothes", "images", "poses", "drops", "posture")
     children = np.random.SeedSequence(options.seed).spawn(len(names))
     seeds = dict(zip(names, children, strict=True))
-    length_s = options.seconds + max(0.0, *options.offsets_s.values(), 0.0)
+    clocks = true_clocks(options)
+    first_s, last_s = first_and_last_s(options, clocks)
+    length_s = max(options.seconds, last_s)
     sigmas = options.mount_sigma_deg, options.mount_sigma_m
     mount_rng = np.random.default_rng(seeds["mounts"])
     motion: MovingBody
     if options.motion is not None:
-        motion = load_clip(options.motion, options.motion_start_s, length_s - 1.0 / options.fps)
+        # With free clocks, the earliest camera starts at the start of the used part of the file.
+        lead_s = max(0.0, -first_s) if options.clocks == "free" else 0.0
+        start_s = options.motion_start_s + lead_s
+        motion = load_clip(options.motion, start_s, length_s - 1.0 / options.fps)
         mounts = draw_mounts(options.cameras, motion.skeleton, sigmas, mount_rng)
     else:
         body = draw_body(
@@ -144,9 +151,8 @@ def _write_camera_truth(
     """Write a camera's true path, its timestamps if frames are lost, and its noisy poses if requested."""
     camera = mount.camera
     times_ns = frame_times_ns(options, camera)[kept]
-    poses = camera_poses_at(
-        subject.motion, mount, seconds_from_ns(times_ns) + options.offsets_s.get(camera, 0.0)
-    )
+    clock = true_clocks(options)[camera]
+    poses = camera_poses_at(subject.motion, mount, clock.common_s(seconds_from_ns(times_ns)))
     write_path(folder / "gt" / f"{camera}.tum", times_ns, poses, "world_from_camera, the camera's own clock")
     if not kept.all():
         write_timestamps(folder / f"{camera}.timestamps.txt", times_ns)
@@ -180,16 +186,21 @@ def _write_videos(
     total, done = sum(int(frames.sum()) for frames in kept.values()), 0
     context.progress(0, total, "room")
     renderers = build_renderers(options, subject)
+    clocks = true_clocks(options)
+    sounds = CameraSounds(options, subject.motion) if options.sound else None
     with _single_opencv_thread(), ThreadPoolExecutor(max_workers=max(1, context.threads)) as pool:
         for renderer, seed in zip(renderers, subject.seeds["images"].spawn(len(renderers)), strict=True):
             camera = renderer.mount.camera
             recorder = _FrameRecorder(
                 renderer=renderer,
                 sensor=Sensor(options.noise, 3 * options.width * options.height, seed),
-                times_s=seconds_from_ns(frame_times_ns(options, camera)) + options.offsets_s.get(camera, 0.0),
+                times_s=clocks[camera].common_s(seconds_from_ns(frame_times_ns(options, camera))),
             )
             size = (options.width, options.height)
-            with VideoWriter(folder / f"{camera}.mp4", options.fps, size, options.quality) as video:
+            heard = None if sounds is None else sounds.of_camera(camera)
+            with VideoWriter(
+                folder / f"{camera}.mp4", options.fps, size, options.quality, sound=heard
+            ) as video:
                 for image in _render_in_order(pool, recorder, np.flatnonzero(kept[camera]).tolist(), context):
                     video.add(image)
                     done += 1

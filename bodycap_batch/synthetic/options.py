@@ -31,6 +31,18 @@ _MAX_SECONDS = 3600.0
 _MAX_FRAMES = 432_000
 """Maximum number of frames of one camera, from the start of the first camera to the end of the last: four
 hours at 30 frames per second. The true poses of all joints take about 1.4 GB for this number of frames."""
+_FREE_OFFSET_S = 3.0
+"""Maximum offset (seconds) of a clock that is drawn at random. It is not larger than `_EARLIEST_S`."""
+_FREE_OFFSET_SHARE = 0.25
+"""Maximum offset of a clock that is drawn at random, as a share of the length of the video. Origin: two
+cameras then have at least half of their videos in common."""
+_MAX_DRIFT_PPM = 1000.0
+"""Maximum absolute drift (parts per million). Evidence: none."""
+_MAX_SKEW_S = 1.0
+"""Maximum absolute time (seconds) between sound and pictures. Evidence: none."""
+_MAX_SOUND_S = 1200.0
+"""Maximum length (seconds) of a video with sound. The sources of the sound take about 1 GB for this length.
+"""
 _DEFAULT_FOCAL_PX = 420.0
 """Focal length (px) of the default lens at an image width of 640 px. The horizontal angle of view is 75
 degrees."""
@@ -40,6 +52,8 @@ _DEFAULT_FOV_OMEGA_RAD = 0.8
 
 _LensParameter = Annotated[float, Field(ge=-MAX_LENS_PARAMETER, le=MAX_LENS_PARAMETER)]
 _Offset = Annotated[float, Field(ge=-_EARLIEST_S, le=_MAX_SECONDS)]
+_Drift = Annotated[float, Field(ge=-_MAX_DRIFT_PPM, le=_MAX_DRIFT_PPM)]
+_Skew = Annotated[float, Field(ge=-_MAX_SKEW_S, le=_MAX_SKEW_S)]
 _Moment = Annotated[float, Field(ge=0, le=_MAX_SECONDS)]
 _Rate = Annotated[float, Field(ge=MIN_FPS, le=MAX_FPS)]
 _GapFrames = Annotated[int, Field(ge=1, le=_MAX_FRAMES)]
@@ -145,6 +159,50 @@ class SynthOptions(Options):
         default_factory=dict,
         description="clock offset of each camera in seconds: common time = camera time + offset",
     )
+    clocks: Literal["common", "free"] = Field(
+        "common",
+        description=(
+            "free: each camera has a clock of its own, with a random offset of up to 3 s or a quarter of "
+            "seconds, and a random drift of up to 50 ppm; the torso's camera, or else the first camera, "
+            "gives the common time; the clocks are only written to gt/clocks.json"
+        ),
+    )
+    drifts_ppm: Mapping[str, _Drift] = Field(
+        default_factory=dict,
+        description=(
+            "with free clocks: drift of each camera's clock in parts per million instead of a random drift: "
+            "common time = camera time × (1 + drift / 1,000,000) + offset"
+        ),
+    )
+    sound: bool = Field(
+        False,
+        description=(
+            "give the videos sound: a voice, claps, a distant source, and footsteps at the time of the true "
+            "steps, through the room, with cloth noise, as AAC"
+        ),
+    )
+    sound_ratio_db: float = Field(
+        6.0,
+        ge=-40,
+        le=40,
+        description=(
+            "with sound: power of the sound over the power of the cloth noise, from 200 to 6,000 Hz, in "
+            "decibels"
+        ),
+    )
+    sound_skews_s: Mapping[str, _Skew] = Field(
+        default_factory=dict,
+        description="with sound: time in seconds by which the sound of a camera is late against its pictures",
+    )
+    sound_skew_range_s: float = Field(
+        0.0,
+        ge=0,
+        le=_MAX_SKEW_S,
+        description=(
+            "with sound: the sound of each camera is late or early against its pictures by a random time of "
+            "up to this value, in seconds"
+        ),
+    )
     drop_frames: float = Field(
         0.0,
         ge=0,
@@ -228,6 +286,7 @@ class SynthOptions(Options):
                 f"lens_params: the model {self.lens} needs {parameter_count(self.lens)} parameters"
             )
         self._check_cameras_named()
+        self._check_clocks()
         self._check_frames()
         if self.exposure_s > 1.0 / self.fps or self.rolling_shutter_s > 1.0 / self.fps:
             raise ValueError(
@@ -247,7 +306,8 @@ class SynthOptions(Options):
 
         All camera names must exist. Different frame rates are permitted only without videos.
         """
-        for key, named in (("offsets_s", self.offsets_s), ("rates_fps", self.rates_fps)):
+        for key in ("offsets_s", "drifts_ppm", "sound_skews_s", "rates_fps"):
+            named = getattr(self, key)
             unknown = sorted(set(named) - set(self.cameras))
             if unknown:
                 raise ValueError(f"{key}: there is no camera {', '.join(unknown)}")
@@ -256,9 +316,27 @@ class SynthOptions(Options):
         if self.gap_frames[0] > self.gap_frames[1]:
             raise ValueError("gap_frames: shortest first")
 
+    def _check_clocks(self) -> None:
+        """Check that options which need free clocks or sound are used with these only."""
+        if self.drifts_ppm and self.clocks != "free":
+            raise ValueError("drifts_ppm: common clocks have no drift; set clocks to free")
+        for key in ("sound_skews_s", "sound_skew_range_s"):
+            if getattr(self, key) and not self.sound:
+                raise ValueError(f"{key} has no effect without sound; set sound to true")
+        if self.sound and self.poses_only:
+            raise ValueError(
+                "sound: poses_only writes no videos, which contain the sound; leave out one of them"
+            )
+        if self.sound and self.seconds > _MAX_SOUND_S:
+            raise ValueError(
+                f"seconds: a video with sound can last {_MAX_SOUND_S:g} s at most; lower seconds, or set "
+                "sound to false"
+            )
+
     def _check_frames(self) -> None:
         """Check the number of frames, which determines the memory that the renderer needs."""
-        offsets_s = [0.0, *self.offsets_s.values()]
+        drawn_s = self.offset_range_s if self.clocks == "free" else 0.0
+        offsets_s = [0.0, -drawn_s, drawn_s, *self.offsets_s.values()]
         length_s = self.seconds + max(offsets_s) - min(offsets_s)
         fps = max(self.fps, *self.rates_fps.values(), self.fps)
         if length_s * fps > _MAX_FRAMES:
@@ -293,6 +371,11 @@ class SynthOptions(Options):
     def frame_count(self) -> int:
         """Number of frames of each camera at the common frame rate, including the frames that are dropped."""
         return max(1, round(self.seconds * self.fps))
+
+    @property
+    def offset_range_s(self) -> float:
+        """Maximum absolute offset of a clock that is drawn at random, seconds."""
+        return min(_FREE_OFFSET_S, _FREE_OFFSET_SHARE * self.seconds)
 
     def rate_fps(self, camera: str) -> float:
         """Return the frame rate of one camera, frames per second."""

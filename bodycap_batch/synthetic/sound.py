@@ -8,14 +8,15 @@ its own frequency band and gain. The noise of cloth is added. The same seed give
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from scipy.signal import butter, oaconvolve, sosfilt
+
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.formats.sound_frames import sound_frames
 
 Samples = npt.NDArray[np.float32]
 """Samples (N,) of mono sound, full scale −1 to 1."""
@@ -45,6 +46,8 @@ _SWING_M = 0.15
 ±30° about the shoulder, half of it towards the source."""
 _REVERBERATION_S = (0.25, 0.5)
 """Least and greatest time, seconds, in which the sound of a room decays by 60 dB. Origin: furnished rooms."""
+_STEP_DECAY_S = 0.02
+"""Time, seconds, in which the amplitude of a footstep falls by a factor of e. Evidence: none."""
 _BLOCK_S = 30.0
 """Duration, seconds, of the blocks in which a microphone's recording is resampled."""
 
@@ -99,6 +102,7 @@ def make_scene(
     seed: int,
     rate_hz: int = 48_000,
     sources: tuple[str, ...] = ("voice", "steps", "claps", "distant"),
+    steps_s: FloatArray | None = None,
 ) -> Scene:
     """Generate the sources of a scene.
 
@@ -108,6 +112,7 @@ def make_scene(
         seed: Seed of all sources.
         rate_hz: Samples per second.
         sources: Names of the sources, from `SOURCES`.
+        steps_s: (N,) common times of the footsteps, seconds; None for times that are drawn at random.
 
     Raises:
         KeyError: A source has an unknown name.
@@ -117,7 +122,13 @@ def make_scene(
     made = {}
     for name in sources:
         rng = np.random.default_rng([seed, SOURCES.index(name)])
-        made[name] = (_LEVELS[name] * makers[name](count, rate_hz, rng)).astype(np.float32)
+        if name == "steps" and steps_s is not None:
+            starts = steps_s - (start_s - _PADDING_S)
+            inside = starts[(starts >= 0.0) & (starts < count / rate_hz)]
+            samples = _bursts(count, rate_hz, rng, inside, _STEP_DECAY_S)
+        else:
+            samples = makers[name](count, rate_hz, rng)
+        made[name] = (_LEVELS[name] * samples).astype(np.float32)
     return Scene(rate_hz=rate_hz, start_s=start_s - _PADDING_S, sources=made)
 
 
@@ -183,20 +194,6 @@ def write_sound(
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     return path
-
-
-def sound_frames(
-    samples: npt.NDArray[np.float32], rate_hz: int, layout: str = "mono", start: int = 0
-) -> Iterator[object]:
-    """Yield the frames of PyAV for samples (N,) or (channels,N); the first has the timestamp `start`."""
-    import av
-
-    planes = np.atleast_2d(samples)
-    for first in range(0, planes.shape[1], 1024):
-        part = np.ascontiguousarray(planes[:, first : first + 1024], np.float32)
-        frame = av.AudioFrame.from_ndarray(part, format="fltp", layout=layout)
-        frame.sample_rate, frame.pts, frame.time_base = rate_hz, start + first, Fraction(1, rate_hz)
-        yield frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -344,7 +341,7 @@ def _steps(count: int, rate_hz: int, rng: np.random.Generator) -> Samples:
     seconds, period = count / rate_hz, rng.uniform(0.5, 0.65)
     starts = np.cumsum(period * (1.0 + 0.03 * rng.standard_normal(int(seconds / period) + 1)))
     walking = np.sin(2 * np.pi * starts / rng.uniform(15.0, 40.0) + rng.uniform(0, 6.28)) > -0.5
-    return _bursts(count, rate_hz, rng, starts[walking & (starts < seconds)], 0.02)
+    return _bursts(count, rate_hz, rng, starts[walking & (starts < seconds)], _STEP_DECAY_S)
 
 
 def _claps(count: int, rate_hz: int, rng: np.random.Generator) -> Samples:

@@ -18,6 +18,7 @@ from bodycap_batch.formats.tum import TimedPoses, seconds_text, write_tum
 from bodycap_batch.model.geometry import quat_xyzw_from_rotation
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 from bodycap_batch.synthetic.camera_renderer import MovingBody, joint_poses_at
+from bodycap_batch.synthetic.clocks import has_own_clocks, reference_name, true_clocks
 from bodycap_batch.synthetic.options import SynthOptions
 
 JOINT_ROLES = {
@@ -41,12 +42,23 @@ synth.json     the options the capture was made with.
 
 The files ../skeleton.bvh and motion.bvh have the true proportions of the body.
 """
+_CLOCKS_README = """
+clocks.json    the clock of each camera, and the time by which its sound is late against its pictures:
+               common time = camera time * (1 + drifts_ppm * 1e-6) + offsets_s. These values count where
+               calib.json has no offsets_s. Sound takes up to 12 ms more from its source to the microphone.
+"""
+_CLOCK_OPTIONS = {"clocks", "drifts_ppm", "sound", "sound_ratio_db", "sound_skews_s", "sound_skew_range_s"}
+"""Options that are left out of the truth if no camera has its own clock or sound."""
 MARKER = Path("gt", "synth.json")
 """Path of the file that marks a folder as a complete synthetic capture, relative to the folder."""
 
 
 def write_calibration(folder: Path, options: SynthOptions) -> None:
-    """Write ``calib.json``: the intrinsics, the timing and the clock offsets of all cameras."""
+    """Write ``calib.json``: the intrinsics, the timing and the clock offsets of all cameras.
+
+    The offsets of free clocks are left out: a user does not know them.
+    """
+    stated = {name: options.offsets_s.get(name, 0.0) for name in options.cameras}
     content: dict[str, Any] = {
         "width": options.width,
         "height": options.height,
@@ -55,7 +67,7 @@ def write_calibration(folder: Path, options: SynthOptions) -> None:
         "params": options.camera().params.tolist(),
         "rolling_shutter_s": options.rolling_shutter_s,
         **({"rates_fps": dict(options.rates_fps)} if options.rates_fps else {}),
-        "offsets_s": {name: options.offsets_s.get(name, 0.0) for name in options.cameras},
+        **({"offsets_s": stated} if options.clocks == "common" else {}),
         "exposure_s": options.exposure_s,
         "timestamp": "middle of the exposure",
         "pixel_origin": "COLMAP (centre of first pixel = 0.5)",
@@ -89,8 +101,11 @@ def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts:
         for mount in mounts
     }
     _write_json(truth / "mounts.json", content)
-    write_text(truth / "README.txt", _README)
-    settings = options.model_dump(mode="json")
+    own_clocks = has_own_clocks(options)
+    if own_clocks:
+        _write_clocks(truth / "clocks.json", options)
+    write_text(truth / "README.txt", _README + (_CLOCKS_README if own_clocks else ""))
+    settings = options.model_dump(mode="json", exclude=None if own_clocks else _CLOCK_OPTIONS)
     if options.motion is not None:
         settings["motion"] = options.motion.name
     _write_json(folder / MARKER, settings)
@@ -106,8 +121,11 @@ def common_ticks_ns(options: SynthOptions) -> IntArray:
 
     The times cover the capture from the earliest to the latest timestamp of all cameras.
     """
-    offsets = [options.offsets_s.get(name, 0.0) for name in options.cameras]
-    lasts_s = (options.frame_count - 1) / options.fps + max(offsets) - min(offsets)
+    clocks = true_clocks(options).values()
+    length_s = (options.frame_count - 1) / options.fps
+    offsets = [clock.offset_s for clock in clocks]
+    lasts_s = length_s + max(clock.offset_s + 1e-6 * clock.drift_ppm * length_s for clock in clocks)
+    lasts_s -= min(offsets)
     ticks = np.arange(int(np.floor(lasts_s * options.fps + 1e-6)) + 1)
     return np.asarray(np.round(min(offsets) * 1e9 + ticks * (1e9 / options.fps)), dtype=np.int64)
 
@@ -128,6 +146,18 @@ def write_path(path: Path, times_ns: IntArray, world_from_cam: FloatArray, note:
 def write_timestamps(path: Path, times_ns: IntArray) -> None:
     """Write the times of a video's frames in seconds, one time per line."""
     write_text(path, "".join(f"{seconds_text(int(time))}\n" for time in times_ns))
+
+
+def _write_clocks(path: Path, options: SynthOptions) -> None:
+    """Write the true clocks of all cameras."""
+    clocks = true_clocks(options)
+    content = {
+        "reference": reference_name(options.cameras),
+        "offsets_s": {name: clock.offset_s for name, clock in clocks.items()},
+        "drifts_ppm": {name: clock.drift_ppm for name, clock in clocks.items()},
+        "sound_skews_s": {name: clock.skew_s for name, clock in clocks.items()},
+    }
+    _write_json(path, content)
 
 
 def _rest_pose_motion(skeleton: SkeletonModel, fps: float) -> Motion:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.capture import open_capture
+from bodycap_batch.clocks import estimate_clocks
 from bodycap_batch.config.job import load_job
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import Cancelled, JobError, StoreError
@@ -19,6 +20,7 @@ from bodycap_batch.model.geometry import interpolate_pose, invert, rotation_angl
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions
 from bodycap_batch.synthetic import SynthOptions, synthesise
+from bodycap_batch.synthetic.clocks import true_clocks
 
 TINY = {"width": 64, "height": 48, "seconds": 0.3, "cameras": ("torso", "left_palm")}
 
@@ -136,6 +138,105 @@ def test_a_clock_offset_shifts_what_a_camera_sees_and_where_it_is(capture, tmp_p
     data = np.load(late / "gt" / "joints.npz")
     assert data["t"][0] == 0.0
     assert data["t"][-1] == pytest.approx(8 / 30 + 0.1, abs=1 / 30)
+
+
+def test_free_clocks_are_only_in_the_truth_and_agree_with_the_cameras(tmp_path):
+    cameras = ("head", "torso", "left_palm")
+    folder = _make(
+        tmp_path / "free",
+        clocks="free",
+        poses_only=True,
+        seconds=16.0,
+        cameras=cameras,
+        drifts_ppm={"left_palm": 1000.0},
+        offsets_s={"left_palm": -0.7},
+    )
+    assert "offsets_s" not in json.loads((folder / "calib.json").read_text())
+    clocks = json.loads((folder / "gt" / "clocks.json").read_text())
+    assert clocks["reference"] == "torso"
+    assert (clocks["offsets_s"]["torso"], clocks["drifts_ppm"]["torso"]) == (0.0, 0.0)
+    assert (clocks["offsets_s"]["left_palm"], clocks["drifts_ppm"]["left_palm"]) == (-0.7, 1000.0)
+    assert 0.0 < abs(clocks["offsets_s"]["head"]) <= 3.0
+    assert 0.0 < abs(clocks["drifts_ppm"]["head"]) <= 50.0
+    skeleton, motion = read_bvh(folder / "gt" / "motion.bvh")
+    joints = motion.world_from_joint()
+    mounts = json.loads((folder / "gt" / "mounts.json").read_text())
+    ticks_s = np.load(folder / "gt" / "joints.npz")["t"]
+    for name in cameras:
+        truth = read_tum(folder / "gt" / f"{name}.tum")
+        common_s = truth.times_ns * 1e-9 * (1 + 1e-6 * clocks["drifts_ppm"][name])
+        common_s += clocks["offsets_s"][name]
+        assert ticks_s[0] <= common_s[0] + 1e-9
+        assert common_s[-1] < ticks_s[-1] + 1 / 30
+        place = joints[:, skeleton.index_of_role(mounts[name]["role"])]
+        path = (place @ np.array(mounts[name]["joint_from_cam"]))[:, :3, 3]
+        inside = common_s <= ticks_s[-1]
+        expected = np.stack([np.interp(common_s[inside], ticks_s, path[:, axis]) for axis in range(3)], 1)
+        error_m = np.abs(expected - truth.world_from_cam[inside, :3, 3])
+        # A palm accelerates with up to 20 m/s²: a line between ticks is off by 1/8 of that times (1/30 s)².
+        assert error_m.max() < 0.003
+    # The drift alone moves the palm by up to 16 ms, which is more than 1 cm at 1 m/s.
+    undrifted = truth.times_ns * 1e-9 - 0.7
+    moved = np.stack([np.interp(undrifted, ticks_s, path[:, axis]) for axis in range(3)], 1)
+    assert np.abs(moved - truth.world_from_cam[:, :3, 3]).max() > 0.01
+
+
+def test_free_clocks_are_drawn_from_the_seed_and_a_quarter_of_the_length(tmp_path):
+    drawn = []
+    for seed in range(3):
+        options = SynthOptions(clocks="free", seconds=8.0, seed=seed)
+        clocks = true_clocks(options)
+        assert clocks == true_clocks(options)
+        drawn.append([clocks[name].offset_s for name in ("left_palm", "right_palm")])
+    assert np.abs(drawn).max() <= 2.0
+    assert len(np.unique(drawn)) == 6
+    stated = true_clocks(SynthOptions(clocks="free", seconds=8.0, seed=2, offsets_s={"left_palm": 1.0}))
+    assert (stated["left_palm"].offset_s, stated["right_palm"].offset_s) == (1.0, drawn[2][1])
+
+
+def test_a_motion_file_starts_with_the_earliest_free_camera(capture, tmp_path):
+    longer = _make(tmp_path / "longer", poses_only=True, seconds=3.0, cameras=("torso",))
+    options = {
+        "motion": longer / "gt" / "motion.bvh", "clocks": "free", "poses_only": True, "seconds": 2.0,
+        "offsets_s": {"left_palm": -0.5}, "drifts_ppm": {"left_palm": 0.0},
+    }  # fmt: skip
+    folder = _make(tmp_path / "moved", **options)
+    _, given = read_bvh(longer / "gt" / "motion.bvh")
+    _, followed = read_bvh(folder / "gt" / "motion.bvh")
+    assert followed.start_ns == -500_000_000 or len(followed.local_rotation) == 75
+    assert np.abs(followed.local_rotation[:75] - given.local_rotation[:75]).max() < 1e-6
+
+
+def test_videos_have_sound_from_which_the_clocks_are_found(tmp_path):
+    values = {
+        "clocks": "free", "sound": True, "sound_ratio_db": 20.0, "seconds": 8.0, "fps": 5.0, "seed": 4,
+        "sound_skews_s": {"left_palm": 0.05}, "width": 32, "height": 32,
+    }  # fmt: skip
+    folder = _make(tmp_path / "sound", **values)
+    with av.open(str(folder / "torso.mp4")) as video:
+        sound = video.streams.audio[0]
+        assert sound.codec_context.name == "aac"
+        assert float(sound.duration * sound.time_base) == pytest.approx(8.0, abs=0.05)
+        assert len([0 for packet in video.demux(video.streams.video[0]) if packet.size]) == 40
+    clocks = json.loads((folder / "gt" / "clocks.json").read_text())
+    assert clocks["sound_skews_s"] == {"torso": 0.0, "left_palm": 0.05}
+    found = estimate_clocks(load_job(folder).capture, 1)
+    assert found.reference == clocks["reference"]
+    clock = found.camera("left_palm")
+    assert clock.source == "sound"
+    # The sound of the palm is late by 50 ms, so its clock seems to start that much earlier.
+    expected_s = clocks["offsets_s"]["left_palm"] - 0.05
+    assert clock.offset_s == pytest.approx(expected_s, abs=0.004)  # the way of sound to both
+
+
+def test_sound_does_not_change_the_pictures_and_a_capture_without_it_does_not_name_it(capture, tmp_path):
+    folder = _make(tmp_path / "sound", sound=True)
+    for name in ("torso", "left_palm"):
+        assert np.array_equal(_frames(folder / f"{name}.mp4"), _frames(capture / f"{name}.mp4"))
+    assert json.loads((folder / "calib.json").read_text())["offsets_s"] == {"torso": 0.0, "left_palm": 0.0}
+    assert json.loads((folder / "gt" / "synth.json").read_text())["sound"] is True
+    silent = json.loads((capture / "gt" / "synth.json").read_text())
+    assert not {"clocks", "sound", "drifts_ppm"} & set(silent)
 
 
 def test_lost_frames_come_with_their_times(tmp_path):
@@ -268,7 +369,7 @@ def test_frames_lie_between_their_neighbours(capture):
 
 def test_a_full_disk_is_reported_and_leaves_no_files(tmp_path, monkeypatch):
     class Full:
-        def __init__(self, *arguments):
+        def __init__(self, *arguments, **_):
             self.path = arguments[0]
 
         def __enter__(self):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import xml.etree.ElementTree as ET
 
+import numpy as np
 import pytest
 
 from bodycap_batch.cli import main
@@ -141,6 +142,36 @@ def test_recordings_that_share_no_moment_are_refused(folder, tmp_path, capsys):
     assert "matches that of torso" in error
     assert "2.5 days apart" in error
     assert "hint:" in error
+
+
+def test_recordings_that_the_files_place_one_after_the_other_are_refused_with_the_gap(tmp_path):
+    for seed, name, minute in ((31, "torso", 0), (32, "left_palm", 3)):
+        write_video_with_sound(
+            tmp_path / f"{name}.mp4",
+            heard(scene(seed, 6.0), seed, 6.0),
+            metadata={"creation_time": f"2024-05-01T10:0{minute}:00Z"},
+        )
+    clock = estimate_clocks(capture(tmp_path, "torso", "left_palm")).camera("left_palm")
+    assert (clock.source, clock.offset_s) == ("none", None)
+    # Both last 6 s and start 180 s apart.
+    assert any("do not overlap: there are 174.0 s between them" in reason for reason in clock.reasons)
+
+
+def test_cameras_with_other_formats_are_compared_and_have_a_larger_sigma(tmp_path):
+    room = scene(33, 8.0)
+    write_video_with_sound(tmp_path / "torso.mp4", heard(room, 1, 8.0))
+    low = np.ascontiguousarray(heard(room, 2, 8.0, 0.6, band_hz=(150.0, 3400.0))[::2])
+    frames = np.cumsum([0, *np.random.default_rng(0).integers(40, 180, 70)]).tolist()
+    write_video_with_sound(
+        tmp_path / "left_palm.mp4", np.tile(low, (2, 1)), 8_000, layout="stereo", frame_times=frames
+    )
+    write_video_with_sound(tmp_path / "head.mp4", np.zeros(8 * 16_000, np.float32))
+    found = estimate_clocks(capture(tmp_path, "torso", "left_palm", "head"))
+    clock = found.camera("left_palm")
+    assert clock.source == "sound"
+    assert clock.offset_s == pytest.approx(0.6, abs=WAY_S)
+    assert clock.sigma_s >= 0.015
+    assert found.camera("head").reasons == ("the sound is silent",)
 
 
 def test_one_camera_has_nothing_to_compare(folder, tmp_path, capsys):

@@ -7,7 +7,7 @@ import pytest
 
 from bodycap_batch.clocks.pair_offsets import measure_pair
 from bodycap_batch.clocks.sound_track import RATE_HZ, SoundTrack
-from bodycap_batch.synthetic.sound import wind_noise
+from bodycap_batch.synthetic.sound import cloth_noise, wind_noise
 from tests.sounds import heard, scene, track
 
 WAY_S = 0.004
@@ -129,6 +129,32 @@ def test_one_short_common_moment_of_long_recordings():
     pair = measure_pair(track(first), track(second, "b"))
     assert pair.accepted, pair.reason
     assert pair.offset_s == pytest.approx(13.0, abs=WAY_S)
+
+
+@pytest.mark.parametrize("expected_s", [None, (128.0, 136.0)])
+def test_a_camera_that_starts_minutes_later(expected_s):
+    """The second camera starts 132 s after the first, which ends 12 s later."""
+    room = scene(9, 24.0)
+    alone = 0.1 * cloth_noise(132 * RATE_HZ, RATE_HZ, np.random.default_rng(9))
+    first = np.concatenate([alone, heard(room, 1, 12.0)])
+    second = heard(room, 2, 24.0)
+    pair = measure_pair(track(first), track(second, "b"), expected_s)
+    assert pair.accepted, pair.reason
+    assert pair.offset_s == pytest.approx(132.0, abs=WAY_S)
+    turned = measure_pair(track(second, "b"), track(first))
+    assert turned.offset_s == pytest.approx(-132.0, abs=WAY_S)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_twenty_seconds_with_loud_cloth_noise_are_enough(seed):
+    room = scene(40 + seed, 20.0)
+    one, other = (
+        heard(room, 2 * seed + each, 20.0, offset, noise_ratio_db=-6.0)
+        for each, offset in ((0, 0.0), (1, 1.3))
+    )
+    pair = measure_pair(track(one), track(other, "b"))
+    assert pair.accepted, pair.reason
+    assert pair.offset_s == pytest.approx(1.3, abs=WAY_S)
 
 
 def test_a_low_sample_rate_limits_the_band(room, torso):

@@ -50,6 +50,13 @@ def test_sound_that_starts_later_than_the_picture(tmp_path):
     assert burst_time(found) == pytest.approx(1.3, abs=TOLERANCE_S)
 
 
+def test_a_variable_frame_rate_does_not_move_the_sound(tmp_path):
+    frames = np.cumsum([0, *np.random.default_rng(1).integers(30, 250, 12)]).tolist()
+    found = read(write_video_with_sound(tmp_path / "a.mp4", burst(2.0, 1.5), frame_times=frames))
+    assert len(found.pieces) == 1
+    assert burst_time(found) == pytest.approx(1.5, abs=TOLERANCE_S)
+
+
 def test_a_gap_keeps_the_times_behind_it(tmp_path):
     path = write_video_with_sound(tmp_path / "a.mkv", burst(2.0, 1.5), gap=(1.0, 0.4), seconds=2.4)
     found = read(path)

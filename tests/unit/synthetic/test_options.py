@@ -33,6 +33,13 @@ def test_every_camera_model_has_default_parameters(model):
         ({"motion": "walk.bvh", "t_pose_s": 2.0}, "t_pose_s cannot be used with motion"),
         ({"motion": "walk.bvh", "on_the_spot": True}, "on_the_spot cannot be used with motion"),
         ({"colour": True}, "Extra inputs"),
+        ({"clocks": "own"}, "'common' or 'free'"),
+        ({"drifts_ppm": {"torso": 20.0}}, "drifts_ppm: common clocks have no drift"),
+        ({"clocks": "free", "drifts_ppm": {"head": 20.0}}, "drifts_ppm: there is no camera head"),
+        ({"sound_skews_s": {"torso": 0.02}}, "sound_skews_s has no effect without sound"),
+        ({"sound_skew_range_s": 0.02}, "sound_skew_range_s has no effect without sound"),
+        ({"sound": True, "poses_only": True}, "sound: poses_only writes no videos"),
+        ({"sound": True, "seconds": 1300}, "can last 1200 s at most"),
         ({"width": 641}, "multiple of 2"),
     ],
 )
