@@ -122,6 +122,7 @@ class Recording:
         recorder: Device and encoder of the sound; None without sound.
         start: Start of the recording according to the container.
         first_frame_s: Time of the first frame on the clock of the camera, seconds.
+        end_s: End of the sound, or of the pictures without usable sound, on the clock of the camera, seconds.
         frames: Number of frames.
     """
 
@@ -132,6 +133,7 @@ class Recording:
     recorder: Recorder | None
     start: ContainerTime
     first_frame_s: float
+    end_s: float
     frames: int
 
 
@@ -205,6 +207,7 @@ def _read_recording(config: CameraConfig) -> tuple[Recording, SoundTrack]:
         recorder=track.recorder,
         start=read_container_time(videos, first_frame_s),
         first_frame_s=first_frame_s,
+        end_s=track.end_s if track.pieces else int(times_ns[-1]) / 1e9,
         frames=len(times_ns),
     )
     return recording, track
@@ -374,13 +377,13 @@ def _date_contradictions(
     return out
 
 
-def _gap_s(expected: ExpectedOffset, first: SoundTrack, second: SoundTrack) -> float:
+def _gap_s(expected: ExpectedOffset, first: Recording, second: Recording) -> float:
     """Return the time between two recordings according to their files, seconds; 0 if they may overlap."""
     low_s, high_s = expected.limits()
-    if second.start_s + low_s > first.end_s:
-        return second.start_s + expected.offset_s - first.end_s
-    if first.start_s > second.end_s + high_s:
-        return first.start_s - second.end_s - expected.offset_s
+    if second.first_frame_s + low_s > first.end_s:
+        return second.first_frame_s + expected.offset_s - first.end_s
+    if first.first_frame_s > second.end_s + high_s:
+        return first.first_frame_s - second.end_s - expected.offset_s
     return 0.0
 
 
@@ -410,7 +413,7 @@ def _why_none(
                 f"according to the files, {other} was recorded {duration_text(prior.offset_s)} apart"
             )
         elif prior is not None:
-            gap_s = _gap_s(prior, recordings[pair.first].track, recordings[pair.second].track)
+            gap_s = _gap_s(prior, recordings[pair.first], recordings[pair.second])
             if gap_s > 0.0:
                 reasons.append(
                     f"according to the files, the recordings of {name} and {other} do not overlap: there are "
