@@ -14,6 +14,7 @@ from bodycap_batch.clocks.estimate import (
     combine_evidence,
     estimate_clocks,
     measure_sound,
+    stated_offsets,
 )
 from bodycap_batch.clocks.motion_evidence import add_motion
 from bodycap_batch.clocks.motion_offsets import motion_clocks
@@ -35,5 +36,6 @@ __all__ = [
     "estimate_clocks",
     "measure_sound",
     "motion_clocks",
+    "stated_offsets",
     "with_known_offsets",
 ]

@@ -142,7 +142,8 @@ def _clock_of(
         source="common" if is_common else "stated",
     )
     if not estimated.is_known:
-        return stated
+        against = estimate.against_stated
+        return replace(stated, notes=(against,), is_contradicted=True) if against else stated
     text = describe_contradiction(
         stated.offset_s - base_s,
         estimated.source,

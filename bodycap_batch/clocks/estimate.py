@@ -62,6 +62,7 @@ class ClockEstimate:
         reasons: Why the sound gives no clock, and notes about the sound.
         contradictions: What contradicts the clock.
         is_contradicted: True if the motion contradicts the sound.
+        against_stated: How the motion contradicts the stated offset; empty if it does not.
     """
 
     camera: str
@@ -74,6 +75,7 @@ class ClockEstimate:
     reasons: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()
     is_contradicted: bool = False
+    against_stated: str = ""
 
     def sigma_at(self, camera_s: float) -> float | None:
         """Return the standard deviation of the common time at a camera time, seconds; None if unknown."""
@@ -240,7 +242,7 @@ def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstim
         starts_s,
         {name: _floor_s(recordings[reference], recordings[name]) for name in starts_s},
     )
-    stated = _stated_offsets(spec, reference)
+    stated = stated_offsets(spec, reference)
     triggered = _triggered_with(spec, reference)
     clocks = []
     for name, recording in recordings.items():
@@ -313,7 +315,7 @@ def _floor_s(reference: Recording, recording: Recording) -> float:
     return WAY_SIGMA_S if recording.recorder.is_like(reference.recorder) else UNLIKE_SIGMA_S
 
 
-def _stated_offsets(spec: CaptureConfig, reference: str) -> dict[str, float]:
+def stated_offsets(spec: CaptureConfig, reference: str) -> dict[str, float]:
     """Return the stated offset of each camera relative to the reference camera, seconds."""
     stated = {camera.name: camera.offset_s for camera in spec.cameras}
     base = stated.pop(reference) or 0.0

@@ -16,6 +16,9 @@ _MAX_SIGMAS = 3.0
 """Maximum difference of sound and motion, in standard deviations."""
 _MAX_DIFFERENCE_S = 1.0 / 30.0
 """Difference, seconds, of sound and motion that is no contradiction. Origin: one frame at 30 fps."""
+_MIN_SCORE_DROP = 5.0
+"""Minimum logarithm of the likelihood of the best offset over that of a stated offset, with which the motion
+contradicts the latter. Evidence: docs/decisions/clocks.md."""
 _EQUAL_COUNT_PRIOR, _OTHER_PRIOR = 0.5, 0.02
 """Probability that the first frames of two videos show the same instant, before the motion is looked at: if
 the videos have the same number of frames, and otherwise. Cameras that were started by hand hardly ever record
@@ -26,18 +29,25 @@ _START_RANGE_S = 20.0
 """Range, seconds, in which the offsets of cameras that were started by hand lie. Evidence: none."""
 
 
-def add_motion(estimates: ClockEstimates, motion: MotionClocks, evidence: SoundEvidence) -> ClockEstimates:
+def add_motion(
+    estimates: ClockEstimates,
+    motion: MotionClocks,
+    evidence: SoundEvidence,
+    stated_s: Mapping[str, float] | None = None,
+) -> ClockEstimates:
     """Return the clocks from the sound, completed and checked by the motion.
 
     - A clock that the sound does not determine is taken from the motion.
     - A clock that is related by sound only to cameras with a clock from the motion is taken from both.
     - If the sound is known only as well as the motion (unlike cameras), the mean of both is used.
-    - A contradiction between sound and motion is noted.
+    - A contradiction between sound and motion is noted, and so is a stated offset that fits the motion much
+      worse than another one.
 
     Args:
         estimates: The clocks that were estimated from the sound.
         motion: The clocks that were estimated from the motion, with the same reference camera.
         evidence: What the sound says, with the numbers of frames of the videos.
+        stated_s: Stated offset of each camera relative to the reference camera, seconds, by camera name.
     """
     recordings = {recording.camera: recording for recording in evidence.recordings}
     found = {}
@@ -54,6 +64,10 @@ def add_motion(estimates: ClockEstimates, motion: MotionClocks, evidence: SoundE
             reason = motion.reasons.get(estimate.camera, "the motion does not determine the offset")
             found[estimate.camera] = replace(estimate, reasons=(*estimate.reasons, f"motion: {reason}"))
     _complete_from_sound(found, estimates.pairs)
+    for name, offset_s in (stated_s or {}).items():
+        text = _against_stated(motion, name, offset_s)
+        if name in found and text:
+            found[name] = replace(found[name], against_stated=text)
     return replace(estimates, cameras=tuple(found[each.camera] for each in estimates.cameras))
 
 
@@ -79,6 +93,34 @@ def _compared(estimate: ClockEstimate, clock: JointClock | None) -> ClockEstimat
         sigma_s=mean_sigma_s,
         covariance=None if estimate.covariance is None else _with_sigma(estimate.covariance, mean_sigma_s),
     )
+
+
+def _against_stated(motion: MotionClocks, camera: str, offset_s: float) -> str:
+    """Return how the motion contradicts a stated offset; empty if it does not.
+
+    The test needs no clear peak: it compares the stated offset with the best one.
+
+    Args:
+        motion: The clocks that were estimated from the motion.
+        camera: Name of the camera.
+        offset_s: Stated offset relative to the reference camera, seconds.
+    """
+    for pair in motion.pairs:
+        if {pair.first, pair.second} != {motion.reference, camera} or pair.curve is None:
+            continue
+        assert pair.curve_lags_s is not None
+        sign = 1.0 if pair.first == motion.reference else -1.0
+        lags_s = pair.curve_lags_s
+        if not lags_s[0] <= sign * offset_s <= lags_s[-1]:
+            continue
+        best = int(np.argmax(pair.curve))
+        drop = float(pair.curve[best] - np.interp(sign * offset_s, lags_s, pair.curve))
+        if drop >= _MIN_SCORE_DROP:
+            return (
+                f"the motion contradicts the offset of {offset_s:.3f} s that the job uses: an offset of "
+                f"about {sign * lags_s[best]:.1f} s fits much better"
+            )
+    return ""
 
 
 def _with_sigma(covariance: np.ndarray, sigma_s: float) -> np.ndarray:

@@ -231,24 +231,6 @@ class CameraReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ClockReport:
-    """A camera with a suspicious clock.
-
-    Attributes:
-        shift_s: Seconds to add to the camera's timestamps for the best fit.
-        scatter_left: Scatter after the shift divided by the scatter before the shift, 0 to 1. The scatter is
-            computed from the camera's positions relative to the trunk.
-        offset_s: Clock offset of the camera after adding the shift, seconds.
-        says: Sentence about the clock for the user.
-    """
-
-    shift_s: float
-    scatter_left: float
-    offset_s: float
-    says: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SwappedSidesReport:
     """The cameras on limbs that were found on the wrong side of the body, as if left and right were swapped.
 
@@ -342,7 +324,6 @@ class MergeReport:
         floor: The floor.
         mounts: By camera name, the solved mount.
         cameras: By camera name, the measurements of the camera.
-        doubted_clocks: By camera name, the clock of a camera whose clock seems wrong.
         exchanged_sides: Cameras that seem to be on the wrong side of the body; None if there are none.
         inverted_cameras: Cameras that are mounted upside down; None if there are none.
         unused_cameras: By camera name, the reason why the camera's map could not be linked to the body. Only
@@ -367,7 +348,6 @@ class MergeReport:
     floor: FloorReport
     mounts: Mapping[str, MountReport]
     cameras: Mapping[str, CameraReport]
-    doubted_clocks: Mapping[str, ClockReport]
     exchanged_sides: SwappedSidesReport | None = field(metadata=_EMPTY_IF_NONE)
     inverted_cameras: InvertedCamerasReport | None = field(default=None, metadata=_OMIT_NONE)
     unused_cameras: Mapping[str, str]

@@ -350,6 +350,10 @@ def _median_triangulation_deg(scene: Map) -> float | None:
     return float(np.degrees(np.arccos(np.median(smallest_cosine[np.unique(point)]))))
 
 
+def _clock_notes(inputs: ReportInputs, cameras: Sequence[str]) -> str:
+    return "; ".join(f"{name}: {note}" for name in cameras for note in inputs.clocks[name].notes)
+
+
 def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
     """Yield recommendations about the body: exchanged sides, wrong clocks, and constants not well known."""
     if inputs.merge is None:
@@ -367,20 +371,18 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
             action="Clap once, or hop once, while all cameras record with sound. For this recording, read "
             "the time of an event in two videos and state `offset_s`: the time in the video of "
             f"{inputs.reference_camera} minus the time in the camera's own video.",
-            reason="; ".join(f"{name}: {note}" for name in unknown for note in inputs.clocks[name].notes),
+            reason=_clock_notes(inputs, unknown),
             priority=2.9,
         )
-    clocks = report.doubted_clocks
-    if clocks:
-        offsets = ", ".join(
-            f"about {clock.offset_s:.1f} for {name}" for name, clock in sorted(clocks.items())
-        )
+    contradicted = sorted(name for name, clock in inputs.clocks.items() if clock.is_contradicted)
+    if contradicted:
         yield Recommendation(
-            action="Run `bodycap sync`, which finds the `offset_s` of each camera from the sound. If the "
-            "videos have no common sound, clap once in view of all cameras; `offset_s` is the time of the "
-            "clap in the first video minus the time of the clap in the camera's own video. Or try an "
-            f"`offset_s` of {offsets}.",
-            reason="; ".join(clock.says for _, clock in sorted(clocks.items())),
+            action="Leave out the stated `offset_s`, so that it is estimated, or correct it: `offset_s` is "
+            f"the time of an event in the video of {inputs.reference_camera} minus its time in the camera's "
+            "own video.",
+            reason="; ".join(
+                f"{name}: {note}" for name in contradicted for note in inputs.clocks[name].notes
+            ),
             priority=2.5,
         )
     yield from _about_scale(report.scale)

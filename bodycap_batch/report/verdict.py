@@ -374,11 +374,9 @@ def _gap_criteria(cameras: Mapping[str, Any]) -> Iterator[Criterion]:
 
 def _clock_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
     """Yield the criterion about the clocks: unknown, contradicted, or estimated with an uncertainty."""
-    clocks, doubted = metrics.get("clocks", {}), metrics["merge"].get("doubted_clocks", {})
-    notes = metrics.get("clock_notes", {})
+    clocks, notes = metrics.get("clocks", {}), metrics.get("clock_notes", {})
     names = (*unknown_clocks(metrics), *metrics.get("contradicted_clocks", ()))
     wrong = [f"{name}: {note}" for name in names for note in notes.get(name, ())]
-    wrong += [str(doubt["says"]) for _, doubt in sorted(doubted.items())]
     rationale = (
         "Half a second is half a step. If a camera's clock is wrong by half a second, the limb with this "
         "camera is half a step too early or too late. The metric scale is wrong too: by 28 % on a walk with "

@@ -63,6 +63,7 @@ def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
         clocks_from_paths,
         combine_evidence,
         decide_clocks,
+        stated_offsets,
     )
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.validation.camera_distance_check import check_distances
@@ -75,7 +76,8 @@ def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
     if len(paths) > 1:
         roles = {name: stated.role or "" for name, stated in task.stated.items()}
         motion = clocks_from_paths(paths, roles, estimates.reference)
-        estimates = add_motion(estimates, motion, evidence)
+        stated_s = stated_offsets(capture, estimates.reference)
+        estimates = add_motion(estimates, motion, evidence, stated_s)
     clocks = decide_clocks(capture, estimates)
     write_dataclass(clocks, files, CLOCKS_NAME)
     reach = {(pair.first, pair.second): (pair.least_m, pair.most_m) for pair in task.reach}

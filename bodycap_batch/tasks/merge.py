@@ -71,7 +71,6 @@ def run_merge(task: MergeTask, context: StageContext, files: Path) -> None:
         raise
     write_dataclass(result, files, "merge")
     notes = [f"camera {name} is not used for the body: {why}" for name, why in result.unused_cameras.items()]
-    notes += [clock.says for clock in result.report.doubted_clocks.values()]
     notes += [result.report.exchanged_sides.says] if result.report.exchanged_sides is not None else []
     notes += [result.report.inverted_cameras.says] if result.report.inverted_cameras is not None else []
     write_summary(files, unused_cameras=dict(result.unused_cameras), notes=notes)

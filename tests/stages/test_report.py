@@ -202,11 +202,6 @@ def test_a_lens_that_the_map_contradicts_is_not_graded_good(
     ("doubt", "name", "action"),
     [
         (
-            {"doubted_clocks": {"left_palm": {"offset_s": 0.47, "says": "0.5 s behind"}}},
-            "One clock",
-            "about 0.5 for",
-        ),
-        (
             {"exchanged_sides": {"cameras": {"left_palm": 1.0}, "says": "0.5 s behind"}},
             "Left and right",
             "Exchange",

@@ -46,27 +46,6 @@ _MOVEMENTS = {
 }
 
 
-def describe_clock(camera: str, shift_s: float, scatter_left: float, offset_s: float) -> str:
-    """Describe a suspicious clock and the offset that fits better.
-
-    Args:
-        camera: Camera name.
-        shift_s: Time to add to the camera's timestamps, seconds.
-        scatter_left: Scatter of the camera's positions relative to the trunk after the shift, divided by the
-            scatter before the shift, 0 to 1.
-        offset_s: Clock offset after the shift, seconds.
-
-    Returns:
-        A sentence for the report.
-    """
-    direction = "behind" if shift_s > 0.0 else "ahead"
-    return (
-        f"the movement of {camera} relative to the body suggests that its clock is {abs(shift_s):.1f} s "
-        f"{direction}: with an offset_s of about {offset_s:.1f}, its position relative to the trunk would "
-        f"vary {1.0 - scatter_left:.0%} less"
-    )
-
-
 def describe_swapped_sides(swapped: Mapping[str, float]) -> str:
     """Describe cameras on the wrong side of the body, and the likely reasons.
 

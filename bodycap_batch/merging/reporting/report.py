@@ -11,12 +11,10 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body_calibration.calibrate_body import BodyCalibration
 from bodycap_batch.merging.body_calibration.camera_roll import hanging_tracks, has_unknown_roll, roll_deg
 from bodycap_batch.merging.body_calibration.scale import ScaleSource, chi_square
-from bodycap_batch.merging.cameras.clock_check import suspicious_clocks
 from bodycap_batch.merging.cameras.side_check import swapped_sides
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.motion_graph import MotionSolution
 from bodycap_batch.merging.reporting.advice import (
-    describe_clock,
     describe_hinge,
     describe_inverted_cameras,
     describe_mount,
@@ -27,7 +25,6 @@ from bodycap_batch.merging.reporting.advice import (
 )
 from bodycap_batch.merging.world.floor import Floor
 from bodycap_batch.merging.world.vertical import angle_deg
-from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.merge_data import Activity, MergeInputs
 from bodycap_batch.model.merge_report import (
@@ -35,7 +32,6 @@ from bodycap_batch.model.merge_report import (
     AlignedCameraReport,
     BodyScaleReport,
     CameraReport,
-    ClockReport,
     FloorReport,
     HingeReport,
     InvertedCamerasReport,
@@ -128,7 +124,6 @@ def build_report(
             for mount in calibration.mounts
         },
         cameras={track.camera: _camera_report(track, solution, facts) for track in tracks},
-        doubted_clocks=_clock_reports(inputs.clocks, main_tracks),
         exchanged_sides=_sides_report(inputs.mounts, calibration, main_tracks),
         inverted_cameras=_inverted_cameras_report(inputs.mounts, calibration),
         unused_cameras=dict(facts.unused),
@@ -163,26 +158,6 @@ def _camera_report(track: CameraTrack, solution: MotionSolution, facts: MotionFa
         residual_deg=_percentiles(np.degrees(solution.residual_rad[track.camera])),
         longest_gap_s=longest_gap_s(track, facts.start_ns, facts.end_ns),
     )
-
-
-def _clock_reports(
-    clocks: Mapping[str, CameraClock], tracks: Sequence[CameraTrack]
-) -> dict[str, ClockReport]:
-    """Report suspicious clocks of the cameras in the main map.
-
-    The tracks of aligned maps cannot be tested. If a camera in such a map has a wrong clock, the alignment
-    shifts the map and hides the error. The caller therefore passes only tracks of the main map.
-    """
-    out = {}
-    for camera, doubt in suspicious_clocks(tracks).items():
-        offset_s = round(clocks[camera].offset_s + doubt["shift_s"], 2)
-        out[camera] = ClockReport(
-            shift_s=doubt["shift_s"],
-            scatter_left=doubt["scatter_left"],
-            offset_s=offset_s,
-            says=describe_clock(camera, doubt["shift_s"], doubt["scatter_left"], offset_s),
-        )
-    return out
 
 
 def _sides_report(

@@ -100,7 +100,6 @@ def a_report() -> MergeReport:
     return MergeReport.from_dict(
         {
             "scale": {"source": "height", "relative_sigma": 0.05, "body_alone": {"costs": [[1.0, 2.5]]}},
-            "doubted_clocks": {"torso": {"shift_s": 0.5, "says": "late"}},
             "exchanged_sides": {"cameras": {"left_palm": 1.0}, "says": "swapped"},
         }
     )

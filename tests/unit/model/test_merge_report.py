@@ -15,7 +15,6 @@ STORED = {
     },
     "t_pose": {"from_s": 0.5, "to_s": 2.0},
     "mounts": {"torso": {"role": "Spine1", "joint_from_cam": [[1.0, 0.0], [0.0, 1.0]]}},
-    "doubted_clocks": {"left_palm": {"shift_s": 0.5, "says": "late"}},
     "exchanged_sides": {"cameras": {"left_palm": 1.0}, "says": "swapped"},
     "joint_sigma_m": {"LeftHand": {"observed": {"p50": 0.01, "p95": 0.02}}},
     "a key of another version": 1,
@@ -26,7 +25,6 @@ def test_stored_values_are_read_as_types() -> None:
     report = MergeReport.from_dict(STORED)
     assert report.scale.sources[0].metres_per_map_unit == 2.0
     assert report.scale.body_alone.costs == ((1.0, 2.5), (1.1, 3.0))
-    assert report.doubted_clocks["left_palm"].says == "late"
     assert report.exchanged_sides is not None
     assert report.exchanged_sides.cameras == {"left_palm": 1.0}
     assert report.joint_sigma_m["LeftHand"]["observed"] == Percentiles(p50=0.01, p95=0.02)
@@ -45,7 +43,6 @@ def test_values_without_content_keep_their_keys() -> None:
     values = MergeReport.from_dict({"mounts": {"torso": {}}}).to_dict()
     assert values["exchanged_sides"] == {}
     assert values["t_pose"] is None
-    assert values["doubted_clocks"] == {}
     # These keys exist only if a limb was calibrated alone or a roll was searched.
     assert "limbs" not in values["scale"]
     assert not {"roll_deg", "roll_runner_up"} & set(values["mounts"]["torso"])
