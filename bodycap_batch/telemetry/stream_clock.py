@@ -7,6 +7,7 @@ first sample of a payload = start + number of the sample / rate.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -126,20 +127,29 @@ def fit_stream_clock(payloads: Sequence[Payload]) -> StreamClock | None:
 def _first_samples(payloads: Sequence[Payload], counts: IntArray) -> IntArray:
     """Return the number of the first sample of each payload.
 
-    The counters of the payloads show where samples were lost. Counters that contradict themselves are
-    ignored.
+    The counters of the payloads show where samples were lost. Without counters, or with counters that
+    contradict themselves, the times of the payloads in the file show where payloads are missing.
     """
-    running = np.concatenate([[0], np.cumsum(counts)[:-1]])
     totals = [payload.total for payload in payloads]
-    if any(total is None for total in totals):
-        return running
-    counted = np.array(totals, dtype=np.int64) - counts
-    counted -= counted[0]
-    lost = np.diff(counted) - counts[:-1]
-    duration_s = payloads[-1].time_s + payloads[-1].duration_s - payloads[0].time_s
-    rate_hz = float(counts.sum()) / max(duration_s, 1e-9)
-    is_plausible = (lost >= 0).all() and (lost <= _MAX_LOST_S * rate_hz).all()
-    return counted if is_plausible and counted[-1] < MAX_SAMPLES else running
+    if all(total is not None for total in totals):
+        counted = np.array(totals, dtype=np.int64) - counts
+        counted -= counted[0]
+        lost = np.diff(counted) - counts[:-1]
+        duration_s = payloads[-1].time_s + payloads[-1].duration_s - payloads[0].time_s
+        rate_hz = float(counts.sum()) / max(duration_s, 1e-9)
+        is_plausible = (lost >= 0).all() and (lost <= _MAX_LOST_S * rate_hz).all()
+        if is_plausible and counted[-1] < MAX_SAMPLES:
+            return counted
+    lost = np.array([_missing_between(one, other) for one, other in itertools.pairwise(payloads)], np.int64)
+    return np.concatenate([[0], np.cumsum(counts[:-1] + lost)])
+
+
+def _missing_between(payload: Payload, after: Payload) -> int:
+    """Return the number of samples that are missing between two payloads, according to their times."""
+    gap_s = after.time_s - payload.time_s - payload.duration_s
+    if not 0.5 * payload.duration_s < gap_s <= _MAX_LOST_S or payload.duration_s <= 0:
+        return 0
+    return min(round(payload.count * gap_s / payload.duration_s), MAX_SAMPLES)
 
 
 def _robust_slope(first: IntArray, times_s: FloatArray) -> float:

@@ -109,6 +109,14 @@ def test_a_lost_payload_is_a_gap_and_moves_no_later_sample():
     assert cut.times_s[-1] == pytest.approx(whole.times_s[-1], abs=0.002)
 
 
+def test_a_lost_payload_of_a_stream_without_counters_is_a_gap():
+    exposure = nested("STRM", item("SHUT", "f", [0.001] * 30))
+    track = payloads(Sensor(), 12, extra=[exposure])
+    stream = _read(track[:5] + track[6:]).exposure
+    assert stream.rate_hz == pytest.approx(FPS, rel=1e-6)
+    assert stream.gaps_s[0] == pytest.approx((5.005 - 1 / FPS, 6.006), abs=1e-6)
+
+
 def test_without_stamps_the_rate_comes_from_the_times_in_the_file():
     gyro = _read(payloads(Sensor(rate_hz=403.8, stamps=False), 30, _turn)).gyro
     # Each payload starts at a whole sample, up to 2.5 ms after its time; over 30 s this is below 1e-4.
