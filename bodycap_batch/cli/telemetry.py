@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +17,7 @@ from bodycap_batch.cli.shared_options import JsonOption
 from bodycap_batch.cli.terminal import print_json, print_line
 
 if TYPE_CHECKING:
-    from bodycap_batch.telemetry import CameraTelemetry, GpsTrack, Stream
+    from bodycap_batch.telemetry import CameraTelemetry, GpsTrack, PictureGyroComparison, Stream
 
 _MAX_LISTED_GAPS = 5
 """Maximum number of gaps that the text lists for each stream."""
@@ -33,6 +35,14 @@ def telemetry(
     picture: Annotated[
         Path | None, typer.Option(metavar="FILE.svg", help="Draw the streams along time.")
     ] = None,
+    with_comparison: Annotated[
+        bool,
+        typer.Option(
+            "--compare",
+            help="Compare the gyroscope with the pictures: delay, rotation, bias, stabilisation. Takes some "
+            "seconds.",
+        ),
+    ] = False,
 ) -> None:
     """Show what a camera recorded beside pictures and sound.
 
@@ -41,8 +51,9 @@ def telemetry(
     <camera>.gcsv beside the video is read, too.
 
     \b
-    Example:
+    Examples:
       bodycap telemetry GX010123.MP4 --picture streams.svg
+      bodycap telemetry GX010123.MP4 --compare
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.capture.frame_index import index_video
     from bodycap_batch.capture.timeline import join_chapters
@@ -57,14 +68,58 @@ def telemetry(
     found = read_telemetry(videos, times_ns, file.stem)
     if picture is not None:
         write_text(picture, draw_telemetry(found))
+    compared = _compared(paths, file.stem, found) if with_comparison else None
     if as_json:
-        print_json(telemetry_as_json(found), indent=1)
+        print_json(telemetry_as_json(found, compared), indent=1)
     else:
         for line in lines_of(found, file.name):
             print_line(line)
+        for line in [] if compared is None else comparison_lines(compared):
+            print_line(line)
 
 
-def telemetry_as_json(found: CameraTelemetry) -> dict[str, Any]:
+def _compared(paths: tuple[Path, ...], name: str, found: CameraTelemetry) -> PictureGyroComparison:
+    """Compare the gyroscope with the pictures of the videos."""
+    from bodycap_batch.capture import open_camera
+    from bodycap_batch.config.models import CameraConfig, CaptureConfig
+    from bodycap_batch.telemetry import compare_picture_and_gyro
+    from bodycap_batch.telemetry.picture_rotation import WORK_PX
+
+    config = CameraConfig(name=name[:64], video=paths, calibration="auto")
+    spec = CaptureConfig(cameras=(config,), work_px=WORK_PX)
+    return compare_picture_and_gyro(open_camera(spec, config), found)
+
+
+def comparison_lines(compared: PictureGyroComparison) -> Iterator[str]:
+    """Yield the comparison of the gyroscope with the pictures as text for the user."""
+    yield from textwrap.wrap(f"pictures: {compared.reason}", _WIDTH, subsequent_indent="  ")
+    fit = compared.best
+    if fit is None:
+        return
+    chord = float(np.linalg.norm(fit.cam_from_sensor - np.eye(3)))
+    turned = 2.0 * math.degrees(math.asin(min(1.0, chord / math.sqrt(8.0))))
+    bias = " ".join(f"{value:+.4f}" for value in fit.bias_rad_s)
+    yield f"  delay {1e3 * fit.delay_s:+.1f} ms ± {1e3 * fit.delay_sigma_s:.1f} (sample = frame + delay)"
+    yield (
+        f"  sensor turned by {turned:.1f}° against the stated axes (scatter "
+        f"{np.degrees(np.linalg.norm(fit.rotation_sigma_rad)):.1f}°); bias {bias} rad/s"
+    )
+    yield f"  focal length {fit.focal_ratio:.2f} of the assumed one, from {fit.pairs} pairs of frames"
+
+
+def _comparison_as_json(compared: PictureGyroComparison) -> dict[str, Any]:
+    out: dict[str, Any] = {"verdict": compared.verdict, "reason": compared.reason}
+    for name in ("fit", "undone"):
+        fit = getattr(compared, name)
+        out[name] = None if fit is None else {
+            key: np.asarray(value).tolist() for key, value in asdict(fit).items()
+        }  # fmt: skip
+    return out
+
+
+def telemetry_as_json(
+    found: CameraTelemetry, compared: PictureGyroComparison | None = None
+) -> dict[str, Any]:
     """Return the telemetry as plain JSON values, with statistics instead of samples."""
     return {
         "source": found.source,
@@ -79,6 +134,7 @@ def telemetry_as_json(found: CameraTelemetry) -> dict[str, Any]:
         "other_streams": dict(found.other_streams),
         "settings": dict(found.settings),
         "notes": list(found.notes),
+        "comparison": None if compared is None else _comparison_as_json(compared),
     }
 
 

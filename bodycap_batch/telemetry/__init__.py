@@ -1,6 +1,19 @@
 """Telemetry that cameras record: inertial sensors, exposure, gravity, GPS and settings."""
 
+from bodycap_batch.telemetry.comparison import (
+    PictureGyroComparison,
+    compare_picture_and_gyro,
+    stabilisation_notes,
+)
 from bodycap_batch.telemetry.reading import read_telemetry
 from bodycap_batch.telemetry.streams import CameraTelemetry, GpsTrack, Stream
 
-__all__ = ["CameraTelemetry", "GpsTrack", "Stream", "read_telemetry"]
+__all__ = [
+    "CameraTelemetry",
+    "GpsTrack",
+    "PictureGyroComparison",
+    "Stream",
+    "compare_picture_and_gyro",
+    "read_telemetry",
+    "stabilisation_notes",
+]

@@ -6,9 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bodycap_batch.capture import open_camera
 from bodycap_batch.capture.frame_index import index_video
-from bodycap_batch.telemetry import read_telemetry
+from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from bodycap_batch.telemetry import compare_picture_and_gyro, read_telemetry
 from bodycap_batch.telemetry.gopro import gopro_telemetry, read_gpmf_payloads
+from bodycap_batch.telemetry.picture_rotation import WORK_PX
 
 pytestmark = pytest.mark.data
 
@@ -78,6 +81,40 @@ def test_raw_tracks_of_other_models(data_root, name, model, streams, gps):
     assert len(telemetry.gps.times_s) == gps
     # People walk: on the average, the specific force is that of gravity.
     assert np.linalg.norm(telemetry.accelerometer.values, axis=1).mean() == pytest.approx(9.8, abs=2.5)
+
+
+def _compare(path: Path):
+    config = CameraConfig(name=path.stem, video=(path,), calibration="auto")
+    camera = open_camera(CaptureConfig(cameras=(config,), work_px=WORK_PX), config)
+    return compare_picture_and_gyro(camera, _read(path))
+
+
+def test_pictures_and_gyroscope_agree_on_the_clip_without_stabilisation(data_root):
+    result = _compare(data_root / "gopro" / "karma.mp4")
+    assert result.verdict == "agrees"
+    assert result.best.r_squared > 0.98
+    assert result.best.delay_s == pytest.approx(-0.016, abs=0.003)
+
+
+def test_stabilisation_is_named_and_undone_on_the_clip_that_has_it(data_root):
+    result = _compare(data_root / "gopro" / "max-heromode.mp4")
+    assert result.verdict == "stabilised"
+    assert result.can_be_undone
+    assert result.best.r_squared > 0.95
+    # The stated axes are right to the accuracy of the mounting.
+    turned = np.degrees(np.linalg.norm(result.best.cam_from_sensor - np.eye(3)) / np.sqrt(2))
+    assert turned < 3.0
+
+
+@pytest.mark.parametrize(
+    ("capture", "camera"),
+    [("roll131", "torso"), ("roll131", "left_palm"), ("clocks05", "head"), ("clocks05", "right_palm")],
+)
+def test_delays_of_rendered_captures(data_root, capture, camera):
+    # 8 ms; a rolling shutter of 12 ms and the path of the camera disturb it.
+    result = _compare(data_root / capture / f"{camera}.mp4")
+    assert result.verdict == "agrees"
+    assert result.best.delay_s == pytest.approx(0.008, abs=0.003)
 
 
 @pytest.mark.parametrize("capture", ["roll131", "clocks05"])
