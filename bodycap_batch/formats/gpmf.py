@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -30,6 +30,19 @@ _MAX_BOXES = 10_000
 """Maximum number of boxes of an MP4 file that are read. Real files have some hundred. Evidence: none."""
 _MAX_BOX_DEPTH = 8
 """Maximum depth of boxes inside boxes. The settings of real files are at depth 3. Evidence: none."""
+_FIRMWARE_MODELS = {
+    "HD3": "HERO3", "HD4": "HERO4", "HD5": "HERO5 Black", "HX5": "HERO5 Session", "HD6": "HERO6 Black",
+    "HD7": "HERO7 Black", "HD8": "HERO8 Black", "HD9": "HERO9 Black", "H19": "GoPro Max",
+    "H21": "HERO10 Black", "H22": "HERO11 Black", "H23": "HERO12 Black", "H24": "HERO13 Black",
+    "FS1": "Fusion",
+}  # fmt: skip
+"""Model by start of the firmware's name. The file of an old camera names only its firmware."""
+_LENS_MODES = {
+    "W": "Wide", "L": "Linear", "N": "Narrow", "S": "SuperView", "M": "Medium", "X": "Max SuperView",
+    "H": "HyperView",
+}  # fmt: skip
+"""Lens mode by the setting VFOV."""
+_OFF = ("", "N", "N/A", "NA", "OFF", "NONE")
 MAX_PAYLOAD_BYTES = 8 << 20
 """Maximum size (bytes) of a payload that is read. Real payloads hold a second and have 5 to 100 kilobytes.
 Evidence: none."""
@@ -215,6 +228,38 @@ def gopro_settings(path: Path) -> dict[str, str]:
     except OSError:
         return {}
     return dict(_text_items(read_items(data, Damage()))) if data else {}
+
+
+def gopro_model(settings: Mapping[str, str], firmware: str, device: str) -> str:
+    """Return the name of the camera model; "" if it is unknown.
+
+    Args:
+        settings: The settings of the file.
+        firmware: Name of the firmware; "" if it is not given.
+        device: Name of the device in the track; "" if it is not given.
+    """
+    stated = settings.get("MINF", "")
+    if stated:
+        return stated
+    if device and device not in ("Camera", "Highlights"):
+        return device
+    return _FIRMWARE_MODELS.get(firmware[:3].upper(), "")
+
+
+def gopro_lens_mode(settings: Mapping[str, str]) -> str:
+    """Return the lens mode that the settings of a GoPro give; "" if they do not give it."""
+    return _LENS_MODES.get(settings.get("VFOV", ""), settings.get("VFOV", ""))
+
+
+def gopro_stabilisation(settings: Mapping[str, str]) -> str:
+    """Return the mode of the stabilisation, "off", or "" if the settings do not give it."""
+    mode = settings.get("EISA", "")
+    switch = settings.get("EISE", mode)
+    if "EISE" not in settings and "EISA" not in settings:
+        return ""
+    if switch.upper() in _OFF:
+        return "off"
+    return mode if mode.upper() not in (*_OFF, "Y") else "on"
 
 
 class _BoxFinder:

@@ -16,7 +16,15 @@ import numpy as np
 
 from bodycap_batch.capture.video import open_container
 from bodycap_batch.core.arrays import BoolArray, FloatArray
-from bodycap_batch.formats.gpmf import Damage, GpmfItem, gopro_settings, read_items
+from bodycap_batch.formats.gpmf import (
+    Damage,
+    GpmfItem,
+    gopro_lens_mode,
+    gopro_model,
+    gopro_settings,
+    gopro_stabilisation,
+    read_items,
+)
 from bodycap_batch.telemetry.stream_clock import MAX_SAMPLES, Payload, StreamClock, fit_stream_clock
 from bodycap_batch.telemetry.streams import (
     ACCELEROMETER,
@@ -78,18 +86,6 @@ _OLD_AXES = (("FUSION", "yXZ"), ("HERO5", "ZXY"), ("HERO6", "YxZ"), ("HERO7", "Y
 is the negative axis. Source: GoPro's list of streams."""
 _ZXY_NAMES = ("(z,x,y)", "(up/down, right/left, forward/back)")
 """Ends of the names of streams that name the axes z, x, y, of files that name neither model nor axes."""
-_FIRMWARE_MODELS = {
-    "HD3": "HERO3", "HD4": "HERO4", "HD5": "HERO5", "HX5": "HERO5 Session", "HD6": "HERO6", "HD7": "HERO7",
-    "HD8": "HERO8", "HD9": "HERO9", "H19": "MAX", "H21": "HERO10", "H22": "HERO11", "H23": "HERO12",
-    "H24": "HERO13", "FS1": "FUSION",
-}  # fmt: skip
-"""Model by start of the firmware's name. The file of an old camera names only its firmware."""
-_LENS_MODES = {
-    "W": "Wide", "L": "Linear", "N": "Narrow", "S": "SuperView", "M": "Medium", "X": "Max SuperView",
-    "H": "HyperView",
-}  # fmt: skip
-"""Lens mode by the setting VFOV."""
-_OFF = ("", "N", "N/A", "NA", "OFF", "NONE")
 _MAX_GAP_RATIO = 1.5
 """Distance of two samples, as a multiple of the sample interval, above which there is a gap."""
 _MIN_IMU_PER_FRAME = 1.5
@@ -313,7 +309,7 @@ def gopro_telemetry(
         frame_rate_hz: Nominal frame rate of the video; 0 if it is unknown.
     """
     firmware = settings.get("FMWR", firmware)
-    model = model_of(settings, firmware, track.device)
+    model = gopro_model(settings, firmware, track.device)
     notes: list[str] = []
     streams: dict[str, Stream] = {}
     gps: list[tuple[str, GpsTrack]] = []
@@ -346,8 +342,8 @@ def gopro_telemetry(
         source="GPMF" if track.streams or track.other else "none",
         model=model,
         firmware=firmware,
-        lens_mode=_LENS_MODES.get(settings.get("VFOV", ""), settings.get("VFOV", "")),
-        stabilisation=_stabilisation(settings),
+        lens_mode=gopro_lens_mode(settings),
+        stabilisation=gopro_stabilisation(settings),
         settings=dict(settings),
         streams=streams,
         gps=max(gps, key=lambda item: item[0])[1] if gps else None,
@@ -372,33 +368,6 @@ def read_gopro_file(path: Path, frame_rate_hz: float) -> CameraTelemetry:
         firmware = str(container.metadata.get("firmware", ""))
     track = read_gpmf_payloads(gpmf_payloads(path))
     return gopro_telemetry(track, gopro_settings(path), firmware, frame_rate_hz)
-
-
-def model_of(settings: Mapping[str, str], firmware: str, device: str) -> str:
-    """Return the name of the camera model; "" if it is unknown.
-
-    Args:
-        settings: The settings of the file.
-        firmware: Name of the firmware; "" if it is not given.
-        device: Name of the device in the track; "" if it is not given.
-    """
-    stated = settings.get("MINF", "")
-    if stated:
-        return stated
-    if device and device not in ("Camera", "Highlights"):
-        return device
-    return _FIRMWARE_MODELS.get(firmware[:3].upper(), "")
-
-
-def _stabilisation(settings: Mapping[str, str]) -> str:
-    """Return the mode of the stabilisation, "off", or "" if the settings do not give it."""
-    mode = settings.get("EISA", "")
-    switch = settings.get("EISE", mode)
-    if "EISE" not in settings and "EISA" not in settings:
-        return ""
-    if switch.upper() in _OFF:
-        return "off"
-    return mode if mode.upper() not in (*_OFF, "Y") else "on"
 
 
 def cam_from_stored(raw: _RawStream, model: str) -> FloatArray | None:

@@ -23,7 +23,7 @@ def _read(path: Path):
 
 def test_a_drone_clip_without_stabilisation(data_root):
     telemetry = _read(data_root / "gopro" / "karma.mp4")
-    assert telemetry.model == "HERO5"
+    assert telemetry.model == "HERO5 Black"
     assert telemetry.notes == ()
     counts = {key: len(stream.times_s) for key, stream in telemetry.streams.items()}
     assert counts == {"ACCL": 2397, "GYRO": 4795, "ISOG": 361, "SHUT": 361}

@@ -8,9 +8,9 @@ import pytest
 
 from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.capture.timeline import join_chapters
-from bodycap_batch.formats.gpmf import Damage, read_items
+from bodycap_batch.formats.gpmf import Damage, gopro_model, read_items
 from bodycap_batch.telemetry import read_telemetry
-from bodycap_batch.telemetry.gopro import gopro_telemetry, model_of, read_gpmf_payloads
+from bodycap_batch.telemetry.gopro import gopro_telemetry, read_gpmf_payloads
 from tests.gpmf import Sensor, header, item, nested, payloads, raw, write_gopro
 from tests.videos import textured_frame
 
@@ -88,14 +88,14 @@ def test_unknown_axes_are_reported():
     ("settings", "firmware", "device", "model"),
     [
         ({"MINF": "HERO9 Black"}, "HD9.01", "Camera", "HERO9 Black"),
-        ({}, "HD5.02.02.00.00", "Camera", "HERO5"),
-        ({}, "H22.01.10", "", "HERO11"),
+        ({}, "HD5.02.02.00.00", "Camera", "HERO5 Black"),
+        ({}, "H22.01.10", "", "HERO11 Black"),
         ({}, "", "Hero7 Black", "Hero7 Black"),
         ({}, "XX1", "Camera", ""),
     ],
 )
 def test_the_model_may_be_known_from_the_firmware_alone(settings, firmware, device, model):
-    assert model_of(settings, firmware, device) == model
+    assert gopro_model(settings, firmware, device) == model
 
 
 def test_a_lost_payload_is_a_gap_and_moves_no_later_sample():
