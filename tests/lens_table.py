@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-TABLE = Path(__file__).resolve().parent.parent / "bodycap_batch" / "presets" / "lens_profiles.json.gz"
+TABLE = Path(__file__).resolve().parent.parent / "bodycap_batch" / "presets" / "lenses" / "profiles.json.gz"
 SOURCE = "Gyroflow lens profiles, https://github.com/gyroflow/lens_profiles, CC0"
 COLUMNS = (
     *("brand", "model", "lens", "setting", "width", "height", "fps"),

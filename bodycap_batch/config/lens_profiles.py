@@ -21,7 +21,7 @@ from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX, Camera
 
 NAME_SEPARATOR = " / "
 """Separates the parts of a name: model, lens mode, size."""
-_PACKAGE, _TABLE = "bodycap_batch.presets", "lens_profiles.json.gz"
+_PACKAGE, _TABLE = "bodycap_batch.presets.lenses", "profiles.json.gz"
 _ASPECT_TOLERANCE = 0.004
 """Maximum relative difference between two aspect ratios that are treated as equal. Origin: image sizes are
 rounded to even numbers."""
