@@ -119,10 +119,10 @@ class LensProfile:
         return 0.5 * (self.params[0] + self.params[1]) * angle_rad * series / self.width
 
     def first_guess(self, size: tuple[int, int]) -> Camera:
-        """Return the lens at an image size, as a fisheye model with one focal length and two radial terms.
+        """Return the lens at an image size, with one focal length and two radial terms.
 
         Mapping refines these three parameters. They are fitted to the radial curve of the profile, as far as
-        the image goes.
+        the image goes, with a fisheye model or with a perspective model, whichever fits better.
 
         Args:
             size: Width and height, pixels, of the same shape as the profile.
@@ -135,13 +135,16 @@ class LensProfile:
         curve = theta * (1.0 + squared * np.polynomial.polynomial.polyval(squared, radial))
         # Beyond its largest value, the curve of a profile is meaningless.
         end = int(np.argmax((np.diff(curve, append=-1.0) <= 0) | (curve > corner))) + 1
-        theta, curve = theta[:end], curve[:end]
-        terms = np.stack([theta, theta**3, theta**5], axis=1)
-        scale, cubic, fifth = np.linalg.lstsq(terms, curve, rcond=None)[0]
+        fits = []
+        for model, base in (("RADIAL_FISHEYE", theta[:end]), ("RADIAL", np.tan(theta[:end]))):
+            terms = np.stack([base, base**3, base**5], axis=1)
+            found = np.linalg.lstsq(terms, curve[:end], rcond=None)[0]
+            fits.append((float(np.abs(terms @ found - curve[:end]).mean()), model, found.tolist()))
+        _, model, (scale, cubic, fifth) = min(fits)
         ratio = size[0] / self.width
         centre = [(cx + CV2_PIXEL_OFFSET_PX) * ratio, (cy + CV2_PIXEL_OFFSET_PX) * size[1] / self.height]
         return Camera(
-            model="RADIAL_FISHEYE",
+            model=model,
             width_px=size[0],
             height_px=size[1],
             params=np.array([focal * scale * ratio, *centre, cubic / scale, fifth / scale]),

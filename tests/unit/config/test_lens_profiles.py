@@ -100,13 +100,21 @@ def test_an_anamorphic_lens_is_never_chosen_by_itself(table):
     assert isinstance(choose_named("Cam 5 / Wide anamorphic", (1920, 1080), 30.0), LensChoice)
 
 
-def test_the_first_guess_is_near_the_profile():
-    profile = choose_named("GoPro HERO11 Black / Wide / 4K", (3840, 2160), 29.97).profile
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [("GoPro HERO11 Black / Wide / 4K", "RADIAL_FISHEYE"), ("GoPro HERO8 Black / Linear / 4K", "RADIAL")],
+)
+def test_the_first_guess_is_near_the_profile(name, model):
+    profile = choose_named(name, (3840, 2160), 29.97).profile
     guess = profile.first_guess((960, 540))
     fx, fy, cx, cy, *radial = profile.params
     exact = Camera(
-        model="OPENCV_FISHEYE", width_px=3840, height_px=2160, params=[fx, fy, cx + 0.5, cy + 0.5, *radial]
+        model="OPENCV_FISHEYE",
+        width_px=profile.width,
+        height_px=profile.height,
+        params=[fx, fy, cx + 0.5, cy + 0.5, *radial],
     ).scaled(960, 540)
+    assert guess.model == model
     assert guess.refine
     angles = np.linspace(-0.75, 0.75, 20)
     points = np.stack([np.sin(angles), 0.3 * np.sin(angles), np.cos(angles)], axis=1)
@@ -132,7 +140,7 @@ def test_the_lens_of_a_known_model_is_the_first_guess(tmp_path):
     _gopro(tmp_path, MAX_WIDE)
     capture = open_capture(load_job(tmp_path).capture)
     (camera,) = capture.cameras
-    assert camera.camera.model == "RADIAL_FISHEYE"
+    assert camera.camera.model in ("RADIAL", "RADIAL_FISHEYE")
     assert camera.camera.refine
     assert not camera.calibrated
     (found,) = check_path(tmp_path).cameras
@@ -170,7 +178,7 @@ def test_a_job_names_a_lens(tmp_path):
     job = load_job(_job(tmp_path, "GoPro HERO11 Black / Wide / 4K"))
     assert job.capture.cameras[0].calibration == "GoPro HERO11 Black / Wide / 4K"
     (camera,) = open_capture(job.capture).cameras
-    assert camera.camera.model == "RADIAL_FISHEYE"
+    assert camera.camera.model in ("RADIAL", "RADIAL_FISHEYE")
     assert camera.camera.refine
     (found,) = check_path(tmp_path).cameras
     assert found.origins.calibration.value == "GoPro HERO11 Black / Wide / 4K"
