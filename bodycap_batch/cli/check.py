@@ -32,12 +32,12 @@ def check(
     from bodycap_batch.check import check_path
     from bodycap_batch.clocks import offset_notes
     from bodycap_batch.config.job import Overrides
-    from bodycap_batch.telemetry import stabilisation_notes
+    from bodycap_batch.telemetry import telemetry_notes
 
     report = check_path(job, Overrides(out=out, skeleton=skeleton, height_m=height))
     if report.ready and report.job is not None:
         capture = report.job.capture
-        notes = (*report.notes, *offset_notes(capture), *stabilisation_notes(capture))
+        notes = (*report.notes, *offset_notes(capture), *telemetry_notes(capture))
         report = replace(report, notes=notes)
     if as_json:
         print_json(report.to_dict(), indent=1)

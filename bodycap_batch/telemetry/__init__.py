@@ -3,7 +3,7 @@
 from bodycap_batch.telemetry.comparison import (
     PictureGyroComparison,
     compare_picture_and_gyro,
-    stabilisation_notes,
+    telemetry_notes,
 )
 from bodycap_batch.telemetry.reading import read_telemetry
 from bodycap_batch.telemetry.streams import CameraTelemetry, GpsTrack, Stream
@@ -15,5 +15,5 @@ __all__ = [
     "Stream",
     "compare_picture_and_gyro",
     "read_telemetry",
-    "stabilisation_notes",
+    "telemetry_notes",
 ]

@@ -205,8 +205,8 @@ def all_times_ns(camera: CaptureCamera, config: CameraConfig) -> IntArray:
     return join_chapters(camera.videos, config.timestamps).times_ns
 
 
-def stabilisation_notes(spec: CaptureConfig, threads: int = 1) -> list[str]:
-    """Return a note for each camera whose gyroscope shows that the video is stabilised, or not its own.
+def telemetry_notes(spec: CaptureConfig, threads: int = 1) -> list[str]:
+    """Return notes on damaged telemetry, timelapses, and videos that the gyroscope shows to be stabilised.
 
     Args:
         spec: The capture block of a job, as returned by `load_job`.
@@ -218,6 +218,7 @@ def stabilisation_notes(spec: CaptureConfig, threads: int = 1) -> list[str]:
         try:
             camera = open_camera(small, config.model_copy(update={"mask": None}), threads)
             telemetry = read_telemetry(camera.videos, all_times_ns(camera, config), camera.name)
+            notes += [f"{config.name}: {note}" for note in telemetry.notes]
             compared = compare_picture_and_gyro(camera, telemetry)
         except CaptureError as error:  # a video that cannot be read is reported by the other checks
             if error.path is not None and error.path.endswith((".csv", ".gcsv")):

@@ -186,3 +186,20 @@ def test_check_notes_a_stabilised_video(tmp_path, capsys):
     _clip(tmp_path, stabilised=True)
     main(["check", str(tmp_path), "--skeleton", "none"])
     assert "torso: the camera stabilised the video" in capsys.readouterr().out
+
+
+def test_check_notes_damaged_telemetry_and_uses_the_video(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 255, (48, 64), dtype=np.uint8) for _ in range(90)]
+    track = payloads(Sensor(), 3)
+    data, start, duration = track[1]
+    write_gopro(
+        tmp_path / "torso.mp4", frames, [track[0], (data[: len(data) // 2], start, duration), track[2]]
+    )
+    code = main(["check", str(tmp_path), "--skeleton", "none"])
+    out = capsys.readouterr().out
+    assert code == 0
+    assert "torso: an item of the telemetry is cut off" in out
+    (tmp_path / "torso.imu.csv").write_text("hello")
+    assert main(["check", str(tmp_path), "--skeleton", "none"]) == 0
+    assert "its samples are not used" in capsys.readouterr().out

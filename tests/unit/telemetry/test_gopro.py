@@ -2,6 +2,7 @@
 
 import struct
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -177,6 +178,17 @@ def test_a_video_with_a_track_and_its_chapters(tmp_path):
     # The second chapter starts with the 91st frame, 3.003 s after the first.
     assert len(gyro.times_s) == pytest.approx(2 * 606, abs=2)
     np.testing.assert_allclose(gyro.values[610], gyro.values[610 - 606], atol=0.01)
+
+
+def test_the_vectors_of_a_turned_video_are_in_the_axes_of_the_shown_image(tmp_path):
+    path = write_gopro(
+        tmp_path / "a.mp4", [textured_frame(index) for index in range(30)], payloads(Sensor(), 1, _turn)
+    )
+    video = index_video(path)
+    upright = read_telemetry([video], video.times_ns()).gyro.values
+    upside_down = replace(video, orientation=((-1, 0), (0, -1)))
+    turned = read_telemetry([upside_down], video.times_ns()).gyro.values
+    np.testing.assert_allclose(turned, upright * [-1, -1, 1])
 
 
 def test_a_file_without_telemetry(tmp_path):
