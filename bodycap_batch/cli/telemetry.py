@@ -101,7 +101,7 @@ def comparison_lines(compared: PictureGyroComparison) -> Iterator[str]:
     bias = " ".join(f"{value:+.4f}" for value in fit.bias_rad_s)
     yield f"  delay {1e3 * fit.delay_s:+.1f} ms ± {1e3 * fit.delay_sigma_s:.1f} (sample = frame + delay)"
     yield (
-        f"  sensor turned by {turned:.1f}° against the stated axes (scatter "
+        f"  sensor turned by {turned:.1f}° against the stated axes (± "
         f"{np.degrees(np.linalg.norm(fit.rotation_sigma_rad)):.1f}°); bias {bias} rad/s"
     )
     yield f"  focal length {fit.focal_ratio:.2f} of the assumed one, from {fit.pairs} pairs of frames"

@@ -1,5 +1,7 @@
 """Pictures against the gyroscope: delay, rotation, bias, rate, and stabilised pictures."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -88,6 +90,20 @@ def test_the_rate_of_the_clock(path):
     # The delay is that of the middle of the clip.
     assert fit.drift == pytest.approx(0.002, abs=0.0004)
     assert fit.delay_s == pytest.approx(0.01 + 0.002 * 4.0, abs=0.001)
+
+
+def test_residuals_that_last_raise_the_stated_sigma(path):
+    times, orientation = path
+    gyro = _gyro(8, Rotation.identity(), np.zeros(3), 0.008)
+    clean = _picture(orientation, times)
+    # A walk beside a wall: the translation looks like slow rotations.
+    slow = 0.006 * np.sin(2 * np.pi * np.outer(clean.start_s, [1.1, 0.7, 0.9]) + [0.0, 1.0, 2.0])
+    walking = replace(clean, turn_rad=clean.turn_rad + slow)
+    telemetry = CameraTelemetry(axes_known=True)
+    plain, disturbed = (judge_rotations(each, gyro, telemetry).fit for each in (clean, walking))
+    # Residuals of 0.9 Hz last for some ten pairs; as independent ones they would state a fifth of this.
+    assert disturbed.delay_sigma_s > 10 * plain.delay_sigma_s
+    assert abs(disturbed.delay_s - 0.008) < 3 * disturbed.delay_sigma_s
 
 
 def _stabilised(times, orientation):
