@@ -18,6 +18,7 @@ LAYERS = (
     {"formats", "overlay", "runner"},
     {"config"},
     {"capture"},
+    {"telemetry"},
     {
         "keyframes", "mapping", "registration", "merging", "export", "report", "preview", "evaluate",
         "synthetic", "check", "calibration", "clocks",

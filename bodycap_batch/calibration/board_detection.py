@@ -62,6 +62,7 @@ class CalibrationBoard:
     marker: float = 0.75
     legacy: bool = False
     _charuco: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
+    _inverted: list[bool] = field(default_factory=lambda: [False], init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         min_size = 3 if self.kind == "chessboard" else 4
@@ -85,9 +86,22 @@ class CalibrationBoard:
         return f"ChArUco board of {self.columns}x{self.rows} squares ({self.dictionary})"
 
     def find(self, image: GreyImage) -> BoardCorners | None:
-        """Find the board's corners in a grey picture (H,W); return None if too few corners are visible."""
+        """Find the board's corners in a grey picture (H,W); return None if too few corners are visible.
+
+        A ChArUco board may be printed black on white or white on black.
+        """
         if self.kind == "chessboard":
             return self._find_chessboard(image)
+        # Some programs print boards white on black. The detector finds no inverted board.
+        for is_inverted in (self._inverted[-1], not self._inverted[-1]):
+            found = self._find_charuco(255 - image if is_inverted else image)
+            if found is not None:
+                self._inverted[:] = [is_inverted]
+                return found
+        return None
+
+    def _find_charuco(self, image: GreyImage) -> BoardCorners | None:
+        """Find the corners of a ChArUco board that is printed black on white; None if there are too few."""
         detector, board = self._detector()
         corners, ids, _, _ = detector.detectBoard(image)
         if ids is None or len(ids) < MIN_CORNERS or board.checkCharucoCornersCollinear(ids):

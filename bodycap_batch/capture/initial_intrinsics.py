@@ -51,6 +51,11 @@ def work_size(
     return width, height
 
 
+def work_size_of(video: VideoFile, work_px: int) -> tuple[int, int]:
+    """Return the work size of a video, pixels: see `work_size`."""
+    return work_size(video.shown_size, work_px, video.turned_size)
+
+
 def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Camera:
     """Return the intrinsics of a calibration at the work size.
 
@@ -75,7 +80,7 @@ def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Cam
             "camera crops the picture), or use `calibration: auto`",
         )
     camera = calibration.camera()
-    size = work_size((width, height), work_px, video.turned_size)
+    size = work_size_of(video, work_px)
     if size[0] * camera.height_px != size[1] * camera.width_px:
         camera = with_two_focal_lengths(camera)
     return camera.scaled(*size)
@@ -105,7 +110,7 @@ def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Cam
             length in the metadata of the video is used. Without such metadata, a typical field of view is
             used.
     """
-    width, height = work_size(video.shown_size, work_px, video.turned_size)
+    width, height = work_size_of(video, work_px)
     long_side = max(width, height)
     if fov_deg is not None:
         focal = 0.5 * long_side / np.tan(0.5 * np.radians(fov_deg))

@@ -8,7 +8,8 @@ import numpy as np
 
 from bodycap_batch.capture.cameras import Capture, CaptureCamera
 from bodycap_batch.capture.frame_index import index_video
-from bodycap_batch.capture.initial_intrinsics import guessed_camera, work_camera
+from bodycap_batch.capture.initial_intrinsics import guessed_camera, work_camera, work_size_of
+from bodycap_batch.capture.lens_choice import chosen_lens
 from bodycap_batch.capture.masks import read_mask
 from bodycap_batch.capture.timeline import join_chapters
 from bodycap_batch.capture.video import VideoFile
@@ -54,11 +55,13 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         if not used.any():
             raise _no_frames_error(spec, config, timeline.times_ns, config.offset_s)
     calibration = config.calibration if isinstance(config.calibration, Calibration) else None
-    camera = (
-        guessed_camera(videos[0], spec.work_px, config.fov_deg)
-        if calibration is None
-        else work_camera(calibration, videos[0], spec.work_px)
-    )
+    lens = chosen_lens(config, videos[0])
+    if calibration is not None:
+        camera = work_camera(calibration, videos[0], spec.work_px)
+    elif lens is not None:
+        camera = lens.profile.first_guess(work_size_of(videos[0], spec.work_px))
+    else:
+        camera = guessed_camera(videos[0], spec.work_px, config.fov_deg)
     return CaptureCamera(
         name=config.name,
         chapters=config.video,
@@ -74,7 +77,7 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         # Sensors are wider than they are high. Therefore a picture that is higher than wide was rotated by
         # 90°, by the camera or by the person who edited the video.
         may_be_sideways=_is_quarter_turned(videos[0]) or camera.height_px > camera.width_px,
-        notes=timeline.notes,
+        notes=(*timeline.notes, *([] if lens is None or not lens.note else [lens.note])),
         videos=videos,
         threads=threads,
         mask=None if config.mask is None else read_mask(config.mask, (camera.width_px, camera.height_px)),

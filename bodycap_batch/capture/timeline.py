@@ -45,6 +45,41 @@ class Timeline:
     notes: tuple[str, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class ChapterClock:
+    """Clock of a camera = time in the file of a chapter · rate + shift_s."""
+
+    rate: float
+    shift_s: float
+
+    def camera_s(self, file_s: float) -> float:
+        """Return a time on the clock of the camera, seconds."""
+        return file_s * self.rate + self.shift_s
+
+
+def clock_of_chapter(file_ns: IntArray, camera_ns: IntArray) -> ChapterClock:
+    """Return how times in the file of a chapter become times on the clock of the camera.
+
+    Usually the two differ by a constant. If a sidecar file gives the times, the clocks may run at different
+    rates. If the sidecar file contains pauses that the file does not contain, only the first frame is common
+    to both.
+
+    Args:
+        file_ns: (N,) time of every frame of the chapter in the file, nanoseconds.
+        camera_ns: (N,) time of every frame on the clock of the camera, nanoseconds: see `join_chapters`.
+    """
+    shift_s = (int(camera_ns[0]) - int(file_ns[0])) / 1e9
+    own = (file_ns - file_ns[0]) / 1e9
+    difference = (camera_ns - camera_ns[0]) / 1e9 - own
+    if len(own) < 3 or np.abs(difference).max() < 1e-6:
+        return ChapterClock(1.0, shift_s)
+    slope, constant = np.polyfit(own, difference, 1)
+    frame_s = float(np.median(np.diff(own)))
+    if np.abs(difference - slope * own - constant).max() > 0.5 * frame_s:
+        return ChapterClock(1.0, shift_s)
+    return ChapterClock(1.0 + slope, shift_s + constant - slope * float(file_ns[0]) / 1e9)
+
+
 def read_timestamps(path: Path) -> IntArray:
     """Read a sidecar file, which contains the time in seconds of one frame on each line.
 

@@ -5,21 +5,15 @@ Settings are found only if they are stored in the video files or visible in the 
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.video import open_container
 from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.formats.gpmf import gopro_settings
 
-_CONTAINER_BOXES = (b"moov", b"udta")
-_GOPRO_BOX = b"GPMF"
-_MAX_BOX_BYTES = 1 << 20
-"""Maximum size (bytes) of a box of settings that is read. A larger box is damaged. Evidence: none."""
 _OFF_VALUES = ("", "N", "N/A", "NA", "OFF", "NONE")
 """Values that mean that a setting is switched off."""
 _PHONE_KEYS = {
@@ -49,69 +43,6 @@ def setting_notes(camera: CaptureCamera) -> list[str]:
     """Return notes on a camera's settings, found in the first chapter's metadata and in the frame times."""
     path = camera.chapters[0]
     return [*_gopro_notes(gopro_settings(path)), *_phone_notes(path), *_rate_notes(camera.times_ns)]
-
-
-def gopro_settings(path: Path) -> dict[str, str]:
-    """Return the settings of a GoPro camera, by four-letter key.
-
-    The result is empty if the file is not from a GoPro camera.
-
-    The settings are in the box ``moov/udta/GPMF`` of an MP4 file.
-
-    Source: the GPMF key-length-value format, published by GoPro.
-    """
-    with path.open("rb") as handle:
-        handle.seek(0, 2)
-        data = _find_box(handle, 0, handle.tell())
-    return dict(_text_items(data)) if data else {}
-
-
-def _find_box(handle: BinaryIO, start: int, end: int) -> bytes | None:
-    """Return the content of the first GPMF box in a part of an MP4 file, or None if there is no such box.
-
-    Args:
-        handle: The open file.
-        start: Offset of the first byte of the part.
-        end: Offset of the end of the part.
-    """
-    while start + 8 <= end:
-        handle.seek(start)
-        header = handle.read(16)
-        if len(header) < 8:
-            return None
-        size, kind = struct.unpack(">I4s", header[:8])
-        content = 8
-        if size == 1 and len(header) == 16:
-            size, content = struct.unpack(">Q", header[8:])[0], 16
-        size = end - start if size == 0 else size
-        if size < content:
-            return None
-        if kind == _GOPRO_BOX and size <= _MAX_BOX_BYTES:
-            handle.seek(start + content)
-            return handle.read(size - content)
-        if kind in _CONTAINER_BOXES:
-            found = _find_box(handle, start + content, min(start + size, end))
-            if found is not None:
-                return found
-        start += size
-    return None
-
-
-def _text_items(data: bytes) -> Iterator[tuple[str, str]]:
-    """Yield the key and the value of each key-length-value item that contains text, including nested items.
-
-    Each item is padded to a multiple of four bytes.
-    """
-    offset = 0
-    while offset + 8 <= len(data):
-        key, kind, size, repeat = struct.unpack(">4sBBH", data[offset : offset + 8])
-        length = size * repeat
-        content = data[offset + 8 : offset + 8 + length]
-        if kind == 0:
-            yield from _text_items(content)
-        elif kind == ord("c"):
-            yield key.decode("ascii", "replace"), content.decode("latin-1").strip("\0 ")
-        offset += 8 + (length + 3) // 4 * 4
 
 
 def _gopro_notes(settings: dict[str, str]) -> list[str]:

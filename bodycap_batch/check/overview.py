@@ -9,6 +9,7 @@ from pathlib import Path
 
 from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.capture.initial_intrinsics import guessed_fov_deg
+from bodycap_batch.capture.lens_choice import chosen_lens
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.job import load_job_with_origins
@@ -29,6 +30,9 @@ def with_first_guess(origins: CameraOrigins, config: CameraConfig, video: VideoF
     """
     if isinstance(config.calibration, Calibration):
         return origins
+    lens = chosen_lens(config, video)
+    if lens is not None:
+        return replace(origins, first_guess=Origin(source="lens profile", value=lens.profile.text()))
     fov_deg, source = guessed_fov_deg(video, config.fov_deg)
     return replace(origins, first_guess=Origin(source=source, value=f"{fov_deg:.0f}°"))
 

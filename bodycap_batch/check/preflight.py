@@ -205,7 +205,8 @@ def _frame_runs(numbers: IntArray) -> tuple[tuple[int, int], ...]:
 
 def _intrinsics_text(camera: CaptureCamera) -> str:
     width, focal = max(camera.camera.width_px, camera.camera.height_px), camera.camera.focal_px
-    view = 2.0 * np.degrees(np.arctan(0.5 * width / focal))
+    is_fisheye = camera.camera.model.endswith("FISHEYE")
+    view = 2.0 * np.degrees(0.5 * width / focal if is_fisheye else np.arctan(0.5 * width / focal))
     if camera.calibrated:
         return (
             f"the camera is calibrated: {camera.camera.model}, focal length {focal:.0f} px in the reduced "

@@ -32,10 +32,13 @@ def check(
     from bodycap_batch.check import check_path
     from bodycap_batch.clocks import describe_clocks
     from bodycap_batch.config.job import Overrides
+    from bodycap_batch.telemetry import telemetry_notes
 
     report = check_path(job, Overrides(out=out, skeleton=skeleton, height_m=height))
     if report.ready and report.job is not None:
-        report = replace(report, notes=(*report.notes, *describe_clocks(report.job.capture)))
+        capture = report.job.capture
+        notes = (*report.notes, *describe_clocks(capture), *telemetry_notes(capture))
+        report = replace(report, notes=notes)
     if as_json:
         print_json(report.to_dict(), indent=1)
     else:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import butter, sosfilt, sosfilt_zi
 
+from bodycap_batch.capture.timeline import ChapterClock, clock_of_chapter
 from bodycap_batch.capture.video import VideoFile, error_reason, open_container
 from bodycap_batch.clocks.recorders import Recorder, recorder_of
 from bodycap_batch.core.arrays import FloatArray, IntArray
@@ -157,10 +158,10 @@ def read_sound_track(camera: str, videos: Sequence[VideoFile], times_ns: IntArra
     recorders: list[Recorder] = []
     first = 0
     for video in videos:
-        clock = _clock_of_chapter(video.times_ns(), times_ns[first : first + len(video.pts)])
+        clock = clock_of_chapter(video.times_ns(), times_ns[first : first + len(video.pts)])
         first += len(video.pts)
         chapter = read_sound_file(video.path)
-        pieces += [moved for piece in chapter.pieces for moved in clock.moved(piece)]
+        pieces += [moved for piece in chapter.pieces for moved in _moved(piece, clock)]
         notes += [f"{video.path.name}: {note}" for note in chapter.notes]
         if chapter.problem:
             problems.append(f"{video.path.name}: {chapter.problem}" if len(videos) > 1 else chapter.problem)
@@ -181,38 +182,11 @@ def read_sound_track(camera: str, videos: Sequence[VideoFile], times_ns: IntArra
     return track
 
 
-@dataclass(frozen=True, slots=True)
-class _ChapterClock:
-    """Clock of a camera = time in the file · rate + shift_s."""
-
-    rate: float
-    shift_s: float
-
-    def moved(self, piece: SoundPiece) -> Iterator[SoundPiece]:
-        """Yield the piece on the clock of the camera, in parts if the clocks run at different rates."""
-        step = len(piece.samples) if self.rate == 1.0 else _BATCH_SAMPLES
-        for first in range(0, len(piece.samples), max(step, 1)):
-            start_s = (piece.start_s + first / RATE_HZ) * self.rate + self.shift_s
-            yield SoundPiece(start_s, piece.samples[first : first + step])
-
-
-def _clock_of_chapter(file_ns: IntArray, camera_ns: IntArray) -> _ChapterClock:
-    """Return how times in the file of a chapter become times on the clock of the camera.
-
-    Usually the two differ by a constant. If a sidecar file gives the times, the clocks may run at different
-    rates. If the sidecar file contains pauses that the file does not contain, only the first frame is common
-    to both.
-    """
-    shift_s = (int(camera_ns[0]) - int(file_ns[0])) / 1e9
-    own = (file_ns - file_ns[0]) / 1e9
-    difference = (camera_ns - camera_ns[0]) / 1e9 - own
-    if len(own) < 3 or np.abs(difference).max() < 1e-6:
-        return _ChapterClock(1.0, shift_s)
-    slope, constant = np.polyfit(own, difference, 1)
-    frame_s = float(np.median(np.diff(own)))
-    if np.abs(difference - slope * own - constant).max() > 0.5 * frame_s:
-        return _ChapterClock(1.0, shift_s)
-    return _ChapterClock(1.0 + slope, shift_s + constant - slope * float(file_ns[0]) / 1e9)
+def _moved(piece: SoundPiece, clock: ChapterClock) -> Iterator[SoundPiece]:
+    """Yield a piece on the clock of the camera, in parts if the clocks run at different rates."""
+    step = len(piece.samples) if clock.rate == 1.0 else _BATCH_SAMPLES
+    for first in range(0, len(piece.samples), max(step, 1)):
+        yield SoundPiece(clock.camera_s(piece.start_s + first / RATE_HZ), piece.samples[first : first + step])
 
 
 def _without_overlaps(pieces: list[SoundPiece]) -> tuple[SoundPiece, ...]:

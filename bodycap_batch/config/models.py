@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
 
 from bodycap_batch.config.bounds import (
     MAX_ANGLE_DEG,
@@ -18,6 +18,7 @@ from bodycap_batch.config.bounds import (
     MIN_SIGMA_M,
 )
 from bodycap_batch.config.calibration import Calibration
+from bodycap_batch.config.lens_profiles import NAME_SEPARATOR, profiles_named
 from bodycap_batch.config.mounts import REFERENCE_ROLES, mount_of, role_of_segment
 from bodycap_batch.config.options import (
     ExportOptions,
@@ -48,7 +49,15 @@ class _Block(BaseModel):
 def _calibration_kind(value: object) -> str:
     if isinstance(value, dict | Calibration):
         return "inline"
+    if isinstance(value, str) and NAME_SEPARATOR in value:
+        return "lens"
     return "auto" if value == "auto" else "file"
+
+
+def _known_lens(name: str) -> str:
+    """Return the name of a lens. Raises `ValueError` if the table of lens profiles does not have it."""
+    profiles_named(name)
+    return name
 
 
 def _pose_kind(value: object) -> str:
@@ -62,6 +71,7 @@ def _none_if_auto(value: object) -> object:
 AnyCalibration = Annotated[
     Annotated[Calibration, Tag("inline")]
     | Annotated[Literal["auto"], Tag("auto")]
+    | Annotated[str, AfterValidator(_known_lens), Tag("lens")]
     | Annotated[Path, Tag("file")],
     Discriminator(_calibration_kind),
 ]
@@ -118,8 +128,8 @@ class CameraConfig(_Block):
     )
     calibration: AnyCalibration | None = Field(
         None,
-        description="a block with the calibration, the path of a calib.json, or auto; default: the "
-        "calibration of the capture",
+        description="a block with the calibration, the path of a calib.json, the name of a lens "
+        "(`bodycap lenses`), or auto; default: the calibration of the capture",
     )
     fov_deg: float | None = Field(
         None,

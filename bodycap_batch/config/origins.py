@@ -19,10 +19,18 @@ from bodycap_batch.config.folder import (
 from bodycap_batch.config.models import Job
 
 Source = Literal[
-    "job file", "folder", "sidecar file", "calib.json", "video metadata", "camera name", "default"
+    "job file",
+    "folder",
+    "sidecar file",
+    "calib.json",
+    "video metadata",
+    "camera name",
+    "lens profile",
+    "default",
 ]
 """Kind of place that a setting comes from. "folder" means a video that the job file does not list, in the
-capture's folder; "sidecar file" means a file of timestamps beside the video."""
+capture's folder; "sidecar file" means a file of timestamps beside the video; "lens profile" means the table
+of lenses, with the camera model that the video's metadata name."""
 
 _NOT_NAMED = "not a video, and no setting names it"
 
@@ -55,7 +63,8 @@ class CameraOrigins:
     Attributes:
         video: Origin of the list of the camera's videos.
         calibration: Origin of the calibration.
-        first_guess: Origin of the field of view from which `calibration: auto` starts. None if the camera is
+        first_guess: Origin of the field of view or of the lens from which `calibration: auto` starts. None if
+        the camera is
             calibrated, or if the videos have not been opened.
         timestamps: Origin of the frame times.
         clock_offset: Origin of `offset_s`.

@@ -122,6 +122,8 @@ def _file_names(paths: tuple[Path, ...]) -> str:
 
 
 def _calibration_origin(config: CameraConfig, file: Path | None, folder: Path, *, is_stated: bool) -> Origin:
+    if isinstance(config.calibration, str) and config.calibration != "auto":
+        return Origin(source="job file", value=config.calibration)
     if not isinstance(config.calibration, Calibration):
         return Origin(source="job file" if is_stated else "default", value="auto")
     model = config.calibration.model

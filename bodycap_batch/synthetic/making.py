@@ -26,6 +26,7 @@ from bodycap_batch.synthetic.camera_sounds import CameraSounds
 from bodycap_batch.synthetic.clip import load_clip
 from bodycap_batch.synthetic.clocks import first_and_last_s, true_clocks
 from bodycap_batch.synthetic.gait import Walk, WalkStyle
+from bodycap_batch.synthetic.imu import write_imu
 from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
 from bodycap_batch.synthetic.measured import disturb_poses
 from bodycap_batch.synthetic.options import SynthOptions
@@ -72,7 +73,7 @@ def draw_subject(options: SynthOptions) -> Subject:
     Raises:
         JobError: The BVH file cannot be used.
     """
-    names = ("body", "walk", "mounts", "room", "clothes", "images", "poses", "drops", "posture")
+    names = ("body", "walk", "mounts", "room", "clothes", "images", "poses", "drops", "posture", "imu")
     children = np.random.SeedSequence(options.seed).spawn(len(names))
     seeds = dict(zip(names, children, strict=True))
     clocks = true_clocks(options)
@@ -119,6 +120,7 @@ def write_synthetic_capture(
         kept = _draw_kept_frames(options, subject)
         for mount in subject.mounts:
             _write_camera_truth(folder, options, subject, mount, kept[mount.camera])
+            _write_camera_imu(folder, options, subject, mount)
         if not options.poses_only:
             _write_videos(folder, options, subject, kept, context)
         write_truth(folder, options, subject.motion, subject.mounts)
@@ -165,6 +167,20 @@ def _write_camera_truth(
             measured.world_from_cam[measured.present],
             "world_from_camera with noise, gross errors and gaps; the camera's own clock",
         )
+
+
+def _write_camera_imu(folder: Path, options: SynthOptions, subject: Subject, mount: Mount) -> None:
+    """Write the samples of the inertial sensors on a camera, if they are requested."""
+    if options.imu is None:
+        return
+    clock = true_clocks(options)[mount.camera]
+
+    def world_from_cam_at(camera_s: FloatArray) -> FloatArray:
+        return camera_poses_at(subject.motion, mount, clock.common_s(camera_s))
+
+    number = options.cameras.index(mount.camera)
+    seed = np.random.SeedSequence([number, *subject.seeds["imu"].generate_state(4).tolist()])
+    write_imu(folder, mount.camera, options.imu, options.seconds, world_from_cam_at, seed)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from bodycap_batch.config.bounds import (
     MAX_ANGLE_DEG,
@@ -22,6 +22,7 @@ from bodycap_batch.config.bounds import (
 from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.config.options import Options
 from bodycap_batch.model.camera import CAMERA_MODELS, Camera, parameter_count
+from bodycap_batch.synthetic.imu_options import ImuOptions, imu_from_word
 
 _EARLIEST_S = 3.0
 """Maximum time (seconds) from the start of a camera to time 0 of the common clock. The built-in walk starts
@@ -266,6 +267,11 @@ class SynthOptions(Options):
         description="with poses_only: frame rate of each camera whose rate differs from fps",
     )
 
+    imu: Annotated[ImuOptions | None, BeforeValidator(imu_from_word)] = Field(
+        None,
+        description="inertial sensors, written to <camera>.imu.csv: true for those of a consumer's camera, "
+        "perfect for sensors without errors, or a block with options of its own",
+    )
     quality: Literal["high", "lossless"] = Field(
         "high", description="quality of the videos; high: H.264 with CRF 16, lossless: no loss of quality"
     )

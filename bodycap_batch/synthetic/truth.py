@@ -38,6 +38,8 @@ _README = """Ground truth of a synthetic capture. Metres, Z up, floor at z = 0.
 joints.npz     names (J,), t (T,) s on the common clock, world (T,J,3) m: joint centres.
 motion.bvh     the motion on the common clock, at the cameras' rate; frame 0 is the earliest frame.
 mounts.json    joint_from_cam of each camera: the true mount, which differs from the nominal mount.
+<camera>.imu.json  of ../<camera>.imu.csv, if there is one: x_in_cam = cam_from_sensor · x_in_sensor, the
+               biases in the axes of the sensor, and late_s: time stamp of a sample = camera time + late_s.
 synth.json     the options the capture was made with.
 
 The files ../skeleton.bvh and motion.bvh have the true proportions of the body.

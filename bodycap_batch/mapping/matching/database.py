@@ -95,7 +95,8 @@ def add_camera(database: pycolmap.Database, camera: CaptureCamera) -> int:
     Each camera has a separate rig, so the map does not assume that cameras expose at the same instants.
     """
     model = camera.camera.to_pycolmap()
-    model.has_prior_focal_length = camera.calibrated
+    # COLMAP searches an initial pair only among fisheye cameras with a prior focal length.
+    model.has_prior_focal_length = camera.calibrated or camera.camera.model.endswith("FISHEYE")
     return _write_camera(database, model)
 
 

@@ -214,3 +214,25 @@ def test_diverse_views_are_selected():
 def test_coverage_counts_cells():
     assert corner_coverage([np.array([[0.0, 0.0], [1.0, 1.0]])], (640, 480)) == 1 / 48
     assert corner_coverage([np.array([[-0.5, -0.5], [639.5, 479.5]])], (640, 480)) == 2 / 48
+
+
+def test_boards_printed_white_on_black_are_found():
+    board = CalibrationBoard(kind="charuco", columns=7, rows=5)
+    picture = with_margin(board.picture(SQUARE_TEXELS))
+    frames = board_clip(PINHOLE_LENS, picture, 18, np.random.default_rng(5), whole=False)
+    upright = [board.find(frame) for frame in frames]
+    inverted = [board.find(255 - frame) for frame in frames]
+    both = [(one, other) for one, other in zip(upright, inverted, strict=True) if one is not None]
+    assert len(both) >= 10
+    assert sum(other is not None for _, other in both) >= 0.9 * len(both)
+    # The corners are the same.
+    for one, other in both:
+        if other is not None and len(one.px) == len(other.px):
+            np.testing.assert_allclose(other.px, one.px, atol=0.2)
+
+
+def test_no_board_is_found_in_noise_of_either_polarity():
+    board = CalibrationBoard(kind="charuco", columns=7, rows=5)
+    noise = np.random.default_rng(1).integers(0, 255, (240, 320)).astype(np.uint8)
+    assert board.find(noise) is None
+    assert board.find(255 - noise) is None

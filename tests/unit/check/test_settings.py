@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.check import check_path
-from bodycap_batch.check.camera_settings import gopro_settings
+from bodycap_batch.formats.gpmf import gopro_settings
 from tests.videos import textured_frame, write_video
 
 FRAMES = [textured_frame(index % 40) for index in range(75)]

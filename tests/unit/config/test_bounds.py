@@ -62,6 +62,7 @@ SYNTH: dict[str, Any] = {
     "body_in_view": True,
     "rates_fps": {"torso": 30.0},
     "poses_only": True,
+    "imu": {"rate_hz": 200},
 }
 """Options of a synthetic capture that give every number without a default."""
 WILD = (math.inf, -math.inf, math.nan, 1e308, -1e308, 10**30, 10**18 + 1)

@@ -1,0 +1,229 @@
+"""Compare the gyroscope of a camera with its pictures: clock, mounting, and stabilisation of the pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from bodycap_batch.capture import CaptureCamera, open_camera
+from bodycap_batch.capture.timeline import join_chapters
+from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.telemetry.gyro_fit import GyroFit, fit_gyro
+from bodycap_batch.telemetry.picture_rotation import WORK_PX, PictureRotation, measure_picture_rotation
+from bodycap_batch.telemetry.reading import read_telemetry
+from bodycap_batch.telemetry.streams import IMAGE_ORIENTATION, CameraTelemetry, Stream
+
+Verdict = Literal["agrees", "stabilised", "unknown"]
+"""Whether pictures and gyroscope turn together, the camera stabilised the pictures, or neither can be
+said."""
+
+_MIN_R_SQUARED = 0.9
+"""Minimum share of the variance that the gyroscope explains if pictures and gyroscope agree. Evidence:
+docs/decisions/telemetry.md."""
+_MAX_PEAK_RATIO = 0.5
+"""Maximum unexplained share of the variance at the best delay, as a ratio to that at a typical delay. With a
+larger ratio there is no peak, and the delay is not determined. Evidence: none."""
+_MIN_SHAKE_RAD_S = 0.02
+"""Minimum fast changes (rad/s) of the gyroscope that a comparison needs. Origin: a tenth of a pixel per
+frame, at 30 frames per second and 500 pixels of focal length, is 0.006 rad/s."""
+_MAX_SHAKE_RATIO = 0.6
+"""Maximum ratio of the fast changes of the pictures to those of the gyroscope, of a stabilised video.
+Evidence: docs/decisions/telemetry.md."""
+_MAX_DISTANCE = 0.6
+"""Maximum distance of an orientation from its frame, in intervals of its stream: half, and some rounding."""
+_UNDO_ROUNDS = 3
+"""Number of times that a stabilisation is undone, each time with a better focal ratio."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PictureGyroComparison:
+    """The result of a comparison.
+
+    Attributes:
+        verdict: Whether pictures and gyroscope agree.
+        reason: Sentence that explains the verdict.
+        fit: The fit of the pictures as they are; None if there are too few pictures or samples.
+        undone: The fit after the recorded orientations undid the stabilisation; None if it was not undone.
+    """
+
+    verdict: Verdict
+    reason: str
+    fit: GyroFit | None = None
+    undone: GyroFit | None = None
+
+    @property
+    def best(self) -> GyroFit | None:
+        """The fit that gives delay, rotation and bias; None if they are not determined."""
+        if self.verdict == "agrees":
+            return self.fit
+        return self.undone if self.undone is not None and _is_good(self.undone) else None
+
+    @property
+    def can_be_undone(self) -> bool:
+        """True if the video is stabilised, and the recorded orientations undo it."""
+        return self.verdict == "stabilised" and self.best is not None
+
+
+def compare_picture_and_gyro(camera: CaptureCamera, telemetry: CameraTelemetry) -> PictureGyroComparison:
+    """Compare the rotations of the pictures with the gyroscope of the same camera.
+
+    Args:
+        camera: The camera. A work size of `WORK_PX` is enough.
+        telemetry: Its telemetry.
+
+    Raises:
+        CaptureError: The video cannot be read.
+    """
+    gyro = telemetry.gyro
+    if gyro is None or len(gyro.times_s) < 2:
+        return PictureGyroComparison(verdict="unknown", reason="there is no gyroscope to compare with")
+    picture = measure_picture_rotation(camera, gyro)
+    return judge_rotations(picture, gyro, telemetry)
+
+
+def judge_rotations(
+    picture: PictureRotation, gyro: Stream, telemetry: CameraTelemetry
+) -> PictureGyroComparison:
+    """Compare measured rotations of pictures with a gyroscope.
+
+    Args:
+        picture: The rotations of the pictures.
+        gyro: The gyroscope.
+        telemetry: The telemetry with the orientations of the image, if the camera recorded them.
+    """
+    fit = fit_gyro(picture, gyro, axes_known=telemetry.axes_known)
+    if fit is None:
+        reason = "too few pictures with texture have samples of the gyroscope"
+        return PictureGyroComparison(verdict="unknown", reason=reason)
+    if _is_good(fit):
+        reason = f"pictures and gyroscope turn together (R² {fit.r_squared:.2f})"
+        return PictureGyroComparison(verdict="agrees", reason=reason, fit=fit)
+    if fit.gyro_shake_rad_s < _MIN_SHAKE_RAD_S:
+        return PictureGyroComparison(
+            verdict="unknown",
+            reason=f"the camera turns too little for a comparison ({fit.gyro_shake_rad_s:.3f} rad/s)",
+            fit=fit,
+        )
+    share = fit.picture_shake_rad_s / fit.gyro_shake_rad_s
+    if share > _MAX_SHAKE_RATIO:
+        return PictureGyroComparison(
+            verdict="unknown",
+            reason=f"pictures and gyroscope do not agree (R² {fit.r_squared:.2f}), although both turn: the "
+            "samples may belong to another video, or the pictures show too little of the room",
+            fit=fit,
+        )
+    undone = _undone_fit(picture, gyro, telemetry)
+    return PictureGyroComparison(
+        verdict="stabilised",
+        reason=f"the camera stabilised the video: the pictures show {100 * share:.0f} % of the shaking that "
+        f"its gyroscope measured (R² {max(fit.r_squared, 0.0):.2f}); {_undo_text(undone)}",
+        fit=fit,
+        undone=undone,
+    )
+
+
+def _is_good(fit: GyroFit) -> bool:
+    has_peak = 1.0 - fit.r_squared < _MAX_PEAK_RATIO * (1.0 - fit.typical_r_squared)
+    return fit.r_squared >= _MIN_R_SQUARED and has_peak
+
+
+def _undo_text(undone: GyroFit | None) -> str:
+    if undone is None:
+        return "it cannot be undone, because the camera recorded no orientations of the image"
+    if _is_good(undone):
+        return f"the recorded orientations of the image undo it (R² {undone.r_squared:.2f})"
+    return (
+        "it cannot be undone: with the recorded orientations of the image, pictures and gyroscope still "
+        f"disagree (R² {max(undone.r_squared, 0.0):.2f})"
+    )
+
+
+def _undone_fit(picture: PictureRotation, gyro: Stream, telemetry: CameraTelemetry) -> GyroFit | None:
+    """Return the fit after the orientations of the image undid the stabilisation; None without them."""
+    orientations = telemetry.streams.get(IMAGE_ORIENTATION)
+    if orientations is None:
+        return None
+    ratio, best = 1.0, None
+    for _ in range(_UNDO_ROUNDS):
+        undone = undo_stabilisation(picture, orientations, ratio)
+        fit = fit_gyro(undone, gyro, axes_known=telemetry.axes_known)
+        if fit is None:
+            break
+        best = fit
+        ratio *= fit.focal_ratio
+    return best
+
+
+def undo_stabilisation(
+    picture: PictureRotation, orientations: Stream, focal_ratio: float = 1.0
+) -> PictureRotation:
+    """Return the rotations of the camera instead of those of the stabilised image.
+
+    The camera records how it turned the image of each frame relative to the lens. A pair of frames without
+    such an orientation is left out.
+
+    Args:
+        picture: Rotations that the stabilised pictures show.
+        orientations: The stream of these orientations (IORI): w, x, y, z of the conjugate quaternion, in
+            OpenCV's axes.
+        focal_ratio: True focal length divided by the assumed one.
+    """
+    from scipy.spatial.transform import Rotation
+
+    first, has_first = _nearest(orientations, picture.start_s)
+    second, has_second = _nearest(orientations, picture.end_s)
+    keep = np.flatnonzero(has_first & has_second)
+    picture = picture.chosen(keep)
+    quat_xyzw = orientations.values[:, [1, 2, 3, 0]] * [-1.0, -1.0, -1.0, 1.0]
+    norm = np.linalg.norm(quat_xyzw, axis=1, keepdims=True)
+    cam_from_image = Rotation.from_quat(np.where(norm > 0.5, quat_xyzw, [0.0, 0.0, 0.0, 1.0]))
+    second_from_first = Rotation.from_rotvec(-picture.turn_rad / focal_ratio)
+    turned = cam_from_image[second[keep]] * second_from_first * cam_from_image[first[keep]].inv()
+    return replace(picture, turn_rad=-turned.as_rotvec())
+
+
+def _nearest(stream: Stream, times_s: FloatArray) -> tuple[IntArray, BoolArray]:
+    """Return the index (N,) of the sample nearest to each time, and whether it is within half an interval."""
+    after = np.clip(np.searchsorted(stream.times_s, times_s), 1, max(len(stream.times_s) - 1, 1))
+    after = np.minimum(after, len(stream.times_s) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.abs(stream.times_s[before] - times_s) <= np.abs(stream.times_s[after] - times_s)
+    index = np.asarray(np.where(nearer, before, after), dtype=np.int64)
+    return index, np.asarray(np.abs(stream.times_s[index] - times_s) <= _MAX_DISTANCE / stream.rate_hz)
+
+
+def all_times_ns(camera: CaptureCamera, config: CameraConfig) -> IntArray:
+    """Return the time of every frame of a camera, used or not, on its clock, nanoseconds.
+
+    Raises:
+        CaptureError: A file of timestamps cannot be used.
+    """
+    return join_chapters(camera.videos, config.timestamps).times_ns
+
+
+def telemetry_notes(spec: CaptureConfig, threads: int = 1) -> list[str]:
+    """Return notes on damaged telemetry, timelapses, and videos that the gyroscope shows to be stabilised.
+
+    Args:
+        spec: The capture block of a job, as returned by `load_job`.
+        threads: Number of threads of each decoder.
+    """
+    notes = []
+    small = spec.model_copy(update={"work_px": min(spec.work_px, WORK_PX)})
+    for config in spec.cameras:
+        try:
+            camera = open_camera(small, config.model_copy(update={"mask": None}), threads)
+            telemetry = read_telemetry(camera.videos, all_times_ns(camera, config), camera.name)
+            notes += [f"{config.name}: {note}" for note in telemetry.notes]
+            compared = compare_picture_and_gyro(camera, telemetry)
+        except CaptureError as error:  # a video that cannot be read is reported by the other checks
+            if error.path is not None and error.path.endswith((".csv", ".gcsv")):
+                notes.append(f"{config.name}: {error.one_line}; its samples are not used")
+            continue
+        if compared.verdict == "stabilised":
+            notes.append(f"{config.name}: {compared.reason}")
+    return notes
