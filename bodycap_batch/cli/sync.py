@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.shared_options import JobArgument, JsonOption
+from bodycap_batch.cli.shared_options import JobArgument, JsonOption, results_folder
 from bodycap_batch.cli.terminal import print_json, print_line
 
 if TYPE_CHECKING:
@@ -29,7 +31,8 @@ def sync(
     """Find the clock offsets of the cameras from their sound.
 
     Prints the offset and the drift of each camera's clock relative to the torso's camera, and the lines for
-    the job file. Nothing in the job is changed.
+    the job file. Where the sound does not decide, the clocks of the last run of the job are shown; the run
+    estimates them from the motion. Nothing in the job is changed.
 
     \b
     Example:
@@ -41,14 +44,15 @@ def sync(
     from bodycap_batch.core.errors import JobError
     from bodycap_batch.formats.atomic_files import write_text
 
-    capture = load_job(job).capture
+    loaded = load_job(job)
+    capture = loaded.capture
     if len(capture.cameras) < 2:
         raise JobError(
             "there is only one camera: clocks are compared between cameras",
             path=job,
             hint="give a folder or a job with the videos of all cameras",
         )
-    estimates = estimate_clocks(capture)
+    estimates = with_clocks_of_run(estimate_clocks(capture), results_folder(loaded))
     if picture is not None:
         write_text(picture, draw_clocks(estimates))
     _require_common_sound(estimates, job)
@@ -59,12 +63,39 @@ def sync(
             print_line(line)
 
 
+def with_clocks_of_run(estimates: ClockEstimates, results: Path) -> ClockEstimates:
+    """Return the clocks, completed by those that the last run of the job estimated from the motion.
+
+    Args:
+        estimates: The clocks that were estimated from the sound.
+        results: Folder of the results of the job. It may be missing.
+    """
+    try:
+        stored = json.loads((results / "metrics.json").read_text(encoding="utf-8"))["clocks"]
+    except (OSError, ValueError, KeyError, TypeError):
+        stored = {}
+    cameras = []
+    for clock in estimates.cameras:
+        found = stored.get(clock.camera, {}) if clock.source == "none" else {}
+        if found.get("source") == "motion":
+            values = {key: found[key] for key in _KEYS}
+            cameras.append(replace(clock, **values, reasons=(*clock.reasons, "from the last run of the job")))
+        elif clock.source == "none":
+            cameras.append(replace(clock, reasons=(*clock.reasons, "needs a run, which compares the motion")))
+        else:
+            cameras.append(clock)
+    return replace(estimates, cameras=tuple(cameras))
+
+
+_KEYS = ("offset_s", "sigma_s", "drift_ppm", "drift_sigma_ppm", "source")
+"""Keys of a clock in ``metrics.json`` and in the JSON output."""
+
+
 def clocks_as_json(estimates: ClockEstimates) -> dict[str, object]:
     """Return the clocks as plain JSON values."""
-    keys = ("offset_s", "sigma_s", "drift_ppm", "drift_sigma_ppm", "source")
     return {
         "reference": estimates.reference,
-        "clocks": {clock.camera: {key: getattr(clock, key) for key in keys} for clock in estimates.cameras},
+        "clocks": {clock.camera: {key: getattr(clock, key) for key in _KEYS} for clock in estimates.cameras},
         "contradictions": {clock.camera: list(clock.contradictions) for clock in estimates.cameras},
         "reasons": {clock.camera: list(clock.reasons) for clock in estimates.cameras},
     }
@@ -82,7 +113,7 @@ def lines_of(estimates: ClockEstimates) -> Iterator[str]:
             for text in texts:
                 mark = f"{kind}: {clock.camera}: "
                 yield from textwrap.wrap(text, 100, initial_indent=mark, subsequent_indent="  ")
-    found = [clock for clock in estimates.cameras if clock.source == "sound"]
+    found = [clock for clock in estimates.cameras if clock.source in ("sound", "motion")]
     if found:
         yield "for the cameras in job.yaml:"
         for clock in found:
@@ -103,7 +134,7 @@ def _require_common_sound(estimates: ClockEstimates, job: Path) -> None:
     from bodycap_batch.core.errors import EstimationError
 
     others = [clock for clock in estimates.cameras if clock.camera != estimates.reference]
-    if any(clock.source in ("sound", "common") for clock in others):
+    if any(clock.source in ("sound", "motion", "common") for clock in others):
         return
     reasons = "; ".join(f"{clock.camera}: {', '.join(clock.reasons)}" for clock in others)
     raise EstimationError(

@@ -174,6 +174,22 @@ def test_cameras_with_other_formats_are_compared_and_have_a_larger_sigma(tmp_pat
     assert found.camera("head").reasons == ("the sound is silent",)
 
 
+def test_the_command_shows_what_the_last_run_found_from_the_motion(folder, tmp_path, capsys):
+    job = write_job(folder, tmp_path, "torso", "left_palm", "left_thigh")
+    assert main(["sync", job]) == 0
+    assert "needs a run" in capsys.readouterr().out
+    out = tmp_path / "out" / "job"
+    out.mkdir(parents=True)
+    clock = {"offset_s": 0.5, "sigma_s": 0.02, "drift_ppm": 0.0, "drift_sigma_ppm": 40.0, "source": "motion"}
+    (out / "metrics.json").write_text(json.dumps({"clocks": {"left_thigh": clock}}))
+    text = (tmp_path / "job.yaml").read_text()
+    (tmp_path / "job.yaml").write_text(f"out: {out}\n{text}")
+    assert main(["sync", job]) == 0
+    shown = capsys.readouterr().out
+    assert "+0.5000 s" in shown
+    assert "from the last run of the job" in shown
+
+
 def test_one_camera_has_nothing_to_compare(folder, tmp_path, capsys):
     assert main(["sync", write_job(folder, tmp_path, "torso")]) == 2
     assert "only one camera" in capsys.readouterr().err
