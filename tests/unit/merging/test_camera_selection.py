@@ -115,7 +115,7 @@ def test_a_stationary_camera_is_excluded(capture):
     assert "stands still" in together.unused["left_palm"]
 
 
-def test_a_camera_with_an_unknown_clock_is_excluded_with_the_reason(capture: Capture) -> None:
+def test_a_camera_with_an_unknown_clock_is_excluded_with_the_reason(capture):
     why = "the clock is unknown: the video has no sound"
     clocks = dict(capture.inputs.clocks)
     clocks["left_palm"] = replace(clocks["left_palm"], source="none", notes=(why,))
