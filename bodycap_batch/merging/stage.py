@@ -22,6 +22,7 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
 from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSigma
 from bodycap_batch.merging.camera_paths import trajectory_in_world, with_solved_centres
 from bodycap_batch.merging.camera_selection import select_cameras
+from bodycap_batch.merging.cameras.excluded_cameras import MIN_LOCALISED_FRAMES
 from bodycap_batch.merging.cameras.track import CameraTrack, inflate_sigmas, make_track
 from bodycap_batch.merging.cameras.track_outliers import remove_outliers
 from bodycap_batch.merging.graph.adaptive_motion_noise import scale_motion_noise
@@ -92,9 +93,9 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     used = aligned.trajectories
     bones = kinematic_chain(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps
-    tick_times = timeline(inputs.clocks, used, fps)
     prepared = _prepare_tracks(inputs, used, bones)
     tracks = prepared.tracks
+    tick_times = timeline(inputs.clocks, used, fps, tracks)
     calibration = calibrate_body(
         inputs,
         options,
@@ -109,6 +110,7 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     )
     step.what = "solving"
     scale = calibration.scale.metres_per_unit
+    tracks = [within_ticks(track, tick_times) for track in tracks]
     metric = [track.scaled(scale) for track in tracks]
     rules = soft_limits(inputs.skeleton, bones, inputs.activity)
     loose = tuple(replace(bone, off_hinge_m=calibration.off_hinge_m.get(bone.role, 0.0)) for bone in bones)
@@ -200,21 +202,59 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
     )
 
 
-def timeline(clocks: Mapping[str, CameraClock], used: Sequence[Trajectory], fps: float) -> IntArray:
-    """Return the ticks of the motion, from the first to the last timestamp of all used cameras.
+_MAX_TRIM_NS = 10_000_000_000
+"""Maximum time, nanoseconds, that is left out at the start and at the end of the motion because not all
+cameras run. Origin: the time in which a person starts some cameras by hand. Evidence: none."""
+
+
+def timeline(
+    clocks: Mapping[str, CameraClock],
+    used: Sequence[Trajectory],
+    fps: float,
+    tracks: Sequence[CameraTrack] = (),
+) -> IntArray:
+    """Return the ticks of the motion.
+
+    They extend from the first to the last timestamp of all used cameras. If the cameras were started by hand,
+    so that their clocks were estimated, the motion begins when the last camera starts and ends when the first
+    one stops. At an end where this would leave out more than `_MAX_TRIM_NS`, nothing is left out.
 
     Args:
         clocks: By camera, the clock that converts its timestamps to common time.
         used: Trajectories of the used cameras.
         fps: Number of ticks per second.
+        tracks: Localised frames of the used cameras. Nothing is left out if a camera would keep fewer
+            localised frames than `MIN_LOCALISED_FRAMES`.
 
     Returns:
         (T,) common time of each tick, nanoseconds.
     """
     times = [clocks[each.camera].common_times_ns(each.times_ns) for each in used]
     start, end = min(int(each.min()) for each in times), max(int(each.max()) for each in times)
+    if any(clocks[each.camera].source in ("sound", "motion") for each in used):
+        late, early = max(int(each.min()) for each in times), min(int(each.max()) for each in times)
+        late = late if late - start <= _MAX_TRIM_NS else start
+        early = early if end - early <= _MAX_TRIM_NS else end
+        kept = [int(((track.times_ns >= late) & (track.times_ns <= early)).sum()) for track in tracks]
+        if early > late and min(kept, default=MIN_LOCALISED_FRAMES) >= MIN_LOCALISED_FRAMES:
+            start, end = late, early
     count = int(np.floor((end - start) * 1e-9 * fps + 1e-6)) + 1
     return np.asarray(start + np.round(np.arange(count) * (1e9 / fps)), dtype=np.int64)
+
+
+def within_ticks(track: CameraTrack, tick_times: IntArray) -> CameraTrack:
+    """Return the frames of a track from the first to the last tick (T,), with one frame beyond each end.
+
+    The last tick is up to one tick before the end of the motion. A track that ends within this time is
+    returned as it is.
+    """
+    step_ns = (tick_times[-1] - tick_times[0]) / max(1, len(tick_times) - 1)
+    if track.times_ns[0] >= tick_times[0] and track.times_ns[-1] <= tick_times[-1] + step_ns:
+        return track
+    first = int(np.searchsorted(track.times_ns, tick_times[0], side="right")) - 1
+    last = int(np.searchsorted(track.times_ns, tick_times[-1]))
+    index = np.arange(len(track.times_ns))
+    return track.keep((index >= first) & (index <= last))
 
 
 @dataclass(frozen=True, slots=True)

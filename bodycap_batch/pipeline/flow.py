@@ -133,6 +133,8 @@ class Flow:
         # Mapping keeps one core busy. Meanwhile, another core loads the libraries of the last stages.
         preload = [[module for stage in later for module in stage.modules]] if self._threads > 1 else []
         artefact = self.runner.run(make_task(MAP, task, threads=self._threads), preload)
+        if self._sound is not None:
+            self._sound.result()  # The sound is compared in much less time, so this does not wait.
         self.runner.report_notes(artefact, "map")
         return artefact
 

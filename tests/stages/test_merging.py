@@ -167,6 +167,25 @@ def test_a_clock_offset_has_the_documented_sign(walk, context, offset_s, right):
     assert right or error > 0.1
 
 
+@pytest.mark.parametrize(("source", "trimmed"), [("sound", True), ("stated", False)])
+def test_the_motion_begins_when_all_cameras_that_were_started_by_hand_run(walk, context, source, trimmed):
+    recorded = _recorded(walk, left_palm={"shift_s": 0.5})
+    clocks = {name: CameraClock(nominal_fps=FPS) for name in ROLES}
+    clocks["left_palm"] = CameraClock(nominal_fps=FPS, offset_s=0.5, sigma_s=0.002, source=source)
+    result = merge_trajectories(
+        make_inputs(walk, recorded, clocks=clocks, **_known(walk)), MergeOptions(), context
+    )
+    whole_s = 1e-9 * (recorded[0].times_ns[-1] - recorded[0].times_ns[0])
+    times_s = result.times_ns() * 1e-9
+    assert times_s[0] == pytest.approx(0.5 if trimmed else 0.0, abs=0.01)
+    assert times_s[-1] == pytest.approx(whole_s if trimmed else whole_s + 0.5, abs=0.05)
+    assert {path.camera: len(path.status) for path in result.trajectories} == {
+        path.camera: len(path.status) for path in recorded
+    }
+    gaps = {name: camera.longest_gap_s for name, camera in result.report.cameras.items()}
+    assert (max(gaps.values()) < 0.2) is trimmed
+
+
 def test_frames_between_ticks_are_not_moved_onto_them(walk, base, context):
     # 11 ms late, as webcams without genlock: at 2 m/s a frame pulled to its tick would be 2 cm off.
     recorded = _recorded(walk, left_palm={"shift_s": 0.011})
