@@ -69,6 +69,14 @@ SYNTH: dict[str, Any] = {
     "imu": {"rate_hz": 200},
 }
 """Options of a synthetic capture that give every number without a default."""
+SOUNDING: dict[str, Any] = {
+    **{key: value for key, value in SYNTH.items() if key not in ("rates_fps", "poses_only")},
+    "clocks": "free",
+    "sound": True,
+    "drifts_ppm": {"torso": 0.0},
+    "sound_skews_s": {"torso": 0.0},
+}
+"""The options that only videos have."""
 WILD = (math.inf, -math.inf, math.nan, 1e308, -1e308, 10**30, 10**18 + 1)
 
 Where = tuple[str | int, ...]
@@ -165,12 +173,12 @@ def unbounded(model: type[BaseModel]) -> list[str]:
     return [each.place for each, _ in numbers_of(model, {}) if each.least is None or each.most is None]
 
 
-@pytest.mark.parametrize(("model", "value"), [(Job, JOB), (SynthOptions, SYNTH)])
+@pytest.mark.parametrize(("model", "values"), [(Job, (JOB,)), (SynthOptions, (SYNTH, SOUNDING))])
 def test_every_number_has_two_bounds_and_is_tried_below(
-    model: type[BaseModel], value: Mapping[str, Any]
+    model: type[BaseModel], values: tuple[Mapping[str, Any], ...]
 ) -> None:
     assert unbounded(model) == []
-    found = numbers_of(model, full(model, value))
+    found = [each for value in values for each in numbers_of(model, full(model, value))]
     tried = {each.place for each, where in found if where is not None}
     assert {each.place for each, _ in found} - tried == set(), "add the field to JOB or SYNTH above"
     assert len(tried) > 20
@@ -204,7 +212,12 @@ def refusal(folder: Path, document: Mapping[str, Any]) -> JobError:
 
 
 @pytest.mark.parametrize(
-    ("model", "value", "block"), [(Job, JOB, ()), (SynthOptions, SYNTH, ("capture", "synthetic"))]
+    ("model", "value", "block"),
+    [
+        (Job, JOB, ()),
+        (SynthOptions, SYNTH, ("capture", "synthetic")),
+        (SynthOptions, SOUNDING, ("capture", "synthetic")),
+    ],
 )
 def test_a_number_outside_its_bounds_is_refused_with_its_field(
     tmp_path: Path, model: type[BaseModel], value: Mapping[str, Any], block: Where
