@@ -58,10 +58,6 @@ JOB: dict[str, Any] = {
 SYNTH: dict[str, Any] = {
     "lens_params": [420, 420, 320, 240],
     "offsets_s": {"torso": 0.0},
-    "clocks": "free",
-    "sound": True,
-    "drifts_ppm": {"torso": 0.0},
-    "sound_skews_s": {"torso": 0.0},
     "pressed_s": {"left_palm": [2, 4]},
     "body_in_view": True,
     "rates_fps": {"torso": 30.0},
