@@ -33,7 +33,7 @@ from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint, exclud
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.model_files import write_models
-from bodycap_batch.mapping.results import finalise_models, make_result
+from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
 from bodycap_batch.mapping.validation.camera_distance_check import Reach, check_distances
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
@@ -158,7 +158,9 @@ def build_map_once(
     write_models(workspace, models)
     calibrated = {number: name for name, number in ids.items() if capture.camera(name).calibrated}
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
-    log = MapDiagnostics(misfit_factors=misfits, details=log).to_log()
+    removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
+    misplaced = misplaced_frames(removed, models)
+    log = MapDiagnostics(misfit_factors=misfits, misplaced=misplaced, details=log).to_log()
     result = make_result(models, workspace, log)
     reach_log = check_distances(result.maps[0], common_times_ns(capture), reach).to_log() if reach else None
     ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]

@@ -31,7 +31,7 @@ from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_k
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.model_files import read_model, registered_ids, write_models
-from bodycap_batch.mapping.results import finalise_models, make_result
+from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
 from bodycap_batch.mapping.validation.repair import remove_misregistered
 from bodycap_batch.model.scene import MapResult
 
@@ -104,8 +104,12 @@ def extend_map(
         **match_log,
     }
     diagnostics = previous.diagnostics
+    before = [
+        ImageRef(name, frame).name for name, frames in diagnostics.misplaced.items() for frame in frames
+    ]
     diagnostics = replace(
         diagnostics,
+        misplaced=misplaced_frames([*before, *removed], models),
         extensions=(*diagnostics.extensions, entry),
         details={**diagnostics.details, "keyframes": len(existing) + len(new)},
     )

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.mapping.inputs import common_times_ns
 from bodycap_batch.mapping.mapping_context import MappingContext
+from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robustly
 from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction
-from bodycap_batch.mapping.reconstruction.model_files import registered_ids
+from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, registered_ids
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
 from bodycap_batch.model.scene import MapResult
 
@@ -40,6 +41,19 @@ def finalise_models(
         if only is None or only:
             adjust_robustly(model, context.mapper_options(), context.calibrated_ids, only)
     return total
+
+
+def misplaced_frames(names: Collection[str], models: Sequence[Any]) -> dict[str, tuple[int, ...]]:
+    """Return the frame indices of the removed keyframes that no model contains, by camera name.
+
+    Args:
+        names: Image names of keyframes that were removed because they contradict a model.
+        models: The final models.
+    """
+    inside = set[str]().union(*(keyframe_names(model) for model in models))
+    refs = sorted(ImageRef.parse(name) for name in set(names) - inside)
+    cameras = sorted({ref.camera for ref in refs})
+    return {camera: tuple(ref.frame for ref in refs if ref.camera == camera) for camera in cameras}
 
 
 def make_result(models: Sequence[Any], workspace: Path, log: dict[str, Any]) -> MapResult:

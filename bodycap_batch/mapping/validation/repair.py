@@ -15,10 +15,12 @@ from bodycap_batch.mapping.re_registration import adjust_unless_large, re_regist
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model
 from bodycap_batch.mapping.reconstruction.model_files import registered_ids
 from bodycap_batch.mapping.validation.epipolar_consistency import (
+    PairConsistency,
     evaluate_pairs,
     find_misregistered_images,
     inconsistent_match_ratio,
 )
+from bodycap_batch.mapping.validation.track_agreement import evaluate_agreement, find_misplaced_images
 
 if TYPE_CHECKING:
     import pycolmap
@@ -61,7 +63,7 @@ def repair_model(
     if keyframes is not None:
         ids = {ref: ids[ref] for ref in keyframes}
     pairs = evaluate_pairs(context.workspace, model)
-    wrong = find_misregistered_images(pairs)
+    wrong = _find_wrong_images(context, model, pairs)
     for _ in range(_ROUNDS):
         registered = registered_ids(model)
         missing = set(ids.values()) - registered
@@ -85,7 +87,7 @@ def repair_model(
             break
         other = re_register_images(model, wrong, context, len(ids))
         other_pairs = evaluate_pairs(context.workspace, other)
-        still_wrong = find_misregistered_images(other_pairs)
+        still_wrong = _find_wrong_images(context, other, other_pairs)
         sound_before = len(registered - wrong)
         sound_after = len(registered_ids(other) - still_wrong)
         entry |= {"sound_before": sound_before, "sound_after": sound_after}
@@ -123,8 +125,16 @@ def remove_without_adjustment(
         matches in inconsistent pairs before the removal.
     """
     pairs = evaluate_pairs(context.workspace, model)
-    kept, removed = _remove_images(model, find_misregistered_images(pairs))
+    kept, removed = _remove_images(model, _find_wrong_images(context, model, pairs))
     return kept, removed, round(inconsistent_match_ratio(pairs), 4)
+
+
+def _find_wrong_images(
+    context: MappingContext, model: pycolmap.Reconstruction, pairs: Sequence[PairConsistency]
+) -> set[int]:
+    """Return the ids of the images whose matches contradict the poses or the points of the model."""
+    agreement = evaluate_agreement(context.workspace, model)
+    return find_misregistered_images(pairs) | find_misplaced_images(agreement, registered_ids(model))
 
 
 def _remove_images(model: Any, image_ids: set[int]) -> tuple[Any, list[str]]:

@@ -26,6 +26,10 @@ _MIN_COMMON_FRAMES = 10
 distance between the two cameras is not used. Evidence: none."""
 
 
+class ImplausibleBody(EstimationError):
+    """The distances between the cameras fit no person. A wrong position of one camera is a possible cause."""
+
+
 @dataclass(frozen=True, slots=True)
 class ReachConstraint:
     """Bound on the distance of a bone's joint from a point on another bone.
@@ -93,8 +97,8 @@ def provisional_scale(
         ignored_cameras: Names of cameras whose distances from their kinematic neighbours are not used.
 
     Raises:
-        EstimationError: No two related cameras were localised at the same time, or the distances fit no
-            person.
+        EstimationError: No two related cameras were localised at the same time.
+        ImplausibleBody: The distances fit no person.
     """
     links = [
         distance_constraint(bones, track, other, mounts)
@@ -113,7 +117,7 @@ def provisional_scale(
     costs = np.array([sum(constraint.cost(scale) for constraint in constraints) for scale in scales])
     best = int(np.argmin(costs))
     if best in (0, len(scales) - 1):
-        raise EstimationError(
+        raise ImplausibleBody(
             "the distances between the cameras are not possible for a person: the scale of "
             f"{scales[best]:.3g} m per map unit is out of bounds",
             hint="check that the `mount` of each camera in the job is correct",

@@ -42,9 +42,15 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
     find_misregistered_images,
 )
 from bodycap_batch.mapping.validation.repair import remove_misregistered, repair_model
+from bodycap_batch.mapping.validation.track_agreement import (
+    PairAgreement,
+    evaluate_agreement,
+    find_misplaced_images,
+)
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.geometry import align_points, invert, make_transform, so3_exp
+from bodycap_batch.model.geometry import Similarity, align_points, invert, make_transform, so3_exp
+from tests.misplaced import misplace
 
 _CAMERA = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 _INTRINSICS = {"cam": CameraIntrinsics(_CAMERA, calibrated=True)}
@@ -62,6 +68,15 @@ def test_misregistered_images_are_found_but_not_their_partners() -> None:
         for x in pairs
     ]
     assert find_misregistered_images(wrong) == {4, 5}
+
+
+def test_an_island_that_agrees_only_with_itself_is_misplaced() -> None:
+    pairs = [PairAgreement(a, b, 60, 57) for a in range(8) for b in range(a)]
+    pairs += [PairAgreement(a, b, 60, 57) for a in range(8, 11) for b in range(8, a)]
+    assert find_misplaced_images([*pairs, PairAgreement(7, 8, 40, 36)], range(11)) == set()
+    weak = [*pairs, PairAgreement(7, 8, 12, 12), PairAgreement(6, 8, 12, 12)]
+    assert find_misplaced_images(weak, range(11)) == {8, 9, 10}
+    assert find_misplaced_images(pairs, range(12)) == {8, 9, 10, 11}
 
 
 def _poses() -> FloatArray:
@@ -163,6 +178,32 @@ def test_an_empty_map_without_an_initial_pair_is_no_bug(tmp_path: Path) -> None:
         pass
     settings = make_mapper_options(MapOptions(), [], 1.0)
     assert not register_images(tmp_path, settings, pycolmap.Reconstruction(), lambda: None)
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift"),
+    [(0.3, 0.0), (0.6, 0.0), (1.7, 0.0), (4.0, 0.0), (1.0, 0.1), (1.0, 0.3), (1.0, 0.6)],
+)
+def test_a_block_of_another_scale_or_place_is_found_and_repaired(
+    scale: float, shift: float, built: tuple[Any, FloatArray, MappingContext, set[Any]]
+) -> None:
+    model, poses, mapping, tried = built
+    agreement = evaluate_agreement(mapping.workspace, model)
+    assert find_misplaced_images(agreement, model.reg_image_ids()) == set()
+    numbers = {ImageRef.parse(model.image(i).name).frame: int(i) for i in model.reg_image_ids()}
+    found = np.array([model.image(numbers[frame]).projection_center() for frame in range(_KEYFRAMES)])
+    unit = align_points(found, invert(poses)[:, :3, 3]).scale
+    block = [numbers[frame] for frame in _MOVED]
+    middle = found[list(_MOVED)].mean(axis=0)
+    # The shift is given in the scene's unit, in which the wall is 4 away and keyframes are 0.25 apart.
+    offset = (1.0 - scale) * middle + np.array([0.0, 0.0, shift / unit])
+    wrong = misplace(model, block, Similarity(scale, np.eye(3), offset))
+    agreement = evaluate_agreement(mapping.workspace, wrong)
+    assert find_misplaced_images(agreement, wrong.reg_image_ids()) == set(block)
+    mended, log = repair_model(wrong, tried, mapping)
+    assert _rms(mended, poses) < 0.01
+    assert mended.num_reg_images() == _KEYFRAMES
+    assert log["cut"] == []
 
 
 def test_conjugate_gradients_give_the_same_map_as_the_direct_solver(
