@@ -37,7 +37,7 @@ from bodycap_batch.mapping.results import finalise_models, make_result, misplace
 from bodycap_batch.mapping.validation.camera_distance_check import Reach, check_distances
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
-from bodycap_batch.mapping.validation.repair import repair_model
+from bodycap_batch.mapping.validation.repair import remove_without_adjustment, repair_model
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.scene import KeyframeSelection, MapResult
 
@@ -151,6 +151,7 @@ def build_map_once(
         if skeletal is not generator:
             resected, log["placed"] = resect_remaining(models, generator, tried, mapping)
         log["unconfirmed_points"] = finalise_models(models, mapping, capture, resected)
+        models[0], log["contradicting"], _ = remove_without_adjustment(models[0], mapping)
     attempts = log.get("initial_candidates", log["initial_pair_ladder"])
     refused = add_flip_hint(check_coverage(models, len(refs), attempts, options), flips)
     if refused is not None and not models:
@@ -159,7 +160,7 @@ def build_map_once(
     calibrated = {number: name for name, number in ids.items() if capture.camera(name).calibrated}
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
     removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
-    misplaced = misplaced_frames(removed, models)
+    misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
     log = MapDiagnostics(misfit_factors=misfits, misplaced=misplaced, details=log).to_log()
     result = make_result(models, workspace, log)
     reach_log = check_distances(result.maps[0], common_times_ns(capture), reach).to_log() if reach else None

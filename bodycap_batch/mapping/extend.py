@@ -32,7 +32,7 @@ from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.model_files import read_model, registered_ids, write_models
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
-from bodycap_batch.mapping.validation.repair import remove_misregistered
+from bodycap_batch.mapping.validation.repair import remove_misregistered, remove_without_adjustment
 from bodycap_batch.model.scene import MapResult
 
 
@@ -95,6 +95,9 @@ def extend_map(
         removed += names
         resected.append(registered_ids(model) - kept if mapping.is_large(len(kept)) else None)
     transient = finalise_models(models, mapping, capture, resected)
+    for number, model in enumerate(models):
+        models[number], names, _ = remove_without_adjustment(model, mapping)
+        removed += names
     write_models(workspace, models)
     entry = {
         "new_keyframes": len(new),
