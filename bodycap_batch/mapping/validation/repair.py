@@ -20,7 +20,11 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
     find_misregistered_images,
     inconsistent_match_ratio,
 )
-from bodycap_batch.mapping.validation.track_agreement import evaluate_agreement, find_misplaced_images
+from bodycap_batch.mapping.validation.track_agreement import (
+    evaluate_agreement,
+    find_misplaced_images,
+    image_sequences,
+)
 
 if TYPE_CHECKING:
     import pycolmap
@@ -134,7 +138,7 @@ def _find_wrong_images(
 ) -> set[int]:
     """Return the ids of the images whose matches contradict the poses or the points of the model."""
     agreement = evaluate_agreement(context.workspace, model)
-    return find_misregistered_images(pairs) | find_misplaced_images(agreement, registered_ids(model))
+    return find_misregistered_images(pairs) | find_misplaced_images(agreement, image_sequences(model))
 
 
 def _remove_images(model: Any, image_ids: set[int]) -> tuple[Any, list[str]]:

@@ -8,22 +8,25 @@ not fit one point. Mapping then keeps two points, or removes one of the two obse
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.mapping.matching.database import DATABASE_NAME
+from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef
 
 if TYPE_CHECKING:
     import pycolmap
 
 _MIN_AGREEMENT = 0.8
-"""Minimum agreement of a keyframe: the fraction of its matches that belong to common points. A keyframe with
-a smaller fraction is misplaced. Evidence: docs/decisions/mapping.md."""
+"""Minimum agreement of a block of keyframes: the fraction of its matches with all other keyframes that belong
+to common points. A block with a smaller fraction is misplaced. Evidence: docs/decisions/mapping.md."""
+_MAX_BLOCK = 100
+"""Maximum number of keyframes of a tested block. The time of the test is proportional to this number.
+Evidence: none."""
 _MIN_PAIR_AGREEMENT = 0.5
 """Minimum fraction of the matches of a pair that must belong to common points, so that the pair connects its
 two keyframes. Evidence: none."""
@@ -72,6 +75,15 @@ def evaluate_agreement(workspace: Path, model: pycolmap.Reconstruction) -> list[
     return out
 
 
+def image_sequences(model: pycolmap.Reconstruction) -> list[list[int]]:
+    """Return the ids of each camera's registered images, in the order of time."""
+    refs = sorted((ImageRef.parse(model.image(number).name), int(number)) for number in model.reg_image_ids())
+    cameras: dict[str, list[int]] = {}
+    for ref, number in refs:
+        cameras.setdefault(ref.camera, []).append(number)
+    return list(cameras.values())
+
+
 def _observed_points(model: pycolmap.Reconstruction, image_id: int) -> IntArray:
     """Return the id (N,) of the point that each feature of an image observes; −1 without a point."""
     image = model.image(image_id)
@@ -81,73 +93,147 @@ def _observed_points(model: pycolmap.Reconstruction, image_id: int) -> IntArray:
     return out
 
 
-def find_misplaced_images(pairs: Sequence[PairAgreement], images: Collection[int]) -> set[int]:
+def find_misplaced_images(pairs: Sequence[PairAgreement], sequences: Sequence[Sequence[int]]) -> set[int]:
     """Return the ids of misplaced images.
 
-    Two kinds of images are misplaced. First, in each step the image with the smallest agreement is removed,
-    with its pairs, until every remaining image has an agreement of at least `_MIN_AGREEMENT`. The removal of
-    a misplaced image lowers the agreement of the other images of its block, and raises the agreement of the
-    correct images around it. Second, images that too few common points connect with the largest remaining
-    part: the rest of a block that agrees only with itself.
+    Two kinds of images are misplaced. First, blocks of successive images of one camera. The agreement of a
+    block is the fraction of its matches with all images outside the block that belong to common points. In
+    each step the block with the smallest agreement is removed, until every block has an agreement of at least
+    `_MIN_AGREEMENT`. A block that drifts away agrees at one end and contradicts the other images, so only its
+    agreement as a whole shows it. Second, images that too few common points connect with the largest
+    remaining part: the rest of a block that agrees only with itself.
+
+    Images that contradict only misplaced images are correct. Therefore removed blocks that agree with the
+    largest remaining part are added to it again.
 
     Args:
         pairs: The verified pairs of registered images.
-        images: Ids of all registered images.
+        sequences: For each camera, the ids of its registered images in the order of time.
     """
     partners: dict[int, dict[int, PairAgreement]] = {}
     for pair in pairs:
         if pair.judged:
             partners.setdefault(pair.first, {})[pair.second] = pair
             partners.setdefault(pair.second, {})[pair.first] = pair
-    remaining = _without_disagreeing(partners)
-    return set(images) - _largest_connected(partners, remaining)
+    removed = _remove_blocks(partners, sequences)
+    images = {image for sequence in sequences for image in sequence}
+    kept = _largest_connected(partners, set(partners) - {image for block in removed for image in block})
+    left = list(reversed(removed))
+    while True:
+        block = next((block for block in left if _agrees(block, kept, partners)), None)
+        if block is None:
+            return images - kept
+        kept |= set(block)
+        left.remove(block)
 
 
-def _without_disagreeing(partners: dict[int, dict[int, PairAgreement]]) -> set[int]:
-    """Return the images that remain after images with a small agreement were removed one after the other."""
-    judged = {image: sum(pair.judged for pair in of.values()) for image, of in partners.items()}
-    agreeing = {image: sum(pair.agreeing for pair in of.values()) for image, of in partners.items()}
-    remaining = set(partners)
-
-    def agreement(image: int) -> tuple[float, int]:
-        return agreeing[image] / judged[image] if judged[image] else 0.0, image
-
-    while remaining:
-        worst = min(remaining, key=agreement)
-        if agreement(worst)[0] >= _MIN_AGREEMENT:
-            break
-        remaining.remove(worst)
-        for other, pair in partners[worst].items():
-            judged[other] -= pair.judged
-            agreeing[other] -= pair.agreeing
-    return remaining
+def _remove_blocks(
+    partners: Mapping[int, Mapping[int, PairAgreement]], sequences: Sequence[Sequence[int]]
+) -> list[tuple[int, ...]]:
+    """Return the blocks that contradict the other images, in the order of their removal."""
+    remaining = {image: dict(of) for image, of in partners.items()}
+    removed = []
+    while True:
+        left = ([image for image in sequence if remaining.get(image)] for sequence in sequences)
+        worst = min((_worst_block(sequence, remaining) for sequence in left), default=_NO_BLOCK)
+        if worst.agreement >= _MIN_AGREEMENT:
+            return removed
+        removed.append(worst.images)
+        for image in worst.images:
+            for other in remaining.pop(image):
+                if other in remaining:
+                    del remaining[other][image]
 
 
-def _largest_connected(partners: dict[int, dict[int, PairAgreement]], remaining: set[int]) -> set[int]:
+def _agrees(
+    block: Sequence[int], images: Collection[int], partners: Mapping[int, Mapping[int, PairAgreement]]
+) -> bool:
+    """Return whether enough matches of a block with other images belong to common points."""
+    pairs = [pair for image in block for other, pair in partners[image].items() if other in images]
+    agreeing = sum(pair.agreeing for pair in pairs)
+    return agreeing >= max(_MIN_SUPPORT, _MIN_AGREEMENT * sum(pair.judged for pair in pairs))
+
+
+class _Block(NamedTuple):
+    """A block of successive images of one camera.
+
+    Attributes:
+        agreement: Fraction of the block's matches with images outside the block that belong to common points.
+        size: Number of images. Of two blocks with the same agreement, the smaller one is misplaced.
+        images: Ids of the images.
+    """
+
+    agreement: float
+    size: int
+    images: tuple[int, ...]
+
+
+_NO_BLOCK = _Block(1.0, 0, ())
+
+
+def _worst_block(sequence: Sequence[int], partners: Mapping[int, Mapping[int, PairAgreement]]) -> _Block:
+    """Return the block of successive images with the smallest agreement.
+
+    Blocks with fewer than `_MIN_SUPPORT` judged matches with images outside the block are not tested.
+
+    Args:
+        sequence: Ids of one camera's images in the order of time.
+        partners: By image, the pairs of the image, by the other image.
+    """
+    count = len(sequence)
+    longest = min(count, _MAX_BLOCK)
+    position = {image: index for index, image in enumerate(sequence)}
+    # Rows: judged matches, agreeing matches. `near` holds the matches between images up to `longest` apart.
+    total = np.zeros((2, count))
+    near = np.zeros((2, longest, count))
+    for image, index in position.items():
+        for other, pair in partners[image].items():
+            counts = (pair.judged, pair.agreeing)
+            total[:, index] += counts
+            lag = index - position.get(other, index)
+            if 0 < lag < longest:
+                near[:, lag, index] += counts
+    sums = np.concatenate([np.zeros((2, 1)), total.cumsum(axis=1)], axis=1)
+    inside, ending, worst = np.zeros((2, count)), np.zeros((2, count)), _NO_BLOCK
+    for length in range(1, longest + 1):
+        # Matches of each image with the `length` - 1 images before it.
+        ending += near[:, length - 1]
+        starts = count - length + 1
+        inside = inside[:, :starts] + ending[:, length - 1 :]
+        judged, agreeing = sums[:, length:] - sums[:, :starts] - 2.0 * inside
+        agreement = np.where(judged >= _MIN_SUPPORT, agreeing / np.maximum(judged, 1.0), 1.0)
+        start = int(np.argmin(agreement))
+        if agreement[start] < worst.agreement:
+            worst = _Block(float(agreement[start]), length, tuple(sequence[start : start + length]))
+    return worst
+
+
+def _largest_connected(partners: Mapping[int, Mapping[int, PairAgreement]], remaining: set[int]) -> set[int]:
     """Return the largest part of the remaining images that enough common points connect.
 
-    A part grows from the image with the most common points. In each step, the images that enough common
-    points connect with the part are added.
+    A part grows from the image with the most common points and its nearest partners. In each step, the images
+    that enough common points connect with the part are added.
     """
     links = {
-        image: {other: pair.agreeing for other, pair in partners[image].items() if pair.connects}
+        image: {
+            other: pair.agreeing
+            for other, pair in partners[image].items()
+            if pair.connects and other in remaining
+        }
         for image in remaining
     }
     best: set[int] = set()
     while remaining:
         seed = max(remaining, key=lambda image: (sum(links[image].values()), -image))
         part, support = set[int](), dict[int, int]()
-        added = {seed}
+        strongest = max(links[seed].values(), default=0)
+        added = {seed} | {other for other, count in links[seed].items() if 2 * count >= strongest}
         while added:
             part |= added
             for image in added:
                 for other, count in links[image].items():
                     support[other] = support.get(other, 0) + count
-            added = {
-                image
-                for image, count in support.items()
-                if image in remaining and image not in part and count >= _MIN_SUPPORT
-            }
+            added = {image for image, count in support.items() if image not in part and count >= _MIN_SUPPORT}
         best = max(best, part, key=len)
         remaining = remaining - part
     return best

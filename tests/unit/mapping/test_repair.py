@@ -46,6 +46,7 @@ from bodycap_batch.mapping.validation.track_agreement import (
     PairAgreement,
     evaluate_agreement,
     find_misplaced_images,
+    image_sequences,
 )
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
 from bodycap_batch.model.camera import Camera
@@ -73,10 +74,22 @@ def test_misregistered_images_are_found_but_not_their_partners() -> None:
 def test_an_island_that_agrees_only_with_itself_is_misplaced() -> None:
     pairs = [PairAgreement(a, b, 60, 57) for a in range(8) for b in range(a)]
     pairs += [PairAgreement(a, b, 60, 57) for a in range(8, 11) for b in range(8, a)]
-    assert find_misplaced_images([*pairs, PairAgreement(7, 8, 40, 36)], range(11)) == set()
+    assert find_misplaced_images([*pairs, PairAgreement(7, 8, 40, 36)], [range(11)]) == set()
     weak = [*pairs, PairAgreement(7, 8, 12, 12), PairAgreement(6, 8, 12, 12)]
-    assert find_misplaced_images(weak, range(11)) == {8, 9, 10}
-    assert find_misplaced_images(pairs, range(12)) == {8, 9, 10, 11}
+    assert find_misplaced_images(weak, [range(11)]) == {8, 9, 10}
+    assert find_misplaced_images(pairs, [range(12)]) == {8, 9, 10, 11}
+
+
+def test_a_block_that_drifts_away_is_misplaced_as_a_whole() -> None:
+    drifting = range(20, 28)
+
+    def pair(a: int, b: int) -> PairAgreement:
+        # Successive images agree, also at both ends of the block. The block contradicts all other images.
+        wrong = (a in drifting) != (b in drifting) and a - b > 1 and b != 28
+        return PairAgreement(a, b, 20, 4 if wrong else 19)
+
+    pairs = [pair(a, b) for a in range(40) for b in range(max(0, a - 12), a)]
+    assert find_misplaced_images(pairs, [range(40)]) == set(drifting)
 
 
 def _poses() -> FloatArray:
@@ -189,7 +202,7 @@ def test_a_block_of_another_scale_or_place_is_found_and_repaired(
 ) -> None:
     model, poses, mapping, tried = built
     agreement = evaluate_agreement(mapping.workspace, model)
-    assert find_misplaced_images(agreement, model.reg_image_ids()) == set()
+    assert find_misplaced_images(agreement, image_sequences(model)) == set()
     numbers = {ImageRef.parse(model.image(i).name).frame: int(i) for i in model.reg_image_ids()}
     found = np.array([model.image(numbers[frame]).projection_center() for frame in range(_KEYFRAMES)])
     unit = align_points(found, invert(poses)[:, :3, 3]).scale
@@ -199,7 +212,7 @@ def test_a_block_of_another_scale_or_place_is_found_and_repaired(
     offset = (1.0 - scale) * middle + np.array([0.0, 0.0, shift / unit])
     wrong = misplace(model, block, Similarity(scale, np.eye(3), offset))
     agreement = evaluate_agreement(mapping.workspace, wrong)
-    assert find_misplaced_images(agreement, wrong.reg_image_ids()) == set(block)
+    assert find_misplaced_images(agreement, image_sequences(wrong)) == set(block)
     mended, log = repair_model(wrong, tried, mapping)
     assert _rms(mended, poses) < 0.01
     assert mended.num_reg_images() == _KEYFRAMES
