@@ -18,12 +18,15 @@ from bodycap_batch.model.scene import MapResult
 
 
 def finalise_models(
-    models: Sequence[Any], context: MappingContext, capture: Capture, resected: Sequence[set[int] | None]
+    models: list[Any], context: MappingContext, capture: Capture, resected: Sequence[set[int] | None]
 ) -> int:
     """Remove transient points from models and adjust the models robustly, in place.
 
+    A further model that is left without points is removed from the list: its keyframes saw nothing but
+    transient points, or contradict each other. The largest model stays.
+
     Args:
-        models: Reconstructions, changed in place.
+        models: Reconstructions, the largest first. The list and the reconstructions are changed in place.
         context: Workspace, mapper options.
         capture: All cameras.
         resected: For each model, the ids of the images to adjust: the images that were resected after the
@@ -34,12 +37,17 @@ def finalise_models(
     """
     times_ns = common_times_ns(capture)
     total = 0
+    empty = set[int]()
     for number, (model, image_ids) in enumerate(zip(models, resected, strict=True)):
         context.stage.progress(number, len(models), "maps adjusted")
         total += remove_transient_points(model, times_ns)
+        if number and not model.num_points3D():
+            empty.add(number)
+            continue
         only = None if image_ids is None else image_ids & registered_ids(model)
         if only is None or only:
             adjust_robustly(model, context.mapper_options(), context.calibrated_ids, only)
+    models[:] = [model for number, model in enumerate(models) if number not in empty]
     return total
 
 

@@ -13,6 +13,7 @@ from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pai
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
 from bodycap_batch.mapping.re_registration import adjust_unless_large, re_register_images
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model
+from bodycap_batch.mapping.reconstruction.mapper_options import MIN_MODEL_KEYFRAMES
 from bodycap_batch.mapping.reconstruction.model_files import registered_ids
 from bodycap_batch.mapping.validation.epipolar_consistency import (
     PairConsistency,
@@ -136,9 +137,15 @@ def remove_without_adjustment(
 def _find_wrong_images(
     context: MappingContext, model: pycolmap.Reconstruction, pairs: Sequence[PairConsistency]
 ) -> set[int]:
-    """Return the ids of the images whose matches contradict the poses or the points of the model."""
-    agreement = evaluate_agreement(context.workspace, model)
-    return find_misregistered_images(pairs) | find_misplaced_images(agreement, image_sequences(model))
+    """Return the ids of the images whose matches contradict the poses or the points of the model.
+
+    If no part of the model agrees with itself, only the images that contradict the poses are returned.
+    """
+    wrong = find_misregistered_images(pairs)
+    misplaced = find_misplaced_images(evaluate_agreement(context.workspace, model), image_sequences(model))
+    if model.num_reg_images() - len(wrong | misplaced) < MIN_MODEL_KEYFRAMES:
+        return wrong
+    return wrong | misplaced
 
 
 def _remove_images(model: Any, image_ids: set[int]) -> tuple[Any, list[str]]:

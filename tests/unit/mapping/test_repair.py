@@ -6,18 +6,18 @@ import copy
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pycolmap
 import pytest
 
-from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.mapping import initial_models
+from bodycap_batch.mapping import initial_models, results
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.initial_models import reconstruct_with_intrinsics
 from bodycap_batch.mapping.intrinsics import intrinsics_check
@@ -36,6 +36,7 @@ from bodycap_batch.mapping.reconstruction.incremental_mapper import register_ima
 from bodycap_batch.mapping.reconstruction.initial_pair import find_user_pair, rank_initial_pairs
 from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
 from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
+from bodycap_batch.mapping.results import finalise_models
 from bodycap_batch.mapping.validation.epipolar_consistency import (
     PairConsistency,
     evaluate_pairs,
@@ -217,6 +218,20 @@ def test_a_block_of_another_scale_or_place_is_found_and_repaired(
     assert _rms(mended, poses) < 0.01
     assert mended.num_reg_images() == _KEYFRAMES
     assert log["cut"] == []
+
+
+def test_a_further_model_without_points_is_dropped(
+    built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, poses, mapping, _ = built
+    empty = copy.deepcopy(model)
+    for point in list(empty.point3D_ids()):
+        empty.delete_point3D(point)
+    monkeypatch.setattr(results, "common_times_ns", lambda _: {"cam": np.arange(99) * 10**9})
+    models = [copy.deepcopy(model), empty]
+    finalise_models(models, mapping, cast(Capture, None), [None, None])
+    assert [item.num_reg_images() for item in models] == [_KEYFRAMES]
+    assert _rms(models[0], poses) < 0.01
 
 
 def test_conjugate_gradients_give_the_same_map_as_the_direct_solver(
