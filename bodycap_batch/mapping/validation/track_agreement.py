@@ -169,6 +169,7 @@ class _Block(NamedTuple):
 
 
 _NO_BLOCK = _Block(1.0, 0, ())
+"""Result of a test that found no misplaced block. The agreement of 1 is the largest possible fraction."""
 
 
 def _worst_block(sequence: Sequence[int], partners: Mapping[int, Mapping[int, PairAgreement]]) -> _Block:
