@@ -132,7 +132,7 @@ def _remove_blocks(
 ) -> list[tuple[int, ...]]:
     """Return the blocks that contradict the other images, in the order of their removal."""
     remaining = {image: dict(of) for image, of in partners.items()}
-    removed = []
+    removed = list[tuple[int, ...]]()
     while True:
         left = ([image for image in sequence if remaining.get(image)] for sequence in sequences)
         worst = min((_worst_block(sequence, remaining) for sequence in left), default=_NO_BLOCK)
