@@ -83,6 +83,7 @@ def save_registration(
     """
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.model.merge_data import CameraClock
+    from bodycap_batch.model.scene import FrameStatus
 
     write_dataclass(found, files, "registration")
     clock = CameraClock(
@@ -96,6 +97,7 @@ def save_registration(
         files,
         frames=len(found.trajectory.status),
         localised=int(found.trajectory.localised.sum()),
+        contradicted=found.trajectory.status.count(FrameStatus.CONTRADICTED),
         wanted=[int(frame) for frame in found.wanted_keyframes],
         rolling=rolling,
         notes=list(notes),
