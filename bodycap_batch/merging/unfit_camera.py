@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body.provisional_scale import ImplausibleBody
+from bodycap_batch.core.errors import EstimationError, ImplausibleBody
 from bodycap_batch.model.merge_data import MergeResult
 
 _MAX_JOINT_ERROR = 3.0
@@ -51,15 +50,15 @@ def merge_without_unfit_camera(
         The solved body. The camera that was left out is among its unused cameras.
 
     Raises:
-        EstimationError: No camera can be left out such that the others fit a person, or the data do not
-            determine the motion.
+        ImplausibleBody: No camera can be left out such that the others fit a person.
+        EstimationError: The data do not determine the motion.
     """
     try:
         return solve({})
-    except ImplausibleBody as error:
+    except ImplausibleBody:
         attempts = _solve_without_each(cameras, solve)
         if not attempts:
-            raise EstimationError(error.message, hint=error.hint) from error
+            raise
         return min(attempts, key=lambda attempt: attempt[:2]).result
 
 

@@ -10,9 +10,8 @@ import pytest
 
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.core.errors import ImplausibleBody, error_from_dict
 from bodycap_batch.merging import merge_trajectories
-from bodycap_batch.merging.body.provisional_scale import ImplausibleBody
 from bodycap_batch.model.scene import Trajectory
 from tests.stages.walker import ROLES, make_inputs, make_walk, record
 
@@ -45,6 +44,7 @@ def test_the_camera_that_does_not_fit_is_left_out(wrong: str, tmp_path: Path) ->
 
 def test_two_cameras_that_do_not_fit_are_refused_as_before(tmp_path: Path) -> None:
     paths, walk = _walk_with({"left_palm": 30.0, "right_palm": 0.01})
-    with pytest.raises(EstimationError, match="not possible for a person") as caught:
+    with pytest.raises(ImplausibleBody, match="not possible for a person") as caught:
         merge_trajectories(make_inputs(walk, paths), MergeOptions(), StageContext(work_dir=tmp_path))
-    assert not isinstance(caught.value, ImplausibleBody)
+    # The error keeps its exit code on the way from the child process.
+    assert error_from_dict(caught.value.to_dict()).exit_code == 4

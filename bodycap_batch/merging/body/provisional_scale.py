@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.core.errors import EstimationError, ImplausibleBody
 from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone
 from bodycap_batch.merging.cameras.track import MAX_COARSE_GAP_NS, CameraTrack
 from bodycap_batch.model.geometry import invert
@@ -24,10 +24,6 @@ the elbows of a walking person keep 15 to 30° of flexion."""
 _MIN_COMMON_FRAMES = 10
 """Minimum number of frames in which two cameras are localised at the same time. With fewer such frames, the
 distance between the two cameras is not used. Evidence: none."""
-
-
-class ImplausibleBody(EstimationError):
-    """The distances between the cameras fit no person. A wrong position of one camera is a possible cause."""
 
 
 @dataclass(frozen=True, slots=True)
