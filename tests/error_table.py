@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "bodycap_batch"
 README = ROOT / "README.md"
 BEGIN, END = "<!-- errors: made by `python -m tests.error_table --write` -->", "<!-- end of errors -->"
-CODES = {"JobError": 2, "CaptureError": 3, "EstimationError": 4, "StoreError": 5}
+CODES = {"JobError": 2, "CaptureError": 3, "EstimationError": 4, "ImplausibleBody": 4, "StoreError": 5}
 CODES |= {"Problem": 2, "error": 2}
 """Also what a job's rules find, and what the BVH parser says of a line."""
 DEFAULT_REMEDY = {

@@ -51,7 +51,7 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
         {"body_calibration"},
         {"map_alignment", "reporting"},
         {"main_map", "camera_paths"},
-        {"camera_selection"},
+        {"camera_selection", "unfit_camera"},
         {"stage"},
     ),
 }

@@ -97,6 +97,10 @@ class EstimationError(BodycapError):
     exit_code = 4
 
 
+class ImplausibleBody(EstimationError):
+    """The cameras fit no person together. A wrong position of one camera is a possible cause."""
+
+
 class StoreError(BodycapError):
     """A file cannot be written, a stored artefact is damaged, or the cluster's scheduler was lost."""
 
@@ -124,7 +128,16 @@ def one_line(error: Exception) -> str:
 
 _ERROR_TYPES = {
     cls.__name__: cls
-    for cls in (JobError, CaptureError, EstimationError, StoreError, DiskAway, OutOfMemory, Cancelled)
+    for cls in (
+        JobError,
+        CaptureError,
+        EstimationError,
+        ImplausibleBody,
+        StoreError,
+        DiskAway,
+        OutOfMemory,
+        Cancelled,
+    )
 }
 
 

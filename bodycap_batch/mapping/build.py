@@ -33,10 +33,10 @@ from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint, exclud
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.model_files import write_models
-from bodycap_batch.mapping.results import finalise_models, make_result
+from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
-from bodycap_batch.mapping.validation.repair import repair_model
+from bodycap_batch.mapping.validation.repair import remove_without_adjustment, repair_model
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.scene import KeyframeSelection, MapResult
 
@@ -146,6 +146,7 @@ def build_map_once(
         if skeletal is not generator:
             resected, log["placed"] = resect_remaining(models, generator, tried, mapping)
         log["unconfirmed_points"] = finalise_models(models, mapping, capture, resected)
+        models[0], log["contradicting"], _ = remove_without_adjustment(models[0], mapping)
     attempts = log.get("initial_candidates", log["initial_pair_ladder"])
     refused = add_flip_hint(check_coverage(models, len(refs), attempts, options), flips)
     if refused is not None and not models:
@@ -153,7 +154,9 @@ def build_map_once(
     write_models(workspace, models)
     calibrated = {number: name for name, number in ids.items() if capture.camera(name).calibrated}
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
-    log = MapDiagnostics(misfit_factors=misfits, details=log).to_log()
+    removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
+    misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
+    log = MapDiagnostics(misfit_factors=misfits, misplaced=misplaced, details=log).to_log()
     result = make_result(models, workspace, log)
     ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
     refused = refused or add_flip_hint(check_consistency(max(ratios)), flips)

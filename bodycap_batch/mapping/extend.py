@@ -31,8 +31,8 @@ from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_k
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.model_files import read_model, registered_ids, write_models
-from bodycap_batch.mapping.results import finalise_models, make_result
-from bodycap_batch.mapping.validation.repair import remove_misregistered
+from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
+from bodycap_batch.mapping.validation.repair import remove_misregistered, remove_without_adjustment
 from bodycap_batch.model.scene import MapResult
 
 
@@ -95,6 +95,9 @@ def extend_map(
         removed += names
         resected.append(registered_ids(model) - kept if mapping.is_large(len(kept)) else None)
     transient = finalise_models(models, mapping, capture, resected)
+    for number, model in enumerate(models):
+        models[number], names, _ = remove_without_adjustment(model, mapping)
+        removed += names
     write_models(workspace, models)
     entry = {
         "new_keyframes": len(new),
@@ -104,8 +107,12 @@ def extend_map(
         **match_log,
     }
     diagnostics = previous.diagnostics
+    before = [
+        ImageRef(name, frame).name for name, frames in diagnostics.misplaced.items() for frame in frames
+    ]
     diagnostics = replace(
         diagnostics,
+        misplaced=misplaced_frames([*before, *removed], models),
         extensions=(*diagnostics.extensions, entry),
         details={**diagnostics.details, "keyframes": len(existing) + len(new)},
     )

@@ -42,9 +42,9 @@ def re_register_images(
 
 
 def adjust_unless_large(model: pycolmap.Reconstruction, context: MappingContext) -> None:
-    """Adjust a model in place, unless the model is large.
+    """Adjust a model in place, unless the model is large or has no points.
 
     At the end of the stage, the new images of a large model are adjusted (`finalise_models`).
     """
-    if not context.is_large(model.num_reg_images()):
+    if model.num_points3D() and not context.is_large(model.num_reg_images()):
         adjust_and_filter(model, context.mapper_options(), context.calibrated_ids)

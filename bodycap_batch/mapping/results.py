@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.mapping.inputs import frame_times_ns
 from bodycap_batch.mapping.mapping_context import MappingContext
+from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robustly
 from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction
-from bodycap_batch.mapping.reconstruction.model_files import registered_ids
+from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, registered_ids
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
 from bodycap_batch.model.scene import MapResult
 
 
 def finalise_models(
-    models: Sequence[Any], context: MappingContext, capture: Capture, resected: Sequence[set[int] | None]
+    models: list[Any], context: MappingContext, capture: Capture, resected: Sequence[set[int] | None]
 ) -> int:
     """Remove transient points from models and adjust the models robustly, in place.
 
+    A further model that is left without points is removed from the list: its keyframes saw nothing but
+    transient points, or contradict each other. The largest model stays.
+
     Args:
-        models: Reconstructions, changed in place.
+        models: Reconstructions, the largest first. The list and the reconstructions are changed in place.
         context: Workspace, mapper options.
         capture: All cameras.
         resected: For each model, the ids of the images to adjust: the images that were resected after the
@@ -33,13 +37,31 @@ def finalise_models(
     """
     times_ns = frame_times_ns(capture)
     total = 0
+    empty = set[int]()
     for number, (model, image_ids) in enumerate(zip(models, resected, strict=True)):
         context.stage.progress(number, len(models), "maps adjusted")
         total += remove_transient_points(model, times_ns)
+        if number and not model.num_points3D():
+            empty.add(number)
+            continue
         only = None if image_ids is None else image_ids & registered_ids(model)
         if only is None or only:
             adjust_robustly(model, context.mapper_options(), context.calibrated_ids, only)
+    models[:] = [model for number, model in enumerate(models) if number not in empty]
     return total
+
+
+def misplaced_frames(names: Collection[str], models: Sequence[Any]) -> dict[str, tuple[int, ...]]:
+    """Return the frame indices of the removed keyframes that no model contains, by camera name.
+
+    Args:
+        names: Image names of keyframes that were removed because they contradict a model.
+        models: The final models.
+    """
+    inside = set[str]().union(*(keyframe_names(model) for model in models))
+    refs = sorted(ImageRef.parse(name) for name in set(names) - inside)
+    cameras = sorted({ref.camera for ref in refs})
+    return {camera: tuple(ref.frame for ref in refs if ref.camera == camera) for camera in cameras}
 
 
 def make_result(models: Sequence[Any], workspace: Path, log: dict[str, Any]) -> MapResult:

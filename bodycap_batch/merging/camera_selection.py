@@ -29,7 +29,12 @@ class SelectedCameras(NamedTuple):
     aligned: UsableCameras
 
 
-def select_cameras(inputs: MergeInputs, step: Callable[[], None], options: MergeOptions) -> SelectedCameras:
+def select_cameras(
+    inputs: MergeInputs,
+    step: Callable[[], None],
+    options: MergeOptions,
+    left_out: Mapping[str, str] | None = None,
+) -> SelectedCameras:
     """Select the cameras that are used to solve the body.
 
     This function also widens the mount priors of cameras that share one nominal position.
@@ -38,6 +43,7 @@ def select_cameras(inputs: MergeInputs, step: Callable[[], None], options: Merge
         inputs: Trajectories, skeleton, mounts and clocks.
         step: Function that is called after each iteration. It may raise an exception to stop the work.
         options: Options of the stage, with the known distance and the marker board of the job.
+        left_out: By name of a camera that must not be used, the reason.
 
     Returns:
         The selected cameras.
@@ -45,7 +51,7 @@ def select_cameras(inputs: MergeInputs, step: Callable[[], None], options: Merge
     Raises:
         EstimationError: No map contains two cameras whose distance is limited by the skeleton.
     """
-    excluded = excluded_cameras(inputs)
+    excluded = {**excluded_cameras(inputs), **(left_out or {})}
     correlated = correlate_mount_priors(inputs, excluded)
     return SelectedCameras(correlated, align_usable_cameras(correlated, step, options, excluded))
 

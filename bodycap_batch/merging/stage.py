@@ -38,6 +38,7 @@ from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
 from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, max_window_ticks, solve_windows
 from bodycap_batch.merging.projection.project import project_motion
 from bodycap_batch.merging.reporting.report import MotionFacts, build_report
+from bodycap_batch.merging.unfit_camera import merge_without_unfit_camera
 from bodycap_batch.merging.world.floor import (
     WALKING_HEIGHT_RATIO,
     Floor,
@@ -87,9 +88,35 @@ class _Progress:
 
 
 def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> MergeResult:
-    """Run the merging stage. `bodycap_batch.merging.merge_trajectories` describes arguments and result."""
+    """Run the merging stage. `bodycap_batch.merging.merge_trajectories` describes arguments and result.
+
+    If the distances between the cameras fit no person, the body is solved without the camera that does not
+    fit (`merge_without_unfit_camera`).
+    """
     step = _Progress(context)
-    inputs, aligned = select_cameras(inputs, step, options)
+
+    def solve(left_out: Mapping[str, str]) -> MergeResult:
+        return _solve_body(inputs, options, step, left_out)
+
+    return merge_without_unfit_camera([each.camera for each in inputs.trajectories], solve)
+
+
+def _solve_body(
+    inputs: MergeInputs, options: MergeOptions, step: _Progress, left_out: Mapping[str, str]
+) -> MergeResult:
+    """Solve the motion of the body without some cameras.
+
+    Args:
+        inputs: The inputs of the stage.
+        options: Options of the stage.
+        step: The progress.
+        left_out: By name of a camera that must not be used, the reason.
+
+    Raises:
+        ImplausibleBody: The distances between the cameras fit no person.
+        EstimationError: The data do not determine the motion.
+    """
+    inputs, aligned = select_cameras(inputs, step, options, left_out)
     used = aligned.trajectories
     bones = kinematic_chain(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps

@@ -15,6 +15,7 @@ _RECALIBRATED = "freed_lenses"
 _REFINED_INTRINSICS = "found_lenses"
 _EXTENSIONS = "growth"
 _REACH = "reach"
+_MISPLACED = "misplaced_keyframes"
 
 CameraGroups = tuple[tuple[str, ...], tuple[str, ...]]
 """Two groups of cameras, by name."""
@@ -51,6 +52,8 @@ class MapDiagnostics:
         extensions: For each extension of the map, the entry that describes the extension in the log.
         reach: Result of comparing the distances between the cameras with the distances that the body permits,
             as entries of the log. None if the distances were not checked.
+        misplaced: By camera name, the frame indices of the keyframes that contradicted the map. They are not
+            in the map.
         details: All entries of the log in the order of the log, including the entries of the other fields.
     """
 
@@ -62,6 +65,7 @@ class MapDiagnostics:
     refined_intrinsics: Mapping[str, RefinedIntrinsics] = field(default_factory=dict)
     extensions: tuple[Mapping[str, Any], ...] = ()
     reach: Mapping[str, Any] | None = None
+    misplaced: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
@@ -83,6 +87,7 @@ class MapDiagnostics:
             },
             extensions=tuple(log.get(_EXTENSIONS, ())),
             reach=log.get(_REACH),
+            misplaced={name: tuple(frames) for name, frames in log.get(_MISPLACED, {}).items()},
             details=log,
         )
 
@@ -115,6 +120,8 @@ class MapDiagnostics:
             log[_EXTENSIONS] = list(self.extensions)
         if self.reach is not None:
             log[_REACH] = dict(self.reach)
+        if self.misplaced or _MISPLACED in log:
+            log[_MISPLACED] = {name: list(frames) for name, frames in self.misplaced.items()}
         return log
 
 

@@ -37,6 +37,7 @@ class FrameStatus(StrEnum):
     UNCONSTRAINED: Lost; the observations do not determine the pose well enough.
     POSE_JUMP: Lost; the estimated pose was rejected as an outlier of the trajectory.
     UNCONFIRMED: Lost; few observations support the estimated pose, and no neighbouring frame confirms it.
+    CONTRADICTED: Lost; the pose was withdrawn, because the keyframes around the frame contradict the map.
     NO_MAP: Lost; no map contains this camera.
     DAMAGED: Lost; the frame cannot be decoded, or the decoder reports that its data are damaged.
     FROZEN: Lost; the recording repeats an earlier picture although the camera moves.
@@ -51,6 +52,7 @@ class FrameStatus(StrEnum):
     UNCONSTRAINED = "UNCONSTRAINED"
     POSE_JUMP = "POSE_JUMP"
     UNCONFIRMED = "UNCONFIRMED"
+    CONTRADICTED = "CONTRADICTED"
     NO_MAP = "NO_MAP"
     DAMAGED = "DAMAGED"
     FROZEN = "FROZEN"

@@ -173,8 +173,9 @@ class Flow:
         """Add keyframes at times of lost frames and register again, until no further frame is localised.
 
         Returns:
-            The artefact of the extended map, and the registrations against this map. A round that reduces the
-            number of localised frames is not used.
+            The artefact of the extended map, and the registrations against this map. A round that loses
+            frames is not used. Frames whose pose a round withdraws, because they contradict the map, were
+            wrong before and do not count as lost.
         """
         for _ in range(self._job.registration.rounds):
             summaries = {name: read_summary(artefact.path) for name, artefact in registrations.items()}
@@ -183,7 +184,7 @@ class Flow:
                 break
             extended = self._extend(scene_map, wanted, keyframes)
             again = self.register(extended, keyframes, registrations)
-            gained = _localised_frames(again) - _localised_frames(registrations)
+            gained = _posed_frames(again) - _posed_frames(registrations)
             if gained < 0:
                 break
             # The new map is used even if no further frame is localised: misregistered keyframes have new
@@ -411,6 +412,7 @@ class Flow:
         )
 
 
-def _localised_frames(registrations: ByCamera) -> int:
-    """Return the total number of localised frames of all cameras."""
-    return sum(int(read_summary(artefact.path)["localised"]) for artefact in registrations.values())
+def _posed_frames(registrations: ByCamera) -> int:
+    """Return the number of frames of all cameras that are localised, or whose pose was withdrawn."""
+    summaries = [read_summary(artefact.path) for artefact in registrations.values()]
+    return sum(int(summary["localised"]) + int(summary["contradicted"]) for summary in summaries)

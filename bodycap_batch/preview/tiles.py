@@ -31,6 +31,7 @@ _LOSS_REASONS = {
     FrameStatus.UNCONSTRAINED: "the points do not determine the pose",
     FrameStatus.POSE_JUMP: "the pose jumped",
     FrameStatus.UNCONFIRMED: "no neighbouring frame confirms the pose",
+    FrameStatus.CONTRADICTED: "this part contradicts the map",
     FrameStatus.NO_MAP: "camera not in the map",
     FrameStatus.DAMAGED: "damaged in the video",
     FrameStatus.FROZEN: "the recording is frozen",

@@ -1,5 +1,6 @@
 """Stage 3: estimate the pose of every frame by tracking map points from the keyframes."""
 
+from bodycap_batch.registration.poses.contradicted import withdraw_contradicted_poses
 from bodycap_batch.registration.poses.rig_members import RegisteredCamera
 from bodycap_batch.registration.recovery.recover import RecoveryInputs, recover_lost_frames
 from bodycap_batch.registration.stage import register_frames, register_in_rig
@@ -10,4 +11,5 @@ __all__ = [
     "recover_lost_frames",
     "register_frames",
     "register_in_rig",
+    "withdraw_contradicted_poses",
 ]

@@ -43,6 +43,7 @@ class LossCause(StrEnum):
     PLAIN = "plain surfaces"
     SHALLOW = "points too far away or too close together"
     UNKNOWN_PLACE = "place not in the map"
+    CONTRADICTED = "part that contradicts the map"
     NO_MAP = "no map for this camera"
     DAMAGED = "damaged video"
     FROZEN = "frozen recording"
@@ -95,6 +96,7 @@ def find_frame_losses(inputs: ReportInputs) -> list[FrameLoss]:
 
 
 _CAUSES_OF_REASONS = {
+    FrameStatus.CONTRADICTED: LossCause.CONTRADICTED,
     FrameStatus.NO_MAP: LossCause.NO_MAP,
     FrameStatus.DAMAGED: LossCause.DAMAGED,
     FrameStatus.FROZEN: LossCause.FROZEN,

@@ -63,6 +63,8 @@ _ACTIONS = {
     "picture.",
     LossCause.UNKNOWN_PLACE: "Turn the camera so that it sees less of the wearer's body, keep other people "
     "out of the picture, and walk past each place more than once.",
+    LossCause.CONTRADICTED: "Put up posters or patterned cloth where the cameras look, or turn the cameras "
+    "away from plain walls and ceilings.",
     LossCause.DAMAGED: "Copy the video again from the camera's card. If it is damaged there, too, use "
     "another card.",
     LossCause.NO_MAP: "Let all cameras see the same places: walk in a loop and look around in each place.",
@@ -79,6 +81,7 @@ _OBSERVATIONS = {
     LossCause.SHALLOW: "the visible points did not determine the camera's position (the points are too far "
     "away or too close together)",
     LossCause.UNKNOWN_PLACE: "the picture was sharp and textured, but its content is not in the map",
+    LossCause.CONTRADICTED: "the poses of this part contradict the rest of the map, so they were left out",
     LossCause.NO_MAP: "no map contains the camera",
     LossCause.DAMAGED: "the video file is damaged there",
     LossCause.FROZEN: "the recording repeated one picture instead of new ones",

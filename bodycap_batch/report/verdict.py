@@ -63,6 +63,12 @@ _GOOD_OBSERVED_SHARE, _FAIR_OBSERVED_SHARE = 0.95, 0.8
 
 Evidence: none.
 """
+_GOOD_MISPLACED_SHARE, _FAIR_MISPLACED_SHARE = 0.02, 0.1
+"""Maximum fraction of the keyframes of the worst camera that contradict the map, for the grades "good" and
+"usable with care".
+
+Evidence: docs/decisions/report.md.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,6 +219,7 @@ def _map_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
         )
     yield _one_map_criterion(metrics)
     mapping = MapDiagnostics.from_log(metrics.get("mapping", {}))
+    yield from _misplaced_criteria(mapping.misplaced, metrics["cameras"])
     merge = metrics.get("merge", {})
     unused = merge.get("unused_cameras", {})
     yield from distance_criteria(mapping.reach, unused)
@@ -248,6 +255,36 @@ def _one_map_criterion(metrics: Mapping[str, Any]) -> Criterion:
         rationale="A camera outside the main map has no known position in the room. The body's motion does "
         "not use this camera, unless the body itself determines the camera's position. Such a position is "
         "less accurate.",
+    )
+
+
+def _misplaced_criteria(
+    misplaced: Mapping[str, Collection[int]], cameras: Mapping[str, Mapping[str, Any]]
+) -> Iterator[Criterion]:
+    """Yield the criterion about parts of the map that were left out because they contradict the rest.
+
+    Args:
+        misplaced: Frame indices of the keyframes that were left out, by camera name.
+        cameras: The metrics of each camera, by camera name.
+    """
+    shares = {
+        name: len(frames) / (len(frames) + int(cameras[name]["keyframes"]))
+        for name, frames in misplaced.items()
+        if name in cameras and frames
+    }
+    name, worst = max(shares.items(), key=lambda item: item[1], default=("", None))
+    if worst is None:
+        return
+    yield Criterion(
+        subject="cameras",
+        name="Parts that contradict the map",
+        grade=grade_value(worst, _GOOD_MISPLACED_SHARE, _FAIR_MISPLACED_SHARE),
+        finding=f"{name}: {len(misplaced[name])} keyframes ({format_percent(worst, 1)}) contradict the rest "
+        f"of the map and were left out (frames {min(misplaced[name])} to {max(misplaced[name])})",
+        rationale="The matches of these keyframes do not belong to common points: the part has another scale "
+        "or another place. The poses of the frames near these keyframes can be wrong by decimetres, although "
+        "their error in pixels is small.",
+        value=worst,
     )
 
 

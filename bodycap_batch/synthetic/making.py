@@ -32,7 +32,7 @@ from bodycap_batch.synthetic.measured import disturb_poses
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
 from bodycap_batch.synthetic.pressing import find_press
-from bodycap_batch.synthetic.room import build_room
+from bodycap_batch.synthetic.room import BareSurfaces, build_room
 from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, triangles_from_surfaces
 from bodycap_batch.synthetic.truth import (
     MARKER,
@@ -236,6 +236,7 @@ def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRende
         subject.seeds["room"],
         furnished=options.furnished,
         repeated_posters=options.repeated_posters,
+        bare=BareSurfaces(names=frozenset(options.bare), pictures=options.flat_pictures),
     )
     images = [surface.image for surface in surfaces]
     wearer = Wearer(subject.motion.skeleton, subject.seeds["clothes"]) if options.body_in_view else None

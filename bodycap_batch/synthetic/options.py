@@ -224,6 +224,14 @@ class SynthOptions(Options):
         "is hardly any parallax",
     )
     furnished: bool = Field(True, description="false: the room is empty except for pictures on the walls")
+    bare: tuple[Literal["ceiling", "floor", "north", "east", "south", "west"], ...] = Field(
+        (),
+        description="plain surfaces of the room: ceiling, floor, or the walls in the directions +y (north), "
+        "+x (east), -y (south) and -x (west); nothing but flat_pictures is on them",
+    )
+    flat_pictures: int = Field(
+        3, ge=0, le=20, description="number of flat pictures on each plain surface that bare names"
+    )
     repeated_posters: bool = Field(False, description="hang the same poster in several places of the room")
     pressed_s: Mapping[str, tuple[_Moment, _Moment]] = Field(
         default_factory=dict,
@@ -291,6 +299,8 @@ class SynthOptions(Options):
             raise ValueError(
                 f"lens_params: the model {self.lens} needs {parameter_count(self.lens)} parameters"
             )
+        if len(set(self.bare)) != len(self.bare):
+            raise ValueError("bare: each surface must occur only once")
         self._check_cameras_named()
         self._check_clocks()
         self._check_frames()

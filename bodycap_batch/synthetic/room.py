@@ -33,6 +33,15 @@ _MIN_HALF_M = (3.4, 3.0)
 """Minimum distances (metres) from the room's middle to the walls along x and y."""
 _CARPETS = ((-0.38, -0.35), (0.42, 0.30), (-0.25, 0.45), (0.4, -0.5))
 """Centres (x, y) of the carpets. The value 0 is the room's middle, and the values −1 and 1 are the walls."""
+_WALL_NAMES = ("north", "east", "south", "west")
+"""Names of the walls in the directions +y, +x, -y and -x from the room's middle, in the order of
+`_build_shell`."""
+_FLAT_PICTURE_M = (0.3, 0.9)
+"""Minimum and maximum side (metres) of a flat picture on a plain surface. Evidence: none."""
+_FLAT_PICTURE_SPREAD = 0.7
+"""Maximum distance of a flat picture from the middle of its surface, as a fraction of half the surface."""
+_FLAT_PICTURE_OFF_M = 0.012
+"""Distance (metres) of a flat picture from its surface."""
 _PICTURE_BASES_M = (2.05, 1.25, 1.55, 1.10)
 """Minimum height (metres) of the lower edges of pictures, for each of the four walls. The pictures are above
 the furniture at the wall."""
@@ -89,6 +98,19 @@ class _Builder:
                 self.textured(face, texture)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BareSurfaces:
+    """The plain surfaces of a room.
+
+    Attributes:
+        names: Names of the plain surfaces: ``ceiling``, ``floor``, or a name in `_WALL_NAMES`.
+        pictures: Number of flat pictures on each plain surface.
+    """
+
+    names: frozenset[str] = frozenset()
+    pictures: int = 0
+
+
 @dataclass(frozen=True, slots=True)
 class _Wall:
     """One wall of the room. It gives world positions for the objects at the wall.
@@ -129,6 +151,7 @@ def build_room(
     *,
     furnished: bool = True,
     repeated_posters: bool = False,
+    bare: BareSurfaces | None = None,
 ) -> list[Surface]:
     """Build a furnished and lit room around a walk.
 
@@ -138,19 +161,24 @@ def build_room(
         seed: Seed of all textures and positions.
         furnished: False: the room has plain walls, floor and ceiling, and pictures on the walls only.
         repeated_posters: True: copies of only three different pictures hang at many positions.
+        bare: The plain surfaces; None: no surface is plain on request.
 
     Returns:
         The surfaces of the room. Their textures include the light of the lamps.
     """
     half = [max(low, extent + MARGIN_M) for low, extent in zip(_MIN_HALF_M, half_extent_m, strict=True)]
     build = _Builder(seed, texels_per_m)
-    walls = _build_shell(build, half, bare=not furnished)
+    bare = bare or BareSurfaces()
+    plain = bare.names if furnished else bare.names | {"ceiling", "floor", "east"}
+    walls = _build_shell(build, half, plain)
     furnish = (_add_shelves, _add_desks, _add_cupboards, _add_sofa)
-    for wall, furniture in zip(walls, furnish if furnished else (), strict=furnished):
-        furniture(build, wall)
-    _add_pictures(build, walls, repeated_posters)
-    if furnished:
+    for name, wall, furniture in zip(_WALL_NAMES, walls, furnish, strict=True):
+        if furnished and name not in bare.names:
+            furniture(build, wall)
+    _add_pictures(build, walls, repeated_posters, bare.names)
+    if "ceiling" not in plain:
         _add_ceiling_fittings(build, half)
+    _add_flat_pictures(build, half, walls, bare)
     rng = build.rng()
     count = max(2, round(half[0] / 1.7)), max(2, round(half[1] / 1.7))
     grid = np.meshgrid(*(np.linspace(-0.6, 0.6, n) * side for n, side in zip(count, half, strict=True)))
@@ -159,20 +187,21 @@ def build_room(
     return light_surfaces(build.surfaces, lamps, rng)
 
 
-def _build_shell(build: _Builder, half: list[float], *, bare: bool) -> list[_Wall]:
+def _build_shell(build: _Builder, half: list[float], plain: frozenset[str]) -> list[_Wall]:
     """Add floor, carpets, ceiling and four walls, and return the walls.
 
     Args:
         build: Collector of the surfaces.
         half: Half of the room's size along x and y, metres.
-        bare: True: all surfaces are plain, and there are no carpets.
+        plain: Names of the plain surfaces. There are no carpets on a plain floor.
     """
     up = np.array([0.0, 0.0, 1.0])
     floor, ceiling = box_faces([0, 0, HEIGHT_M / 2], [2 * half[0], 2 * half[1], HEIGHT_M], 0.0)[4:][::-1]
-    build.textured(_seen_from_behind(floor), textures.plaster if bare else textures.planks)
-    build.textured(_seen_from_behind(ceiling), textures.plaster if bare else textures.ceiling_panels)
+    build.textured(_seen_from_behind(floor), textures.plaster if "floor" in plain else textures.planks)
+    panels = textures.plaster if "ceiling" in plain else textures.ceiling_panels
+    build.textured(_seen_from_behind(ceiling), panels)
     rng = build.rng()
-    for x, y in () if bare else _CARPETS:
+    for x, y in () if "floor" in plain else _CARPETS:
         size = (rng.uniform(1.3, 2.2), rng.uniform(1.0, 1.6), 0.012)
         centre = np.array([x * half[0], y * half[1], size[2] / 2])
         texture = textures.carpet if rng.uniform() < 0.75 else textures.tiles
@@ -180,7 +209,7 @@ def _build_shell(build: _Builder, half: list[float], *, bare: bool) -> list[_Wal
     walls = []
     materials = (
         textures.plaster,
-        textures.plaster if bare else textures.bricks,
+        textures.plaster if "east" in plain else textures.bricks,
         textures.plaster,
         textures.plaster,
     )
@@ -281,12 +310,17 @@ def _add_sofa(build: _Builder, wall: _Wall) -> None:
     build.box(partition, (1.1, 0.05, 1.7), wall.yaw_deg + 15.0, pictures.notes)
 
 
-def _add_pictures(build: _Builder, walls: list[_Wall], repeated: bool) -> None:
-    """Add whiteboards, posters and paintings above the furniture. Some parts of the walls stay bare."""
+def _add_pictures(build: _Builder, walls: list[_Wall], repeated: bool, bare: frozenset[str]) -> None:
+    """Add whiteboards, posters and paintings above the furniture. Some parts of the walls stay bare.
+
+    The walls that `bare` names get no pictures.
+    """
     rng = build.rng()
     kinds = list(pictures.WALL_PICTURES)
     repeats = [build.image((0.6, 0.8), kind, _PICTURE_DETAIL) for kind in kinds[:3]]
     for index, wall in enumerate(walls):
+        if _WALL_NAMES[index] in bare:
+            continue
         # The first wall has shelves up to 2.1 m high. So its pictures hang higher and are less tall.
         along = -wall.length_m / 2 + 0.3
         while along < wall.length_m / 2 - 0.7:
@@ -305,6 +339,31 @@ def _add_pictures(build: _Builder, walls: list[_Wall], repeated: bool) -> None:
                 centre = wall.point_at(along + wide / 2, base + tall / 2, 0.012)
                 build.surfaces.append(surface_facing(centre, wall.normal, (wide, tall), image))
             along += wide + float(rng.uniform(0.12, 0.5))
+
+
+def _add_flat_pictures(build: _Builder, half: list[float], walls: list[_Wall], bare: BareSurfaces) -> None:
+    """Add flat pictures at random positions on the plain surfaces that were requested."""
+    floor, ceiling = box_faces([0, 0, HEIGHT_M / 2], [2 * half[0], 2 * half[1], HEIGHT_M], 0.0)[4:][::-1]
+    faces = {"floor": _seen_from_behind(floor), "ceiling": _seen_from_behind(ceiling)}
+    for name, wall in zip(_WALL_NAMES, walls, strict=True):
+        middle = wall.point_at(0.0, HEIGHT_M / 2, 0.0)
+        faces[name] = surface_facing(middle, wall.normal, (wall.length_m, HEIGHT_M), _BLANK)
+    for name in sorted(bare.names):
+        rng = build.rng()
+        for _ in range(bare.pictures):
+            kind = pictures.WALL_PICTURES[int(rng.integers(len(pictures.WALL_PICTURES)))]
+            build.surfaces.append(_picture_on(build, faces[name], kind, rng))
+
+
+def _picture_on(build: _Builder, face: Surface, kind: Texture, rng: np.random.Generator) -> Surface:
+    """Return a flat picture at a random position on a surface."""
+    lengths = np.array([np.linalg.norm(face.across), np.linalg.norm(face.down)])
+    size = rng.uniform(*_FLAT_PICTURE_M, 2)
+    place = 0.5 * lengths + rng.uniform(-0.5, 0.5, 2) * _FLAT_PICTURE_SPREAD * (lengths - size) - size / 2
+    right, down = face.across / lengths[0], face.down / lengths[1]
+    corner = face.corner + place[0] * right + place[1] * down + _FLAT_PICTURE_OFF_M * face.normal
+    image = build.image((float(size[0]), float(size[1])), kind, _PICTURE_DETAIL)
+    return Surface(corner=corner, across=size[0] * right, down=size[1] * down, image=image)
 
 
 def _add_ceiling_fittings(build: _Builder, half: list[float]) -> None:

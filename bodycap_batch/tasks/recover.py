@@ -21,11 +21,17 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
     """Recover the lost frames of the task's first camera; store all poses of this camera."""
     from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
     from bodycap_batch.model.relative_pose import RigPoses
-    from bodycap_batch.registration import RecoveryInputs, RegisteredCamera, recover_lost_frames
+    from bodycap_batch.registration import (
+        RecoveryInputs,
+        RegisteredCamera,
+        recover_lost_frames,
+        withdraw_contradicted_poses,
+    )
 
     context.check_cancelled()
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
     paths = paths_of(task.registrations.values())
+    scene = load_map(task.map.path)
     in_rig = (paths[0] / f"{RIG_POSES}.json").exists()
     inputs = RecoveryInputs(
         capture=capture,
@@ -34,11 +40,13 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
             RegisteredCamera(camera=camera, registration=load_registration(path))
             for camera, path in zip(capture.cameras, paths, strict=True)
         ),
-        maps=load_map(task.map.path).maps,
+        maps=scene.maps,
         selection=load_keyframes(task.keyframes[task.cameras[0]].path),
         in_rig=in_rig,
     )
     registration = recover_lost_frames(load_registration(paths[0]), inputs, task.options, context)
+    misplaced = scene.diagnostics.misplaced.get(task.cameras[0], ())
+    registration = withdraw_contradicted_poses(registration, scene.maps, misplaced)
     save_registration(registration, capture.cameras[0], files, rolling=read_summary(paths[0])["rolling"])
     if in_rig:
         write_dataclass(read_dataclass(RigPoses, paths[0], RIG_POSES), files, RIG_POSES)

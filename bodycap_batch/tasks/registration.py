@@ -46,13 +46,15 @@ class RegistrationTask:
 def run_registration(task: RegistrationTask, context: StageContext, files: Path) -> None:
     """Register the camera's frames and store their poses."""
     from bodycap_batch.model.rolling_shutter import has_visible_rolling_shutter
-    from bodycap_batch.registration import register_frames
+    from bodycap_batch.registration import register_frames, withdraw_contradicted_poses
 
     camera = load_capture(task.capture, task.keyframes, threads=context.threads).cameras[0]
     selection = load_keyframes(task.keyframes[camera.name].path)
     previous = None if task.previous is None else load_registration(task.previous.path)
-    maps = load_map(task.map.path).maps
+    scene = load_map(task.map.path)
+    maps = scene.maps
     found = register_frames(camera, maps, selection, task.options, context, previous)
+    found = withdraw_contradicted_poses(found, maps, scene.diagnostics.misplaced.get(camera.name, ()))
     known = camera.rolling_shutter_known
     rolling = (
         bool(camera.rolling_shutter_s)
@@ -81,6 +83,7 @@ def save_registration(
     """
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.model.camera_clock import FrameTiming
+    from bodycap_batch.model.scene import FrameStatus
 
     write_dataclass(found, files, "registration")
     timing = FrameTiming(nominal_fps=camera.nominal_fps, rolling_shutter_s=camera.rolling_shutter_s)
@@ -90,6 +93,7 @@ def save_registration(
         files,
         frames=len(found.trajectory.status),
         localised=int(found.trajectory.localised.sum()),
+        contradicted=found.trajectory.status.count(FrameStatus.CONTRADICTED),
         wanted=[int(frame) for frame in found.wanted_keyframes],
         rolling=rolling,
         notes=list(notes),

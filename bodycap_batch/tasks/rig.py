@@ -21,7 +21,11 @@ def run_rig(task: CameraGroupTask, context: StageContext, files: Path) -> None:
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.model.camera_clock import ClockRelation
     from bodycap_batch.model.relative_pose import RigPoses, not_rigid_note
-    from bodycap_batch.registration import RegisteredCamera, register_in_rig
+    from bodycap_batch.registration import (
+        RegisteredCamera,
+        register_in_rig,
+        withdraw_contradicted_poses,
+    )
 
     context.check_cancelled()
     own, *others = (
@@ -32,8 +36,10 @@ def run_rig(task: CameraGroupTask, context: StageContext, files: Path) -> None:
         for camera in load_capture(task.capture, task.keyframes, threads=context.threads).cameras
     )
     selection = load_keyframes(task.keyframes[own.camera.name].path)
-    maps = load_map(task.map.path).maps
-    found, relative = register_in_rig(own, others, maps, selection, task.options, context.threads)
+    scene = load_map(task.map.path)
+    found, relative = register_in_rig(own, others, scene.maps, selection, task.options, context.threads)
+    misplaced = scene.diagnostics.misplaced.get(own.camera.name, ())
+    found = withdraw_contradicted_poses(found, scene.maps, misplaced)
     notes = [not_rigid_note(each) for each in relative if not each.is_rigid]
     save_registration(found, own.camera, files, rolling=False, notes=notes)
     write_dataclass(RigPoses(relative=tuple(relative)), files, RIG_POSES)

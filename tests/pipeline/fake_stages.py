@@ -18,7 +18,7 @@ from bodycap_batch.runner import child_main
 Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
-"wanted" | "localised": [a value per round], "lost": {camera: frames},
+"wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
 "rolling": true, "real": [stages that are no stand-ins]}.
 "fail" may be a list of stages."""
 
@@ -99,6 +99,7 @@ def registered(options: Json, arguments: Json, files: Path) -> None:
         "round": again,
         "wanted": wanted,
         "localised": localised,
+        "contradicted": [*orders().get("contradicted", []), *[0] * 9][again],
         "frames": frames,
         "rolling": rolling,
     }

@@ -326,6 +326,16 @@ def test_the_map_is_not_extended_further_if_no_frame_is_gained(
     assert passes == rounds_used + 1
 
 
+@pytest.mark.parametrize(("contradicted", "extensions_used"), [(0, 0), (3, 1)])
+def test_a_round_that_withdraws_wrong_poses_loses_no_frames(
+    bench: Bench, contradicted: int, extensions_used: int
+) -> None:
+    bench.order(wanted=[[5]], localised=[10, 7], contradicted=[0, contradicted])
+    bench.executed()
+    used = json.loads(json.loads((bench.out / "result.ply").read_text())["registrations"]["torso"])
+    assert (used[2]["previous"] is not None) == bool(extensions_used)
+
+
 def test_rounds_limit_the_extensions(bench: Bench) -> None:
     bench.order(wanted=[[5]] * 5, localised=[1, 2, 3, 4, 5, 6])
     assert bench.executed(registration={"rounds": 1}).count("extend") == 1

@@ -29,6 +29,13 @@ _CONTRAST_THRESHOLD = 0.02
 """Contrast threshold of the detector. It is half of OpenCV's default, because blurred walls and ceilings
 have little contrast. Evidence: docs/decisions/mapping.md."""
 
+_POOR_RATIO = 0.5
+"""Fraction of the maximum number of features below which a frame is poor in features. Features of such a
+frame are detected again in the full frame, with `_POOR_CONTRAST_THRESHOLD`. Evidence:
+docs/decisions/mapping.md."""
+_POOR_CONTRAST_THRESHOLD = 0.01
+"""Contrast threshold of the second detection. Evidence: docs/decisions/mapping.md."""
+
 
 @dataclass(frozen=True, slots=True)
 class SiftFeatures:
@@ -91,14 +98,25 @@ def extract_features(
 
 
 def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
-    """Return the features of one RGB image (H,W,3) that lie inside the camera's mask."""
+    """Return the features of one RGB image (H,W,3) that lie inside the camera's mask.
+
+    Features are detected in a reduced image. If there are few, for example on a bare ceiling, they are
+    detected in the full frame.
+    """
     import cv2
 
     height, width = rgb.shape[:2]
     shrink = min(1.0, max(_DETECTION_SCALE, _MIN_LONG_SIDE_PX / max(height, width)))
     size = (round(width * shrink), round(height * shrink))
-    grey = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+    whole = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    grey = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
     found, raw = detector.detectAndCompute(grey, None)
+    count = detector.getNFeatures()
+    if len(found) < _POOR_RATIO * count:
+        sensitive = cv2.SIFT.create(
+            count, contrastThreshold=_POOR_CONTRAST_THRESHOLD, enable_precise_upscale=True
+        )
+        size, (found, raw) = (width, height), sensitive.detectAndCompute(whole, None)
     if not found:
         return SiftFeatures(
             np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.uint8)

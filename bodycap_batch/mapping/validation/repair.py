@@ -13,11 +13,18 @@ from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pai
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
 from bodycap_batch.mapping.re_registration import adjust_unless_large, re_register_images
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model
+from bodycap_batch.mapping.reconstruction.mapper_options import MIN_MODEL_KEYFRAMES
 from bodycap_batch.mapping.reconstruction.model_files import registered_ids
 from bodycap_batch.mapping.validation.epipolar_consistency import (
+    PairConsistency,
     evaluate_pairs,
     find_misregistered_images,
     inconsistent_match_ratio,
+)
+from bodycap_batch.mapping.validation.track_agreement import (
+    evaluate_agreement,
+    find_misplaced_images,
+    image_sequences,
 )
 
 if TYPE_CHECKING:
@@ -61,7 +68,7 @@ def repair_model(
     if keyframes is not None:
         ids = {ref: ids[ref] for ref in keyframes}
     pairs = evaluate_pairs(context.workspace, model)
-    wrong = find_misregistered_images(pairs)
+    wrong = _find_wrong_images(context, model, pairs)
     for _ in range(_ROUNDS):
         registered = registered_ids(model)
         missing = set(ids.values()) - registered
@@ -85,7 +92,7 @@ def repair_model(
             break
         other = re_register_images(model, wrong, context, len(ids))
         other_pairs = evaluate_pairs(context.workspace, other)
-        still_wrong = find_misregistered_images(other_pairs)
+        still_wrong = _find_wrong_images(context, other, other_pairs)
         sound_before = len(registered - wrong)
         sound_after = len(registered_ids(other) - still_wrong)
         entry |= {"sound_before": sound_before, "sound_after": sound_after}
@@ -123,8 +130,22 @@ def remove_without_adjustment(
         matches in inconsistent pairs before the removal.
     """
     pairs = evaluate_pairs(context.workspace, model)
-    kept, removed = _remove_images(model, find_misregistered_images(pairs))
+    kept, removed = _remove_images(model, _find_wrong_images(context, model, pairs))
     return kept, removed, round(inconsistent_match_ratio(pairs), 4)
+
+
+def _find_wrong_images(
+    context: MappingContext, model: pycolmap.Reconstruction, pairs: Sequence[PairConsistency]
+) -> set[int]:
+    """Return the ids of the images whose matches contradict the poses or the points of the model.
+
+    If no part of the model agrees with itself, only the images that contradict the poses are returned.
+    """
+    wrong = find_misregistered_images(pairs)
+    misplaced = find_misplaced_images(evaluate_agreement(context.workspace, model), image_sequences(model))
+    if model.num_reg_images() - len(wrong | misplaced) < MIN_MODEL_KEYFRAMES:
+        return wrong
+    return wrong | misplaced
 
 
 def _remove_images(model: Any, image_ids: set[int]) -> tuple[Any, list[str]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.core.errors import EstimationError, ImplausibleBody
 from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone
 from bodycap_batch.merging.cameras.track import MAX_COARSE_GAP_NS, CameraTrack
 from bodycap_batch.model.geometry import invert
@@ -93,8 +93,8 @@ def provisional_scale(
         ignored_cameras: Names of cameras whose distances from their kinematic neighbours are not used.
 
     Raises:
-        EstimationError: No two related cameras were localised at the same time, or the distances fit no
-            person.
+        EstimationError: No two related cameras were localised at the same time.
+        ImplausibleBody: The distances fit no person.
     """
     links = [
         distance_constraint(bones, track, other, mounts)
@@ -113,7 +113,7 @@ def provisional_scale(
     costs = np.array([sum(constraint.cost(scale) for constraint in constraints) for scale in scales])
     best = int(np.argmin(costs))
     if best in (0, len(scales) - 1):
-        raise EstimationError(
+        raise ImplausibleBody(
             "the distances between the cameras are not possible for a person: the scale of "
             f"{scales[best]:.3g} m per map unit is out of bounds",
             hint="check that the `mount` of each camera in the job is correct",

@@ -192,7 +192,17 @@ class MapAlignmentProblem:
         return mounts, derivatives
 
     def _cost(self) -> float:
-        return self._calibration.solve(self._scale) + 0.5 * float((self._source_residuals() ** 2).sum())
+        """Return the cost at the current scale and corrections.
+
+        Raises:
+            EstimationError: The calibration has no finite solution there. The step to it was too large,
+                because the movement hardly determines the position of a map.
+        """
+        try:
+            calibration = self._calibration.solve(self._scale)
+        except np.linalg.LinAlgError as error:
+            raise _undetermined() from error
+        return calibration + 0.5 * float((self._source_residuals() ** 2).sum())
 
     def scale_residual(self) -> float:
         """Return the difference of the log scale from the log scale of the limbs' reach, in sigmas."""
@@ -246,8 +256,13 @@ def _solve_normal_equations(normal: FloatArray, right: FloatArray) -> FloatArray
     try:
         return np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
     except np.linalg.LinAlgError as error:
-        raise EstimationError(
-            "the body's movement does not determine the position of this map relative to the main map",
-            hint="bend the body, turn while walking, wear a camera on an upper arm, or film one place "
-            "with cameras of both maps",
-        ) from error
+        raise _undetermined() from error
+
+
+def _undetermined() -> EstimationError:
+    """Return the error of a map whose position relative to the main map is not determined."""
+    return EstimationError(
+        "the body's movement does not determine the position of this map relative to the main map",
+        hint="bend the body, turn while walking, wear a camera on an upper arm, or film one place "
+        "with cameras of both maps",
+    )

@@ -6,18 +6,18 @@ import copy
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pycolmap
 import pytest
 
-from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.mapping import initial_models
+from bodycap_batch.mapping import initial_models, results
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.initial_models import reconstruct_with_intrinsics
 from bodycap_batch.mapping.intrinsics import intrinsics_check
@@ -36,15 +36,23 @@ from bodycap_batch.mapping.reconstruction.incremental_mapper import register_ima
 from bodycap_batch.mapping.reconstruction.initial_pair import find_user_pair, rank_initial_pairs
 from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
 from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
+from bodycap_batch.mapping.results import finalise_models
 from bodycap_batch.mapping.validation.epipolar_consistency import (
     PairConsistency,
     evaluate_pairs,
     find_misregistered_images,
 )
 from bodycap_batch.mapping.validation.repair import remove_misregistered, repair_model
+from bodycap_batch.mapping.validation.track_agreement import (
+    PairAgreement,
+    evaluate_agreement,
+    find_misplaced_images,
+    image_sequences,
+)
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.geometry import align_points, invert, make_transform, so3_exp
+from bodycap_batch.model.geometry import Similarity, align_points, invert, make_transform, so3_exp
+from tests.misplaced import misplace
 
 _CAMERA = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 _INTRINSICS = {"cam": CameraIntrinsics(_CAMERA, calibrated=True)}
@@ -62,6 +70,27 @@ def test_misregistered_images_are_found_but_not_their_partners() -> None:
         for x in pairs
     ]
     assert find_misregistered_images(wrong) == {4, 5}
+
+
+def test_an_island_that_agrees_only_with_itself_is_misplaced() -> None:
+    pairs = [PairAgreement(a, b, 60, 57) for a in range(8) for b in range(a)]
+    pairs += [PairAgreement(a, b, 60, 57) for a in range(8, 11) for b in range(8, a)]
+    assert find_misplaced_images([*pairs, PairAgreement(7, 8, 40, 36)], [range(11)]) == set()
+    weak = [*pairs, PairAgreement(7, 8, 12, 12), PairAgreement(6, 8, 12, 12)]
+    assert find_misplaced_images(weak, [range(11)]) == {8, 9, 10}
+    assert find_misplaced_images(pairs, [range(12)]) == {8, 9, 10, 11}
+
+
+def test_a_block_that_drifts_away_is_misplaced_as_a_whole() -> None:
+    drifting = range(20, 28)
+
+    def pair(a: int, b: int) -> PairAgreement:
+        # Successive images agree, also at both ends of the block. The block contradicts all other images.
+        wrong = (a in drifting) != (b in drifting) and a - b > 1 and b != 28
+        return PairAgreement(a, b, 20, 4 if wrong else 19)
+
+    pairs = [pair(a, b) for a in range(40) for b in range(max(0, a - 12), a)]
+    assert find_misplaced_images(pairs, [range(40)]) == set(drifting)
 
 
 def _poses() -> FloatArray:
@@ -162,6 +191,46 @@ def test_an_empty_map_without_an_initial_pair_is_no_bug(tmp_path: Path) -> None:
         pass
     settings = make_mapper_options(MapOptions(), [], 1.0)
     assert not register_images(tmp_path, settings, pycolmap.Reconstruction(), lambda: None)
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift"),
+    [(0.3, 0.0), (0.6, 0.0), (1.7, 0.0), (4.0, 0.0), (1.0, 0.1), (1.0, 0.3), (1.0, 0.6)],
+)
+def test_a_block_of_another_scale_or_place_is_found_and_repaired(
+    scale: float, shift: float, built: tuple[Any, FloatArray, MappingContext, set[Any]]
+) -> None:
+    model, poses, mapping, tried = built
+    agreement = evaluate_agreement(mapping.workspace, model)
+    assert find_misplaced_images(agreement, image_sequences(model)) == set()
+    numbers = {ImageRef.parse(model.image(i).name).frame: int(i) for i in model.reg_image_ids()}
+    found = np.array([model.image(numbers[frame]).projection_center() for frame in range(_KEYFRAMES)])
+    unit = align_points(found, invert(poses)[:, :3, 3]).scale
+    block = [numbers[frame] for frame in _MOVED]
+    middle = found[list(_MOVED)].mean(axis=0)
+    # The shift is given in the scene's unit, in which the wall is 4 away and keyframes are 0.25 apart.
+    offset = (1.0 - scale) * middle + np.array([0.0, 0.0, shift / unit])
+    wrong = misplace(model, block, Similarity(scale, np.eye(3), offset))
+    agreement = evaluate_agreement(mapping.workspace, wrong)
+    assert find_misplaced_images(agreement, image_sequences(wrong)) == set(block)
+    mended, log = repair_model(wrong, tried, mapping)
+    assert _rms(mended, poses) < 0.01
+    assert mended.num_reg_images() == _KEYFRAMES
+    assert log["cut"] == []
+
+
+def test_a_further_model_without_points_is_dropped(
+    built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, poses, mapping, _ = built
+    empty = copy.deepcopy(model)
+    for point in list(empty.point3D_ids()):
+        empty.delete_point3D(point)
+    monkeypatch.setattr(results, "common_times_ns", lambda _: {"cam": np.arange(99) * 10**9})
+    models = [copy.deepcopy(model), empty]
+    finalise_models(models, mapping, cast(Capture, None), [None, None])
+    assert [item.num_reg_images() for item in models] == [_KEYFRAMES]
+    assert _rms(models[0], poses) < 0.01
 
 
 def test_conjugate_gradients_give_the_same_map_as_the_direct_solver(

@@ -12,6 +12,7 @@ import pytest
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.mapping.matching import sift
 from bodycap_batch.mapping.matching.sift import SiftFeatures, extract_features
 
 _CENTRES = np.array([(x, y) for y in range(40, 460, 70) for x in range(45, 620, 80)], dtype=np.float64)
@@ -70,3 +71,29 @@ def test_nothing_is_found_under_a_mask(tmp_path: Path) -> None:
     assert len(found.keypoints) > 0
     assert len(found.keypoints) == len(found.descriptors) == len(found.rgb)
     assert found.keypoints[:, 0].min() >= 300.0
+
+
+@pytest.mark.parametrize(("contrast", "searched_again"), [(60, False), (14, True)])
+def test_frames_with_few_features_are_searched_in_full_size(
+    contrast: int, searched_again: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(0)
+    noise = cv2.GaussianBlur(rng.normal(0.0, 1.0, (480, 640)), (0, 0), 2.5)
+    image = np.clip(128 + contrast * noise / np.abs(noise).max(), 0, 255).astype(np.uint8)
+
+    class Wall(_Blobs):
+        def read(self, frames: np.ndarray, *, colour: bool) -> Iterator[tuple[int, np.ndarray]]:
+            yield from ((int(frame), np.repeat(image[..., None], 3, axis=2)) for frame in frames)
+
+    def features() -> SiftFeatures:
+        context = StageContext(work_dir=tmp_path)
+        ((_, found),) = extract_features(cast(CaptureCamera, Wall()), np.array([0]), 200, context)
+        return found
+
+    with_second_search = features()
+    monkeypatch.setattr(sift, "_POOR_RATIO", 0.0)
+    without = features()
+    if searched_again:
+        assert len(with_second_search.keypoints) > 2 * max(1, len(without.keypoints))
+    else:
+        assert np.array_equal(with_second_search.keypoints, without.keypoints)

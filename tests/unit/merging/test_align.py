@@ -198,6 +198,16 @@ def test_a_map_that_fits_no_person_is_left_out_with_the_reason(walk, recorded):
     assert len(together.trajectories) == 2
 
 
+def test_a_map_whose_alignment_diverges_is_left_out_with_the_reason(walk, recorded, monkeypatch):
+    def diverge(*_, **__):
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    monkeypatch.setattr(CalibrationGraph, "solve", diverge)
+    together = align_cameras(make_inputs(walk, recorded), recorded[:2], recorded[2:], lambda: None)
+    assert list(together.main_from_gauge) == ["map-0"]
+    assert "does not determine the position of this map" in together.unused["right_palm"]
+
+
 def test_without_further_maps_nothing_changes(walk, recorded):
     together = align_cameras(make_inputs(walk, recorded[:2]), recorded[:2], [], lambda: None)
     assert together.trajectories == tuple(recorded[:2])

@@ -17,6 +17,7 @@ from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclas
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.geometry import invert, make_transform, rotation_angle_rad, so3_exp
+from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.relative_pose import RigPoses, estimate_relative_pose, match_instants, mean_rotation
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.registration import RegisteredCamera, register_in_rig
@@ -186,7 +187,8 @@ def test_relative_poses_of_the_rig_survive_recovery(tmp_path: Path, monkeypatch:
     write_dataclass(RigPoses(relative=(relative,)), folders[0], RIG_POSES)
     capture = SimpleNamespace(cameras=tuple(each.camera for each in cameras))
     monkeypatch.setattr(recover, "load_capture", lambda *_, **__: capture)
-    monkeypatch.setattr(recover, "load_map", lambda _: SimpleNamespace(maps=(scene_map,)))
+    stored_map = SimpleNamespace(maps=(scene_map,), diagnostics=MapDiagnostics())
+    monkeypatch.setattr(recover, "load_map", lambda _: stored_map)
     monkeypatch.setattr(recover, "load_keyframes", lambda _: selection)
     monkeypatch.setattr(
         "bodycap_batch.registration.recovery.recover.find_lost_poses", lambda found, *_: found

@@ -6,7 +6,7 @@ import pytest
 from bodycap_batch.synthetic.camera_renderer import camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.making import build_renderers, draw_subject
 from bodycap_batch.synthetic.options import SynthOptions
-from bodycap_batch.synthetic.room import build_room
+from bodycap_batch.synthetic.room import HEIGHT_M, BareSurfaces, build_room
 from bodycap_batch.synthetic.triangle_renderer import SceneRenderer
 
 SMALL = {"width": 64, "height": 48, "seconds": 5.0, "body_in_view": True}
@@ -82,14 +82,38 @@ def test_a_bare_room_has_pictures_on_its_walls_only():
         assert abs(surface.normal[2]) < 1e-9
 
 
+@pytest.mark.parametrize("name", ["ceiling", "floor", "east"])
+def test_a_bare_surface_has_only_its_flat_pictures(name):
+    seed = np.random.SeedSequence(1)
+    bare = BareSurfaces(names=frozenset({name}), pictures=4)
+    surfaces = build_room((1.0, 1.0), 20.0, seed, bare=bare)
+    normal = {"ceiling": (0, 0, -1), "floor": (0, 0, 1), "east": (-1, 0, 0)}[name]
+    place = {"ceiling": HEIGHT_M, "floor": 0.0, "east": surfaces[0].corners()[:, 0].max()}[name]
+    axis = int(np.argmax(np.abs(normal)))
+    # Everything within 2 cm of the surface that faces the room: the surface itself and its pictures. Carpets
+    # lie 1.2 cm above the floor, and pictures hang 1.2 cm before a wall.
+    near = [
+        surface
+        for surface in surfaces
+        if np.dot(surface.normal, normal) > 0.99
+        and np.abs(surface.corners()[:, axis] - place).max() < 0.02
+        and not surface.shines
+    ]
+    assert len(near) == 5
+    whole = max(near, key=lambda surface: np.linalg.norm(np.cross(surface.across, surface.down)))
+    assert np.abs(np.diff(whole.image.astype(float), axis=0)).mean() < 3.0
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
+        ({"bare": ("floor", "floor")}, "each surface must occur only once"),
+        ({"bare": ("roof",)}, "Input should be 'ceiling'"),
         ({"pressed_s": {"torso": (1.0, 2.0)}, "body_in_view": True}, "no camera torso on a hand"),
         ({"pressed_s": {"left_palm": (2.0, 1.0)}, "body_in_view": True}, "is not after its start"),
         ({"pressed_s": {"left_palm": (1.0, 2.0)}}, "without body_in_view"),
     ],
 )
-def test_invalid_presses_are_refused(values, message):
+def test_invalid_options_are_refused(values, message):
     with pytest.raises(ValueError, match=message):
         SynthOptions.model_validate(values)

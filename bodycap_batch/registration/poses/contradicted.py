@@ -1,0 +1,68 @@
+"""Withdraw the poses of frames around keyframes that contradict the map."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, IntArray
+from bodycap_batch.model.scene import FrameStatus, Map, Registration
+
+_MIN_MISPLACED = 2
+"""Minimum number of misplaced keyframes between two keyframes of the map, so that the frames between these
+two are withdrawn. A single misplaced keyframe is often a blurred one. Evidence: none."""
+
+
+def withdraw_contradicted_poses(
+    registration: Registration, maps: Sequence[Map], misplaced: Collection[int]
+) -> Registration:
+    """Withdraw the poses of the frames that lie in a block of misplaced keyframes.
+
+    Mapping removed these keyframes because their matches contradict the rest of the map. The frames around
+    them see the same points from almost the same place. Their poses can be wrong by decimetres, although many
+    points agree with them.
+
+    Args:
+        registration: The registration of one camera.
+        maps: The maps that the camera was registered against.
+        misplaced: Frame indices of the camera's keyframes that contradict the map.
+
+    Returns:
+        The registration. The frames without a pose have the status `CONTRADICTED`.
+    """
+    path = registration.trajectory
+    scene = next((scene for scene in maps if scene.gauge == path.gauge), None)
+    if scene is None or not misplaced:
+        return registration
+    kept = scene.keyframe_frame[scene.keyframes_of(path.camera)]
+    inside = _frames_in_blocks(len(path.status), np.asarray(kept), np.array(sorted(misplaced)))
+    inside &= path.localised
+    if not inside.any():
+        return registration
+    status = [
+        FrameStatus.CONTRADICTED if withdrawn else before
+        for before, withdrawn in zip(path.status, inside, strict=True)
+    ]
+    poses = np.where(inside[:, None, None], np.nan, path.gauge_from_cam)
+    covariance = np.where(inside[:, None, None], np.nan, path.covariance)
+    return replace(
+        registration,
+        trajectory=replace(path, status=tuple(status), gauge_from_cam=poses, covariance=covariance),
+    )
+
+
+def _frames_in_blocks(count: int, kept: IntArray, misplaced: IntArray) -> BoolArray:
+    """Return for each of `count` frames whether it lies in a block of misplaced keyframes.
+
+    A block lies between two successive keyframes of the map, or before the first or after the last one. The
+    keyframes of the map are not part of it.
+    """
+    inside = np.zeros(count, dtype=bool)
+    bounds = [-1, *np.setdiff1d(kept, misplaced).tolist(), count]
+    for before, after in pairwise(bounds):
+        if ((misplaced > before) & (misplaced < after)).sum() >= _MIN_MISPLACED:
+            inside[before + 1 : after] = True
+    return inside
