@@ -28,7 +28,8 @@ from bodycap_batch.clocks.joint_offsets import (
     connected_cameras,
     solve_clocks,
 )
-from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM, PairOffset, measure_pair
+from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM, MAX_DRIFT_PPM, PairOffset, measure_pair
+from bodycap_batch.clocks.phase_correlation import PEAK_WIDTH_S
 from bodycap_batch.clocks.recorders import Recorder
 from bodycap_batch.clocks.sound_track import SoundTrack, read_sound_track
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
@@ -174,13 +175,43 @@ def measure_sound(spec: CaptureConfig, threads: int | None = None) -> SoundEvide
         found = SoundEvidence(recordings=tuple(recording for recording, _ in read))
         expected = found.expected()
 
+        measured: dict[tuple[str, str], PairOffset] = {}
+
         def measure(pair: tuple[str, str]) -> PairOffset:
             prior = expected[pair]
-            limits = None if prior is None else prior.limits()
+            limits = _offset_through(reference, pair, measured, tracks)
+            if limits is None and prior is not None:
+                limits = prior.limits()
             return measure_pair(tracks[pair[0]], tracks[pair[1]], limits)
 
-        usable = [name for name, track in tracks.items() if not track.problem]
-        return replace(found, pairs=tuple(pool.map(measure, camera_pairs(usable))))
+        reference = spec.reference_camera().name
+        pairs = camera_pairs([name for name, track in tracks.items() if not track.problem])
+        direct = [pair for pair in pairs if reference in pair]
+        measured.update(zip(direct, pool.map(measure, direct), strict=True))
+        others = [pair for pair in pairs if reference not in pair]
+        measured.update(zip(others, list(pool.map(measure, others)), strict=True))
+        return replace(found, pairs=tuple(measured[pair] for pair in pairs))
+
+
+def _offset_through(
+    reference: str,
+    pair: tuple[str, str],
+    measured: Mapping[tuple[str, str], PairOffset],
+    tracks: Mapping[str, SoundTrack],
+) -> tuple[float, float] | None:
+    """Return limits of the offset of a pair, seconds, from the offsets of both to the reference camera.
+
+    None if one of them is not measured. The limits contain every drift that is possible.
+    """
+    offsets_s = []
+    for name in pair:
+        through = next((each for key, each in measured.items() if set(key) == {name, reference}), None)
+        if through is None or not through.accepted:
+            return None
+        offsets_s.append(through.offset_s if through.first == reference else -through.offset_s)
+    longest_s = max(abs(time) for name in pair for time in (tracks[name].start_s, tracks[name].end_s))
+    middle_s, reach_s = offsets_s[1] - offsets_s[0], PEAK_WIDTH_S + 2e-6 * MAX_DRIFT_PPM * longest_s
+    return middle_s - reach_s, middle_s + reach_s
 
 
 def estimate_clocks(spec: CaptureConfig, threads: int | None = None) -> ClockEstimates:

@@ -41,7 +41,8 @@ bursts of the noise, show more than a few long ones. Evidence: docs/decisions/cl
 _MAX_WINDOWS = 24
 """Maximum number of windows along the common time. More windows hardly improve the line. Evidence: none."""
 _SEARCHES = (1, 3, 8, 12)
-"""Number of windows in each round of the search. The search ends as soon as a lag is accepted."""
+"""Number of windows in each round of the search. The search ends as soon as an offset is accepted, or two
+offsets pass every test but the comparison with each other. Evidence: docs/decisions/clocks.md."""
 _CANDIDATES = 6
 """Number of peaks of each searched window that are examined."""
 _MIN_CANDIDATE_RATIO = 0.5
@@ -53,7 +54,7 @@ memory to some megabytes."""
 _AGREEMENT_S = 0.003
 """Maximum difference, seconds, of a window's offset from the line of the others. Origin: between the ears of
 a body the way of sound differs by up to 3 ms, which changes as the arms move."""
-_MAX_DRIFT_PPM = 150.0
+MAX_DRIFT_PPM = 150.0
 """Maximum drift, ppm. Origin: twice the tolerance of crystals, with some room for cold and heat."""
 _CLEAR_LOG_CHANCE = float(np.log(0.01))
 """Logarithm of the probability below which the peak of a window counts. At most one of a hundred windows of
@@ -224,7 +225,7 @@ def _measure(first: SoundTrack, second: SoundTrack, limits: tuple[float, float] 
             ]
             found = _decide(first, second, finer)
             outcome = found if found.accepted else outcome
-        if outcome.accepted:
+        if outcome.accepted or _repeats(examined):
             break
     return outcome
 
@@ -340,6 +341,17 @@ class _Candidate:
         summed = float(np.minimum(heights, 2.0 * heights[-2]).sum())
         return log_chance(summed / float(np.sqrt(len(self.heights))), self.lags)
 
+    def refusal(self) -> str:
+        """Return why this offset is refused, whatever the others are; "" if it is not."""
+        agreeing, clear = int(self.agrees.sum()), int((self.log_chances < _CLEAR_LOG_CHANCE).sum())
+        if agreeing < 2:
+            return "fewer than two windows of the sound agree on an offset"
+        if agreeing < _MIN_AGREEING * clear:
+            return f"only {agreeing} of {clear} windows of the sound agree on an offset"
+        if self.log_chance > _MAX_LOG_CHANCE:
+            return "the sounds resemble each other no more than unrelated sounds do"
+        return ""
+
 
 def _is_known(examined: Sequence[_Candidate], lag_s: float) -> bool:
     """Return True if an examined candidate has this offset."""
@@ -362,7 +374,7 @@ def _examine(
     middles = _middles((begin, end), length, anchor, windows)
     rows = []
     for middle in middles:
-        reach_s = 0.006 + 1e-6 * _MAX_DRIFT_PPM * abs(middle - anchor)
+        reach_s = 0.006 + 1e-6 * MAX_DRIFT_PPM * abs(middle - anchor)
         found = _window_peak(first, second, middle, length, offset, reach_s)
         # Most of the reach serves to find the drift: on a given line only ±_AGREEMENT_S remains.
         near = 2 * _AGREEMENT_S * RATE_HZ
@@ -423,7 +435,7 @@ def _on_best_line(times: FloatArray, offsets: FloatArray, weights: FloatArray) -
     if not weights.any():
         return np.zeros(len(times), bool)
     span = float(np.ptp(times))
-    slopes = np.arange(0.0, _MAX_DRIFT_PPM * 1e-6 + 1e-12, max(0.5 * _AGREEMENT_S / max(span, 1.0), 2e-6))
+    slopes = np.arange(0.0, MAX_DRIFT_PPM * 1e-6 + 1e-12, max(0.5 * _AGREEMENT_S / max(span, 1.0), 2e-6))
     if span < MIN_DRIFT_SPAN_S:
         slopes = slopes[:1]
     best, most = np.zeros(len(times), bool), 0.0
@@ -438,21 +450,26 @@ def _on_best_line(times: FloatArray, offsets: FloatArray, weights: FloatArray) -
     return best
 
 
+def _rival_ratio(examined: Sequence[_Candidate], best: _Candidate) -> float:
+    """Return the evidence of the best candidate over that of the second one."""
+    return best.evidence / max([each.evidence for each in examined if each is not best] + [1.0])
+
+
+def _repeats(examined: Sequence[_Candidate]) -> bool:
+    """Return True if two offsets, neither of which is much better, pass all tests of a single offset."""
+    passing = [each for each in examined if not each.refusal()]
+    if len(passing) < 2:
+        return False
+    return _rival_ratio(passing, max(passing, key=lambda each: each.evidence)) < _MIN_RIVAL_RATIO
+
+
 def _decide(first: SoundTrack, second: SoundTrack, examined: Sequence[_Candidate]) -> PairOffset:
     """Accept or refuse the best candidate."""
     best = max(examined, key=lambda each: each.evidence)
-    others = [each.evidence for each in examined if each is not best]
-    ratio = best.evidence / max([*others, 1.0])
-    clear = best.log_chances < _CLEAR_LOG_CHANCE
-    reason = ""
-    if best.agrees.sum() < 2:
-        reason = "fewer than two windows of the sound agree on an offset"
-    elif best.agrees.sum() < _MIN_AGREEING * clear.sum():
-        reason = f"only {best.agrees.sum()} of {clear.sum()} windows of the sound agree on an offset"
-    elif ratio < _MIN_RIVAL_RATIO:
+    ratio = _rival_ratio(examined, best)
+    reason = best.refusal()
+    if not reason and ratio < _MIN_RIVAL_RATIO:
         reason = "several offsets suit the sound equally well: it repeats"
-    elif best.log_chance > _MAX_LOG_CHANCE:
-        reason = "the sounds resemble each other no more than unrelated sounds do"
     chunks = tuple(
         ChunkOffset(time_s=time, offset_s=offset, height=height, agrees=bool(agrees))
         for time, offset, height, agrees in zip(

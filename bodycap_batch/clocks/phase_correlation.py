@@ -116,8 +116,11 @@ def find_peaks(
         return []
     begin, end = (0, len(energy)) if within is None else (within[0] - first_lag, within[1] - first_lag + 1)
     begin, end = max(begin, 0), min(end, len(energy))
+    # The weights of the sum reach no farther than the margin.
+    margin = round(4 * SMOOTHING_S * RATE_HZ)
+    low, high = max(begin - margin, 0), min(end + margin, len(energy))
     height = np.zeros_like(energy)
-    height[begin:end] = smoothed_energy(energy)[begin:end]
+    height[begin:end] = smoothed_energy(energy[low:high])[begin - low : end - low]
     width = round(PEAK_WIDTH_S * RATE_HZ)
     peaks = []
     for _ in range(count):
