@@ -32,7 +32,12 @@ from bodycap_batch.merging.graph.foot_contact import (
     find_contacts,
     standing_joints,
 )
-from bodycap_batch.merging.graph.joint_covariance import sigma_percentiles, skeleton_covariance
+from bodycap_batch.merging.graph.joint_covariance import (
+    flexion_percentiles,
+    flexion_sigma,
+    sigma_percentiles,
+    skeleton_covariance,
+)
 from bodycap_batch.merging.graph.joint_distance_limits import soft_limits
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution, hinge_deviations, joint_gaps
 from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, max_window_ticks, solve_windows
@@ -177,7 +182,8 @@ def _solve_body(
             for path in paths
         )
     observed = observed_joints(inputs.skeleton, bones, tracks, tick_times, options.max_gap_s)
-    covariance = skeleton_covariance(to_world.rotation, bones, solution.joint_covariance, len(placed.solved))
+    covariance = skeleton_covariance(to_world.rotation, bones, solution.uncertainty, len(placed.solved))
+    flexion_rad = flexion_sigma(bones, solution.uncertainty, len(placed.solved))
     body = SolvedBody(
         skeleton=inputs.skeleton,
         fps=fps,
@@ -219,6 +225,7 @@ def _solve_body(
                 unused=aligned.unused,
                 aligned={name: AlignedCameraReport(**sigmas) for name, sigmas in aligned.report().items()},
                 joint_sigma_m=sigma_percentiles(inputs.skeleton.roles, covariance, observed),
+                flexion_sigma_deg=flexion_percentiles(inputs.skeleton.roles, flexion_rad, observed),
                 joint_gap_m=joint_gaps(bones, solution.world_from_bone),
                 hinge_off_plane_m=hinge_deviations(inputs.skeleton, bones, solution.world_from_bone),
                 contacts=contact_statistics(contacts, solution.world_from_bone, fps),
@@ -226,6 +233,7 @@ def _solve_body(
             ),
         ),
         joint_covariance_m2=covariance,
+        flexion_sigma_rad=flexion_rad,
     )
 
 

@@ -183,6 +183,8 @@ class MergeResult(SolvedBody):
         joint_covariance_m2: (T,J,3,3) covariance of the position of each joint relative to the first solved
             joint, in world axes. It contains the errors of measurements, mounts and scale, but not the error
             of the world axes. NaN if the joint was not solved.
+        flexion_sigma_rad: (T,J) sigma of the flexion of each elbow and knee that was solved, radians; NaN for
+            other joints. It contains the same errors.
     """
 
     motion: Motion
@@ -191,6 +193,7 @@ class MergeResult(SolvedBody):
     unused_cameras: Mapping[str, str]
     report: MergeReport
     joint_covariance_m2: FloatArray | None = None
+    flexion_sigma_rad: FloatArray | None = None
 
     def __post_init__(self) -> None:
         # With slots=True, the dataclass decorator makes a new class. super() without arguments would refer to
@@ -200,6 +203,8 @@ class MergeResult(SolvedBody):
             raise ValueError("motion: its ticks and joints are not those of the graph")
         if self.joint_covariance_m2 is not None:
             set_array(self, "joint_covariance_m2", (*self.observed.shape, 3, 3), finite=False)
+        if self.flexion_sigma_rad is not None:
+            set_array(self, "flexion_sigma_rad", self.observed.shape, finite=False)
 
     def joint_sigma_m(self) -> FloatArray:
         """Return the sigmas (T,J) of the joint positions, metres per axis.

@@ -333,6 +333,8 @@ class MergeReport:
             two bones that meet at the joint.
         joint_sigma_m: By role of a joint, then by ``observed`` or ``filled``, percentiles of the sigma of the
             joint's centre, metres per axis.
+        flexion_sigma_deg: By role of the bone below an elbow or a knee, then by ``observed`` or ``filled``,
+            percentiles of the sigma of its flexion, degrees.
         hinge_off_plane_m: By role of a joint, percentiles of its distance, metres, from the plane of a hinge.
             The joint is at the far end of the bone below the hinge.
         loose_hinges: By role of the bone below a hinge, the violation of the hinge. Hinges that the motion
@@ -354,6 +356,7 @@ class MergeReport:
     joined_cameras: Mapping[str, AlignedCameraReport]
     joint_gap_m: Mapping[str, Percentiles]
     joint_sigma_m: Mapping[str, Mapping[str, Percentiles]]
+    flexion_sigma_deg: Mapping[str, Mapping[str, Percentiles]]
     hinge_off_plane_m: Mapping[str, Percentiles]
     loose_hinges: Mapping[str, HingeReport]
     activity: ActivityReport

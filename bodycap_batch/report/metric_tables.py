@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.percent import format_percent
+from bodycap_batch.model.skeleton_presets import split_side
 from bodycap_batch.report.metric_paths import metric_at, metric_path
 from bodycap_batch.report.report_inputs import ReportInputs
 from bodycap_batch.report.viewer_data import known_joint_sigma_m
@@ -21,6 +22,8 @@ _LIMIT_TEXTS = {
     "palm on its side": "palm must stay on its own side of the body",
 }
 """Text for the user, by the name of a soft limit without its side."""
+_HINGE_TEXTS = {"ForeArm": "elbow", "Leg": "knee"}
+"""Text for the user, by the part of the body below a hinge."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,6 +78,7 @@ def make_tables(inputs: ReportInputs) -> dict[str, Table]:
             "limbs": _limb_scales_table(merge),
             "rules": _soft_limits_table(merge),
             "sigma": _joint_sigma_table(inputs),
+            "flexion": _flexion_table(merge),
         }
     return {name: table for name, table in tables.items() if table.rows}
 
@@ -401,6 +405,25 @@ def _joint_sigma_table(inputs: ReportInputs) -> Table:
         caption="Uncertainty of each joint's position (one standard deviation)",
         heads=("Joint", "Median", "95 %"),
         rows=tuple(rows),
+    )
+
+
+def _flexion_table(merge: Mapping[str, Any]) -> Table:
+    """Return how well the angles of elbows and knees are known."""
+    metrics, rows = {"merge": merge}, []
+    for role in merge.get("flexion_sigma_deg", {}):
+        side, part = split_side(role)
+        paths = [
+            metric_path("merge", "flexion_sigma_deg", role, name, "p50") for name in ("observed", "filled")
+        ]
+        name = Cell(text=f"{side.lower()} {_HINGE_TEXTS[part]}".strip())
+        rows.append((name, *(metric_cell(metrics, path, "± {:.0f}°") for path in paths)))
+    return Table(
+        caption="Uncertainty of the bending angle of elbows and knees (one standard deviation, median)",
+        heads=("Joint", "Measured", "In gaps"),
+        rows=tuple(rows),
+        note="Most of it is an error that stays the same over the capture: it comes from the mounts, the "
+        "metric scale and the bone lengths.",
     )
 
 

@@ -110,6 +110,11 @@ class Hinge:
     range_m: float
     sigma_m: float = 0.0
 
+    def axis(self) -> FloatArray:
+        """Return the axis (3,) of the hinge in the upper bone's frame; a positive turn bends the elbow."""
+        across = self.anchors_m[0] - self.anchors_m[1]
+        return np.asarray(across / np.linalg.norm(across))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bone:

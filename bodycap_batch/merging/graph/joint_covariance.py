@@ -1,4 +1,7 @@
-"""The covariance of each joint's centre relative to the root, from measurement noise and calibration."""
+"""How well the joints are known: covariances of their centres and sigmas of the hinges' flexion.
+
+Both contain the noise of the measurements and the errors of the calibration.
+"""
 
 from __future__ import annotations
 
@@ -50,15 +53,48 @@ class SolvedGraph:
     first_joint: int
 
 
+@dataclass(frozen=True, slots=True)
+class JointUncertainty:
+    """How well the joints of the bones are known.
+
+    Attributes:
+        centre_m2: (T,B,3,3) covariance, m², of each joint's centre relative to the first bone's joint centre,
+            in the axes of the solution.
+        flexion_rad2: (T,B) variance, rad², of the flexion of each hinge, at the bone below it. NaN for bones
+            whose joint is not a hinge.
+    """
+
+    centre_m2: FloatArray
+    flexion_rad2: FloatArray
+
+    def blended(self, later: JointUncertainty, low: int, weight: FloatArray) -> JointUncertainty:
+        """Return this uncertainty, continued by that of a later window.
+
+        Args:
+            later: The uncertainty from the tick `low` on.
+            low: First tick of the later window.
+            weight: (S,) weights of the later window at the ticks that both contain.
+        """
+
+        def join(one: FloatArray, other: FloatArray) -> FloatArray:
+            factor = weight.reshape(-1, *[1] * (one.ndim - 1))
+            both = (1.0 - factor) * one[low:] + factor * other[: len(weight)]
+            return np.concatenate([one[:low], both, other[len(weight) :]])
+
+        return JointUncertainty(
+            join(self.centre_m2, later.centre_m2), join(self.flexion_rad2, later.flexion_rad2)
+        )
+
+
 def joint_covariance(
     solved: SolvedGraph,
     world_from_bone: FloatArray,
     error_modes: ErrorModes,
     begin: Callable[[str], None] = lambda _: None,
-) -> FloatArray:
-    """Return the covariance (T,B,3,3), m², of each joint's centre relative to the first bone's joint centre.
+) -> JointUncertainty:
+    """Return the covariances of the joints' centres, and the variances of the hinges' flexion.
 
-    The covariance is the sum of two parts. The first part is the marginal covariance of the graph, which
+    Each covariance is the sum of two parts. The first part is the marginal covariance of the graph, which
     contains the noise of the measurements. The second part is J Σ Jᵀ, the effect of errors of the
     calibration. The solver held the calibration fixed. Σ is the covariance of the calibration, given by its
     error modes. J contains the derivatives of the joint centres with respect to the calibration. The function
@@ -72,7 +108,7 @@ def joint_covariance(
             freed memory to the operating system.
 
     Returns:
-        The covariance in the axes of the solution; NaN if the equations of the graph are singular.
+        The uncertainty; NaN if the equations of the graph are singular.
     """
     begin("joint covariances")
     linear = linearise(solved.graph, solved.values)
@@ -83,7 +119,8 @@ def joint_covariance(
         normal = BlockTridiagonal.from_sparse((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     except np.linalg.LinAlgError:
         # The measurements do not determine some state of the graph, so the covariance does not exist.
-        return np.full((*world_from_bone.shape[:2], 3, 3), np.nan)
+        nothing = np.full(world_from_bone.shape[:2], np.nan)
+        return JointUncertainty(np.full((*nothing.shape, 3, 3), np.nan), nothing)
     begin("covariances of the measurements")
     changes = _measurement_residual_jacobian(solved, linear, error_modes)
     changes = changes + joint_residual_jacobian(
@@ -93,15 +130,34 @@ def joint_covariance(
     position = np.argsort(order)
     ticks, count = world_from_bone.shape[:2]
     out = np.zeros((ticks, count, 3, 3))
+    hinges = solved.body.hinges
+    flexion = np.full((ticks, count), np.nan)
+    lowers = [hinge.lower for hinge in hinges]
+    flexion[:, lowers] = 0.0
+
+    def first_columns(tick: int) -> list[int]:
+        """Return the first column of each bone's pose among the unknowns of the tick's states."""
+        return [
+            int(position[linear.columns[bone_key(tick, bone)]]) - int(bounds[tick]) for bone in range(count)
+        ]
+
+    def flexion_jacobian_at(tick: int) -> FloatArray:
+        """Return the derivatives (H,n) of the flexion of each hinge: the turn about the axis of the hinge."""
+        first = first_columns(tick)
+        jacobian = np.zeros((len(hinges), int(bounds[tick + 1] - bounds[tick])))
+        for row, hinge in enumerate(hinges):
+            axis = hinge.axis()
+            upper, lower = world_from_bone[tick, [hinge.upper, hinge.lower], :3, :3]
+            jacobian[row, first[hinge.upper] : first[hinge.upper] + 3] = -axis
+            jacobian[row, first[hinge.lower] : first[hinge.lower] + 3] = lower.T @ upper @ axis
+        return jacobian
 
     def jacobian_at(tick: int) -> FloatArray:
         """Return the derivatives (B-1,3,n) of relative joint centres.
 
         The derivatives are with respect to the n unknowns of the tick's states.
         """
-        first = [
-            int(position[linear.columns[bone_key(tick, bone)]]) - int(bounds[tick]) for bone in range(count)
-        ]
+        first = first_columns(tick)
         jacobian = np.zeros((count - 1, 3, int(bounds[tick + 1] - bounds[tick])))
         jacobian[:, :, first[0] + 3 : first[0] + 6] = -world_from_bone[tick, 0, :3, :3]
         for bone in range(1, count):
@@ -111,6 +167,8 @@ def joint_covariance(
     def add_marginal(tick: int, covariance: FloatArray) -> None:
         jacobian = jacobian_at(tick)
         out[tick, 1:] += jacobian @ covariance @ jacobian.swapaxes(1, 2)
+        turn = flexion_jacobian_at(tick)
+        flexion[tick, lowers] += np.einsum("hi,ij,hj->h", turn, covariance, turn)
 
     normal.marginals(add_marginal)
     begin("covariances of the calibration")
@@ -119,7 +177,8 @@ def joint_covariance(
         for tick, states in enumerate(normal.solve(rhs)):
             moved = jacobian_at(tick) @ states
             out[tick, 1:] += moved @ moved.swapaxes(1, 2)
-    return out
+            flexion[tick, lowers] += np.square(flexion_jacobian_at(tick) @ states).sum(axis=1)
+    return JointUncertainty(out, flexion)
 
 
 class _TickColumns(NamedTuple):
@@ -170,22 +229,43 @@ def _measurement_residual_jacobian(
     return out
 
 
+def flexion_sigma(
+    bones: Sequence[Bone], uncertainty: JointUncertainty | None, joints: int
+) -> FloatArray | None:
+    """Return the sigma (T,J), radians, of the flexion of each hinge of the skeleton.
+
+    Args:
+        bones: The graph's bones.
+        uncertainty: How well the joints of the bones are known; None if it was not computed.
+        joints: Number J of joints of the skeleton.
+
+    Returns:
+        NaN for joints that are not hinges of the graph; None if `uncertainty` is None.
+    """
+    if uncertainty is None:
+        return None
+    out = np.full((len(uncertainty.flexion_rad2), joints), np.nan)
+    out[:, [bone.joint for bone in bones]] = np.sqrt(uncertainty.flexion_rad2)
+    return out
+
+
 def skeleton_covariance(
-    rotation: FloatArray, bones: Sequence[Bone], covariance: FloatArray | None, joints: int
+    rotation: FloatArray, bones: Sequence[Bone], uncertainty: JointUncertainty | None, joints: int
 ) -> FloatArray | None:
     """Return the covariance of all joints of the skeleton in rotated axes.
 
     Args:
         rotation: (3,3) rotation from the old axes to the new axes.
         bones: The graph's bones.
-        covariance: (T,B,3,3) covariances of the bones' joint centres; None if they were not computed.
+        uncertainty: How well the joints of the bones are known; None if it was not computed.
         joints: Number J of joints of the skeleton.
 
     Returns:
-        (T,J,3,3) covariances, NaN for joints without a bone in the graph; None if `covariance` is None.
+        (T,J,3,3) covariances, NaN for joints without a bone in the graph; None if `uncertainty` is None.
     """
-    if covariance is None:
+    if uncertainty is None:
         return None
+    covariance = uncertainty.centre_m2
     out = np.full((len(covariance), joints, 3, 3), np.nan)
     out[:, [bone.joint for bone in bones]] = rotation @ covariance @ rotation.T
     return out
@@ -205,14 +285,35 @@ def sigma_percentiles(
     Returns:
         By role of a joint, then by "observed" or "filled", then by "p50" or "p95": sigma (metres per axis).
     """
-    out: dict[str, dict[str, dict[str, float]]] = {}
     if covariance is None:
-        return out
-    sigma_m = np.sqrt(np.trace(covariance, axis1=2, axis2=3) / 3.0)
+        return {}
+    return _percentiles(roles, np.sqrt(np.trace(covariance, axis1=2, axis2=3) / 3.0), observed, digits=5)
+
+
+def flexion_percentiles(
+    roles: Sequence[str], flexion_rad: FloatArray | None, observed: BoolArray
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Return percentiles of the sigmas of the hinges' flexion, separately for observed and filled ticks.
+
+    Args:
+        roles: Roles of the J joints.
+        flexion_rad: (T,J) sigmas, radians, NaN for joints that are no hinges; None if they were not computed.
+        observed: (T,J) whether cameras measured each joint at each tick.
+
+    Returns:
+        By role of a joint, then by "observed" or "filled", then by "p50" or "p95": sigma, degrees.
+    """
+    return {} if flexion_rad is None else _percentiles(roles, np.degrees(flexion_rad), observed, digits=2)
+
+
+def _percentiles(
+    roles: Sequence[str], sigma: FloatArray, observed: BoolArray, digits: int
+) -> dict[str, dict[str, dict[str, float]]]:
+    out: dict[str, dict[str, dict[str, float]]] = {}
     for joint, role in enumerate(roles):
         for name, mask in (("observed", observed[:, joint]), ("filled", ~observed[:, joint])):
-            found = sigma_m[mask & np.isfinite(sigma_m[:, joint]), joint]
+            found = sigma[mask & np.isfinite(sigma[:, joint]), joint]
             if role and len(found) and found.any():
-                figures = {f"p{q}": round(float(np.percentile(found, q)), 5) for q in (50, 95)}
+                figures = {f"p{q}": round(float(np.percentile(found, q)), digits) for q in (50, 95)}
                 out.setdefault(role, {})[name] = figures
     return out

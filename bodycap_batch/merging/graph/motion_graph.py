@@ -29,7 +29,7 @@ from bodycap_batch.merging.graph.factors import (
     velocity_key,
 )
 from bodycap_batch.merging.graph.foot_contact import FootContact
-from bodycap_batch.merging.graph.joint_covariance import SolvedGraph, joint_covariance
+from bodycap_batch.merging.graph.joint_covariance import JointUncertainty, SolvedGraph, joint_covariance
 from bodycap_batch.merging.graph.joint_distance_limits import DistanceLimit
 from bodycap_batch.merging.graph.motion_prior import add_motion_prior
 from bodycap_batch.merging.graph.optimiser import gauss_newton_then_lm
@@ -72,8 +72,7 @@ class MotionSolution:
         world_from_cam: By camera, (N,4,4) solved pose at each measurement, from bone and mount.
         iterations: Number of iterations of the optimiser.
         errors: By kind of factor, half the sum of the squared residuals.
-        joint_covariance: (T,B,3,3) covariance, m², of each joint's centre relative to the first bone's joint
-            centre; None if it was not computed.
+        uncertainty: How well the joints are known; None if it was not computed.
     """
 
     world_from_bone: FloatArray
@@ -83,7 +82,7 @@ class MotionSolution:
     world_from_cam: Mapping[str, FloatArray]
     iterations: int
     errors: Mapping[str, float]
-    joint_covariance: FloatArray | None = None
+    uncertainty: JointUncertainty | None = None
 
 
 class SolverProgress(Protocol):
@@ -163,8 +162,9 @@ class MotionGraph:
         solution = self._read(values, poses, count)
         if error_modes is None:
             return solution
-        covariance = joint_covariance(self.solved_graph(values), poses, error_modes, step)
-        return replace(solution, joint_covariance=covariance)
+        return replace(
+            solution, uncertainty=joint_covariance(self.solved_graph(values), poses, error_modes, step)
+        )
 
     def solved_graph(self, values: Any) -> SolvedGraph:
         """Return the graph at a solution, for the computation of the covariance.

@@ -10,6 +10,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
 from bodycap_batch.merging.graph.error_modes import ErrorModes
+from bodycap_batch.merging.graph.joint_covariance import JointUncertainty
 from bodycap_batch.merging.graph.motion_graph import (
     MotionGraph,
     MotionSolution,
@@ -218,24 +219,22 @@ def _blend_windows(
 ) -> MotionSolution:
     """Join the solutions of the windows. Near each boundary, blend from one solution to the next."""
     start = parts[0].solution
-    poses, covariance = start.world_from_bone, start.joint_covariance
+    poses, uncertainty = start.world_from_bone, start.uncertainty
     cameras = {track.camera: np.zeros((0, 4, 4)) for track in tracks} | dict(start.world_from_cam)
     for part in parts[1:]:
         solution, low = part.solution, part.low
         boundary_ns = int(tick_times_ns[part.first])
         weight = _blend_weight(tick_times_ns[low : len(poses)], boundary_ns)
         poses = _blend_poses(poses, solution.world_from_bone, weight)
-        if covariance is not None and solution.joint_covariance is not None:
-            later, factor = solution.joint_covariance, weight[:, None, None, None]
-            blended = (1.0 - factor) * covariance[low:] + factor * later[: len(weight)]
-            covariance = np.concatenate([covariance[:low], blended, later[len(weight) :]])
+        if uncertainty is not None and solution.uncertainty is not None:
+            uncertainty = uncertainty.blended(solution.uncertainty, low, weight)
         from_ns, _ = _time_span(tick_times_ns, low, low)
         for track in tracks:
             before, after = cameras[track.camera], solution.world_from_cam.get(track.camera)
             if after is not None:
                 times = track.times_ns[np.searchsorted(track.times_ns, from_ns) : len(before)]
                 cameras[track.camera] = _blend_poses(before, after, _blend_weight(times, boundary_ns))
-    return _assemble(parts, tracks, poses, covariance, cameras)
+    return _assemble(parts, tracks, poses, uncertainty, cameras)
 
 
 def _blend_poses(before: FloatArray, after: FloatArray, weight: FloatArray) -> FloatArray:
@@ -257,7 +256,7 @@ def _assemble(
     parts: Sequence[WindowSolution],
     tracks: Sequence[CameraTrack],
     poses: FloatArray,
-    covariance: FloatArray | None,
+    uncertainty: JointUncertainty | None,
     cameras: dict[str, FloatArray],
 ) -> MotionSolution:
     """Make one solution from the blended poses, and compute the residuals of the measurements."""
@@ -274,5 +273,5 @@ def _assemble(
         world_from_cam=cameras,
         iterations=max(part.solution.iterations for part in parts),
         errors=errors,
-        joint_covariance=covariance,
+        uncertainty=uncertainty,
     )

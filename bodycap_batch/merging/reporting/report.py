@@ -74,6 +74,8 @@ class MotionFacts:
             only cameras whose map was aligned to the main map.
         joint_sigma_m: By role of a joint, then by ``observed`` or ``filled`` ticks, percentiles of the sigma
             of the joint's centre, metres per axis.
+        flexion_sigma_deg: By role of the bone below a hinge, then by ``observed`` or ``filled`` ticks,
+            percentiles of the sigma of the flexion, degrees.
         joint_gap_m: By role of a joint, (T,) distance of the joint from its place on the parent bone, metres.
         hinge_off_plane_m: By role of the joint at the far end of a hinged bone, (T,) distance of this joint
             from the plane of the hinge, metres.
@@ -88,6 +90,7 @@ class MotionFacts:
     unused: Mapping[str, str]
     aligned: Mapping[str, AlignedCameraReport]
     joint_sigma_m: Mapping[str, Mapping[str, Mapping[str, float]]]
+    flexion_sigma_deg: Mapping[str, Mapping[str, Mapping[str, float]]]
     joint_gap_m: Mapping[str, FloatArray]
     hinge_off_plane_m: Mapping[str, FloatArray]
     contacts: Mapping[str, Mapping[str, float]]
@@ -129,10 +132,8 @@ def build_report(
         unused_cameras=dict(facts.unused),
         joined_cameras=dict(facts.aligned),
         joint_gap_m=_percentiles_by_name(facts.joint_gap_m),
-        joint_sigma_m={
-            role: {name: Percentiles(**figures) for name, figures in sigmas.items()}
-            for role, sigmas in facts.joint_sigma_m.items()
-        },
+        joint_sigma_m=_sigmas_by_role(facts.joint_sigma_m),
+        flexion_sigma_deg=_sigmas_by_role(facts.flexion_sigma_deg),
         hinge_off_plane_m=_percentiles_by_name(facts.hinge_off_plane_m),
         loose_hinges={
             role: HingeReport(sigma_m=round(off_m, 5), known_to=describe_hinge(role, off_m))
@@ -298,6 +299,15 @@ def _activity_report(activity: Activity, violations_m: Mapping[str, FloatArray])
             if (violation > 0.0).any()
         },
     )
+
+
+def _sigmas_by_role(
+    sigmas: Mapping[str, Mapping[str, Mapping[str, float]]],
+) -> dict[str, dict[str, Percentiles]]:
+    return {
+        role: {name: Percentiles(**figures) for name, figures in each.items()}
+        for role, each in sigmas.items()
+    }
 
 
 def _percentiles_by_name(values: Mapping[str, FloatArray]) -> dict[str, Percentiles]:

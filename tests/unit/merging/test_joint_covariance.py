@@ -13,7 +13,12 @@ from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.merging.graph.error_modes import ErrorModes, stack_modes
 from bodycap_batch.merging.graph.factors import bone_key
-from bodycap_batch.merging.graph.joint_covariance import joint_covariance, sigma_percentiles
+from bodycap_batch.merging.graph.joint_covariance import (
+    flexion_percentiles,
+    flexion_sigma,
+    joint_covariance,
+    sigma_percentiles,
+)
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
 from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp
@@ -27,9 +32,11 @@ def test_a_graph_without_factors_has_no_covariance(walk):
     poses = np.tile(np.eye(4), (round(FPS), len(bones), 1, 1))
     unchanged = np.zeros((len(bones), 3, 0))
     modes = ErrorModes(mounts={}, log_scale=np.zeros(0), rest=unchanged, offsets_m=unchanged)
-    covariance = joint_covariance(loose, poses, modes)
-    assert covariance.shape == (*poses.shape[:2], 3, 3)
-    assert np.isnan(covariance).all()
+    uncertainty = joint_covariance(loose, poses, modes)
+    assert uncertainty.centre_m2.shape == (*poses.shape[:2], 3, 3)
+    assert np.isnan(uncertainty.centre_m2).all()
+    assert uncertainty.flexion_rad2.shape == poses.shape[:2]
+    assert np.isnan(uncertainty.flexion_rad2).all()
 
 
 def test_the_adjoint_equals_that_of_gtsam():
@@ -79,6 +86,23 @@ def _no_modes(bones) -> ErrorModes:
     )
 
 
+def _centres(solution: MotionSolution) -> np.ndarray:
+    assert solution.uncertainty is not None
+    return np.asarray(solution.uncertainty.centre_m2)
+
+
+def _flexion_rad(solution: MotionSolution, bones, side: str) -> np.ndarray:
+    """Return the flexion (T,) of an elbow: the angle between the upper arm and the forearm."""
+    upper, lower, hand = (
+        next(place for place, bone in enumerate(bones) if bone.role == side + part)
+        for part in ("Arm", "ForeArm", "Hand")
+    )
+    centres = solution.world_from_bone[..., :3, 3]
+    arm, forearm = centres[:, lower] - centres[:, upper], centres[:, hand] - centres[:, lower]
+    cosine = (arm * forearm).sum(-1) / np.linalg.norm(arm, axis=-1) / np.linalg.norm(forearm, axis=-1)
+    return np.arccos(np.clip(cosine, -1.0, 1.0))
+
+
 def _relative(solution: MotionSolution) -> np.ndarray:
     centres = solution.world_from_bone[..., :3, 3]
     return np.asarray(centres - centres[:, :1])
@@ -97,7 +121,7 @@ def test_without_error_modes_the_covariance_is_the_marginal_of_gtsam(walk):
         reader = np.hstack([np.zeros((3, 3)), -turns[0], np.zeros((3, 3)), turns[1]])
         expected = reader @ joint @ reader.T
         # The two are linearised at solutions that differ by the tolerance of the solver.
-        assert_allclose(solution.joint_covariance[tick, hand], expected, rtol=1e-3, atol=1e-9)
+        assert_allclose(_centres(solution)[tick, hand], expected, rtol=1e-3, atol=1e-9)
 
 
 def _optimised(graph):
@@ -137,13 +161,17 @@ def test_the_solution_follows_the_calibration_as_predicted(walk, what):
     with_modes = _solve(graph, modes)
     again = _solve(_graph(walk, shift_s=shift_s, **changes)[0])
     actual = _relative(again) - _relative(plain)
-    predicted = np.sqrt(
-        np.einsum("tbii->tb", with_modes.joint_covariance - plain.joint_covariance).clip(min=0.0)
-    )
+    predicted = np.sqrt(np.einsum("tbii->tb", _centres(with_modes) - _centres(plain)).clip(min=0.0))
     size = np.linalg.norm(actual, axis=-1)
     assert size[:, 1:].max() > 5e-4
     # Geman-McClure's curvature is a tenth below that of its weights (residuals of 2.4 sigmas, c = 6).
     assert np.sqrt(((predicted - size) ** 2).mean()) < 0.15 * np.sqrt((size**2).mean())
+    for side in ("Left", "Right"):
+        bent = np.abs(_flexion_rad(again, bones, side) - _flexion_rad(plain, bones, side))
+        place = next(place for place, bone in enumerate(bones) if bone.role == side + "ForeArm")
+        variances = [each.uncertainty.flexion_rad2[:, place] for each in (with_modes, plain)]
+        stated = np.sqrt((variances[0] - variances[1]).clip(min=0.0))
+        assert np.sqrt(((stated - bent) ** 2).mean()) < 0.25 * np.sqrt((bent**2).mean()) + 1e-3
 
 
 def test_stacked_modes_contain_those_of_all_parts(walk):
@@ -167,6 +195,23 @@ def test_sigmas_of_observed_and_filled_ticks_are_separate():
     }
 
 
+def test_the_sigma_of_a_hinge_is_that_of_the_bone_below_it(walk):
+    graph, bones, _ = _graph(walk)
+    solution = _solve(graph, _no_modes(bones))
+    roles = [bone.role for bone in bones]
+    sigma = flexion_sigma(bones, solution.uncertainty, len(walk.skeleton.joints))
+    known = {walk.skeleton.roles[joint] for joint in np.flatnonzero(np.isfinite(sigma).all(axis=0))}
+    assert known == {"LeftForeArm", "RightForeArm"} & set(roles)
+    assert flexion_sigma(bones, None, 3) is None
+    observed = np.ones(sigma.shape, dtype=bool)
+    found = flexion_percentiles(walk.skeleton.roles, sigma, observed)
+    joint = walk.skeleton.roles.index("LeftForeArm")
+    assert found["LeftForeArm"]["observed"]["p50"] == pytest.approx(
+        np.degrees(np.median(sigma[:, joint])), abs=0.01
+    )
+    assert flexion_percentiles(walk.skeleton.roles, None, observed) == {}
+
+
 def test_a_mounts_error_moves_the_joint_by_its_lever(walk):
     # A mount that rotates about the camera's own axis moves the wrist by the lever, and not the camera.
     graph, bones, held = _graph(walk)
@@ -174,9 +219,7 @@ def test_a_mounts_error_moves_the_joint_by_its_lever(walk):
     modes.mounts["right_palm"][2, 0] = 0.05
     hand = next(place for place, bone in enumerate(bones) if bone.role == "RightHand")
     plain, with_modes = _solve(graph, _no_modes(bones)), _solve(graph, modes)
-    added = np.sqrt(
-        np.einsum("tii->t", with_modes.joint_covariance[:, hand] - plain.joint_covariance[:, hand])
-    )
+    added = np.sqrt(np.einsum("tii->t", _centres(with_modes)[:, hand] - _centres(plain)[:, hand]))
     wrist_in_cam = np.linalg.inv(held["right_palm"] @ make_transform(np.eye(3), np.zeros(3)))[:3, 3]
     lever = np.linalg.norm(np.cross([0.0, 0.0, 1.0], wrist_in_cam))
     # Joints and the pose prior take a part of it: between a quarter of the lever and all of it.

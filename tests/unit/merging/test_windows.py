@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bodycap_batch.merging.cameras.track import CameraTrack
+from bodycap_batch.merging.graph.joint_covariance import JointUncertainty
 from bodycap_batch.merging.graph.motion_graph import MotionSolution
 from bodycap_batch.merging.graph.windows import (
     WINDOW_TICKS,
@@ -74,7 +75,10 @@ class _ShiftedSolution:
             world_from_cam={track.camera: np.tile(pose, (len(track.times_ns), 1, 1)) for track in self._seen},
             iterations=1,
             errors={"joints": 1.0},
-            joint_covariance=np.full((len(self._ticks), 2, 3, 3), 1.0 + self._number),
+            uncertainty=JointUncertainty(
+                np.full((len(self._ticks), 2, 3, 3), 1.0 + self._number),
+                np.full((len(self._ticks), 2), 1.0 + self._number),
+            ),
         )
 
 
@@ -96,8 +100,11 @@ def test_blended_solutions_do_not_jump_at_a_boundary():
     turns = rotation_angle_rad(poses[1:, ..., :3, :3] @ np.swapaxes(poses[:-1, ..., :3, :3], -1, -2))
     assert steps.max() < 1.51 * 0.08 / (2 * FPS)
     assert turns.max() < 1.51 * 0.3 / (2 * FPS)
-    assert blended.joint_covariance is not None
-    assert np.abs(np.diff(blended.joint_covariance, axis=0)).max() < 1.51 / (2 * FPS)
+    assert blended.uncertainty is not None
+    assert blended.uncertainty.centre_m2.shape == (*poses.shape[:2], 3, 3)
+    assert blended.uncertainty.flexion_rad2.shape == poses.shape[:2]
+    for variance in (blended.uncertainty.centre_m2, blended.uncertainty.flexion_rad2):
+        assert np.abs(np.diff(variance, axis=0)).max() < 1.51 / (2 * FPS)
     for track in tracks:
         there = np.searchsorted(TICKS, track.times_ns)
         assert_allclose(blended.world_from_cam[track.camera], poses[there, 0], atol=1e-12)
