@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.job_places import find_job
 from bodycap_batch.cli.shared_options import HeightOption, JobArgument, OutOption, SkeletonOption
 from bodycap_batch.cli.terminal import print_json, print_line
 
@@ -34,7 +35,7 @@ def check(
     from bodycap_batch.config.job import Overrides
     from bodycap_batch.telemetry import telemetry_notes
 
-    report = check_path(job, Overrides(out=out, skeleton=skeleton, height_m=height))
+    report = check_path(find_job(job).file, Overrides(out=out, skeleton=skeleton, height_m=height))
     if report.ready and report.job is not None:
         capture = report.job.capture
         notes = (*report.notes, *describe_clocks(capture), *telemetry_notes(capture))

@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share, and the default folders for results and stores."""
+"""Options and arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -32,14 +32,15 @@ JobArgument = Annotated[
     Path,
     typer.Argument(
         metavar="JOB_OR_FOLDER",
-        help="A job file (YAML), or a folder of videos. If the folder contains a job.yaml, this file is "
-        "used.",
+        help="A job file (YAML), a folder of videos, or a folder of results. If a folder of videos contains "
+        "a job.yaml, this file is used.",
         readable=False,  # typer does not check this: the job loader gives a better message, with advice
     ),
 ]
-OutOption = Annotated[Path | None, _out("Folder for the results (default: out/<job>).")]
+OutOption = Annotated[Path | None, _out("Folder for the results (default: out/<name> beside the job).")]
 BatchOutOption = Annotated[
-    Path | None, _out("Folder that contains the results folder of each job (default: out).")
+    Path | None,
+    _out("Folder that contains the results folder of each job (default: the folder out beside each job)."),
 ]
 SkeletonOption = Annotated[
     str | None,
@@ -65,8 +66,7 @@ MemoryOption = Annotated[
         show_default=False,
     ),
 ]
-StoreOption = Annotated[Path | None, _store(".store beside the results")]
-BatchStoreOption = Annotated[Path | None, _store(".store in the results folder")]
+StoreOption = Annotated[Path | None, _store("the one that the results name, else .store beside them")]
 WatchStoreOption = Annotated[Path | None, _store(".store beside INBOX")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
@@ -76,21 +76,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def default_out() -> Path:
-    """Return the default parent folder of all results: ``out`` in the working folder."""
-    return Path.cwd() / "out"
-
-
 def results_folder(job: Job) -> Path:
-    """Return the results folder of a job: the job's `out`, else the folder ``out/<name of the job>``."""
-    return job.out or default_out() / job.name
-
-
-def default_store(out_dir: Path) -> Path:
-    """Return the default folder of the store that a results folder uses.
-
-    All results folders in ``out/`` share the store ``out/.store``. Any other results folder has a separate
-    store inside it.
-    """
-    shared = default_out()
-    return (shared if out_dir in (shared, shared / out_dir.name) else out_dir) / ".store"
+    """Return the results folder of a loaded job."""
+    assert job.out is not None  # the loader gives every job a folder
+    return job.out

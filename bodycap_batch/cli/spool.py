@@ -34,7 +34,7 @@ def status(
     spool: SpoolArgument = Path("jobs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print jobs and watchers as JSON.")] = False,
 ) -> None:
-    """List the jobs of a watched folder with state, stage, progress, age and cause of failure.
+    """List the jobs of a watched folder with state, stage, progress, age, verdict and cause of failure.
 
     Also lists the watchers of the folder.
 
@@ -118,10 +118,10 @@ def _find_spool(path: Path) -> Spool:
 def _job_table(rows: list[JobRow]) -> list[str]:
     if not rows:
         return ["no jobs"]
-    cells = [("JOB", "STATE", "STAGE", "PROGRESS", "AGE", "")]
+    cells = [("JOB", "STATE", "STAGE", "PROGRESS", "AGE", "VERDICT", "")]
     for row in rows:
         progress = "" if row.progress is None else format_percent(row.progress)
-        cause = printable(" ".join(row.cause.split()))
+        cause = printable(" ".join((row.cause or row.headline).split()))
         cause = cause if len(cause) <= _MAX_CAUSE_LENGTH else f"{cause[: _MAX_CAUSE_LENGTH - 1]}…"
         cells.append(
             (
@@ -130,14 +130,15 @@ def _job_table(rows: list[JobRow]) -> list[str]:
                 printable(row.stage),
                 progress,
                 _age_text(row.age_s),
+                printable(row.verdict),
                 cause,
             )
         )
-    widths = [max(len(line[column]) for line in cells) for column in range(5)]
+    widths = [max(len(line[column]) for line in cells) for column in range(6)]
     lines = [
         "  ".join(f"{part:{width}}" for part, width in zip(line, widths, strict=False)) for line in cells
     ]
-    return [f"{line}  {cell[5]}".rstrip() for line, cell in zip(lines, cells, strict=True)]
+    return [f"{line}  {cell[6]}".rstrip() for line, cell in zip(lines, cells, strict=True)]
 
 
 def _age_text(seconds: float | None) -> str:

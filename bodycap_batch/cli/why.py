@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.job_places import find_job, find_store, is_store
 from bodycap_batch.cli.shared_options import (
     STORE_VARIABLE,
     HeightOption,
@@ -18,8 +19,6 @@ from bodycap_batch.cli.shared_options import (
     OutOption,
     SkeletonOption,
     StoreOption,
-    default_out,
-    default_store,
     results_folder,
 )
 from bodycap_batch.cli.terminal import print_json, print_line
@@ -48,10 +47,11 @@ def why(
     from bodycap_batch.pipeline import Settings, explain_job
     from bodycap_batch.store.artefacts import Store
 
-    resolved = load_job(job, Overrides(out=out, skeleton=skeleton, height_m=height))
+    place = find_job(job)
+    resolved = load_job(place.file, Overrides(out=out or place.results, skeleton=skeleton, height_m=height))
     out_dir = results_folder(resolved)
     settings = Settings(
-        store=Store(store or default_store(out_dir)),
+        store=Store(store or find_store(out_dir)),
         threads=1,
         listener=lambda _: None,
         cancelled=lambda: False,
@@ -72,7 +72,9 @@ def gc(
     store: Annotated[
         Path | None,
         typer.Argument(
-            metavar="STORE", help="Folder of the store (default: BODYCAP_STORE, else out/.store)."
+            metavar="STORE",
+            help="Folder of the store, a folder of results, or a folder that holds one of them (default: "
+            "BODYCAP_STORE, else the store below the working folder).",
         ),
     ] = None,
     delete: Annotated[bool, typer.Option("--delete", help="Remove the artefacts that no job uses.")] = False,
@@ -90,12 +92,19 @@ def gc(
     from bodycap_batch.store.artefacts import Store
     from bodycap_batch.store.garbage_collection import collect_garbage
 
-    store_dir = store or Path(os.environ.get(STORE_VARIABLE) or default_store(default_out()))
-    if not (store_dir / "artefacts").is_dir():
+    folder = store or Path(os.environ.get(STORE_VARIABLE) or ".")
+    nearby = (
+        folder,
+        find_store(find_job(folder).results or folder),
+        folder / ".store",
+        folder / "out/.store",
+    )
+    store_dir = next((place for place in nearby if is_store(place)), None)
+    if store_dir is None:
         raise StoreError(
             "there is no store in this folder",
-            path=store_dir,
-            hint="give the folder of the store: bodycap gc FOLDER",
+            path=folder.resolve(),
+            hint="give the folder of the store, or a folder of results: bodycap gc FOLDER",
         )
     garbage = collect_garbage(Store(store_dir), delete=delete)
     if as_json:

@@ -42,9 +42,12 @@ _NAME_LENGTH = 100
 """Maximum number of characters of a job's name. If the job is named after a folder with a longer name, the
 name is shortened. Evidence: none."""
 
-Prepare = Callable[[Mapping[str, Any], Path], None]
-"""Function that renders a synthetic capture. Its arguments are the options of `capture.synthetic` and the
-folder for the videos."""
+RESULTS = "out"
+"""Name of the folder for results beside a job. The folder of one job's results is a subfolder of it."""
+
+Prepare = Callable[[Mapping[str, Any], Path, Path], None]
+"""Function that renders a synthetic capture. Its arguments are the options of `capture.synthetic`, the folder
+for the videos, and the folder for the results of the job."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,7 +178,20 @@ class _StatedJob:
     @property
     def name(self) -> str:
         """Name of the job if the job file gives none."""
-        return self.folder.name if self.source is None or self.path.name in JOB_FILES else self.path.stem
+        return self.folder.name if self._is_folder else self.path.stem
+
+    @property
+    def default_results(self) -> Path:
+        """Folder that holds the results of the job if the job names none: ``out`` beside the job.
+
+        It does not depend on the working folder.
+        """
+        return (self.folder.parent if self._is_folder else self.folder) / RESULTS
+
+    @property
+    def _is_folder(self) -> bool:
+        """True for a folder of videos, also with a ``job.yaml`` in it."""
+        return self.source is None or self.path.name in JOB_FILES
 
 
 def _stated_job(full: Path, source: YamlSource | None, *, alone: bool) -> _StatedJob:
@@ -230,7 +246,7 @@ def _resolved_job(
     if policy is not None:
         policy.require_named(job, base)
     if job.capture.synthetic is not None:
-        _prepare_synthetic(job, base, full, prepare)
+        _prepare_synthetic(job, stated, prepare)
     _require_plausible_calibrations(job, full, source)
     if stated.uses_folder:
         job = job.model_copy(update={"capture": with_found_calibrations(job.capture, base)})
@@ -256,6 +272,7 @@ def _resolved_job(
         unlisted=_reason_of_unlisted(stated),
         warnings=(*stated.beside.warnings, *_calibration_warnings(stated, cameras)),
         no_body=_no_body(job, resolved),
+        states_out=job.out is not None,
     )
 
 
@@ -401,13 +418,14 @@ def _with_overrides(job: Job, overrides: Overrides) -> Job:
     return job.model_copy(update=update)
 
 
-def _prepare_synthetic(job: Job, base: Path, path: Path, prepare: Prepare | None) -> None:
+def _prepare_synthetic(job: Job, stated: _StatedJob, prepare: Prepare | None) -> None:
+    base, path = stated.folder, stated.path
     folder = synthetic_folder(job, base)
     if prepare is not None:
         options = dict(job.capture.synthetic or {})
         if isinstance(options.get("motion"), str):
             options["motion"] = str((base / options["motion"]).resolve())
-        prepare(options, folder)
+        prepare(options, folder, _out(job, stated))
     missing = [v for camera in job.capture.cameras for v in camera.video if not (base / v).is_file()]
     if missing:
         raise CaptureError(
@@ -456,8 +474,15 @@ def _with_resolved(job: Job, cameras: Sequence[ResolvedCamera], stated: _StatedJ
     configs = tuple(camera.config for camera in cameras)
     capture = job.capture.model_copy(update={"cameras": configs, "cameras_only": True, "calibration": None})
     name = job.name or safe_name(stated.name)
-    out = (base / job.out if job.out is not None else Path("out") / name).resolve()
+    out = _out(job, stated)
     return job.model_copy(update={"capture": capture, "name": name, "skeleton": skeleton, "out": out})
+
+
+def _out(job: Job, stated: _StatedJob) -> Path:
+    """Return the folder for the results of a job."""
+    if job.out is not None:
+        return (stated.folder / job.out).resolve()
+    return (stated.default_results / (job.name or safe_name(stated.name))).resolve()
 
 
 def _require_apart(job: Job, full: Path) -> None:

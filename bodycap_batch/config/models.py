@@ -256,7 +256,10 @@ class Job(_Block):
         max_length=100,
         description="name of the job and its results; default: the name of the job file or the folder",
     )
-    out: Path | None = Field(None, description="folder for the results; default: out/<name>")
+    out: Path | None = Field(
+        None,
+        description="folder for the results; default: out/<name> beside the job file or the folder of videos",
+    )
     skeleton: str | None = Field(
         None,
         description="none, upper_body, full_body or a BVH file; default: upper_body, or none if all "

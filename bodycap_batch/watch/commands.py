@@ -71,6 +71,8 @@ class JobRow:
         cause: What the job waits for, or why the job failed.
         hint: What the user can do.
         path: Path of the job.
+        verdict: Grade of the results in words; "" if there are no results, or if it was not recorded.
+        headline: The verdict in one sentence.
     """
 
     name: str
@@ -82,6 +84,8 @@ class JobRow:
     cause: str = ""
     hint: str = ""
     path: str = ""
+    verdict: str = ""
+    headline: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the row as plain JSON values."""
@@ -301,6 +305,7 @@ def job_row(job: JobDir) -> JobRow:
     if state == "stopped" and cause:  # the job waits for a disk or for `bodycap gc`
         where = error.get("path")
         cause = f"the job continues later: {f'{where}: ' if where else ''}{cause}"
+    verdict = (status.get("verdict") or {}) if state == "done" else {}
     if state == "interrupted":
         cause = "the watcher of this job has ended; the job continues when a watcher starts"
     return JobRow(
@@ -313,6 +318,8 @@ def job_row(job: JobDir) -> JobRow:
         cause=cause,
         hint=str(error.get("hint") or ""),
         path=str(job.path),
+        verdict=str(verdict.get("grade", "")),
+        headline=str(verdict.get("headline", "")),
     )
 
 

@@ -48,7 +48,7 @@ def test_only_the_capture_is_needed(tmp_path: Path) -> None:
     job = load(tmp_path, MINIMAL)
     assert job.name == "my_job"
     assert job.skeleton == "upper_body"
-    assert job.out == Path("out/my_job").resolve()
+    assert job.out == tmp_path / "out" / "my_job"
     torso, palm = job.capture.cameras
     assert torso.video == (tmp_path / "torso.mp4",)
     assert palm.video == (tmp_path / "left/a.mp4", tmp_path / "left/b.mp4")
@@ -247,17 +247,18 @@ def test_synthetic_videos_are_prepared_before_they_are_looked_for(tmp_path: Path
     )
     with pytest.raises(CaptureError, match="not been rendered"):
         load_job(path)
-    calls: list[tuple[Mapping[str, Any], Path]] = []
+    calls: list[tuple[Mapping[str, Any], Path, Path]] = []
 
-    def prepare(options: Mapping[str, Any], folder: Path) -> None:
-        calls.append((options, folder))
+    def prepare(options: Mapping[str, Any], folder: Path, out_dir: Path) -> None:
+        calls.append((options, folder, out_dir))
         for name in ("torso.mp4", "left.mp4"):
             (folder / name).write_bytes(b"x")
         lens = {"model": "PINHOLE", "params": [420, 420, 320, 240], "width": 640, "height": 480}
         (folder / "calib.json").write_text(json.dumps(lens))
 
     job = load_job(path, prepare=prepare)
-    assert calls == [({"seconds": 2, "motion": str(tmp_path / "a.bvh")}, tmp_path)]
+    beside = tmp_path.parent / "out" / tmp_path.name
+    assert calls == [({"seconds": 2, "motion": str(tmp_path / "a.bvh")}, tmp_path, beside)]
     assert all(camera.calibration != "auto" for camera in job.capture.cameras)
 
 

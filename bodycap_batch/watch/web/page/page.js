@@ -117,11 +117,19 @@ function actionRow(item, job) {
   return row;
 }
 
+// A job that has ended shows the verdict about its results: a computed result can still be a poor one.
+const gradeClass = { good: "good", "usable with care": "fair", poor: "poor", "no result": "poor" };
+
+function stateBadge(job) {
+  if (!job.verdict) return element("span", `state ${job.state}`, job.state);
+  return element("span", `state ${gradeClass[job.verdict] || job.state}`, `${job.state}: ${job.verdict}`);
+}
+
 function listItem(job) {
   const item = element("li");
   item.dataset.name = job.name;
   const head = element("div", "head");
-  head.append(element("span", "name", job.name), element("span", `state ${job.state}`, job.state));
+  head.append(element("span", "name", job.name), stateBadge(job));
   if (job.since) {
     const since = element("span", "since");
     since.dataset.since = job.since;
@@ -129,6 +137,7 @@ function listItem(job) {
     head.append(since);
   }
   item.append(head);
+  if (job.headline) item.append(element("p", "headline", job.headline));
   if (job.cause) item.append(element("p", "cause", job.cause));
   if (job.hint) item.append(element("p", "hint", job.hint));
   item.append(...progressBars(job));
