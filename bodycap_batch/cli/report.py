@@ -13,6 +13,7 @@ from bodycap_batch.cli.shared_options import (
     StoreOption,
     ThreadsOption,
     cores,
+    make_overrides,
     results_folder,
 )
 from bodycap_batch.cli.signals import event_on_signal
@@ -39,11 +40,10 @@ def report(
       bodycap report out/my_walk
       bodycap report my_walk/ --height 1.75
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.config.job import Overrides
     from bodycap_batch.pipeline import Settings, remake_report
     from bodycap_batch.store.artefacts import Store
 
-    resolved = load_last_run(job, Overrides(out=out, skeleton=skeleton, height_m=height))
+    resolved = load_last_run(job, make_overrides(out, skeleton, height))
     out_dir = results_folder(resolved)
     with event_on_signal() as stop, make_progress_display(as_json=False) as display:
         settings = Settings(

@@ -13,6 +13,8 @@ from bodycap_batch.cli.application import app
 from bodycap_batch.cli.job_places import find_job, find_store
 from bodycap_batch.cli.progress_display import JsonLines, ProgressDisplay, make_progress_display
 from bodycap_batch.cli.shared_options import (
+    ActivityOption,
+    CamerasOption,
     HeightOption,
     JobArgument,
     MemoryOption,
@@ -21,6 +23,7 @@ from bodycap_batch.cli.shared_options import (
     StoreOption,
     ThreadsOption,
     cores,
+    make_overrides,
     results_folder,
 )
 from bodycap_batch.cli.signals import event_on_signal
@@ -40,6 +43,8 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     out: OutOption = None,
     skeleton: SkeletonOption = None,
     height: HeightOption = None,
+    camera: CamerasOption = None,
+    activity: ActivityOption = None,
     threads: ThreadsOption = None,
     store: StoreOption = None,
     memory_mb: MemoryOption = None,
@@ -74,8 +79,9 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap run jobs/cpl_lab.yaml
       bodycap run my_walk/ --from merge
     """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.config.body_height import describe_height
     from bodycap_batch.config.folder import job_file_in
-    from bodycap_batch.config.job import Overrides, load_job_with_origins
+    from bodycap_batch.config.job import load_job_with_origins
     from bodycap_batch.pipeline import Settings, prepare_capture, run_job
     from bodycap_batch.store.artefacts import Store
 
@@ -121,8 +127,11 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         job_file = place.file if place.results else job_file_in(job) if job.is_dir() else None
         if job_file is not None:
             display(Event(kind="note", stage="", what=f"the settings are taken from {job_file}"))
-        overrides = Overrides(out=out or place.results, skeleton=skeleton, height_m=height)
+        overrides = make_overrides(out or place.results, skeleton, height, camera, activity)
         loaded = load_job_with_origins(place.file, overrides, prepare=prepare)
+        if height is not None:
+            shown = describe_height(loaded.job.height_m or 0.0)
+            display(Event(kind="note", stage="", what=f"height of the subject: {shown}"))
         for text in loaded.warnings_of_run():
             display(Event(kind="note", stage="", what=text))
         resolved = loaded.job

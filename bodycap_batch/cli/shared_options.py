@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from bodycap_batch.core.errors import JobError
+
 if TYPE_CHECKING:
+    from bodycap_batch.config.job import Overrides
     from bodycap_batch.config.models import Job
 
 STORE_VARIABLE = "BODYCAP_STORE"
@@ -45,11 +48,30 @@ BatchOutOption = Annotated[
 SkeletonOption = Annotated[
     str | None,
     typer.Option(
-        metavar="NAME|FILE.bvh", help="Skeleton: none, upper_body, full_body, or the subject's own BVH file."
+        metavar="NAME|FILE.bvh",
+        help="Skeleton: auto, full_body, none, or the subject's own BVH file (default: auto).",
     ),
 ]
 HeightOption = Annotated[
-    float | None, typer.Option("--height", metavar="METRES", help="Height of the subject, for example 1.75.")
+    str | None,
+    typer.Option(
+        "--height",
+        metavar="HEIGHT",
+        help="Height of the subject: in metres (1.75), centimetres (175), or feet and inches (5'9\").",
+    ),
+]
+CamerasOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--camera",
+        metavar="NAME=PLACE",
+        help="Place on the body of a video whose name does not contain it, for example gopro1=torso. You can "
+        "repeat this option.",
+    ),
+]
+ActivityOption = Annotated[
+    str | None,
+    typer.Option(metavar="walk|generic", help="What the subject does (default: generic; walk: only walks)."),
 ]
 ThreadsOption = Annotated[
     int | None,
@@ -69,6 +91,44 @@ MemoryOption = Annotated[
 StoreOption = Annotated[Path | None, _store("the one that the results name, else .store beside them")]
 WatchStoreOption = Annotated[Path | None, _store(".store beside INBOX")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+def make_overrides(
+    out: Path | None = None,
+    skeleton: str | None = None,
+    height: str | None = None,
+    cameras: list[str] | None = None,
+    activity: str | None = None,
+) -> Overrides:
+    """Return the values of the command line that replace values of the job.
+
+    Raises:
+        JobError: The height, a camera or the activity cannot be understood.
+    """
+    from bodycap_batch.config.body_height import height_from_text
+    from bodycap_batch.config.job import Overrides
+
+    return Overrides(
+        out=out,
+        skeleton=skeleton,
+        height_m=None if height is None else height_from_text(height),
+        mounts=_mounts(cameras or []),
+        activity=activity,
+    )
+
+
+def _mounts(words: list[str]) -> dict[str, str]:
+    found = {}
+    for text in words:
+        name, equals, place = text.rpartition("=")
+        if not (name and equals and place):
+            raise JobError(
+                f"{text[:60]!r} does not have the form NAME=PLACE",
+                field="--camera",
+                hint="write the name of the video and its place on the body, for example gopro1=torso",
+            )
+        found[name.strip()] = place.strip()
+    return found
 
 
 def cores() -> int:

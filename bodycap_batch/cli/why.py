@@ -13,12 +13,15 @@ from bodycap_batch.cli.application import app
 from bodycap_batch.cli.job_places import find_job, find_store, is_store
 from bodycap_batch.cli.shared_options import (
     STORE_VARIABLE,
+    ActivityOption,
+    CamerasOption,
     HeightOption,
     JobArgument,
     JsonOption,
     OutOption,
     SkeletonOption,
     StoreOption,
+    make_overrides,
     results_folder,
 )
 from bodycap_batch.cli.terminal import print_json, print_line
@@ -26,11 +29,13 @@ from bodycap_batch.core.errors import StoreError
 
 
 @app.command()
-def why(
+def why(  # noqa: PLR0913, PLR0917 - the flags a user types
     job: JobArgument,
     out: OutOption = None,
     skeleton: SkeletonOption = None,
     height: HeightOption = None,
+    camera: CamerasOption = None,
+    activity: ActivityOption = None,
     store: StoreOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -43,12 +48,12 @@ def why(
     Example:
       bodycap why my_walk/ --height 1.75
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.config.job import Overrides, load_job
+    from bodycap_batch.config.job import load_job
     from bodycap_batch.pipeline import Settings, explain_job
     from bodycap_batch.store.artefacts import Store
 
     place = find_job(job)
-    resolved = load_job(place.file, Overrides(out=out or place.results, skeleton=skeleton, height_m=height))
+    resolved = load_job(place.file, make_overrides(out or place.results, skeleton, height, camera, activity))
     out_dir = results_folder(resolved)
     settings = Settings(
         store=Store(store or find_store(out_dir)),
