@@ -310,8 +310,8 @@ def _refuse_unknown_mounts(named: list[tuple[str, Path]], is_known: Callable[[st
             f"the place of {', '.join(path.name for _, path in unknown)} on the body is unknown, because the "
             "name does not contain a place",
             path=folder,
-            hint="rename each video after its place (for example torso.mp4); or give the place of each "
-            f"video, for example --camera {first}=torso; or run `bodycap init {shlex.quote(folder.name)}`, "
-            "which writes a job.yaml with a blank for each place. The places are "
-            f"{', '.join(MOUNT_NAMES)}",
+            hint="rename each video, or the folder of its chapters, after its place (for example torso.mp4); "
+            f"or give the place of each video, for example --camera {first}=torso; or run "
+            f"`bodycap init {shlex.quote(folder.name)}`, which writes a job.yaml with a blank per place. "
+            f"The places are {', '.join(MOUNT_NAMES)}",
         )

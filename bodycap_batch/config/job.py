@@ -43,10 +43,12 @@ from bodycap_batch.config.rules import missing_files, problems_in, skeleton_of
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.config.videos_beside import VideosBeside, find_videos_beside
 from bodycap_batch.config.yaml_source import Location, YamlSource, dotted, read_yaml
-from bodycap_batch.core.errors import CaptureError, JobError, one_error
+from bodycap_batch.core.errors import CaptureError, JobError
 
 _LISTS = ("video", "timestamps")
 """Names of the fields of a camera in which a job file may give a single path instead of a list of paths."""
+_MAX_MISSING = 5
+"""Maximum number of missing files that a message lists after other problems. Evidence: none."""
 _NAME_LENGTH = 100
 """Maximum number of characters of a job's name. If the job is named after a folder with a longer name, the
 name is shortened. Evidence: none."""
@@ -305,9 +307,10 @@ def _resolved_job(
     problems = [] if is_draft else problems_in(job)
     if problems:
         is_own = policy is None and job.capture.synthetic is None
-        missing = missing_files(job, base) if is_own else ()
-        further = [JobError(found.message, field=dotted(found.location)) for found in missing]
-        raise one_error([job_error(problems, full, source), *further])
+        error = job_error(problems, full, source)
+        for found in missing_files(job, base)[:_MAX_MISSING] if is_own else ():
+            error.message += f"; also {dotted(found.location)}: {found.message}"
+        raise error
     if policy is not None:
         policy.require_named(job, base)
     if job.capture.synthetic is not None:

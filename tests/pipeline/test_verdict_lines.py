@@ -29,7 +29,7 @@ def test_a_run_ends_with_the_verdict_its_reasons_and_the_file_to_open(films: Ben
     assert out.splitlines() == [
         "verdict: poor. The cameras are tracked well, but the motion is poor.",
         "  poor: Longest gap: camera torso has no measurement for 5.00 s",
-        "  usable with care: Metric scale: the uncertainty is 5.0% (one standard deviation)",
+        "  usable with care: Metric scale: sizes are known to about ± 8 cm of body height (5.0%)",
         "measured: chest, left hand",
         "not measured: hips, head, both arms, right hand, both legs, both feet",
         f"open first: {results / 'report.html'}",
