@@ -68,6 +68,7 @@ class JobRow:
         progress: Completed fraction of the stage; None if the fraction is unknown.
         since: Time at which the state started, UTC.
         age_s: Time (seconds) since `since`; None if `since` is unknown.
+        duration_s: Time (seconds) from the start of a job to its end; None if it has not ended.
         cause: What the job waits for, or why the job failed.
         hint: What the user can do.
         path: Path of the job.
@@ -81,6 +82,7 @@ class JobRow:
     progress: float | None = None
     since: str = ""
     age_s: float | None = None
+    duration_s: float | None = None
     cause: str = ""
     hint: str = ""
     path: str = ""
@@ -315,6 +317,7 @@ def job_row(job: JobDir) -> JobRow:
         progress=status.get("progress") if running else None,
         since=str(since or ""),
         age_s=_age_s(since),
+        duration_s=_seconds_between(status.get("started_at"), status.get("finished_at")),
         cause=cause,
         hint=str(error.get("hint") or ""),
         path=str(job.path),
@@ -330,6 +333,15 @@ def _is_watcher_gone(job: JobDir) -> bool:
     return bool(owner.get("released")) or (
         is_local and process_start(int(owner.get("pid", 0))) != owner.get("process")
     )
+
+
+def _seconds_between(start: object, end: object) -> float | None:
+    """Return the time (seconds) between two moments that are given as text; None if a text is not a time."""
+    try:
+        first, last = (datetime.fromisoformat(str(moment)) for moment in (start, end))
+        return round((last - first).total_seconds(), 1)
+    except (ValueError, TypeError):
+        return None
 
 
 def _age_s(moment: object) -> float | None:
