@@ -36,7 +36,8 @@ def main() -> None:
     arguments = parser.parse_args()
 
     job = load_job(arguments.job, Overrides(height_m=arguments.height))
-    out = job.out or Path("out") / job.name
+    out = job.out
+    assert out is not None  # a loaded job has a folder for its results: out/NAME beside the job
     settings = Settings(store=Store(out.parent / ".store"), threads=2, listener=show, cancelled=lambda: False)
     summary = run_job(job, out_dir=out, settings=settings)
 

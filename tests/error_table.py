@@ -22,7 +22,7 @@ CODES |= {"Problem": 2, "error": 2}
 """Also what a job's rules find, and what the BVH parser says of a line."""
 DEFAULT_REMEDY = {
     "Problem": "see the description of the field, which is printed with the message",
-    "error": "export the skeleton again as BVH, or use a preset: `skeleton: upper_body`",
+    "error": "export the skeleton again as BVH, or use a preset: `skeleton: auto`",
 }
 """What these say where the code gives no remedy of its own."""
 

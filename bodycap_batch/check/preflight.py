@@ -37,6 +37,7 @@ from bodycap_batch.core.errors import (
     CaptureError,
     EstimationError,
     JobError,
+    one_error,
 )
 from bodycap_batch.formats.bvh import RigOptions, read_rig
 from bodycap_batch.formats.optional_libraries import require_libraries
@@ -83,7 +84,7 @@ def check_path(path: Path, overrides: Overrides | None = None) -> CheckReport:
 
 
 def require_ready(job: Job, threads: int = 1) -> CheckReport:
-    """Check a resolved job before hours of computation, and raise the first error.
+    """Check a resolved job before hours of computation, and raise one error with all problems.
 
     Disk space is not checked, because it changes while the job runs. Damaged frames are not searched: the
     selection of keyframes decodes all frames and finds them.
@@ -100,7 +101,7 @@ def require_ready(job: Job, threads: int = 1) -> CheckReport:
     """
     report = _run_checks(job, _CHECKS, threads, {})
     if report.errors:
-        raise report.errors[0]
+        raise one_error(report.errors)
     return report
 
 
@@ -282,8 +283,8 @@ def _body_notes(job: Job) -> list[str]:
         )
     if job.height_m is None and job.skeleton in SKELETON_PRESETS:
         notes.append(
-            "the job does not give height_m, so the height of a mean adult is assumed; if the height is "
-            "wrong, all distances are wrong by the same factor"
+            "the height of the subject is not given (--height 1.75, or height_m in the job file), so the "
+            "height of a mean adult is assumed; if it is wrong, all distances are wrong by the same factor"
         )
     return notes
 
@@ -377,7 +378,7 @@ def _check_formats(job: Job, _findings: list[CameraSummary]) -> list[str]:
             f"`names: {job.export.names}` cannot be used with a skeleton file, because the joints keep the "
             "names in the file",
             field="export.names",
-            hint="leave out `names`, or use `skeleton: upper_body` or `skeleton: full_body`",
+            hint="leave out `names`, or use `skeleton: auto` or `skeleton: full_body`",
         )
     return []
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from bodycap_batch.check.check_report import CameraSummary
-from bodycap_batch.config.models import SKELETON_PRESETS, Job
+from bodycap_batch.config.models import Job
 
+_MAX_ADVICE = 3
+"""Maximum number of sentences of advice. Evidence: none."""
 _LOW_FPS = 24.0
 """Minimum number of frames per second that needs no advice.
 
@@ -36,7 +38,7 @@ For longer videos the advice contains an estimate of the computation time. Evide
 
 
 def advise(job: Job, cameras: Sequence[CameraSummary]) -> list[str]:
-    """Return sentences of advice, the most important sentences first.
+    """Return at most three sentences of advice, the most important sentences first.
 
     Each sentence gives a reason and a remedy.
 
@@ -46,13 +48,13 @@ def advise(job: Job, cameras: Sequence[CameraSummary]) -> list[str]:
     """
     if not cameras:
         return []
-    return [
+    found = [
         *_intrinsics_advice(cameras),
         *_missing_time_advice(job, cameras),
         *_frame_rate_advice(cameras),
-        *_scale_advice(job),
         *_duration_advice(cameras),
     ]
+    return found[:_MAX_ADVICE]
 
 
 def _intrinsics_advice(cameras: Sequence[CameraSummary]) -> Iterator[str]:
@@ -93,15 +95,6 @@ def _frame_rate_advice(cameras: Sequence[CameraSummary]) -> Iterator[str]:
                 "walk, but hardly enough for swinging arms; film at 30 frames per second or more, and at "
                 "60 for fast movement"
             )
-
-
-def _scale_advice(job: Job) -> Iterator[str]:
-    if job.skeleton in SKELETON_PRESETS and job.skeleton != "none" and job.height_m is not None:
-        yield (
-            "with only a body height, the bones have the proportions of a standard body, which differ "
-            "from a real body by several centimetres. If you have a BVH file of the subject's own "
-            "skeleton, use this file: --skeleton subject.bvh"
-        )
 
 
 def _duration_advice(cameras: Sequence[CameraSummary]) -> Iterator[str]:

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.job_places import find_job, find_store
 from bodycap_batch.cli.progress_display import text_from_event
 from bodycap_batch.cli.shared_options import (
     BatchOutOption,
-    BatchStoreOption,
     MemoryOption,
+    StoreOption,
     cores,
-    default_out,
     results_folder,
 )
 from bodycap_batch.cli.signals import event_on_signal
@@ -30,7 +30,7 @@ from bodycap_batch.core.printable import printable
 from bodycap_batch.core.progress import Event
 
 if TYPE_CHECKING:
-    from bodycap_batch.config.models import Job
+    from bodycap_batch.config.origins import LoadedJob
     from bodycap_batch.pipeline import BatchJob, Outcome, Settings
     from bodycap_batch.runner import Executor
     from bodycap_batch.runner.dask_cluster import Cluster
@@ -57,7 +57,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
     jobs: Annotated[list[Path], typer.Argument(metavar="JOBS...", help="Job files and folders of videos.")],
     executor: _ExecutorOption = "local",
     out: BatchOutOption = None,
-    store: BatchStoreOption = None,
+    store: StoreOption = None,
     memory_mb: MemoryOption = None,
     max_jobs: Annotated[
         int | None, typer.Option(min=1, help="Maximum number of jobs at the same time.", show_default=False)
@@ -93,18 +93,16 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.pipeline import Batch, Settings
     from bodycap_batch.store.artefacts import Store
 
-    batch_jobs = _batch_jobs(list(dict.fromkeys(jobs)), priority or [])
-    folder = (out or default_out()).resolve()
+    batch_jobs = _batch_jobs(_without_results(list(dict.fromkeys(jobs))), priority or [])
     reporter = _BatchReporter(as_json=as_json)
-    artefact_store = Store(store or folder / ".store")
     with (
         event_on_signal() as stop,
         _executor(executor, threads, workers, worker_memory) as (shared, busy_jobs),
     ):
 
-        def settings(job: BatchJob, _: Path | None) -> Settings:
+        def settings(job: BatchJob, out_dir: Path) -> Settings:
             return Settings(
-                store=artefact_store,
+                store=Store(store or find_store(out_dir)),
                 threads=threads,
                 listener=reporter.listener(job.path),
                 cancelled=stop.is_set,
@@ -113,7 +111,9 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
                 memory_mb=memory_mb,
             )
 
-        work = Batch(settings, lambda job: _batch_results_folder(job, folder), max_jobs or busy_jobs)
+        work = Batch(
+            settings, lambda loaded: _batch_results_folder(loaded, out), max_jobs or busy_jobs, stop.is_set
+        )
         outcomes = [reporter.report_outcome(outcome) for outcome in work.run(batch_jobs)]
         if stop.is_set():
             raise Cancelled(
@@ -170,14 +170,37 @@ def _with_worker_note(cluster: Cluster) -> Cluster:
     return cluster
 
 
-def _batch_results_folder(job: Job, folder: Path) -> Path:
+def _batch_results_folder(loaded: LoadedJob, folder: Path | None) -> Path:
     """Return the results folder of a job.
 
-    The `out` of a loaded job is the default folder if the job file does not give `out`. In this case, the
-    results folder is a subfolder of `folder` (the batch's folder) with the job's name.
+    If the command line gives a folder for the whole batch, it is a subfolder of it, unless the job file names
+    its own folder.
     """
-    default_folder = default_out() / job.name
-    return folder / job.name if job.out in (None, default_folder) else results_folder(job)
+    if folder is None or loaded.states_out:
+        return results_folder(loaded.job)
+    return folder.resolve() / loaded.job.name
+
+
+def _without_results(paths: list[Path]) -> list[Path]:
+    """Return the jobs without folders that only hold folders of results.
+
+    A pattern such as ``monday/*/`` also finds ``monday/out``, the folder with the results of the other jobs.
+    """
+    jobs = [path for path in paths if not _holds_only_results(path)]
+    for path in (path for path in paths if path not in jobs):
+        print_message(f"{path} is left out, because it contains results and no videos")
+    return jobs or paths
+
+
+def _holds_only_results(path: Path) -> bool:
+    from bodycap_batch.config.folder import is_video, job_file_in
+
+    try:
+        entries = list(path.iterdir())
+        has_results = any(find_job(entry).results is not None for entry in entries)
+        return has_results and job_file_in(path) is None and not any(map(is_video, entries))
+    except OSError:  # a job file, or a folder that the loader reports
+        return False
 
 
 def _batch_jobs(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJob]:
@@ -193,7 +216,7 @@ def _batch_jobs(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJo
                 hint="write the job as on the command line, for example --priority monday.yaml=5",
             )
         priority_of_job[Path(name)] = int(number)
-    return [BatchJob(path=path, priority=priority_of_job.get(path, 0)) for path in jobs]
+    return [BatchJob(path=find_job(path).file, priority=priority_of_job.get(path, 0)) for path in jobs]
 
 
 class _BatchReporter:
@@ -256,6 +279,8 @@ def _outcome_text(outcome: Outcome) -> str:
     if outcome.summary is None:
         message = outcome.error.message if outcome.error is not None else ""
         return f"failed ({outcome.exit_code}): {message}"
-    if outcome.summary.executed == 0:
-        return f"nothing to do  {outcome.summary.out_dir}"
-    return f"done in {outcome.seconds:.0f} s  {outcome.summary.out_dir}"
+    is_new = outcome.summary.executed > 0
+    work = f"done in {outcome.seconds:.0f} s" if is_new else "nothing to do"
+    verdict = outcome.summary.verdict
+    grade = "" if verdict is None else f"  verdict: {verdict.grade.word}"
+    return f"{work}{grade}  {outcome.summary.out_dir}"

@@ -8,16 +8,27 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.shared_options import HeightOption, JobArgument, OutOption, SkeletonOption
+from bodycap_batch.cli.job_places import find_job
+from bodycap_batch.cli.shared_options import (
+    ActivityOption,
+    CamerasOption,
+    HeightOption,
+    JobArgument,
+    OutOption,
+    SkeletonOption,
+    make_overrides,
+)
 from bodycap_batch.cli.terminal import print_json, print_line
 
 
 @app.command()
-def check(
+def check(  # noqa: PLR0913, PLR0917 - the flags a user types
     job: JobArgument,
     out: OutOption = None,
     skeleton: SkeletonOption = None,
     height: HeightOption = None,
+    camera: CamerasOption = None,
+    activity: ActivityOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
 ) -> None:
     """Show the files and settings that a job uses, and its problems.
@@ -31,10 +42,9 @@ def check(
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.check import check_path
     from bodycap_batch.clocks import describe_clocks
-    from bodycap_batch.config.job import Overrides
     from bodycap_batch.telemetry import telemetry_notes
 
-    report = check_path(job, Overrides(out=out, skeleton=skeleton, height_m=height))
+    report = check_path(find_job(job).file, make_overrides(out, skeleton, height, camera, activity))
     if report.ready and report.job is not None:
         capture = report.job.capture
         notes = (*report.notes, *describe_clocks(capture), *telemetry_notes(capture))

@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.job_places import find_job, find_store
 from bodycap_batch.cli.progress_display import JsonLines, ProgressDisplay, make_progress_display
 from bodycap_batch.cli.shared_options import (
+    ActivityOption,
+    CamerasOption,
     HeightOption,
     JobArgument,
     MemoryOption,
@@ -20,8 +23,7 @@ from bodycap_batch.cli.shared_options import (
     StoreOption,
     ThreadsOption,
     cores,
-    default_out,
-    default_store,
+    make_overrides,
     results_folder,
 )
 from bodycap_batch.cli.signals import event_on_signal
@@ -41,6 +43,8 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     out: OutOption = None,
     skeleton: SkeletonOption = None,
     height: HeightOption = None,
+    camera: CamerasOption = None,
+    activity: ActivityOption = None,
     threads: ThreadsOption = None,
     store: StoreOption = None,
     memory_mb: MemoryOption = None,
@@ -75,8 +79,9 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap run jobs/cpl_lab.yaml
       bodycap run my_walk/ --from merge
     """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.config.body_height import describe_height
     from bodycap_batch.config.folder import job_file_in
-    from bodycap_batch.config.job import Overrides, load_job_with_origins
+    from bodycap_batch.config.job import load_job_with_origins
     from bodycap_batch.pipeline import Settings, prepare_capture, run_job
     from bodycap_batch.store.artefacts import Store
 
@@ -88,16 +93,15 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         )
     first_repeated: StageName | None = "check" if force else from_
     redo = frozenset[str]() if first_repeated is None else stages_from(first_repeated)
-    overrides = Overrides(out=out, skeleton=skeleton, height_m=height)
     with (
         event_on_signal() as stop,
         make_progress_display(as_json=json_progress) as display,
         _report_errors_as_json(display),
     ):
 
-        def settings(default_store: Path) -> Settings:
+        def settings(out_dir: Path) -> Settings:
             return Settings(
-                store=Store(store or default_store),
+                store=Store(store or find_store(out_dir)),
                 threads=threads or cores(),
                 listener=display,
                 cancelled=stop.is_set,
@@ -116,17 +120,23 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
                 )
             )
 
-        def prepare(options: Mapping[str, Any], folder: Path) -> None:
-            prepare_capture(options, folder, settings(default_store(out or default_out())))
+        def prepare(options: Mapping[str, Any], folder: Path, out_dir: Path) -> None:
+            prepare_capture(options, folder, settings(out_dir))
 
-        if job.is_dir() and (job_file := job_file_in(job)) is not None:
+        place = find_job(job)
+        job_file = place.file if place.results else job_file_in(job) if job.is_dir() else None
+        if job_file is not None:
             display(Event(kind="note", stage="", what=f"the settings are taken from {job_file}"))
-        loaded = load_job_with_origins(job, overrides, prepare=prepare)
+        overrides = make_overrides(out or place.results, skeleton, height, camera, activity)
+        loaded = load_job_with_origins(place.file, overrides, prepare=prepare)
+        if height is not None:
+            shown = describe_height(loaded.job.height_m or 0.0)
+            display(Event(kind="note", stage="", what=f"height of the subject: {shown}"))
         for text in loaded.warnings_of_run():
             display(Event(kind="note", stage="", what=text))
         resolved = loaded.job
         out_dir = results_folder(resolved)
-        summary = run_job(resolved, out_dir=out_dir, settings=settings(default_store(out_dir)))
+        summary = run_job(resolved, out_dir=out_dir, settings=settings(out_dir))
     _print_summary(summary, resolved, display, verbose=verbose)
 
 
@@ -144,7 +154,8 @@ def _report_errors_as_json(display: ProgressDisplay) -> Iterator[None]:
 def _print_summary(summary: RunSummary, job: Job, display: ProgressDisplay, *, verbose: bool) -> None:
     if isinstance(display, JsonLines):
         last = {"kind": "done", "out_dir": str(summary.out_dir), "files": list(summary.files)}
-        print_json({**last, "executed": summary.executed})
+        verdict = None if summary.verdict is None else summary.verdict.to_dict()
+        print_json({**last, "executed": summary.executed, "verdict": verdict})
         return
     if verbose:
         for stage in summary.stages:
@@ -161,6 +172,11 @@ def _print_summary(summary: RunSummary, job: Job, display: ProgressDisplay, *, v
             "--until to compute the other stages"
         )
         return
+    from bodycap_batch.report import REPORT_FILE
+
     if summary.executed == 0:
         print_line(f"{job.name}: nothing to do, because all {len(summary.stages)} stages were already done")
+    for line in () if summary.verdict is None else summary.verdict.lines():
+        print_line(line)
+    print_line(f"open first: {summary.out_dir / REPORT_FILE}")
     print_line(f"results: {summary.out_dir}")

@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share, and the default folders for results and stores."""
+"""Options and arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from bodycap_batch.core.errors import JobError
+
 if TYPE_CHECKING:
+    from bodycap_batch.config.job import Overrides
     from bodycap_batch.config.models import Job
 
 STORE_VARIABLE = "BODYCAP_STORE"
@@ -32,23 +35,43 @@ JobArgument = Annotated[
     Path,
     typer.Argument(
         metavar="JOB_OR_FOLDER",
-        help="A job file (YAML), or a folder of videos. If the folder contains a job.yaml, this file is "
-        "used.",
+        help="A job file (YAML), a folder of videos, or a folder of results. If a folder of videos contains "
+        "a job.yaml, this file is used.",
         readable=False,  # typer does not check this: the job loader gives a better message, with advice
     ),
 ]
-OutOption = Annotated[Path | None, _out("Folder for the results (default: out/<job>).")]
+OutOption = Annotated[Path | None, _out("Folder for the results (default: out/<name> beside the job).")]
 BatchOutOption = Annotated[
-    Path | None, _out("Folder that contains the results folder of each job (default: out).")
+    Path | None,
+    _out("Folder that contains the results folder of each job (default: the folder out beside each job)."),
 ]
 SkeletonOption = Annotated[
     str | None,
     typer.Option(
-        metavar="NAME|FILE.bvh", help="Skeleton: none, upper_body, full_body, or the subject's own BVH file."
+        metavar="NAME|FILE.bvh",
+        help="Skeleton: auto, full_body, none, or the subject's own BVH file (default: auto).",
     ),
 ]
 HeightOption = Annotated[
-    float | None, typer.Option("--height", metavar="METRES", help="Height of the subject, for example 1.75.")
+    str | None,
+    typer.Option(
+        "--height",
+        metavar="HEIGHT",
+        help="Height of the subject: in metres (1.75), centimetres (175), or feet and inches (5'9\").",
+    ),
+]
+CamerasOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--camera",
+        metavar="NAME=PLACE",
+        help="Place on the body of a video whose name does not contain it, for example gopro1=torso. You can "
+        "repeat this option.",
+    ),
+]
+ActivityOption = Annotated[
+    str | None,
+    typer.Option(metavar="walk|generic", help="What the subject does (default: generic; walk: only walks)."),
 ]
 ThreadsOption = Annotated[
     int | None,
@@ -65,10 +88,47 @@ MemoryOption = Annotated[
         show_default=False,
     ),
 ]
-StoreOption = Annotated[Path | None, _store(".store beside the results")]
-BatchStoreOption = Annotated[Path | None, _store(".store in the results folder")]
+StoreOption = Annotated[Path | None, _store("the one that the results name, else .store beside them")]
 WatchStoreOption = Annotated[Path | None, _store(".store beside INBOX")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+def make_overrides(
+    out: Path | None = None,
+    skeleton: str | None = None,
+    height: str | None = None,
+    cameras: list[str] | None = None,
+    activity: str | None = None,
+) -> Overrides:
+    """Return the values of the command line that replace values of the job.
+
+    Raises:
+        JobError: The height, a camera or the activity cannot be understood.
+    """
+    from bodycap_batch.config.body_height import height_from_text
+    from bodycap_batch.config.job import Overrides
+
+    return Overrides(
+        out=out,
+        skeleton=skeleton,
+        height_m=None if height is None else height_from_text(height),
+        mounts=_mounts(cameras or []),
+        activity=activity,
+    )
+
+
+def _mounts(words: list[str]) -> dict[str, str]:
+    found = {}
+    for text in words:
+        name, equals, place = text.rpartition("=")
+        if not (name and equals and place):
+            raise JobError(
+                f"{text[:60]!r} does not have the form NAME=PLACE",
+                field="--camera",
+                hint="write the name of the video and its place on the body, for example gopro1=torso",
+            )
+        found[name.strip()] = place.strip()
+    return found
 
 
 def cores() -> int:
@@ -76,21 +136,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def default_out() -> Path:
-    """Return the default parent folder of all results: ``out`` in the working folder."""
-    return Path.cwd() / "out"
-
-
 def results_folder(job: Job) -> Path:
-    """Return the results folder of a job: the job's `out`, else the folder ``out/<name of the job>``."""
-    return job.out or default_out() / job.name
-
-
-def default_store(out_dir: Path) -> Path:
-    """Return the default folder of the store that a results folder uses.
-
-    All results folders in ``out/`` share the store ``out/.store``. Any other results folder has a separate
-    store inside it.
-    """
-    shared = default_out()
-    return (shared if out_dir in (shared, shared / out_dir.name) else out_dir) / ".store"
+    """Return the results folder of a loaded job."""
+    assert job.out is not None  # the loader gives every job a folder
+    return job.out

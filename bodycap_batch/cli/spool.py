@@ -22,8 +22,10 @@ SpoolArgument = Annotated[
     ),
 ]
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the job in `bodycap status`.")]
-_AGE_UNITS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
-"""Units for the display of a job's age: the length (seconds) and the symbol of each unit."""
+_ENDED = ("done", "failed", "cancelled")
+"""States of a job that has ended. Its time is the duration of its run."""
+_TIME_UNITS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
+"""Units for the display of a job's time: the length (seconds) and the symbol of each unit."""
 _MAX_CAUSE_LENGTH = 200
 """Maximum length, in characters, of the text for the cause of a failure in the table. A longer text is cut,
 because it would make the row hard to read."""
@@ -34,9 +36,10 @@ def status(
     spool: SpoolArgument = Path("jobs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print jobs and watchers as JSON.")] = False,
 ) -> None:
-    """List the jobs of a watched folder with state, stage, progress, age and cause of failure.
+    """List the jobs of a watched folder with state, stage, progress, time, verdict and cause of failure.
 
-    Also lists the watchers of the folder.
+    The time is the duration of a job that has ended, and else the time since it waits or runs. Also lists the
+    watchers of the folder.
 
     \b
     Examples:
@@ -118,10 +121,10 @@ def _find_spool(path: Path) -> Spool:
 def _job_table(rows: list[JobRow]) -> list[str]:
     if not rows:
         return ["no jobs"]
-    cells = [("JOB", "STATE", "STAGE", "PROGRESS", "AGE", "")]
+    cells = [("JOB", "STATE", "STAGE", "PROGRESS", "TIME", "VERDICT", "")]
     for row in rows:
         progress = "" if row.progress is None else format_percent(row.progress)
-        cause = printable(" ".join(row.cause.split()))
+        cause = printable(" ".join((row.cause or row.headline).split()))
         cause = cause if len(cause) <= _MAX_CAUSE_LENGTH else f"{cause[: _MAX_CAUSE_LENGTH - 1]}…"
         cells.append(
             (
@@ -129,21 +132,22 @@ def _job_table(rows: list[JobRow]) -> list[str]:
                 printable(row.state),
                 printable(row.stage),
                 progress,
-                _age_text(row.age_s),
+                _time_text(row.duration_s if row.state in _ENDED else row.age_s),
+                printable(row.verdict),
                 cause,
             )
         )
-    widths = [max(len(line[column]) for line in cells) for column in range(5)]
+    widths = [max(len(line[column]) for line in cells) for column in range(6)]
     lines = [
         "  ".join(f"{part:{width}}" for part, width in zip(line, widths, strict=False)) for line in cells
     ]
-    return [f"{line}  {cell[5]}".rstrip() for line, cell in zip(lines, cells, strict=True)]
+    return [f"{line}  {cell[6]}".rstrip() for line, cell in zip(lines, cells, strict=True)]
 
 
-def _age_text(seconds: float | None) -> str:
+def _time_text(seconds: float | None) -> str:
     if seconds is None:
         return ""
-    for size, unit in _AGE_UNITS:
+    for size, unit in _TIME_UNITS:
         if seconds >= size:
             return f"{seconds / size:.0f} {unit}"
     return f"{max(seconds, 0.0):.0f} s"

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.report import job_from_path
+from bodycap_batch.cli.job_places import find_store, load_last_run
 from bodycap_batch.cli.shared_options import (
     JobArgument,
     OutOption,
     StoreOption,
-    default_store,
     results_folder,
 )
 from bodycap_batch.cli.terminal import print_line, print_message
@@ -47,10 +46,9 @@ def view(
 ) -> None:
     """Show a finished job in the browser, together with its videos.
 
-    Serves the report on this machine only (127.0.0.1) until Ctrl-C. The job may also be given by its results
-    folder. The report itself, report.html, needs no server; it shows small pictures instead of the videos.
-    Points and skeleton are drawn over every frame if the store still holds them, otherwise over the small
-    pictures only.
+    Serves the report on this machine only (127.0.0.1) until Ctrl-C. The report itself, report.html, needs no
+    server; it shows small pictures instead of the videos. Points and skeleton are drawn over every frame if
+    the store still holds them, otherwise over the small pictures only.
 
     \b
     Examples:
@@ -58,14 +56,13 @@ def view(
       bodycap view out/my_walk --rerun my_walk.rrd
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.capture import open_capture
-    from bodycap_batch.config.job import Overrides, load_job
+    from bodycap_batch.config.job import Overrides
     from bodycap_batch.report.recording import write_recording
     from bodycap_batch.report.serving import LOOPBACK, make_served_content, make_server
 
-    file, folder = job_from_path(job)
-    resolved = load_job(file, Overrides(out=out or folder))
+    resolved = load_last_run(job, Overrides(out=out))
     out_dir = results_folder(resolved)
-    store = store or default_store(out_dir)
+    store = store or find_store(out_dir)
     if rerun is not None:
         write_recording(_stored_inputs(resolved, out_dir, store), rerun)
         print_line(f"recording: {rerun}")

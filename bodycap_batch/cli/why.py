@@ -10,16 +10,18 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.job_places import find_job, find_store, is_store
 from bodycap_batch.cli.shared_options import (
     STORE_VARIABLE,
+    ActivityOption,
+    CamerasOption,
     HeightOption,
     JobArgument,
     JsonOption,
     OutOption,
     SkeletonOption,
     StoreOption,
-    default_out,
-    default_store,
+    make_overrides,
     results_folder,
 )
 from bodycap_batch.cli.terminal import print_json, print_line
@@ -27,11 +29,13 @@ from bodycap_batch.core.errors import StoreError
 
 
 @app.command()
-def why(
+def why(  # noqa: PLR0913, PLR0917 - the flags a user types
     job: JobArgument,
     out: OutOption = None,
     skeleton: SkeletonOption = None,
     height: HeightOption = None,
+    camera: CamerasOption = None,
+    activity: ActivityOption = None,
     store: StoreOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -44,14 +48,15 @@ def why(
     Example:
       bodycap why my_walk/ --height 1.75
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.config.job import Overrides, load_job
+    from bodycap_batch.config.job import load_job
     from bodycap_batch.pipeline import Settings, explain_job
     from bodycap_batch.store.artefacts import Store
 
-    resolved = load_job(job, Overrides(out=out, skeleton=skeleton, height_m=height))
+    place = find_job(job)
+    resolved = load_job(place.file, make_overrides(out or place.results, skeleton, height, camera, activity))
     out_dir = results_folder(resolved)
     settings = Settings(
-        store=Store(store or default_store(out_dir)),
+        store=Store(store or find_store(out_dir)),
         threads=1,
         listener=lambda _: None,
         cancelled=lambda: False,
@@ -72,7 +77,9 @@ def gc(
     store: Annotated[
         Path | None,
         typer.Argument(
-            metavar="STORE", help="Folder of the store (default: BODYCAP_STORE, else out/.store)."
+            metavar="STORE",
+            help="Folder of the store, a folder of results, or a folder that holds one of them (default: "
+            "BODYCAP_STORE, else the store below the working folder).",
         ),
     ] = None,
     delete: Annotated[bool, typer.Option("--delete", help="Remove the artefacts that no job uses.")] = False,
@@ -90,12 +97,19 @@ def gc(
     from bodycap_batch.store.artefacts import Store
     from bodycap_batch.store.garbage_collection import collect_garbage
 
-    store_dir = store or Path(os.environ.get(STORE_VARIABLE) or default_store(default_out()))
-    if not (store_dir / "artefacts").is_dir():
+    folder = store or Path(os.environ.get(STORE_VARIABLE) or ".")
+    nearby = (
+        folder,
+        find_store(find_job(folder).results or folder),
+        folder / ".store",
+        folder / "out/.store",
+    )
+    store_dir = next((place for place in nearby if is_store(place)), None)
+    if store_dir is None:
         raise StoreError(
             "there is no store in this folder",
-            path=store_dir,
-            hint="give the folder of the store: bodycap gc FOLDER",
+            path=folder.resolve(),
+            hint="give the folder of the store, or a folder of results: bodycap gc FOLDER",
         )
     garbage = collect_garbage(Store(store_dir), delete=delete)
     if as_json:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import shlex
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
@@ -27,6 +28,24 @@ VIDEO_SUFFIXES = frozenset(
         ".wmv",
     }
 )
+PHOTO_SUFFIXES = frozenset(
+    {
+        ".jpg",
+        ".jpeg",
+        ".png",
+        ".heic",
+        ".heif",
+        ".gif",
+        ".webp",
+        ".tif",
+        ".tiff",
+        ".bmp",
+        ".dng",
+        ".gpr",
+        ".raw",
+    }
+)
+ARCHIVE_SUFFIXES = frozenset({".zip", ".rar", ".7z", ".tar", ".gz", ".tgz", ".xz", ".bz2"})
 JOB_FILES = ("job.yaml", "job.yml")
 """File names that the job file of a folder may have."""
 CALIBRATION_FILE = "calib.json"
@@ -96,12 +115,37 @@ def videos_in(folder: Path) -> list[Path]:
         ) from error
     if not videos:
         raise CaptureError(
-            "the folder contains no video",
+            f"the folder contains no video{_content_instead(entries)}",
             path=folder,
             hint="put the videos into the folder, and name each video after its place on the body, for "
             "example torso.mp4, left_palm.mp4, right_palm.mp4",
         )
     return videos
+
+
+def _content_instead(entries: Sequence[Path]) -> str:
+    """Return what a folder without videos contains, as the end of a sentence; "" if it is not known."""
+    kinds = (("photos", PHOTO_SUFFIXES), ("an archive", ARCHIVE_SUFFIXES))
+    found = [name for name, suffixes in kinds if any(path.suffix.lower() in suffixes for path in entries)]
+    deeper = [
+        path.name for path in entries if path.is_dir() and any(map(_has_video_below, _folders_in(path)))
+    ]
+    found += [f"the folder {name} with folders of videos" for name in deeper[:1]]
+    return f"; it contains {' and '.join(found)}" if found else ""
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    try:
+        return [path for path in folder.iterdir() if path.is_dir()]
+    except OSError:
+        return []
+
+
+def _has_video_below(folder: Path) -> bool:
+    try:
+        return any(map(is_video, folder.iterdir()))
+    except OSError:
+        return False
 
 
 def real_path(path: Path) -> Path:
@@ -169,8 +213,13 @@ def job_file_in(folder: Path) -> Path | None:
     return next((folder / name for name in JOB_FILES if (folder / name).is_file()), None)
 
 
-def folder_capture(folder: Path) -> dict[str, object]:
+def folder_capture(folder: Path, is_known: Callable[[str], bool]) -> dict[str, object]:
     """Return the raw ``capture`` block of a job for a folder of videos.
+
+    Args:
+        folder: The folder.
+        is_known: Function that returns True if the place of a video on the body is known. Its argument is the
+            name of the video.
 
     Raises:
         CaptureError: The folder holds no video, or it cannot be read.
@@ -179,10 +228,11 @@ def folder_capture(folder: Path) -> dict[str, object]:
     """
     videos = videos_in(folder)
     _refuse_missing_videos(folder)
+    _refuse_nested_videos(videos)
     named = [(recording_name(path), path) for path in videos]
     _refuse_equal_names(named)
     if len(named) > 1:
-        _refuse_unknown_mounts(named)
+        _refuse_unknown_mounts(named, is_known)
     return {"cameras": [camera_block(name, path) for name, path in named]}
 
 
@@ -223,6 +273,22 @@ def _refuse_missing_videos(folder: Path) -> None:
             chapters_in(path)
 
 
+def _refuse_nested_videos(videos: Sequence[Path]) -> None:
+    """Refuse a folder with one subfolder that holds videos of different cameras.
+
+    Without this check, these videos would be the chapters of one camera.
+    """
+    if len(videos) != 1 or not videos[0].is_dir() or mount_of(videos[0].name) is not None:
+        return
+    places = {found for path in chapters_in(videos[0]) if (found := mount_of(path.stem)) is not None}
+    if len(places) > 1:
+        raise JobError(
+            f"the videos are in the subfolder {videos[0].name}",
+            path=videos[0].parent,
+            hint=f"give the subfolder: {videos[0]}",
+        )
+
+
 def _refuse_equal_names(named: list[tuple[str, Path]]) -> None:
     seen: dict[str, Path] = {}
     for name, path in named:
@@ -236,13 +302,16 @@ def _refuse_equal_names(named: list[tuple[str, Path]]) -> None:
         seen[name.lower()] = path
 
 
-def _refuse_unknown_mounts(named: list[tuple[str, Path]]) -> None:
-    unknown = [path.name for name, path in named if mount_of(name) is None]
+def _refuse_unknown_mounts(named: list[tuple[str, Path]], is_known: Callable[[str], bool]) -> None:
+    unknown = [(name, path) for name, path in named if not is_known(name)]
     if unknown:
+        folder, first = named[0][1].parent, unknown[0][0]
         raise JobError(
-            f"the place of {', '.join(unknown)} on the body is unknown, because the name does not contain "
-            "a place",
-            path=named[0][1].parent,
-            hint=f"rename each video to one of {', '.join(MOUNT_NAMES)}; put the chapters of one camera "
-            "into a folder with such a name; or write a job file that gives each camera its `mount:`",
+            f"the place of {', '.join(path.name for _, path in unknown)} on the body is unknown, because the "
+            "name does not contain a place",
+            path=folder,
+            hint="rename each video, or the folder of its chapters, after its place (for example torso.mp4); "
+            f"or give the place of each video, for example --camera {first}=torso; or run "
+            f"`bodycap init {shlex.quote(folder.name)}`, which writes a job.yaml with a blank per place. "
+            f"The places are {', '.join(MOUNT_NAMES)}",
         )

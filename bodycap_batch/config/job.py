@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import json
 import re
+import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
+from bodycap_batch.config.body_height import height_from_text
 from bodycap_batch.config.calibration import Calibration, implausible_calibration
 from bodycap_batch.config.explain import Problem, job_error, problems_of
 from bodycap_batch.config.folder import (
+    ARCHIVE_SUFFIXES,
     CALIBRATION_FILE,
     JOB_FILES,
+    PHOTO_SUFFIXES,
     RUN_FILE,
     VIDEO_SUFFIXES,
     folder_capture,
@@ -23,37 +27,57 @@ from bodycap_batch.config.folder import (
     videos_in,
 )
 from bodycap_batch.config.limits import Limits
-from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CaptureConfig, Job
-from bodycap_batch.config.mounts import TRUNK_ROLES
+from bodycap_batch.config.models import (
+    NO_SKELETON,
+    SKELETON_PRESETS,
+    Activity,
+    CameraConfig,
+    CaptureConfig,
+    Job,
+)
+from bodycap_batch.config.mounts import TRUNK_ROLES, mount_of
 from bodycap_batch.config.origins import LoadedJob
+from bodycap_batch.config.places import Places
 from bodycap_batch.config.resolved_camera import ResolvedCamera, resolved_camera, with_found_calibrations
-from bodycap_batch.config.rules import problems_in, skeleton_of
+from bodycap_batch.config.rules import missing_files, problems_in, skeleton_of
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.config.videos_beside import VideosBeside, find_videos_beside
 from bodycap_batch.config.yaml_source import Location, YamlSource, dotted, read_yaml
 from bodycap_batch.core.errors import CaptureError, JobError
 
-_HEIGHT_M = (0.4, 2.6)
-"""Minimum and maximum stature (metres) on the command line; equal to the limits of ``height_m`` in a job
-file. Evidence: none."""
 _LISTS = ("video", "timestamps")
 """Names of the fields of a camera in which a job file may give a single path instead of a list of paths."""
+_MAX_MISSING = 5
+"""Maximum number of missing files that a message lists after other problems. Evidence: none."""
 _NAME_LENGTH = 100
 """Maximum number of characters of a job's name. If the job is named after a folder with a longer name, the
 name is shortened. Evidence: none."""
 
-Prepare = Callable[[Mapping[str, Any], Path], None]
-"""Function that renders a synthetic capture. Its arguments are the options of `capture.synthetic` and the
-folder for the videos."""
+RESULTS = "out"
+"""Name of the folder for results beside a job. The folder of one job's results is a subfolder of it."""
+
+Prepare = Callable[[Mapping[str, Any], Path, Path], None]
+"""Function that renders a synthetic capture. Its arguments are the options of `capture.synthetic`, the folder
+for the videos, and the folder for the results of the job."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overrides:
-    """Values of the command line that replace values of the job. Paths are relative to the working folder."""
+    """Values of the command line that replace values of the job. Paths are relative to the working folder.
+
+    Attributes:
+        out: Folder for the results.
+        skeleton: Name of a skeleton, or path of a skeleton file.
+        height_m: Height of the subject, metres.
+        mounts: Place on the body of each named camera, by the name of the camera or of its video.
+        activity: What the subject does.
+    """
 
     out: Path | None = None
     skeleton: str | None = None
     height_m: float | None = None
+    mounts: Mapping[str, str] = field(default_factory=dict)
+    activity: str | None = None
 
 
 def load_job(
@@ -110,8 +134,9 @@ def load_job_with_origins(
     try:
         full = _job_source(full, policy)
         source = _read_source(full, limits or Limits())
-        stated = _stated_job(full, source, alone=alone)
-        return _resolved_job(stated, overrides or Overrides(), prepare, policy, is_draft=is_draft)
+        overrides = overrides or Overrides()
+        stated = _stated_job(full, source, Places(overrides.mounts), alone=alone)
+        return _resolved_job(stated, overrides, prepare, policy, is_draft=is_draft)
     except PermissionError as error:
         kind = JobError if error.filename == str(full) else CaptureError
         raise kind(
@@ -136,13 +161,37 @@ def _read_source(full: Path, limits: Limits) -> YamlSource | None:
     """Return the parsed YAML file of a job; None for a folder of videos."""
     if full.is_dir():
         return None
-    if full.suffix.lower() in VIDEO_SUFFIXES:
+    _require_job_file(full)
+    return read_yaml(full, max_bytes=int(1024 * limits.yaml_kb), max_depth=int(limits.yaml_depth))
+
+
+def _require_job_file(full: Path) -> None:
+    """Raise `JobError` if a file does not exist, or is a video, a photo or an archive instead of a job."""
+    suffix = full.suffix.lower()
+    if not full.exists():
+        raise JobError(
+            "there is no such file or folder",
+            path=full,
+            hint="correct the path; give a folder of videos, a job file (YAML) or a folder of results",
+        )
+    if suffix in VIDEO_SUFFIXES:
         raise JobError(
             "this file is a video, not a job",
             path=full,
             hint=f"give the folder that contains the video: {full.parent}",
         )
-    return read_yaml(full, max_bytes=int(1024 * limits.yaml_kb), max_depth=int(limits.yaml_depth))
+    if suffix in PHOTO_SUFFIXES:
+        raise JobError(
+            "this file is a photo, not a job",
+            path=full,
+            hint="give a folder of videos; photos are not used",
+        )
+    if suffix in ARCHIVE_SUFFIXES:
+        raise JobError(
+            "this file is an archive, not a folder of videos",
+            path=full,
+            hint="unpack it, and give the folder with the videos",
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,17 +224,48 @@ class _StatedJob:
     @property
     def name(self) -> str:
         """Name of the job if the job file gives none."""
-        return self.folder.name if self.source is None or self.path.name in JOB_FILES else self.path.stem
+        return self.folder.name if self._is_folder else self.path.stem
+
+    @property
+    def default_results(self) -> Path:
+        """Folder that holds the results of the job if the job names none: ``out`` beside the job.
+
+        It does not depend on the working folder.
+        """
+        return (self.folder.parent if self._is_folder else self.folder) / RESULTS
+
+    @property
+    def _is_folder(self) -> bool:
+        """True for a folder of videos, also with a ``job.yaml`` in it."""
+        return self.source is None or self.path.name in JOB_FILES
 
 
-def _stated_job(full: Path, source: YamlSource | None, *, alone: bool) -> _StatedJob:
+def _stated_job(full: Path, source: YamlSource | None, places: Places, *, alone: bool) -> _StatedJob:
+    """Return the job with the values of its file and with the cameras of its folder.
+
+    Args:
+        full: The job file, or the folder of videos.
+        source: The parsed job file; None for a folder of videos.
+        places: The places of cameras on the body that the command line gives.
+        alone: True for a job file that another user submitted without a folder.
+    """
+    stated = _stated_without_places(full, source, places, alone=alone)
+    cameras = tuple(map(places.mounted, stated.job.capture.cameras))
+    places.require_used(stated.job.capture.cameras)
+    capture = stated.job.capture.model_copy(update={"cameras": cameras})
+    return replace(stated, job=stated.job.model_copy(update={"capture": capture}))
+
+
+def _stated_without_places(
+    full: Path, source: YamlSource | None, places: Places, *, alone: bool
+) -> _StatedJob:
     if source is None:
-        data: dict[str, Any] = {"capture": folder_capture(full)}
+        data: dict[str, Any] = {"capture": folder_capture(full, places.is_known)}
         job = _validated(data, full, source)
         stated = _without_cameras(job.capture)
         return _StatedJob(path=full, source=None, job=job, stated=stated, uses_folder=True)
     stated_data = _top_mapping(source)
-    data = stated_data if alone else _with_folder_capture(stated_data, full.parent)
+    data = stated_data if alone else _with_folder_capture(stated_data, full.parent, places)
     job = _validated(data, full, source)
     if data is not stated_data:
         stated = _without_cameras(job.capture)
@@ -194,7 +274,7 @@ def _stated_job(full: Path, source: YamlSource | None, *, alone: bool) -> _State
     stated, beside = job.capture, VideosBeside()
     # The videos of a synthetic capture exist only after they have been rendered, so they are not looked for.
     if uses_folder and not stated.cameras_only and stated.synthetic is None:
-        beside = find_videos_beside(full, stated.cameras)
+        beside = find_videos_beside(full, stated.cameras, places)
         if beside.cameras:
             listed = _with_lists(data)["capture"]
             capture = {**listed, "cameras": [*listed["cameras"], *beside.cameras]}
@@ -226,11 +306,15 @@ def _resolved_job(
     job = _with_overrides(stated.job, overrides)
     problems = [] if is_draft else problems_in(job)
     if problems:
-        raise job_error(problems, full, source)
+        is_own = policy is None and job.capture.synthetic is None
+        error = job_error(problems, full, source)
+        for found in missing_files(job, base)[:_MAX_MISSING] if is_own else ():
+            error.message += f"; also {dotted(found.location)}: {found.message}"
+        raise error
     if policy is not None:
         policy.require_named(job, base)
     if job.capture.synthetic is not None:
-        _prepare_synthetic(job, base, full, prepare)
+        _prepare_synthetic(job, stated, prepare)
     _require_plausible_calibrations(job, full, source)
     if stated.uses_folder:
         job = job.model_copy(update={"capture": with_found_calibrations(job.capture, base)})
@@ -254,8 +338,13 @@ def _resolved_job(
         ),
         reasons=stated.beside.reasons,
         unlisted=_reason_of_unlisted(stated),
-        warnings=(*stated.beside.warnings, *_calibration_warnings(stated, cameras)),
+        warnings=(
+            *stated.beside.warnings,
+            *_calibration_warnings(stated, cameras),
+            *_wrist_warnings([camera.config for camera in cameras]),
+        ),
         no_body=_no_body(job, resolved),
+        states_out=job.out is not None,
     )
 
 
@@ -288,6 +377,21 @@ def _calibration_warnings(stated: _StatedJob, cameras: Sequence[ResolvedCamera])
         f"{path.name} is not used for {', '.join(unstated)}: a job file that is not called {JOB_FILES[0]} "
         f"uses it only if it says `calibration: {path.name}`"
     ]
+
+
+def _wrist_warnings(cameras: Sequence[CameraConfig]) -> list[str]:
+    """Return a warning for each camera whose name says the wrist, which is between two bones."""
+    found = []
+    for camera in cameras:
+        place = mount_of(camera.mount or camera.name)
+        if "wrist" in (camera.mount or camera.name).lower() and place is not None and camera.segment is None:
+            side = place[0].partition("_")[0]
+            found.append(
+                f"camera {camera.name} is taken to be on the forearm ({place[0]}), because a camera on the "
+                "wrist does not turn with the hand; if it is strapped to the palm or the back of the hand, "
+                f"give --camera {camera.name}={side}_palm, or name the video {side}_palm"
+            )
+    return found
 
 
 def _no_body(job: Job, resolved: Job) -> str:
@@ -339,7 +443,7 @@ def _top_mapping(source: YamlSource) -> dict[str, Any]:
     return source.data
 
 
-def _with_folder_capture(data: dict[str, Any], folder: Path) -> dict[str, Any]:
+def _with_folder_capture(data: dict[str, Any], folder: Path, places: Places) -> dict[str, Any]:
     """Return the data of a job file. If no cameras are listed, add the videos in the job file's folder.
 
     The cameras are named after these videos, as for a folder without a job file. Data with an unknown key are
@@ -354,7 +458,7 @@ def _with_folder_capture(data: dict[str, Any], folder: Path) -> dict[str, Any]:
         videos_in(folder)
     except CaptureError:  # no videos here: the validation reports the missing cameras
         return data
-    return {**data, "capture": {**folder_capture(folder), **capture}}
+    return {**data, "capture": {**folder_capture(folder, places.is_known), **capture}}
 
 
 def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> Job:
@@ -391,23 +495,30 @@ def _with_overrides(job: Job, overrides: Overrides) -> Job:
         preset = overrides.skeleton in SKELETON_PRESETS or not overrides.skeleton.lower().endswith(".bvh")
         update["skeleton"] = overrides.skeleton if preset else str(Path(overrides.skeleton).resolve())
     if overrides.height_m is not None:
-        if not _HEIGHT_M[0] <= overrides.height_m <= _HEIGHT_M[1]:
-            raise JobError(
-                f"a body height of {overrides.height_m:g} m is not plausible",
-                field="height_m",
-                hint="give the height in metres, for example 1.75",
-            )
-        update["height_m"] = float(overrides.height_m)
+        update["height_m"] = height_from_text(overrides.height_m)
+    if overrides.activity is not None:
+        update["activity"] = _known_activity(overrides.activity)
     return job.model_copy(update=update)
 
 
-def _prepare_synthetic(job: Job, base: Path, path: Path, prepare: Prepare | None) -> None:
+def _known_activity(text: str) -> Activity:
+    known: tuple[Activity, ...] = typing.get_args(Activity)
+    for name in known:
+        if text == name:
+            return name
+    raise JobError(
+        f"there is no activity {text[:40]!r}", field="--activity", hint=f"use one of {', '.join(known)}"
+    )
+
+
+def _prepare_synthetic(job: Job, stated: _StatedJob, prepare: Prepare | None) -> None:
+    base, path = stated.folder, stated.path
     folder = synthetic_folder(job, base)
     if prepare is not None:
         options = dict(job.capture.synthetic or {})
         if isinstance(options.get("motion"), str):
             options["motion"] = str((base / options["motion"]).resolve())
-        prepare(options, folder)
+        prepare(options, folder, _out(job, stated))
     missing = [v for camera in job.capture.cameras for v in camera.video if not (base / v).is_file()]
     if missing:
         raise CaptureError(
@@ -456,8 +567,15 @@ def _with_resolved(job: Job, cameras: Sequence[ResolvedCamera], stated: _StatedJ
     configs = tuple(camera.config for camera in cameras)
     capture = job.capture.model_copy(update={"cameras": configs, "cameras_only": True, "calibration": None})
     name = job.name or safe_name(stated.name)
-    out = (base / job.out if job.out is not None else Path("out") / name).resolve()
+    out = _out(job, stated)
     return job.model_copy(update={"capture": capture, "name": name, "skeleton": skeleton, "out": out})
+
+
+def _out(job: Job, stated: _StatedJob) -> Path:
+    """Return the folder for the results of a job."""
+    if job.out is not None:
+        return (stated.folder / job.out).resolve()
+    return (stated.default_results / (job.name or safe_name(stated.name))).resolve()
 
 
 def _require_apart(job: Job, full: Path) -> None:

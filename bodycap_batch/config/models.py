@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
 
+from bodycap_batch.config.body_height import MAX_HEIGHT_M, MIN_HEIGHT_M, height_from_text
 from bodycap_batch.config.bounds import (
     MAX_ANGLE_DEG,
     MAX_DRIFT_PPM,
@@ -28,11 +29,16 @@ from bodycap_batch.config.options import (
     RegistrationOptions,
 )
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.model.geometry import make_transform, rotation_from_quat_xyzw
 
 NO_SKELETON = "none"
 """Value of ``skeleton`` for a job that computes the camera paths and the map, but no body."""
-SKELETON_PRESETS = (NO_SKELETON, "upper_body", "full_body")
+AUTO_SKELETON = "auto"
+"""Value of ``skeleton`` for a standard body, of which the parts with cameras are solved."""
+SKELETON_PRESETS = (NO_SKELETON, AUTO_SKELETON, "full_body", "upper_body")
+"""Values of ``skeleton`` that are no file. ``auto`` solves the limbs that have cameras. ``upper_body`` is its
+former name, which stays valid."""
 _MAX_ROTATION = 10.0
 """Maximum absolute value (no unit) of a component of a rotation that the job gives, as a quaternion or as a
 matrix. The bound keeps products finite; `rules` checks that the components are a rotation. Evidence: none."""
@@ -62,6 +68,18 @@ def _known_lens(name: str) -> str:
 
 def _pose_kind(value: object) -> str:
     return "matrix" if isinstance(value, list | tuple) else "parts"
+
+
+def _height(value: object) -> object:
+    """Return a height in metres for a text or for a number of centimetres; else the value unchanged."""
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        return value
+    if isinstance(value, str) or value >= 100.0 * MIN_HEIGHT_M:
+        try:
+            return height_from_text(value)
+        except JobError as error:
+            raise ValueError(error.message) from error
+    return value
 
 
 def _none_if_auto(value: object) -> object:
@@ -256,11 +274,14 @@ class Job(_Block):
         max_length=100,
         description="name of the job and its results; default: the name of the job file or the folder",
     )
-    out: Path | None = Field(None, description="folder for the results; default: out/<name>")
+    out: Path | None = Field(
+        None,
+        description="folder for the results; default: out/<name> beside the job file or the folder of videos",
+    )
     skeleton: str | None = Field(
         None,
-        description="none, upper_body, full_body or a BVH file; default: upper_body, or none if all "
-        "cameras are on one bone",
+        description="auto (the parts of the body that have cameras), full_body, none, or a BVH file; "
+        "default: auto, or none if all cameras are on one bone",
     )
     skeleton_map: dict[str, str] = Field(
         default_factory=dict,
@@ -276,8 +297,11 @@ class Job(_Block):
             "the zero pose is not a T-pose"
         ),
     )
-    height_m: float | None = Field(
-        None, ge=0.4, le=2.6, description="the subject's body height in metres, for example 1.75"
+    height_m: Annotated[float | None, BeforeValidator(_height)] = Field(
+        None,
+        ge=MIN_HEIGHT_M,
+        le=MAX_HEIGHT_M,
+        description="the subject's body height in metres, for example 1.75; 175 and 5'9 are understood, too",
     )
     activity: Activity = Field("generic", description="what the subject does; walk: the subject only walks")
     keyframes: KeyframeOptions = KeyframeOptions()

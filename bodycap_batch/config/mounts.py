@@ -60,6 +60,16 @@ TRUNK_ROLES = ("Hips", "Spine", "Spine1", "Neck", "Head")
 REFERENCE_ROLES = ("Spine1", "Spine", "Hips")
 """Roles of the bones of a torso camera, the preferred one first. The common clock is that of this camera."""
 
+_NOISE = frozenset((
+    "cam", "camera", "webcam", "gopro", "go", "pro", "hero", "insta", "osmo", "action", "dji", "sony",
+    "iphone", "phone", "video", "vid", "movie", "clip", "film", "take", "rec", "recording", "footage", "file",
+    "mount", "mounted", "view", "pov", "worn", "side",
+))  # fmt: skip
+"""Words in the name of a video that say nothing about the camera's place on the body."""
+_WORD = re.compile(r"[a-z]+")
+_CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
+_GLUED_CAMERA = re.compile(r"(?:cam|camera|gopro)$")
+
 _QUALIFIER = re.compile(r"[_\- ]?(back|front|top|bottom|upper|lower|inner|outer|[0-9]+|[a-c])$")
 
 
@@ -72,13 +82,19 @@ def mount_of(name: str) -> tuple[str, str] | None:
     """Return the pair (mount, role) for a camera's name; None if the name is not a known place on the body.
 
     A qualifier at the end of the name is ignored. It distinguishes cameras on the same body segment:
-    ``torso_back``, ``torso_2``.
+    ``torso_back``, ``torso_2``. So are numbers, and words that name a camera or a recording: ``Torso Cam 1``,
+    ``chest_cam``.
     """
     known = _MOUNT_BY_SPELLING.get(_key(name))
     if known is not None:
         return known
     bare = _QUALIFIER.sub("", name.lower())
-    return mount_of(bare) if bare and bare != name.lower() else None
+    if bare and bare != name.lower() and (known := mount_of(bare)) is not None:
+        return known
+    words = _WORD.findall(_CAMEL.sub(" ", name).lower())
+    kept = "_".join(word for word in (_GLUED_CAMERA.sub("", word) for word in words) if word not in _NOISE)
+    kept = kept.strip("_")
+    return mount_of(kept) if kept and len(kept) < len(name) and kept != name.lower() else None
 
 
 def role_of_segment(segment: str) -> str | None:

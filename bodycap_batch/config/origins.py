@@ -123,6 +123,7 @@ class LoadedJob:
         warnings: Sentences about what the user probably did not intend.
         no_body: Sentence that explains why no body is computed although the job does not say
             `skeleton: none`; "" otherwise.
+        states_out: True if the job file or the command line names the folder for the results.
     """
 
     job: Job
@@ -134,6 +135,7 @@ class LoadedJob:
     unlisted: str
     warnings: tuple[str, ...]
     no_body: str
+    states_out: bool = False
 
     def warnings_of_run(self) -> tuple[str, ...]:
         """Return the warnings for a run. The missing body is one of them if the job gives the height."""

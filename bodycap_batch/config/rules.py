@@ -13,7 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.config.explain import Problem
-from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CameraConfig, Job, MountPose
+from bodycap_batch.config.models import (
+    AUTO_SKELETON,
+    NO_SKELETON,
+    SKELETON_PRESETS,
+    CameraConfig,
+    Job,
+    MountPose,
+)
 from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES
 from bodycap_batch.config.options import MARKER_COUNTS
 from bodycap_batch.model.skeleton_presets import split_side
@@ -49,13 +56,13 @@ def skeleton_of(job: Job) -> str:
     """Return the skeleton of a job.
 
     A job without a skeleton gets a default. The default is ``none`` if all cameras are mounted on one bone;
-    otherwise it is the preset of the upper body.
+    otherwise it is ``auto``.
     """
     if job.skeleton is not None:
-        return job.skeleton
+        return AUTO_SKELETON if job.skeleton == "upper_body" else job.skeleton
     roles = {camera.role for camera in job.capture.cameras}
     alone = len(job.capture.cameras) == 1 or (len(roles) == 1 and None not in roles)
-    return NO_SKELETON if alone else "upper_body"
+    return NO_SKELETON if alone else AUTO_SKELETON
 
 
 def _camera_names(job: Job, index: int) -> Iterator[Problem]:
@@ -214,6 +221,34 @@ def _rig(job: Job) -> Iterator[Problem]:
         yield Problem(
             ("capture", "rig"), message, "give two cameras the same `mount` or `segment`, or leave out `rig`"
         )
+
+
+def missing_files(job: Job, base: Path) -> list[Problem]:
+    """Return a problem for each file of a job that does not exist.
+
+    Args:
+        job: The job.
+        base: Folder to which the paths of the job are relative.
+    """
+    found = []
+    for index, camera in enumerate(job.capture.cameras):
+        named = [("video", path) for path in camera.video] + [
+            ("timestamps", path) for path in camera.timestamps
+        ]
+        named += [("mask", camera.mask)] if camera.mask is not None else []
+        named += [("calibration", camera.calibration)] if isinstance(camera.calibration, Path) else []
+        for field, path in named:
+            if not _exists(base / path):
+                where = ("capture", "cameras", index, field)
+                found.append(Problem(where, f"there is no such file: {base / path}", "correct the path"))
+    return found
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name that is too long is reported by another rule
+        return True
 
 
 def named_frames(job: Job) -> Iterator[tuple[tuple[str, str, int], str, int]]:

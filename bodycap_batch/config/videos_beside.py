@@ -21,6 +21,7 @@ from bodycap_batch.config.folder import (
 )
 from bodycap_batch.config.models import CameraConfig
 from bodycap_batch.config.mounts import mount_of
+from bodycap_batch.config.places import Places
 from bodycap_batch.core.errors import CaptureError
 
 
@@ -53,7 +54,9 @@ class VideosBeside:
             self.warnings.append(f"{names} {verb} not used: {reason}; {advice}")
 
 
-def find_videos_beside(job_file: Path, listed: Sequence[CameraConfig]) -> VideosBeside:
+def find_videos_beside(
+    job_file: Path, listed: Sequence[CameraConfig], places: Places | None = None
+) -> VideosBeside:
     """Find the videos in the folder of a job file that no camera of the job file lists.
 
     A video belongs to a listed camera if it is the same file, if the camera lists a folder that holds it, or
@@ -63,6 +66,7 @@ def find_videos_beside(job_file: Path, listed: Sequence[CameraConfig]) -> Videos
     Args:
         job_file: The job file.
         listed: The cameras of the job file. Their paths are relative to the folder of the job file.
+        places: The places on the body that the command line gives; None if it gives none.
 
     Raises:
         CaptureError: The folder cannot be read. Or a symbolic link to a video leads nowhere, and its name is
@@ -91,7 +95,7 @@ def find_videos_beside(job_file: Path, listed: Sequence[CameraConfig]) -> Videos
         advice = f"list it under `cameras:` in {job_file.name}, or state `cameras_only: true`"
         if str(block["name"]).lower() in names:
             found.leave_out(paths, f"camera {block['name']} of {job_file.name} lists another video", advice)
-        elif mount_of(name) is None:
+        elif not (places or Places()).is_known(name):
             reason = "the name is not a known place on the body"
             found.leave_out(paths, reason, f"rename it (for example to left_palm.mp4), {advice}")
         else:

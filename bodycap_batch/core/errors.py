@@ -5,6 +5,7 @@ Any exception of another type is a bug. It ends the program with the exit code `
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from bodycap_batch.core.printable import printable
@@ -22,6 +23,10 @@ NO_MOTION_HINT = (
 
 EXIT_CANCELLED = 130
 """Exit code after the user stopped the program. Source: shells report 128 + SIGINT (2)."""
+
+
+_MAX_FURTHER = 5
+"""Maximum number of errors that a message lists after the first error. Evidence: none."""
 
 
 class BodycapError(Exception):
@@ -152,3 +157,12 @@ def error_from_dict(data: dict[str, str | int | None]) -> BodycapError:
         field=None if data.get("field") is None else str(data["field"]),
         hint=None if data.get("hint") is None else str(data["hint"]),
     )
+
+
+def one_error(errors: Sequence[BodycapError]) -> BodycapError:
+    """Return the first error. Its message lists the other errors, too, so that all are corrected at once."""
+    first, *others = errors
+    for other in others[:_MAX_FURTHER]:
+        where = ": ".join(part for part in (other.path, other.field) if part)
+        first.message += f"; also {f'{where}: ' if where else ''}{other.message}"
+    return first

@@ -13,9 +13,9 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.model.skeleton import SkeletonModel, rest_pose
 
-PRESETS = ("upper_body", "full_body")
-"""Names of the preset skeletons. Both presets contain all joints of the body. The cameras, not the preset,
-determine which joints are estimated."""
+PRESETS = ("auto", "full_body", "upper_body")
+"""Names of the preset skeletons. All of them contain all joints of the body. The cameras, not the preset,
+determine which joints are estimated. ``upper_body`` is the former name of ``auto``."""
 
 MEAN_HEIGHT_M = 1.70
 """Stature, metres, that is used if no stature is given. It lies between the means of adult women and men in

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.config.job import Overrides, load_job_with_origins
-from bodycap_batch.config.models import Job
+from bodycap_batch.config.origins import LoadedJob
 from bodycap_batch.core.errors import EXIT_BUG, BodycapError, Cancelled, JobError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.pipeline.run import RunSummary, run_job
@@ -57,12 +57,14 @@ class Outcome:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the outcome as plain JSON values."""
+        verdict = None if self.summary is None else self.summary.verdict
         return {
             "job": str(self.job.path),
             "exit_code": self.exit_code,
             "seconds": round(self.seconds, 3),
             "out_dir": None if self.summary is None else str(self.summary.out_dir),
             "executed": None if self.summary is None else self.summary.executed,
+            "verdict": None if verdict is None else verdict.to_dict(),
             "error": None if self.error is None else self.error.to_dict(),
         }
 
@@ -72,19 +74,21 @@ class Batch:
 
     Args:
         settings: Function that returns the settings of a job. Its arguments are the job and the folder of the
-            job's results. The folder is None as long as the folder is unknown. The settings of all jobs must
-            share one executor.
-        results: Function that returns the folder for the results of a resolved job.
+            job's results. The settings of all jobs must share one executor.
+        results: Function that returns the folder for the results of a loaded job.
         max_jobs: Maximum number of jobs that run at the same time.
+        cancelled: Function that returns True if no further job may start.
     """
 
     def __init__(
         self,
-        settings: Callable[[BatchJob, Path | None], Settings],
-        results: Callable[[Job], Path],
+        settings: Callable[[BatchJob, Path], Settings],
+        results: Callable[[LoadedJob], Path],
         max_jobs: int,
+        cancelled: Callable[[], bool],
     ) -> None:
         self._settings = settings
+        self._cancelled = cancelled
         self._results = results
         self._max_jobs = max_jobs
         self._owners: dict[Path, Path] = {}
@@ -108,14 +112,14 @@ class Batch:
                     yield _outcome(job, future, time.monotonic() - started[job])
 
     def _run_one(self, job: BatchJob) -> RunSummary:
-        if self._settings(job, None).cancelled():
+        if self._cancelled():
             raise Cancelled("the job was stopped before it started", hint="run the batch again to continue")
 
-        def prepare(options: Mapping[str, Any], folder: Path) -> None:
-            prepare_capture(options, folder, self._settings(job, None))
+        def prepare(options: Mapping[str, Any], folder: Path, out_dir: Path) -> None:
+            prepare_capture(options, folder, self._settings(job, out_dir))
 
         loaded = load_job_with_origins(job.path, Overrides(), prepare=prepare)
-        out_dir = self._results(loaded.job)
+        out_dir = self._results(loaded)
         self._claim_folder(out_dir, job.path)
         for text in loaded.warnings_of_run():
             self._settings(job, out_dir).listener(Event(kind="note", stage="", what=text))

@@ -89,6 +89,14 @@ def _link_or_copy(source: Path, target: Path) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def store_of_last_run(folder: Path) -> Path | None:
+    """Return the store that a folder of results names; None if there is no record of a run, or no store."""
+    try:
+        return Path(str(parse_checked_json((folder / RUN_FILE).read_bytes())["store"]))
+    except (OSError, ValueError, KeyError, TypeError):  # also results of versions that did not name it
+        return None
+
+
 def _files_of_last_run(folder: Path) -> list[str]:
     try:
         last: Any = parse_checked_json((folder / RUN_FILE).read_bytes())

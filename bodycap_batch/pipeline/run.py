@@ -24,6 +24,7 @@ from bodycap_batch.pipeline.results import (
 )
 from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.pipeline.stage_results import StageResults
+from bodycap_batch.report.summary import ResultSummary, summary_of_folder
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.store.checked_json import checked_json
 from bodycap_batch.tasks.order import STAGE_ORDER
@@ -42,12 +43,14 @@ class RunSummary:
         files: Names of the result files, relative to `out_dir`; empty if the run ended before the last stage.
         stages: The record of every task that contributed to the results, computed in this run or reused.
         versions: Versions of Python, of this program and of the libraries that computed the results.
+        verdict: The verdict about the results; None if the run ended before the last stage.
     """
 
     out_dir: Path
     files: tuple[str, ...]
     stages: tuple[StageRecord, ...]
     versions: Mapping[str, str]
+    verdict: ResultSummary | None = None
 
     @property
     def executed(self) -> int:
@@ -88,7 +91,9 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
             _publish_failure_report(flow, results, stopped_by, out_dir, settings)
     if (error := _combined_error(results.failure, stopped_by)) is not None:
         raise error
-    return summary if runs_to_end else replace(summary, files=())
+    if not runs_to_end:
+        return replace(summary, files=())
+    return replace(summary, verdict=summary_of_folder(out_dir))
 
 
 def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
@@ -241,6 +246,7 @@ def _write_results(job: Job, results: StageResults, summary: RunSummary, setting
     remove_outdated(out_dir, summary.files)
     record = {
         "versions": dict(summary.versions),
+        "store": str(settings.store.root),
         "threads": settings.threads,
         "seconds": round(sum(stage.seconds for stage in summary.stages), 3),
         "peak_memory_mb": max((stage.peak_memory_mb for stage in summary.stages), default=0.0),

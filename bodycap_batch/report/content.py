@@ -61,7 +61,10 @@ def page_content(
         "failure": inputs.failure,
         "progress": _progress_at_failure(inputs),
         "figures": list(headline_figures(inputs.metrics)) if inputs.metrics is not None else [],
-        "recommendations": recommend_changes(inputs, count_frames_by_cause(losses)),
+        # A good result needs no change.
+        "recommendations": recommend_changes(inputs, count_frames_by_cause(losses))
+        if verdict.grade > Grade.GOOD
+        else [],
         "tables": make_tables(inputs),
         "scene": scene,
         "has_viewer": scene.has_content,

@@ -10,6 +10,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from bodycap_batch.core.errors import StoreError
 
 LIBRARY = "k3d"
@@ -54,6 +56,7 @@ def render_page(context: Mapping[str, Any], data: Mapping[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["code"] = _with_code
     text = environment.get_template("page.html").render(
         **context,
         style=(folder / "style.css").read_text(encoding="utf-8"),
@@ -63,6 +66,13 @@ def render_page(context: Mapping[str, Any], data: Mapping[str, Any]) -> str:
         data=json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
     )
     return text if text.endswith("\n") else f"{text}\n"
+
+
+def _with_code(text: str) -> Markup:
+    """Return a text as HTML; the parts between backquotes become code."""
+    parts = re.split("`([^`]*)`", text)
+    tags = ("{}", "<code>{}</code>")
+    return Markup("").join(Markup(tags[index % 2]).format(part) for index, part in enumerate(parts))  # noqa: S704
 
 
 def viewer_library() -> str:

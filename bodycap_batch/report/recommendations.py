@@ -18,8 +18,16 @@ from bodycap_batch.model.scene import Map
 from bodycap_batch.report.drawn_scene import common_times_s
 from bodycap_batch.report.frame_losses import FAST_DEG, PLAIN_RATIO, LossCause
 from bodycap_batch.report.report_inputs import ReportInputs
-from bodycap_batch.report.verdict import FAIR_GAP_S, GOOD_MOUNT_DEG, describe_lens_misfit
+from bodycap_batch.report.verdict import (
+    FAIR_GAP_S,
+    GOOD_MOUNT_DEG,
+    describe_lens_misfit,
+    describe_scale_error,
+)
 
+MAX_RECOMMENDATIONS = 3
+"""Maximum number of recommendations. Nobody changes more at once, and the next capture tells what remains.
+Evidence: none."""
 _MIN_LOST_SHARE = 0.02
 """Minimum fraction of all frames that a cause of losses must affect to give a recommendation.
 
@@ -45,8 +53,6 @@ _NARROW_DEG = 3.0
 none."""
 _SUFFICIENT_SCALE_SIGMA = 0.02
 """Maximum relative sigma of the metric scale that needs no recommendation. Evidence: none."""
-_ARM_LENGTH_M = 0.6
-"""Length of an arm (metres), used to express a relative error of the scale as a length."""
 _T_POSE = re.compile(r",? or stand in a T-pose for two seconds first")
 """Pattern of the phrase about a T-pose in the advice that merging gives."""
 _ADVICE_SEPARATOR = "; to reduce this, "
@@ -94,18 +100,20 @@ class Recommendation:
     """One change for the next capture.
 
     Attributes:
-        action: The change that the user should make.
+        action: The change that the user should make, in the words of a film maker.
         reason: The measurement that justifies the change.
         priority: Importance of the recommendation. Larger values are shown first.
+        how: Commands and settings for the change; "" if the action needs none.
     """
 
     action: str
     reason: str
     priority: float
+    how: str = ""
 
 
 def recommend_changes(inputs: ReportInputs, lost: Mapping[str, Counter[LossCause]]) -> list[Recommendation]:
-    """Return recommendations for the next capture, the most helpful recommendation first.
+    """Return at most three recommendations for the next capture, the most helpful recommendation first.
 
     Args:
         inputs: The results of the job.
@@ -121,7 +129,8 @@ def recommend_changes(inputs: ReportInputs, lost: Mapping[str, Counter[LossCause
         *_about_start_and_end(inputs),
         *_about_body(inputs),
     ]
-    return sorted(_combine_t_poses(found), key=lambda recommendation: -recommendation.priority)
+    ordered = sorted(_combine_t_poses(found), key=lambda recommendation: -recommendation.priority)
+    return ordered[:MAX_RECOMMENDATIONS]
 
 
 def _combine_t_poses(found: Sequence[Recommendation]) -> list[Recommendation]:
@@ -142,8 +151,8 @@ def _combine_t_poses(found: Sequence[Recommendation]) -> list[Recommendation]:
     combined = Recommendation(
         action="Stand still for two seconds before you start, with the arms stretched out to the sides (a "
         "T-pose). This reduces the uncertainty of the mounts and of the scale.",
-        reason=f"no T-pose was found, and {len(improved)} of the mounts and scales below have a large "
-        "uncertainty",
+        reason="no T-pose was found, and sizes or the directions of cameras on their bones are not well "
+        "known",
         priority=max(recommendation.priority for recommendation in improved) + 1e-3,
     )
     return [*others, combined]
@@ -166,8 +175,9 @@ def _about_mirrored_cameras(inputs: ReportInputs) -> Iterator[Recommendation]:
     """
     if names := _mirrored_cameras(inputs):
         yield Recommendation(
-            action=f"Flip the video of {', '.join(names)} back (ffmpeg -i in -vf hflip out.mp4), and switch "
-            "off the mirroring in the front camera or the app.",
+            action=f"Flip the video of {', '.join(names)} back, and switch off the mirroring in the front "
+            "camera or the app.",
+            how="`ffmpeg -i in.mp4 -vf hflip out.mp4` flips a video.",
             reason="compared with the other cameras, left and right are exchanged in this video, and a "
             "mirrored video is not used in the map",
             priority=3.0,
@@ -175,8 +185,9 @@ def _about_mirrored_cameras(inputs: ReportInputs) -> Iterator[Recommendation]:
     for one, other in _map_diagnostics(inputs).undecided_groups:
         yield Recommendation(
             action=f"Check whether text reads backwards in the video of {', '.join(one)} or "
-            f"{', '.join(other)}. If text reads backwards, flip that video back (ffmpeg -i in -vf hflip "
-            "out.mp4). If text reads correctly in all of these videos, cover wall mirrors.",
+            f"{', '.join(other)}. If text reads backwards, flip that video back. If text reads correctly in "
+            "all of these videos, cover wall mirrors.",
+            how="`ffmpeg -i in.mp4 -vf hflip out.mp4` flips a video.",
             reason="these cameras see mirror images of each other; it is unknown which video is mirrored",
             priority=3.0,
         )
@@ -193,14 +204,18 @@ def _about_lenses(inputs: ReportInputs) -> Iterator[Recommendation]:
             f"{name} has {describe_lens_misfit(factor)}" for name, factor in sorted(misfits.items())
         )
         yield Recommendation(
-            action="Run the job again with `calibration: auto`, or calibrate the camera in the video mode "
-            "of this capture, with stabilisation and digital zoom off.",
+            action="Calibrate the camera in the video mode of this capture, with stabilisation and digital "
+            "zoom off; or run the job again and let the program find the lens.",
+            how="Film a board and use `bodycap calibrate`; or write `calibration: auto` under `capture:` in "
+            "the job file.",
             reason=f"according to the pictures, {fits} than the calibration says",
             priority=3.0,
         )
 
 
 def _as_sentence(text: str) -> str:
+    if not text:
+        return ""
     return f"{text[:1].upper()}{text[1:]}{'' if text.endswith(('.', '!', '?')) else '.'}"
 
 
@@ -321,14 +336,16 @@ def _about_start_and_end(inputs: ReportInputs) -> Iterator[Recommendation]:
     missing += [f"{name} has no measurement after {time:.2f} s" for name, time in early.items()]
     # If one camera ended before another camera started, shortening the capture does not help.
     remaining_s = min(early.values(), default=end_s) - max(late.values(), default=start_s)
-    cut = (
-        f"; to use only the common part of this capture, set {' and '.join(cuts)} under `capture`"
+    how = (
+        f"To use only the common part of this capture, write {' and '.join(cuts)} under `capture:` in the "
+        "job file."
         if remaining_s > 0.0
         else ""
     )
     if missing:
         yield Recommendation(
-            action=f"Start all cameras before the movement and stop all cameras after the movement{cut}.",
+            action="Start all cameras before the movement and stop all cameras after the movement.",
+            how=how,
             reason=f"the motion runs from {start_s:.2f} s to {end_s:.2f} s, but {', '.join(missing)}",
             priority=1.4,
         )
@@ -371,52 +388,74 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
     unknown = sorted(name for name, clock in inputs.clocks.items() if not clock.is_known)
     if unknown:
         yield Recommendation(
-            action="Clap once, or hop once, while all cameras record with sound. For this recording, read "
-            "the time of an event in two videos and state `offset_s`: the time in the video of "
-            f"{inputs.reference_camera} minus the time in the camera's own video.",
+            action="Clap once, or hop once, while all cameras record with sound.",
+            how="For this recording, read the time of an event in two videos and state `offset_s` of the "
+            f"camera in the job file: the time in the video of {inputs.reference_camera} minus the time in "
+            "the camera's own video.",
             reason=_clock_notes(inputs, unknown),
             priority=2.9,
         )
     contradicted = sorted(name for name, clock in inputs.clocks.items() if clock.is_contradicted)
     if contradicted:
         yield Recommendation(
-            action="Leave out the stated `offset_s`, so that it is estimated, or correct it: `offset_s` is "
-            f"the time of an event in the video of {inputs.reference_camera} minus its time in the camera's "
-            "own video.",
+            action="Correct the stated clock offset, or leave it out, so that it is estimated.",
+            how=f"`offset_s` is the time of an event in the video of {inputs.reference_camera} minus its "
+            "time in the camera's own video.",
             reason="; ".join(
                 f"{name}: {note}" for name in contradicted for note in inputs.clocks[name].notes
             ),
             priority=2.5,
         )
-    yield from _about_scale(report.scale)
+    bones = {mount.role for mount in inputs.mounts}
+    yield from _about_scale(report.scale, has_t_pose=report.t_pose is not None, is_one_bone=len(bones) == 1)
     for hinge in report.loose_hinges.values():
         finding, _, advice = hinge.known_to.partition(_ADVICE_SEPARATOR)
-        yield Recommendation(action=_as_sentence(advice), reason=finding, priority=1.1 + hinge.sigma_m)
+        action, _, settings = advice.partition(", and ")
+        yield Recommendation(
+            action=_as_sentence(action),
+            reason=finding,
+            priority=1.1 + hinge.sigma_m,
+            how=_as_sentence(settings),
+        )
     for name, mount in report.mounts.items():
         finding, _, advice = mount.known_to.partition(_ADVICE_SEPARATOR)
         if advice or mount.sigma_deg > GOOD_MOUNT_DEG:
-            measure = f"measure the pose of {name} on its bone and give this pose in the job (joint_from_cam)"
+            measure = f"measure how {name} sits on its bone"
             yield Recommendation(
-                action=_as_sentence(f"{advice}; or {measure}" if advice else measure),
-                reason=finding
-                if advice
-                else f"the uncertainty of the mount of {name} is {mount.sigma_deg:.0f}°",
+                action=_as_sentence(f"at the start of the take, {advice}" if advice else measure),
+                reason=f"the direction of {name} on its bone is known to about ± {mount.sigma_deg:.0f}°",
                 priority=1.0 + mount.sigma_deg / 1000.0,
+                how=f"Or {measure}, and give it in the job file: `joint_from_cam` of the camera."
+                if advice
+                else "Give it in the job file: `joint_from_cam` of the camera.",
             )
 
 
-def _about_scale(scale: ScaleReport) -> Iterator[Recommendation]:
+def _about_scale(scale: ScaleReport, *, has_t_pose: bool, is_one_bone: bool) -> Iterator[Recommendation]:
     sigma = scale.relative_sigma
     if sigma <= _SUFFICIENT_SCALE_SIGMA:
         return
-    _, _, advice = scale.known_to.partition(_ADVICE_SEPARATOR)
-    ways = [advice] if advice else []
-    if all(source.name != "skeleton" for source in scale.sources):
-        ways.append("give the subject's own skeleton (--skeleton subject.bvh)")
-    if ways:
-        yield Recommendation(
-            action=_as_sentence(", or ".join(ways)),
-            reason=f"the metric scale comes from {scale.source}; its uncertainty is {sigma:.1%}, which is "
-            f"{100 * _ARM_LENGTH_M * sigma:.1f} cm for the length of an arm",
-            priority=1.1 + sigma,
-        )
+    used = {source.name for source in scale.sources if source.used}
+    how = [
+        "for a distance, `merge: {known_distance: [torso:0, torso:120, 2.50]}` in the job file, the metres "
+        "between the camera's places in two frames",
+        "for a board, `merge: {marker_board: {square_m: 0.1, columns: 7, rows: 5}}`",
+    ]
+    if is_one_bone:
+        action = "Wear a camera on another bone as well (a hand, an upper arm or the head)"
+    elif "mean stature" in used:
+        action = "Give the height of the person"
+        how.insert(0, "for the height, `--height 1.75`")
+    elif used & {"known distance", "marker board"}:
+        return
+    else:
+        action = "Put a board of printed squares on the floor, or measure how far the person walks"
+    if "skeleton" not in used:
+        how.append("the person's own skeleton (`--skeleton subject.bvh`) is more accurate than the height")
+    t_pose = "" if has_t_pose else ", or stand in a T-pose for two seconds first"
+    yield Recommendation(
+        action=f"{action}{t_pose}.",
+        reason=f"sizes are known to about {describe_scale_error(sigma)}",
+        priority=1.1 + sigma,
+        how=_as_sentence("; ".join(how)),
+    )

@@ -37,6 +37,8 @@ _GOOD_SCALE_SIGMA, _FAIR_SCALE_SIGMA = 0.025, 0.10
 
 The `rationale` of the criterion gives the reason.
 """
+_BODY_HEIGHT_M = 1.7
+"""Body height (metres) with which an error of the scale is shown. Source: `MEAN_HEIGHT_M`."""
 _GOOD_RESIDUAL_M, _FAIR_RESIDUAL_M = 0.01, 0.03
 """Maximum 95th percentile (metres) of two distances for the grades "good" and "usable with care".
 
@@ -339,7 +341,7 @@ def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
             subject="body",
             name="Metric scale",
             grade=grade_value(float(scale), _GOOD_SCALE_SIGMA, _FAIR_SCALE_SIGMA),
-            finding=f"the uncertainty is {scale:.1%} (one standard deviation)",
+            finding=f"sizes are known to about {describe_scale_error(float(scale))}",
             rationale="An error of the scale changes all lengths by the same factor. 2.5 % is 1.5 cm for "
             "the length of an arm, about as much as all other errors together. 10 % is the difference "
             "between a short and a tall adult.",
@@ -389,6 +391,15 @@ def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
         )
     yield from _mount_criteria(merge.get("mounts", {}))
     yield from _unused_camera_criteria(merge.get("unused_cameras", {}))
+
+
+def describe_scale_error(relative_sigma: float) -> str:
+    """Return the uncertainty of the metric scale in words, as a part of a body height.
+
+    Args:
+        relative_sigma: Relative standard deviation of the scale.
+    """
+    return f"± {100.0 * _BODY_HEIGHT_M * relative_sigma:.0f} cm of body height ({relative_sigma:.1%})"
 
 
 def _gap_criteria(cameras: Mapping[str, Any]) -> Iterator[Criterion]:

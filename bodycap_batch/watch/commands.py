@@ -68,9 +68,12 @@ class JobRow:
         progress: Completed fraction of the stage; None if the fraction is unknown.
         since: Time at which the state started, UTC.
         age_s: Time (seconds) since `since`; None if `since` is unknown.
+        duration_s: Time (seconds) from the start of a job to its end; None if it has not ended.
         cause: What the job waits for, or why the job failed.
         hint: What the user can do.
         path: Path of the job.
+        verdict: Grade of the results in words; "" if there are no results, or if it was not recorded.
+        headline: The verdict in one sentence.
     """
 
     name: str
@@ -79,9 +82,12 @@ class JobRow:
     progress: float | None = None
     since: str = ""
     age_s: float | None = None
+    duration_s: float | None = None
     cause: str = ""
     hint: str = ""
     path: str = ""
+    verdict: str = ""
+    headline: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the row as plain JSON values."""
@@ -301,6 +307,7 @@ def job_row(job: JobDir) -> JobRow:
     if state == "stopped" and cause:  # the job waits for a disk or for `bodycap gc`
         where = error.get("path")
         cause = f"the job continues later: {f'{where}: ' if where else ''}{cause}"
+    verdict = (status.get("verdict") or {}) if state == "done" else {}
     if state == "interrupted":
         cause = "the watcher of this job has ended; the job continues when a watcher starts"
     return JobRow(
@@ -310,9 +317,12 @@ def job_row(job: JobDir) -> JobRow:
         progress=status.get("progress") if running else None,
         since=str(since or ""),
         age_s=_age_s(since),
+        duration_s=_seconds_between(status.get("started_at"), status.get("finished_at")),
         cause=cause,
         hint=str(error.get("hint") or ""),
         path=str(job.path),
+        verdict=str(verdict.get("grade", "")),
+        headline=str(verdict.get("headline", "")),
     )
 
 
@@ -323,6 +333,15 @@ def _is_watcher_gone(job: JobDir) -> bool:
     return bool(owner.get("released")) or (
         is_local and process_start(int(owner.get("pid", 0))) != owner.get("process")
     )
+
+
+def _seconds_between(start: object, end: object) -> float | None:
+    """Return the time (seconds) between two moments that are given as text; None if a text is not a time."""
+    try:
+        first, last = (datetime.fromisoformat(str(moment)) for moment in (start, end))
+        return round((last - first).total_seconds(), 1)
+    except (ValueError, TypeError):
+        return None
 
 
 def _age_s(moment: object) -> float | None:

@@ -33,6 +33,7 @@ _FIELD_TYPES: Mapping[str, tuple[type, ...]] = {
     "attempts": (int,),
     "progress": (int, float, NoneType),
     "error": (dict, NoneType),
+    "verdict": (dict, NoneType),
 }
 """Permitted types of each field of `status.json`. A value of another type is ignored, because a user may have
 edited the file."""
@@ -86,6 +87,7 @@ class JobStatusFile:
             "store": previous.get("store"),
             "exit_code": None,
             "error": None,
+            "verdict": None,
         }
 
     def __call__(self, event: Event) -> None:

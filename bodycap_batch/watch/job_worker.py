@@ -140,7 +140,9 @@ class JobWorker:
             turns=self._stage_turns,
         )
         try:
-            run_job(job, out_dir=job_dir.result, settings=settings)
+            summary = run_job(job, out_dir=job_dir.result, settings=settings)
+            if summary.verdict is not None:
+                status.update(verdict=summary.verdict.to_dict())
         finally:
             if claim.ownership.is_held():
                 make_result_paths_relative(job_dir, job)

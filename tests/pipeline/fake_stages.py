@@ -112,7 +112,8 @@ def exported(options: Json, arguments: Json, files: Path) -> None:
     for kind in options["formats"]:
         (results / f"result.{kind}").write_text(json.dumps(made_of(arguments), sort_keys=True))
     (results / "trajectories" / "torso.tum").write_text("0 0 0 0 0 0 0 1\n")
-    (results / "metrics.json").write_text(json.dumps({"partial": arguments["failure"] is not None}))
+    metrics = {**orders().get("metrics", {}), "partial": arguments["failure"] is not None}
+    (results / "metrics.json").write_text(json.dumps(metrics))
 
 
 def previewed(options: Json, arguments: Json, files: Path) -> None:

@@ -73,7 +73,7 @@ def test_two_jobs_of_one_folder_of_results_are_refused(bench: Bench) -> None:
     (bench.folder / "monday").mkdir()
     for camera in ("torso", "left_palm"):
         (bench.folder / "monday" / f"{camera}.mp4").write_text("other frames")
-    code, out, err = bench.run("batch", "monday", "again/monday", "--max-jobs", "1")
+    code, out, err = bench.run("batch", "monday", "again/monday", "--max-jobs", "1", "--out", "out")
     assert code == 2
     assert out.splitlines()[-1] == "1 of 2 jobs done"
     assert "give the jobs different names" in err

@@ -112,7 +112,8 @@ def test_results_elsewhere_have_their_store_beside_them(bench: Bench) -> None:
     code, out, _ = bench.run("run", "my walk", "--out", "elsewhere", "--skeleton", "none")
     assert code == 0
     assert out.splitlines()[-1] == f"results: {bench.folder / 'elsewhere'}"
-    assert (bench.folder / "elsewhere" / ".store" / "artefacts").is_dir()
+    assert (bench.folder / ".store" / "artefacts").is_dir()
+    assert not (bench.folder / "elsewhere" / ".store").exists()
     assert not (bench.folder / "out").exists()
 
 

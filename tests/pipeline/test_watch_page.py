@@ -175,7 +175,7 @@ def test_a_result_that_cannot_be_read_is_an_error_of_the_disk(
     def fail(*_: object) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr("bodycap_batch.watch.web.app._result_file", fail)
+    monkeypatch.setattr("bodycap_batch.watch.web.app._file_in", fail)
     code, data, _ = client.ask("GET", "/results/walk/metrics.json")
     assert (code, json.loads(data)["message"]) == (507, "Input/output error")
 
@@ -433,7 +433,15 @@ def test_the_page_shows_the_jobs_and_accepts_videos(
         document.getElementById("drop").dispatchEvent(drop);
         }"""
     )
+    # The page asks for the height before it sends the videos, and refuses a height that nobody has.
+    tab.fill("#uploads input[name=height]", "17,5")
+    tab.click("#uploads button:text-is('Start')")
+    tab.wait_for_selector("#uploads .cause >> text=not plausible")
+    tab.fill("#uploads input[name=height]", "1,75")
+    tab.click("#uploads button:text-is('Start')")
     tab.wait_for_selector("#jobs .state.waiting")
+    (dropped,) = bench.spool.inbox.glob("[!.]*")
+    assert "height_m: 1.75" in (dropped / "job.yaml").read_text()
     assert tab.inner_text("#jobs .name") == "<img src=x"  # shown as text, not as HTML
     bench.order(hang="map")
     watcher = bench.watcher(once=False)
@@ -456,14 +464,37 @@ def test_the_page_shows_the_jobs_and_accepts_videos(
             tab.click("text=metrics.json")
         assert "partial" in tab.content()
         tab.go_back()
-        # A file that the page does not accept is reported, with a remedy.
+        # A file that a job does not use is not sent.
         tab.set_input_files("#files", files=[{"name": "notes.doc", "mimeType": "text/plain", "buffer": b"x"}])
-        tab.wait_for_selector("#uploads .cause >> text=neither a video")
+        tab.wait_for_selector("#uploads .hint >> text=not sent, because a job does not use them: notes.doc")
     finally:
         watcher.stop()
         thread.join()
     # The browser itself reports the refused file, and the icon that it requested for the sandboxed result.
     assert [line for line in messages if "400" not in line and "NotSameOrigin" not in line] == []
+
+
+@pytest.mark.browser
+def test_the_page_asks_for_the_places_of_cameras_again_where_a_job_failed_for_them(
+    bench: SpoolFixture, page: LivePage, browser: Any
+) -> None:
+    folder = bench.spool.inbox / "walk"
+    folder.mkdir()
+    for name in ("GX010120.MP4", "GX010121.MP4"):
+        (folder / name).write_text(f"frames {name}")
+    (folder / "IMG_1.jpg").touch()
+    assert bench.run_once() == 2
+    tab = browser.new_page()
+    tab.goto(page.access.url)
+    tab.wait_for_selector("#jobs form.ask")
+    tab.select_option("select[name='GX-0120']", "torso")
+    tab.click("button:text-is('Start again')")
+    assert bench.spool.failed.joinpath("walk").is_dir(), "the browser requires both places"
+    tab.select_option("select[name='GX-0121']", "left_palm")
+    tab.click("button:text-is('Start again')")
+    tab.wait_for_selector("#jobs .state.waiting")
+    assert bench.run_once() == 0, bench.lines
+    tab.wait_for_selector("#jobs .state.done")
 
 
 @pytest.mark.browser

@@ -194,7 +194,7 @@ def test_a_lens_that_the_map_contradicts_is_not_graded_good(
     strained["total"]["mean_reprojection_error_px"] = 1.1
     (misfit,) = (each for each in judge(strained, None).criteria if "Lenses" in each.name)
     assert misfit.grade is grade
-    assert "calibration: auto" in recommend_changes(contradicted, {})[0].action
+    assert "calibration: auto" in recommend_changes(contradicted, {})[0].how
     assert says in written(contradicted, tmp_path)
 
 
@@ -236,7 +236,7 @@ def test_an_unknown_clock_is_in_the_first_line_and_poor(inputs: ReportInputs, tm
     assert note in clock.finding
     clocks = {**inputs.clocks, "left_palm": replace(inputs.clocks["left_palm"], source="none", notes=(note,))}
     unknown = replace(inputs, metrics=metrics, clocks=clocks, reference_camera="torso")
-    assert "the video of torso minus" in recommend_changes(unknown, {})[0].action
+    assert "the video of torso minus" in recommend_changes(unknown, {})[0].how
     page = written(unknown, tmp_path)
     assert "Clocks of the cameras" in page
     assert note in page
@@ -263,7 +263,7 @@ def test_a_contradicted_clock_is_poor(inputs: ReportInputs) -> None:
 
 def test_cameras_that_start_late_or_end_early_get_the_advice_to_cut(inputs: ReportInputs) -> None:
     assert inputs.merge is not None
-    assert not any("start_s" in each.action for each in recommend_changes(inputs, {}))
+    assert not any("start_s" in each.how for each in recommend_changes(inputs, {}))
 
     def without_poses(path: Trajectory, lost: slice) -> Trajectory:
         kept = path.localised.copy()
@@ -282,18 +282,16 @@ def test_cameras_that_start_late_or_end_early_get_the_advice_to_cut(inputs: Repo
     (ends,) = (
         each
         for each in recommend_changes(replace(inputs, merge=replace(inputs.merge, trajectories=paths)), {})
-        if "start_s" in each.action
+        if "start_s" in each.how
     )
     start = inputs.merge.start_ns * 1e-9
-    assert f"start_s: {start + 1.0:.2f} and end_s: {start + 39 / 30:.2f}" in ends.action
+    assert f"start_s: {start + 1.0:.2f} and end_s: {start + 39 / 30:.2f}" in ends.how
     assert f"{left.camera} has no measurement before" in ends.reason
 
     paths = (torso, without_poses(left, slice(0, 40)), without_poses(right, slice(20, None)))
     without_cut = recommend_changes(replace(inputs, merge=replace(inputs.merge, trajectories=paths)), {})
     (ends,) = (each for each in without_cut if "Start all cameras" in each.action)
-    assert ends.action.endswith(
-        "stop all cameras after the movement."
-    )  # no time remains between 1.33 and 0.63 s
+    assert ends.how == ""  # no time remains between 1.33 and 0.63 s
     assert f"{right.camera} has no measurement after" in ends.reason
 
 
@@ -376,7 +374,7 @@ def test_a_lens_with_a_wrong_principal_point_is_never_graded_good(inputs: Report
     reasons = [
         each.reason
         for each in recommend_changes(replace(inputs, metrics=metrics), {})
-        if "calibration" in each.action
+        if "calibration" in each.how
     ]
     assert reasons == ["according to the pictures, torso has another lens than the calibration says"]
 
@@ -633,27 +631,34 @@ def test_recommendations_follow_from_measurements(inputs: ReportInputs) -> None:
         "posters" in each.action
         for each in recommend_changes(inputs, {"torso": Counter({LossCause.PLAIN: 1})})
     )
-    assert any("skeleton" in each.action for each in recommendations)
+    assert any("skeleton" in each.how for each in recommendations)
 
 
 @pytest.mark.parametrize(
-    ("source", "says"),
-    [
-        ("height", "Give a known distance, or give the subject's own skeleton (--skeleton subject.bvh)."),
-        ("skeleton", "Give a known distance."),
-    ],
+    ("source", "is_recommended"),
+    [("height", True), ("skeleton", False)],
 )
-def test_a_given_skeleton_is_not_recommended_again(inputs: ReportInputs, source: str, says: str) -> None:
+def test_a_given_skeleton_is_not_recommended_again(
+    inputs: ReportInputs, source: str, is_recommended: bool
+) -> None:
     assert inputs.merge is not None
     scale = {
         "source": f"{source} and floor",
         "relative_sigma": 0.03,
-        "known_to": "the uncertainty of the metric scale is 3.0 % (1 sigma); to reduce this, "
-        "give a known distance",
-        "sources": [{"name": source}, {"name": "floor"}],
+        "sources": [{"name": source, "used": True}, {"name": "floor", "used": True}],
     }
     changed = replace(inputs, merge=replace(inputs.merge, report=MergeReport.from_dict({"scale": scale})))
-    assert [each.action for each in recommend_changes(changed, {}) if "metric scale" in each.reason] == [says]
+    (found,) = [each for each in recommend_changes(changed, {}) if "sizes" in each.reason]
+    assert ("--skeleton" in found.how) is is_recommended
+    assert found.reason == "sizes are known to about ± 5 cm of body height (3.0%)"
+    assert "board of printed squares" in found.action
+
+
+def test_at_most_three_changes_are_recommended(inputs: ReportInputs, tmp_path: Path) -> None:
+    causes = (LossCause.DARK, LossCause.FAST, LossCause.BLUR, LossCause.PLAIN, LossCause.SHALLOW)
+    found = recommend_changes(inputs, {"torso": Counter(dict.fromkeys(causes, 30))})
+    assert len(found) == 3
+    assert "`" not in "".join(each.action + each.reason for each in found)
 
 
 def test_an_elbow_that_violates_its_hinge_model_gets_a_recommendation(inputs: ReportInputs) -> None:
@@ -680,7 +685,10 @@ def test_a_t_pose_that_improves_several_constants_is_recommended_once(inputs: Re
 
     def recommended_actions(*cameras: str) -> list[str]:
         text = "uncertainty 11°; to reduce this, swing the elbow, or stand in a T-pose for two seconds first"
-        report = {"mounts": {name: {"known_to": text, "sigma_deg": 11.0} for name in cameras}}
+        report = {
+            "mounts": {name: {"known_to": text, "sigma_deg": 11.0} for name in cameras},
+            "scale": {"relative_sigma": 0.01},
+        }
         found = recommend_changes(
             replace(inputs, merge=replace(merge, report=MergeReport.from_dict(report))), {}
         )
@@ -690,7 +698,7 @@ def test_a_t_pose_that_improves_several_constants_is_recommended_once(inputs: Re
     assert "elbow, or stand in a T-pose" in single
     first, *others = recommended_actions("left_palm", "right_palm")
     assert first.startswith("Stand still for two seconds")
-    assert [each.split(";")[0] for each in others] == ["Swing the elbow", "Swing the elbow"]
+    assert others == 2 * ["At the start of the take, swing the elbow."]
 
 
 def test_shared_points_count_what_both_cameras_see(inputs: ReportInputs) -> None:

@@ -103,7 +103,7 @@ class _LineReader:
             message,
             path=self.path,
             line=self.number if line is None else line,
-            hint=hint or "export the skeleton again as BVH, or use a preset: `skeleton: upper_body`",
+            hint=hint or "export the skeleton again as BVH, or use a preset: `skeleton: auto`",
         )
 
 

@@ -24,13 +24,16 @@ from starlette.responses import (
 )
 from starlette.routing import Route
 
+from bodycap_batch.config.body_height import height_from_text
+from bodycap_batch.config.folder import VIDEO_SUFFIXES
 from bodycap_batch.core.errors import BodycapError, CaptureError, StoreError
 from bodycap_batch.store.artefacts import store_error
 from bodycap_batch.watch.commands import cancel_job, retry_job
 from bodycap_batch.watch.spool import JobDir, Spool
 from bodycap_batch.watch.web.access import COOKIE, Access
 from bodycap_batch.watch.web.job_list import JobList, list_result_files, read_log_end
-from bodycap_batch.watch.web.uploads import Uploads
+from bodycap_batch.watch.web.questions import questions_about, write_answers
+from bodycap_batch.watch.web.uploads import Uploads, is_accepted
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
@@ -44,10 +47,13 @@ _KEEP_ALIVE_S = 15.0
 keeps the connection open. Evidence: none."""
 _MAX_JSON_BYTES = 4096
 """Maximum size (bytes) of a request's JSON document. The document holds only a name. Evidence: none."""
+_MAX_NAMES_BYTES = 1 << 20
+"""Maximum size (bytes) of a JSON document with the names of all files of a folder. Evidence: none."""
 _NO_SUCH_PATH = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP)
 """Error numbers (errno) that mean that a path does not exist or cannot exist."""
 _PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
+    "media-src 'self' blob:; "
     "form-action 'none'; frame-ancestors 'none'; base-uri 'none'"
 )
 # A result file is sandboxed: scripts in a result cannot send requests with the rights of this page.
@@ -79,11 +85,14 @@ def make_app(job_list: JobList, access: Access, uploads: Uploads, stopped: threa
         Route("/api/jobs/{name}/files", page.files),
         Route("/api/jobs/{name}/retry", page.retry, methods=["POST"]),
         Route("/api/jobs/{name}/cancel", page.cancel, methods=["POST"]),
+        Route("/api/questions", page.questions, methods=["POST"]),
+        Route("/api/answers", page.check_answers, methods=["POST"]),
         Route("/api/uploads", page.start_upload, methods=["POST"]),
         Route("/api/uploads/{key}", page.discard_upload, methods=["DELETE"]),
         Route("/api/uploads/{key}/finish", page.finish_upload, methods=["POST"]),
         Route("/api/uploads/{key}/{name:path}", page.write_upload, methods=["PUT"]),
         Route("/results/{name}/{file:path}", page.result),
+        Route("/inputs/{name}/{file:path}", page.input_video),
     ]
     handlers: dict[Any, Any] = {
         BodycapError: _error_response,
@@ -164,26 +173,40 @@ class _Routes:
     async def result(self, request: Request) -> Response:
         """Return one file from a job's folder of results. Files outside this folder are not found."""
         job = await run_in_threadpool(self._job, request)
-        if job is None:
+        return _not_found() if job is None else await _file_response(job.result, request)
+
+    async def input_video(self, request: Request) -> Response:
+        """Return one video of a job, which the page shows where it asks for the place of the camera."""
+        job = await run_in_threadpool(self._job, request)
+        if job is None or Path(request.path_params["file"]).suffix.lower() not in VIDEO_SUFFIXES:
             return _not_found()
-        path = await run_in_threadpool(_result_file, job, request.path_params["file"])
-        if path is None:
-            return _not_found()
-        return FileResponse(
-            path,
-            headers={**_COMMON_HEADERS, "content-security-policy": _RESULT_POLICY},
-            # Because `stat_result` is given, the response raises `FileNotFoundError` if the job's folder is
-            # moved before the file is opened.
-            stat_result=await run_in_threadpool(path.stat),
-        )
+        return await _file_response(job.input, request)
 
     async def retry(self, request: Request) -> Response:
+        answers = await _read_small_json(request, _MAX_NAMES_BYTES)
+        job = await run_in_threadpool(self._job, request)
+        if job is not None and job.path.parent == self._spool.failed:
+            await run_in_threadpool(write_answers, job.input, answers)
         path = await run_in_threadpool(retry_job, self._spool, request.path_params["name"])
         return JSONResponse({"name": path.name}, headers=_COMMON_HEADERS)
 
     async def cancel(self, request: Request) -> Response:
         await run_in_threadpool(cancel_job, self._spool, request.path_params["name"])
         return JSONResponse({}, headers=_COMMON_HEADERS)
+
+    async def questions(self, request: Request) -> Response:
+        """Return what the page asks about a folder before the folder is sent."""
+        body = await _read_small_json(request, _MAX_NAMES_BYTES)
+        given = body.get("names")
+        names = [str(name) for name in given] if isinstance(given, list) else []
+        found = {**questions_about(names), "ignored": [name for name in names if not is_accepted(name)]}
+        return JSONResponse(found, headers=_COMMON_HEADERS)
+
+    async def check_answers(self, request: Request) -> Response:
+        """Check the height, so that the page can ask again before it sends the videos."""
+        height = str((await _read_small_json(request, _MAX_NAMES_BYTES)).get("height") or "").strip()
+        metres = height_from_text(height) if height else None
+        return JSONResponse({"height_m": metres}, headers=_COMMON_HEADERS)
 
     async def start_upload(self, request: Request) -> Response:
         body = await _read_small_json(request)
@@ -202,7 +225,8 @@ class _Routes:
         return JSONResponse({}, headers=_COMMON_HEADERS)
 
     async def finish_upload(self, request: Request) -> Response:
-        name = await run_in_threadpool(self._uploads.finish, request.path_params["key"])
+        answers = await _read_small_json(request, _MAX_NAMES_BYTES)
+        name = await run_in_threadpool(self._uploads.finish, request.path_params["key"], answers)
         return JSONResponse({"name": name}, headers=_COMMON_HEADERS)
 
     async def discard_upload(self, request: Request) -> Response:
@@ -232,20 +256,34 @@ class _Routes:
             silent_s += _UPDATE_PERIOD_S
 
 
-def _result_file(job: JobDir, name: str) -> Path | None:
-    """Return the path of a file in a job's folder of results; None if there is no such file."""
+async def _file_response(folder: Path, request: Request) -> Response:
+    """Return one file of a folder. Files outside this folder are not found."""
+    path = await run_in_threadpool(_file_in, folder, request.path_params["file"])
+    if path is None:
+        return _not_found()
+    return FileResponse(
+        path,
+        headers={**_COMMON_HEADERS, "content-security-policy": _RESULT_POLICY},
+        # Because `stat_result` is given, the response raises `FileNotFoundError` if the job's folder is
+        # moved before the file is opened.
+        stat_result=await run_in_threadpool(path.stat),
+    )
+
+
+def _file_in(folder: Path, name: str) -> Path | None:
+    """Return the path of a file in a folder; None if there is no such file."""
     try:
-        path = (job.result / name).resolve()
+        path = (folder / name).resolve()
     except (ValueError, RuntimeError):  # the name holds a NUL character, or links form a circle
         return None
-    return path if path.is_relative_to(job.result.resolve()) and path.is_file() else None
+    return path if path.is_relative_to(folder.resolve()) and path.is_file() else None
 
 
-async def _read_small_json(request: Request) -> dict[str, Any]:
+async def _read_small_json(request: Request, max_bytes: int = _MAX_JSON_BYTES) -> dict[str, Any]:
     body = b""
     async for chunk in request.stream():
         body += chunk
-        if len(body) > _MAX_JSON_BYTES:
+        if len(body) > max_bytes:
             return {}
     try:
         found = json.loads(body)

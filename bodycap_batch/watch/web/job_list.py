@@ -13,6 +13,7 @@ from typing import Any
 from bodycap_batch.watch.commands import JobRow, inbox_rows, job_row
 from bodycap_batch.watch.job_status import read_status
 from bodycap_batch.watch.spool import JobDir, Spool, visible_entries
+from bodycap_batch.watch.web.questions import files_below, is_answered_by_page, questions_about
 
 REPORT = "report.html"
 _MAX_AGE_S = 0.8
@@ -91,24 +92,51 @@ def read_log_end(job: JobDir) -> str:
 
 
 def list_result_files(job: JobDir) -> list[str]:
-    """Return the paths of a job's result files, relative to the job's folder of results."""
+    """Return the paths of a job's result files, relative to the job's folder of results.
+
+    The files that people want come first: motion, film, page, map. Logs come last.
+    """
     if not job.result.is_dir():
         return []
     files = (path for path in job.result.rglob("*") if path.is_file() and not path.name.startswith("."))
-    return sorted(path.relative_to(job.result).as_posix() for path in files)
+    return sorted((path.relative_to(job.result).as_posix() for path in files), key=_file_order)
+
+
+def _file_order(name: str) -> tuple[int, str]:
+    """Return the sort key of a result file, given its path relative to the folder of results."""
+    wanted = ("motion.", "preview.", REPORT, "map", "joints.", "metrics.json", "frames.csv", "trajectories/")
+    own = name.removeprefix("partial/")
+    place = next((place for place, start in enumerate(wanted) if own.startswith(start)), len(wanted))
+    return (len(wanted) + 1 if own.startswith("logs/") else place), name
 
 
 def _job_entry(job: JobDir) -> dict[str, Any]:
     return _browser_entry(job_row(job), job)
 
 
+def _open_questions(row: JobRow, job: JobDir | None) -> dict[str, Any] | None:
+    """Return what the page asks about a failed job; None if an answer would not help."""
+    if job is None or row.state != "failed" or not job.input.is_dir():
+        return None
+    try:
+        found = questions_about(files_below(job.input))
+        is_open = bool(found["unknown"]) and is_answered_by_page(job.input)
+    except OSError:
+        return None
+    return found if is_open else None
+
+
 def _browser_entry(row: JobRow, job: JobDir | None) -> dict[str, Any]:
-    """Return a row in the format of the page. The row has no age, because the browser computes the age."""
+    """Return a row in the format of the page.
+
+    The row has no age, because the browser computes it.
+    """
     entry = row.to_dict()
     del entry["age_s"], entry["path"]
     status = {} if job is None else read_status(job)
     entry["active"] = status.get("active", {}) if row.state == "running" else {}
     entry["notes"] = status.get("notes", [])
+    entry["asks"] = _open_questions(row, job)
     entry["finished"] = len(status.get("finished_stages", []))
     reports = [] if job is None else [f"{REPORT}", f"partial/{REPORT}"]
     entry["report"] = next(

@@ -8,9 +8,10 @@ import shutil
 import threading
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from bodycap_batch.config.folder import JOB_FILES, VIDEO_SUFFIXES
 from bodycap_batch.config.limits import Limits
@@ -19,6 +20,7 @@ from bodycap_batch.store.artefacts import disk_errors
 from bodycap_batch.watch.inbox_entries import READY
 from bodycap_batch.watch.process_identity import is_from_this_machine, is_process_running, process_tag
 from bodycap_batch.watch.spool import Spool, folder_name_from_text, move_to_free_name
+from bodycap_batch.watch.web.questions import write_answers
 
 _PREFIX = ".upload-"
 _OTHER_FILES = ("calib.json", *JOB_FILES)
@@ -138,11 +140,16 @@ class Uploads:
                 if upload.discarded:
                     shutil.rmtree(upload.folder, ignore_errors=True)
 
-    def finish(self, key: str) -> str:
+    def finish(self, key: str, answers: Mapping[str, Any] | None = None) -> str:
         """Move a complete upload into the inbox, and return the name of the folder in the inbox.
 
+        Args:
+            key: The key that `start` returned.
+            answers: The answers of the user, for `write_answers`; None without answers.
+
         Raises:
-            JobError: The key is unknown, the folder holds no video, or a file is still being sent.
+            JobError: The key is unknown, the folder holds no video, a file is still being sent, or an answer
+                cannot be understood.
         """
         with self._lock:
             upload = self._get(key)
@@ -156,6 +163,7 @@ class Uploads:
                 raise JobError(
                     "no video was sent", hint="name the videos torso.mp4, left_palm.mp4, right_palm.mp4"
                 )
+            write_answers(upload.folder, answers or {})
             with disk_errors(upload.folder):
                 (upload.folder / READY).touch()
                 target = move_to_free_name(upload.folder, self._spool.inbox, upload.name)
@@ -226,7 +234,7 @@ class Uploads:
                 f"{path.parts[0]} is a folder, but only a file may have this name", hint="rename the folder"
             )
         video = path.suffix.lower() in VIDEO_SUFFIXES
-        if not video and path.name not in _OTHER_FILES and not path.name.lower().endswith(_OTHER_SUFFIXES):
+        if not is_accepted(name):
             known = ", ".join((*_OTHER_FILES, *_OTHER_SUFFIXES))
             raise JobError(f"{path.name} is neither a video nor any of {known}", hint="leave this file out")
         sent = {*upload.files, *upload.coming}
@@ -267,6 +275,13 @@ class Uploads:
             if chunk:
                 upload.touched = self._clock()
             yield chunk
+
+
+def is_accepted(name: str) -> bool:
+    """Return True if a file with this path is a video or another file that a job can use."""
+    path = PurePosixPath(name)
+    is_video = path.suffix.lower() in VIDEO_SUFFIXES
+    return is_video or path.name in _OTHER_FILES or path.name.lower().endswith(_OTHER_SUFFIXES)
 
 
 def _require_short(name: str) -> None:

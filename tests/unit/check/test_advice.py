@@ -44,12 +44,12 @@ def test_a_good_capture_needs_no_advice(tmp_path: Path) -> None:
     assert advice(walk(tmp_path)) == ""
 
 
-def test_a_guessed_lens_and_a_height_without_skeleton_give_advice(tmp_path: Path) -> None:
+def test_a_guessed_lens_gives_advice_and_a_height_gives_none(tmp_path: Path) -> None:
     walk(tmp_path)
     assert "board" not in advice(tmp_path)
     (tmp_path / "calib.json").unlink()
     assert "estimates the lens of head and torso" in advice(tmp_path)
-    assert "--skeleton" in advice(tmp_path, height_m=1.75)
+    assert "--skeleton" not in advice(tmp_path, height_m=1.75), "a height alone needs no advice"
 
 
 def test_a_camera_that_ends_early_or_runs_slowly_is_named(tmp_path: Path) -> None:

@@ -203,7 +203,7 @@ def refusal(folder: Path, document: Mapping[str, Any]) -> JobError:
         store=Store(folder / "store"), threads=1, listener=lambda _: None, cancelled=lambda: False
     )
     with pytest.raises(JobError) as caught:
-        load_job(path, prepare=lambda options, out: prepare_capture(options, out, settings))
+        load_job(path, prepare=lambda options, out, _: prepare_capture(options, out, settings))
     return caught.value
 
 

@@ -57,7 +57,21 @@ def test_names_say_where_a_camera_sits(name: str, role: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["", "camera", "GX010123", "left", "palm", "back", "front_2", "handle", "leftover"]
+    "name",
+    [
+        "",
+        "camera",
+        "GX010123",
+        "left",
+        "palm",
+        "back",
+        "front_2",
+        "handle",
+        "gopro1",
+        "Cam 2",
+        "VID_20230101",
+        "leftover",
+    ],
 )
 def test_other_names_are_not_guessed(name: str) -> None:
     assert mount_of(name) is None
@@ -82,7 +96,7 @@ def test_a_folder_is_a_job(tmp_path: Path) -> None:
     (root / "torso.timestamps.txt").write_text("0\n")
     job = load_job(root)
     assert job.name == "my_walk"
-    assert job.skeleton == "upper_body"
+    assert job.skeleton == "auto"
     by_name = {camera.name: camera for camera in job.capture.cameras}
     assert set(by_name) == {"torso", "left_palm"}
     assert by_name["torso"].timestamps == (root / "torso.timestamps.txt",)
@@ -215,7 +229,7 @@ def test_cameras_on_one_bone_make_no_body(tmp_path: Path) -> None:
     with pytest.raises(JobError, match="two bones") as caught:
         load_job(root, Overrides(skeleton="upper_body"))
     assert "skeleton: none" in str(caught.value.hint)
-    assert load_job(folder(tmp_path, "torso.mp4")).skeleton == "upper_body"
+    assert load_job(folder(tmp_path, "torso.mp4")).skeleton == "auto"
 
 
 def test_a_name_is_asked_for_instead_of_guessed(tmp_path: Path) -> None:

@@ -47,8 +47,8 @@ def refused(tmp_path: Path, text: str) -> JobError:
 def test_only_the_capture_is_needed(tmp_path: Path) -> None:
     job = load(tmp_path, MINIMAL)
     assert job.name == "my_job"
-    assert job.skeleton == "upper_body"
-    assert job.out == Path("out/my_job").resolve()
+    assert job.skeleton == "auto"
+    assert job.out == tmp_path / "out" / "my_job"
     torso, palm = job.capture.cameras
     assert torso.video == (tmp_path / "torso.mp4",)
     assert palm.video == (tmp_path / "left/a.mp4", tmp_path / "left/b.mp4")
@@ -89,8 +89,8 @@ def test_the_command_line_wins(tmp_path: Path) -> None:
     overrides = Overrides(out=tmp_path / "elsewhere", skeleton="none", height_m=1.62)
     job = load(tmp_path, MINIMAL + "height_m: 1.8\nskeleton: upper_body\n", overrides)
     assert (job.out, job.skeleton, job.height_m) == (tmp_path / "elsewhere", "none", 1.62)
-    with pytest.raises(JobError, match="175 m is not plausible"):
-        load(tmp_path, MINIMAL, Overrides(height_m=175))
+    with pytest.raises(JobError, match=r"17\.5 m is not plausible"):
+        load(tmp_path, MINIMAL, Overrides(height_m=17.5))
 
 
 def test_yaml_words_are_not_turned_into_other_things(tmp_path: Path) -> None:
@@ -123,9 +123,9 @@ def test_a_placeholder_is_a_whole_value_and_not_part_of_a_path(tmp_path: Path) -
         (MINIMAL + "  work_pixel: 640\n", 7, "capture.work_pixel", "unknown key", "'work_px'"),
         (MINIMAL + "      montu: torso\n", 7, "capture.cameras.1.montu", "unknown key", "'mount'"),
         (MINIMAL + "map:\n  featurs: 3\n", 8, "map.featurs", "unknown key", "'features'"),
-        (MINIMAL + "height_m: tall\n", 7, "height_m", "'tall' should be a number", None),
+        (MINIMAL + "height_m: tall\n", 7, "height_m", "'tall' is not a body height", None),
         (MINIMAL + "height_m: true\n", 7, "height_m", "True should be a number", None),
-        (MINIMAL + 'height_m: "1.8"\n', 7, "height_m", "should be a number", None),
+        (MINIMAL + 'height_m: "tall"\n', 7, "height_m", "is not a body height", None),
         (MINIMAL + "height_m: 17.5\n", 7, "height_m", "less than or equal to 2.6", None),
         (MINIMAL + "  work_px: 640.5\n", 7, "capture.work_px", "640.5", None),
         (MINIMAL + "  start_s: .nan\n", 7, "capture.start_s", "should be a number", None),
@@ -192,7 +192,7 @@ def test_files_that_are_no_text(tmp_path: Path) -> None:
     path.write_text("#" * (1 << 20) + "#")
     with pytest.raises(JobError, match="too large"):
         load_job(path)
-    with pytest.raises(JobError, match="no such job file"):
+    with pytest.raises(JobError, match="no such file or folder"):
         load_job(tmp_path / "other.yaml")
 
 
@@ -247,17 +247,18 @@ def test_synthetic_videos_are_prepared_before_they_are_looked_for(tmp_path: Path
     )
     with pytest.raises(CaptureError, match="not been rendered"):
         load_job(path)
-    calls: list[tuple[Mapping[str, Any], Path]] = []
+    calls: list[tuple[Mapping[str, Any], Path, Path]] = []
 
-    def prepare(options: Mapping[str, Any], folder: Path) -> None:
-        calls.append((options, folder))
+    def prepare(options: Mapping[str, Any], folder: Path, out_dir: Path) -> None:
+        calls.append((options, folder, out_dir))
         for name in ("torso.mp4", "left.mp4"):
             (folder / name).write_bytes(b"x")
         lens = {"model": "PINHOLE", "params": [420, 420, 320, 240], "width": 640, "height": 480}
         (folder / "calib.json").write_text(json.dumps(lens))
 
     job = load_job(path, prepare=prepare)
-    assert calls == [({"seconds": 2, "motion": str(tmp_path / "a.bvh")}, tmp_path)]
+    beside = tmp_path.parent / "out" / tmp_path.name
+    assert calls == [({"seconds": 2, "motion": str(tmp_path / "a.bvh")}, tmp_path, beside)]
     assert all(camera.calibration != "auto" for camera in job.capture.cameras)
 
 

@@ -38,7 +38,7 @@ def test_videos_beside_a_job_file_become_cameras(tmp_path: Path, name: str) -> N
             "head": ["GX010001.MP4", "GX020001.MP4"],
             "left_palm": ["left_palm.mp4"],
         }
-        assert loaded.job.skeleton == "upper_body"
+        assert loaded.job.skeleton == "auto"
         assert (loaded.warnings, loaded.no_body) == ((), "")
         assert {key: value.video.source for key, value in loaded.origins.items()} == {
             "torso": "job file",

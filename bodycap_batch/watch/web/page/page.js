@@ -31,8 +31,9 @@ function errorText(status, text) {
 const opened = new Map(); // name -> "log" | "files": the part that the user has opened
 const shown = new Map(); // "inbox/name" or "job/name" -> {text, item}
 
-function age(since) {
-  const seconds = Math.max(0, (Date.now() - Date.parse(since)) / 1000);
+const age = (since) => duration(Math.max(0, (Date.now() - Date.parse(since)) / 1000));
+
+function duration(seconds) {
   for (const [size, unit] of [[86400, "d"], [3600, "h"], [60, "min"]]) {
     if (seconds >= size) return `${Math.round(seconds / size)} ${unit}`;
   }
@@ -117,22 +118,34 @@ function actionRow(item, job) {
   return row;
 }
 
+// A job that has ended shows the verdict about its results: a computed result can still be a poor one.
+const gradeClass = { good: "good", "usable with care": "fair", poor: "poor", "no result": "poor" };
+
+function stateBadge(job) {
+  if (!job.verdict) return element("span", `state ${job.state}`, job.state);
+  return element("span", `state ${gradeClass[job.verdict] || job.state}`, `${job.state}: ${job.verdict}`);
+}
+
 function listItem(job) {
   const item = element("li");
   item.dataset.name = job.name;
   const head = element("div", "head");
-  head.append(element("span", "name", job.name), element("span", `state ${job.state}`, job.state));
-  if (job.since) {
+  head.append(element("span", "name", job.name), stateBadge(job));
+  if (job.duration_s !== null && job.duration_s !== undefined) {
+    head.append(element("span", "since", `took ${duration(job.duration_s)}`));
+  } else if (job.since && !["done", "failed", "cancelled"].includes(job.state)) {
     const since = element("span", "since");
     since.dataset.since = job.since;
-    since.textContent = age(job.since);
+    since.textContent = `for ${age(job.since)}`;
     head.append(since);
   }
   item.append(head);
+  if (job.headline) item.append(element("p", "headline", job.headline));
   if (job.cause) item.append(element("p", "cause", job.cause));
-  if (job.hint) item.append(element("p", "hint", job.hint));
+  if (job.hint && !job.asks) item.append(element("p", "hint", job.hint));
   item.append(...progressBars(job));
   for (const note of job.notes) item.append(element("p", "hint", note));
+  if (job.asks) item.append(askAgain(job));
   item.append(actionRow(item, job), element("div", "more"));
   showDetails(item.querySelector(".more"), job);
   return item;
@@ -181,8 +194,58 @@ function listen() {
 }
 
 setInterval(() => {
-  for (const since of document.querySelectorAll("[data-since]")) since.textContent = age(since.dataset.since);
+  for (const since of document.querySelectorAll("[data-since]")) since.textContent = `for ${age(since.dataset.since)}`;
 }, 5000);
+
+// ---- questions: the height of the person, and the places of cameras whose names do not contain them
+
+// Shows the questions, and calls `start` with the answers. `sourceOf` gives the address of a video.
+function questionForm(asks, sourceOf, startText, start) {
+  const form = element("form", "ask");
+  const heightLabel = element("label", "", "Height of the person ");
+  const height = element("input");
+  Object.assign(height, { type: "text", name: "height", placeholder: "1.75, 175 or 5'9\"", size: 14 });
+  heightLabel.append(height, element("span", "since", " without it, sizes can be wrong by a tenth"));
+  form.append(heightLabel);
+  if (asks.unknown.length) form.append(element("p", "", "Where on the body was each of these cameras?"));
+  const selects = asks.unknown.map((recording) => {
+    const row = element("label", "place");
+    const film = element("video");
+    Object.assign(film, { src: `${sourceOf(recording.files[0])}#t=1`, muted: true, preload: "metadata" });
+    film.addEventListener("error", () => film.replaceWith(element("span", "film since", "no preview")));
+    const select = element("select");
+    select.required = true;
+    select.name = recording.name;
+    select.append(new Option("choose the place", ""));
+    for (const place of asks.places) select.append(new Option(place.replaceAll("_", " "), place));
+    row.append(film, element("span", "", recording.files.join(", ")), select);
+    form.append(row);
+    return select;
+  });
+  const error = element("p", "cause");
+  const submit = element("button", "", startText);
+  submit.type = "submit";
+  form.append(submit, error);
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    submit.disabled = true;
+    error.textContent = "";
+    const places = Object.fromEntries(selects.map((select) => [select.name, select.value]));
+    try {
+      await start({ height: height.value, places });
+    } catch (failure) {
+      error.textContent = failure.message;
+    }
+    submit.disabled = false;
+  });
+  return form;
+}
+
+function askAgain(job) {
+  const sourceOf = (file) => path("inputs", job.name, file);
+  return questionForm(job.asks, sourceOf, "Start again", (answers) =>
+    request("POST", path("api/jobs", job.name, "retry"), answers));
+}
 
 // ---- uploads
 
@@ -199,7 +262,7 @@ function send(url, file, progress) {
 
 const isVisible = (name) => !name.split("/").some((part) => part.startsWith("."));
 
-async function uploadFiles(name, files) {
+async function uploadFiles(name, files, answers) {
   const line = element("li", "bar");
   const bar = element("progress");
   const text = element("span", "since", "starting …");
@@ -219,7 +282,7 @@ async function uploadFiles(name, files) {
       });
       sentBefore += file.size;
     }
-    const job = (await (await request("POST", path("api/uploads", key, "finish"))).json()).name;
+    const job = (await (await request("POST", path("api/uploads", key, "finish"), answers)).json()).name;
     text.textContent = `sent as ${job}`;
     setTimeout(() => line.remove(), 10000);
   } catch (error) {
@@ -234,7 +297,37 @@ function startUpload(name, files) {
   const chosen = byId("name").value.trim() || name;
   byId("name").value = "";
   const visible = files.filter(([filePath]) => isVisible(filePath));
-  if (visible.length) uploadFiles(chosen, visible);
+  if (visible.length) askAndUpload(chosen, visible);
+}
+
+async function askAndUpload(name, files) {
+  const line = element("li", "new");
+  line.append(element("span", "name", name));
+  byId("uploads").append(line);
+  try {
+    const asks = await (await request("POST", "api/questions", { names: files.map(([filePath]) => filePath) })).json();
+    const sent = files.filter(([filePath]) => !asks.ignored.includes(filePath));
+    if (asks.ignored.length) {
+      line.append(element("p", "hint", `not sent, because a job does not use them: ${asks.ignored.join(", ")}`));
+    }
+    if (!sent.length) return;
+    if (asks.has_job) {
+      line.remove();
+      uploadFiles(name, sent, {});
+      return;
+    }
+    const fileOf = new Map(sent);
+    const form = questionForm(asks, (filePath) => URL.createObjectURL(fileOf.get(filePath)), "Start", async (answers) => {
+      await request("POST", "api/answers", answers);
+      line.remove();
+      uploadFiles(name, sent, answers);
+    });
+    const discard = button("Discard", `Discard ${name}`, () => line.remove());
+    form.querySelector("button").after(discard);
+    line.append(form);
+  } catch (error) {
+    line.append(element("p", "cause", error.message));
+  }
 }
 
 const entriesIn = (reader) => new Promise((resolve, reject) => reader.readEntries(resolve, reject));

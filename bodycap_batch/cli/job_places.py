@@ -1,0 +1,102 @@
+"""Find the job, the results and the store that a path on the command line means.
+
+A command accepts a job file, a folder of videos and a folder of results alike. The working folder does not
+matter: the results lie beside the job, and a folder of results names its store.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bodycap_batch.config.folder import RUN_FILE, is_video
+
+if TYPE_CHECKING:
+    from bodycap_batch.config.job import Overrides
+    from bodycap_batch.config.models import Job
+
+_JOB_FILE, _STATUS_FILE = "job.yaml", "status.json"
+_PARTIAL, _RESULT = "partial", "result"
+"""Names of the subfolders that can hold results: of a job that stopped early, and of a watched job."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobPlace:
+    """What a path on the command line means.
+
+    Attributes:
+        file: The job to load: a job file or a folder of videos.
+        results: The folder of results that the path means; None if the path is a job or a folder of videos.
+    """
+
+    file: Path
+    results: Path | None = None
+
+
+def find_job(path: Path) -> JobPlace:
+    """Return the job and the results that a path means.
+
+    A folder of results holds ``run.json`` and ``job.yaml``, itself or in its subfolder ``partial``. The
+    folder of a job in a watched folder (``done/NAME``) means its results.
+    """
+    if (path / _STATUS_FILE).is_file() and (path / _RESULT).is_dir():
+        path = path / _RESULT
+    if _is_run(path):
+        results = path.parent if path.name == _PARTIAL else path
+        return JobPlace(file=path / _JOB_FILE, results=results.resolve())
+    if _is_run(path / _PARTIAL) and not any(map(is_video, path.iterdir())):
+        return JobPlace(file=path / _PARTIAL / _JOB_FILE, results=path.resolve())
+    return JobPlace(file=path)
+
+
+def _is_run(folder: Path) -> bool:
+    return (folder / RUN_FILE).is_file() and (folder / _JOB_FILE).is_file()
+
+
+def load_last_run(path: Path, overrides: Overrides) -> Job:
+    """Load the job whose results a command shows; its `out` is the folder of the results.
+
+    If the job has run before, the job is loaded as it was run, with the height and the skeleton of that run.
+
+    Args:
+        path: A job file, a folder of videos or a folder of results.
+        overrides: Values of the command line. If they change the job, the job itself is loaded.
+
+    Raises:
+        BodycapError: The job cannot be loaded.
+    """
+    from dataclasses import replace
+
+    from bodycap_batch.config.job import load_job
+
+    place = find_job(path)
+    changes = overrides.skeleton is not None or overrides.height_m is not None
+    if place.results is None and not changes:
+        job = load_job(path, overrides)
+        assert job.out is not None  # every loaded job has a folder for its results
+        last = find_job(job.out)
+        if last.results is None:
+            return job
+        place = last
+    return load_job(place.file, replace(overrides, out=overrides.out or place.results))
+
+
+def find_store(out_dir: Path) -> Path:
+    """Return the store of a folder of results.
+
+    It is the store that the results name in their ``run.json``. Without results, or if that store no longer
+    exists, it is the folder ``.store`` beside the folder of results. Results of earlier program versions can
+    have their store inside, which is then used further.
+    """
+    from bodycap_batch.pipeline.results import store_of_last_run
+
+    named = store_of_last_run(out_dir) or store_of_last_run(out_dir / _PARTIAL)
+    inside = out_dir / ".store"
+    known = [store for store in (named, inside) if store is not None and is_store(store)]
+    return known[0] if known else out_dir.parent / ".store"
+
+
+def is_store(folder: Path) -> bool:
+    """Return True if a folder is a store with artefacts."""
+    return (folder / "artefacts").is_dir()

@@ -1,0 +1,112 @@
+"""Ask what the videos of a folder do not say: the height of the person, and the places of the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import yaml
+
+from bodycap_batch.config.body_height import height_from_text
+from bodycap_batch.config.folder import JOB_FILES, VIDEO_SUFFIXES, camera_block, grouped_recordings
+from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
+from bodycap_batch.core.errors import JobError
+from bodycap_batch.store.artefacts import disk_errors
+
+_FIRST_LINE = "# Written by the live page from the answers of the user."
+"""First line of a job file with answers. Only such a file is replaced by new answers."""
+
+
+def questions_about(names: Sequence[str]) -> dict[str, Any]:
+    """Return what the page asks about a folder.
+
+    Args:
+        names: Paths of the folder's files, relative to the folder.
+
+    Returns:
+        A dictionary of JSON values: ``unknown``, the recordings whose names do not contain a place on the
+        body, each with its name and its video files; ``places``, the possible places; ``has_job``, True if a
+        job file answers all questions.
+    """
+    recordings = _recordings(names)
+    unknown = [name for name in recordings if mount_of(name) is None] if len(recordings) > 1 else []
+    return {
+        "unknown": [{"name": name, "files": recordings[name]} for name in unknown],
+        "places": list(MOUNT_NAMES),
+        "has_job": any(name in JOB_FILES for name in names),
+    }
+
+
+def files_below(folder: Path) -> list[str]:
+    """Return the paths of the visible files in a folder and in its subfolders, relative to the folder."""
+    found = [*folder.glob("*"), *folder.glob("*/*")]
+    names = (path.relative_to(folder) for path in sorted(found) if path.is_file())
+    return [name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts)]
+
+
+def is_answered_by_page(folder: Path) -> bool:
+    """Return True if a folder has no job file, or only one that the page has written."""
+    found = [folder / name for name in JOB_FILES if (folder / name).is_file()]
+    return all(path.read_text(encoding="utf-8", errors="replace").startswith(_FIRST_LINE) for path in found)
+
+
+def write_answers(folder: Path, answers: Mapping[str, Any]) -> None:
+    """Write the answers of the user into the job file of a folder.
+
+    Args:
+        folder: The folder of videos.
+        answers: ``height``, a text, which may be empty; ``places``, the place of each recording by its name.
+
+    Raises:
+        JobError: An answer cannot be understood, or the user has put a job file into the folder.
+        StoreError: The file cannot be written.
+    """
+    height, places = str(answers.get("height") or "").strip(), answers.get("places") or {}
+    if not height and not places:
+        return
+    if not is_answered_by_page(folder):
+        raise JobError(
+            "the folder has a job file, which answers the questions",
+            path=folder / JOB_FILES[0],
+            hint="correct the job file",
+        )
+    document: dict[str, Any] = {"height_m": height_from_text(height)} if height else {}
+    if places:
+        document["capture"] = {"cameras": _cameras(_recordings(files_below(folder)), places)}
+    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+    with disk_errors(folder):
+        (folder / JOB_FILES[0]).write_text(f"{_FIRST_LINE}\n{text}", encoding="utf-8")
+
+
+def _cameras(recordings: Mapping[str, Sequence[str]], places: object) -> list[dict[str, Any]]:
+    if not isinstance(places, Mapping):
+        raise JobError("the places of the cameras are not given by name", hint="load the page again")
+    cameras = []
+    for name, place in places.items():
+        if name not in recordings:
+            raise JobError(f"there is no video {str(name)[:40]!r}", hint="load the page again")
+        if mount_of(str(place)) is None:
+            raise JobError(
+                f"the place of {str(name)[:40]} on the body is not chosen",
+                field="mount",
+                hint=f"choose one of {', '.join(MOUNT_NAMES)}",
+            )
+        camera = str(camera_block(name, Path(name))["name"])
+        cameras.append({"name": camera, "video": list(recordings[name]), "mount": str(place)})
+    return cameras
+
+
+def _recordings(names: Sequence[str]) -> dict[str, list[str]]:
+    """Return the videos of each recording, by the recording's name.
+
+    A folder of chapters is one recording, as are all chapters of one GoPro video.
+    """
+    videos = [PurePosixPath(name) for name in names if PurePosixPath(name).suffix.lower() in VIDEO_SUFFIXES]
+    found: dict[str, list[str]] = {}
+    for path in videos:
+        if len(path.parts) > 1:
+            found.setdefault(path.parts[0], []).append(str(path))
+    for name, paths in grouped_recordings([Path(path) for path in videos if len(path.parts) == 1]):
+        found.setdefault(name, []).extend(str(path) for path in paths)
+    return found

@@ -1,0 +1,68 @@
+"""The verdict in a few lines."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from bodycap_batch.report.grades import Grade
+from bodycap_batch.report.summary import measured_parts, summarise, summary_of_folder
+
+LIMBS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
+ROLES = ("Hips", "Spine1", "Head", *(side + limb for side in ("Left", "Right") for limb in LIMBS))
+
+
+def joints(*observed: str) -> dict[str, dict[str, object]]:
+    shares = {role: float(role in observed) for role in ROLES}
+    return {
+        f"bone {role}": {"role": role, "observed": share > 0, "observed_share": share}
+        for role, share in shares.items()
+    }
+
+
+def metrics(gap_s: float, scale: float) -> dict[str, object]:
+    return {
+        "frame": "world",
+        "total": {
+            "coverage": 1.0, "frames": 10, "frames_registered": 10, "mean_reprojection_error_px": 0.5,
+        },
+        "cameras": {"torso": {"coverage": 1.0, "frames": 10, "frames_registered": 10, "frame": "world"}},
+        "merge": {
+            "scale": {"relative_sigma": scale},
+            "cameras": {"torso": {"longest_gap_s": gap_s, "residual_m": {"p95": 0.02}}},
+        },
+        "motion": {"joints": {}},
+    }  # fmt: skip
+
+
+def test_parts_of_the_body_are_named_in_words() -> None:
+    measured, rest = measured_parts(
+        joints("Spine1", "LeftArm", "LeftForeArm", "RightArm", "RightForeArm", "LeftHand", "LeftUpLeg")
+    )
+    assert measured == ("chest", "both arms", "left hand", "left thigh")
+    assert rest == ("hips", "head", "right hand", "left shin", "right leg", "both feet")
+
+
+def test_the_worst_two_criteria_are_named_the_worst_first() -> None:
+    summary = summarise(metrics(gap_s=5.0, scale=0.05))
+    assert summary.grade == Grade.POOR
+    assert [doubt.split(":")[:2] for doubt in summary.doubts] == [
+        ["poor", " Longest gap"],
+        ["usable with care", " Metric scale"],
+    ]
+    assert summary.lines()[0] == f"verdict: poor. {summary.headline}"
+    assert "the motion is poor" in summary.headline
+
+
+def test_a_good_result_names_no_criterion() -> None:
+    values = metrics(gap_s=0.0, scale=0.01)
+    values["merge"]["cameras"]["torso"]["residual_m"]["p95"] = 0.001  # type: ignore[index]
+    assert summarise(values).doubts == ()
+
+
+def test_a_folder_without_metrics_has_no_summary(tmp_path: Path) -> None:
+    assert summary_of_folder(tmp_path) is None
+    (tmp_path / "metrics.json").write_text("{")
+    assert summary_of_folder(tmp_path) is None
+    (tmp_path / "metrics.json").write_text(json.dumps(metrics(0.0, 0.01)))
+    assert summary_of_folder(tmp_path) is not None
