@@ -26,6 +26,7 @@ from bodycap_batch.config.options import (
     MapOptions,
     MergeOptions,
     RegistrationOptions,
+    TelemetryOptions,
 )
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import make_transform, rotation_from_quat_xyzw
@@ -283,5 +284,6 @@ class Job(_Block):
     keyframes: KeyframeOptions = KeyframeOptions()
     map: MapOptions = MapOptions()
     registration: RegistrationOptions = RegistrationOptions()
+    telemetry: TelemetryOptions = TelemetryOptions()
     merge: MergeOptions = MergeOptions()
     export: ExportOptions = ExportOptions()
