@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -33,6 +34,13 @@ class Hand:
         return make_transform(so3_exp(self.turn_rad * waves[:, 1]), self.reach_m * waves[:, 0])
 
 
+class Moving(Protocol):
+    """A camera whose motion is known at all times."""
+
+    def poses(self, times_s: FloatArray) -> FloatArray:
+        """Return world_from_cam (T,4,4)."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
     """Errors of a sensor: those of a consumer's camera; noise per sample at 100 samples per second."""
@@ -46,7 +54,7 @@ class Sensor:
     force_noise: float = 0.03
     lever_m: Sequence[float] = (0.0, 0.0, 0.0)
 
-    def samples(self, hand: Hand, seconds: float, seed: int = 1) -> CameraTelemetry:
+    def samples(self, hand: Moving, seconds: float, seed: int = 1) -> CameraTelemetry:
         """Return the telemetry of a recording that starts half a second before the first frame."""
         rng = np.random.default_rng(seed)
         times_s = np.arange(-0.5, seconds + 0.5, 1.0 / self.rate_hz)
@@ -69,7 +77,7 @@ class Sensor:
 
 
 def solved(
-    hand: Hand,
+    hand: Moving,
     seconds: float,
     *,
     fps: float = 30.0,

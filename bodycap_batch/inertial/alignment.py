@@ -15,9 +15,13 @@ from bodycap_batch.telemetry.gyro_fit import GyroFit
 from bodycap_batch.telemetry.picture_rotation import PictureRotation
 from bodycap_batch.telemetry.streams import CameraTelemetry
 
-_MAX_PAIR_S = 0.1
-"""Maximum time (seconds) between two frames whose rotation is compared: three frames at 30 frames per second.
+_MAX_STEP_S = 0.1
+"""Maximum time (seconds) between successive localised frames of a pair: three frames at 30 frames per second.
 Evidence: none."""
+_PAIR_S, _PAIR_RAD = 0.15, 0.35
+"""Maximum time (seconds) and maximum sum of the rotations (radians) between the two frames of a pair, unless
+they are successive. The longer the time, the less the noise of the poses counts; the less the rotation, the
+nearer it is to the integral of the rate. Evidence: none."""
 _BIAS_SPAN_S, _MAX_SPAN_RATIO = 1.0, 1.5
 """Time (seconds) between the two frames of a pair that shows the bias, and maximum of the true time as a
 ratio to it. The error of a pose has 30 times less effect on a bias over 1 s than between successive
@@ -78,18 +82,34 @@ def align_sensor(trajectory: Trajectory, telemetry: CameraTelemetry) -> SensorAl
 
 
 def rotations_between_frames(trajectory: Trajectory) -> PictureRotation:
-    """Return the rotations between successive localised frames that are at most `_MAX_PAIR_S` apart."""
+    """Return the rotation from each localised frame to a later one.
+
+    The later frame is the last one within `_PAIR_S` and `_PAIR_RAD`, at least the next one. Pairs overlap,
+    but hardly two of them have a frame at the same end, so their errors are nearly independent.
+    """
     frames = np.flatnonzero(trajectory.localised)
     times_s = trajectory.seconds[frames]
-    step_s = np.diff(times_s)
-    near = np.flatnonzero((step_s > 0.0) & (step_s <= _MAX_PAIR_S))
     rotation = trajectory.gauge_from_cam[frames][:, :3, :3]
+    step_rad = np.linalg.norm(so3_log(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:]), axis=1)
+    step_s = np.diff(times_s)
+    near = (step_s > 0.0) & (step_s <= _MAX_STEP_S)
+    first = np.flatnonzero(near)
+    last, turned = first + 1, step_rad[first]
+    while True:
+        following = np.minimum(last, len(near) - 1)
+        longer = (last < len(near)) & near[following]
+        longer &= times_s[np.minimum(last + 1, len(times_s) - 1)] - times_s[first] <= _PAIR_S
+        longer &= turned + step_rad[following] <= _PAIR_RAD
+        if not longer.any():
+            break
+        turned = turned + np.where(longer, step_rad[following], 0.0)
+        last = last + longer
     sigma = np.sqrt(np.diagonal(trajectory.covariance[frames], axis1=1, axis2=2)[:, :3].mean(axis=1))
     return PictureRotation(
-        start_s=times_s[near],
-        end_s=times_s[near + 1],
-        turn_rad=so3_log(np.swapaxes(rotation[near], 1, 2) @ rotation[near + 1]).reshape(-1, 3),
-        spread_rad=np.hypot(sigma[near], sigma[near + 1]),
+        start_s=times_s[first],
+        end_s=times_s[last],
+        turn_rad=so3_log(np.swapaxes(rotation[first], 1, 2) @ rotation[last]).reshape(-1, 3),
+        spread_rad=np.hypot(sigma[first], sigma[last]),
     )
 
 

@@ -301,7 +301,7 @@ def _typical_shake(rates: FloatArray, start_s: FloatArray, end_s: FloatArray) ->
         start_s: (N,) start of each pair, seconds.
         end_s: (N,) end of each pair, seconds.
     """
-    width = max(3, round(_SHAKE_WINDOW_S / float(np.median(end_s - start_s))))
+    width = max(3, round(_SHAKE_WINDOW_S / float(np.median(np.diff(start_s)))))
     breaks = np.flatnonzero(start_s[1:] - end_s[:-1] > 1e-6) + 1
     sizes = [np.zeros(0)]
     for part in np.split(rates, breaks):
