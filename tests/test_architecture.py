@@ -19,6 +19,7 @@ LAYERS = (
     {"config"},
     {"capture"},
     {"telemetry"},
+    {"inertial"},
     {
         "keyframes", "mapping", "registration", "merging", "export", "report", "preview", "evaluate",
         "synthetic", "check", "calibration", "clocks",

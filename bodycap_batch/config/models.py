@@ -27,6 +27,7 @@ from bodycap_batch.config.options import (
     MapOptions,
     MergeOptions,
     RegistrationOptions,
+    TelemetryOptions,
 )
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
@@ -307,5 +308,6 @@ class Job(_Block):
     keyframes: KeyframeOptions = KeyframeOptions()
     map: MapOptions = MapOptions()
     registration: RegistrationOptions = RegistrationOptions()
+    telemetry: TelemetryOptions = TelemetryOptions()
     merge: MergeOptions = MergeOptions()
     export: ExportOptions = ExportOptions()

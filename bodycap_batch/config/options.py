@@ -238,6 +238,12 @@ class MergeOptions(Options):
     )
 
 
+class TelemetryOptions(Options):
+    """Uses of the inertial sensors of the cameras. Without telemetry, these options have no effect."""
+
+    gravity: bool = Field(True, description="the accelerometers determine the vertical of the world")
+
+
 class ExportOptions(Options):
     """Options of stage 5, the export of the result files."""
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.camera_clock import CameraClock
+from bodycap_batch.model.inertial_camera import InertialCamera
 from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.relative_pose import RelativePose
 from bodycap_batch.model.scene import KeyframeSelection, Map, Trajectory
@@ -34,6 +35,8 @@ class ExportInputs:
             the fraction is 0.5.
         relative_poses: Relative poses of cameras on the same segment, in the unit of the gauge of both
             cameras.
+        inertial: What the inertial sensor of each camera gives, by camera name. Only cameras with telemetry
+            have an entry.
         log: Diagnostics of mapping as plain JSON values without run times and file paths. They are written to
             ``metrics.json``.
     """
@@ -48,6 +51,7 @@ class ExportInputs:
     partial_reason: str | None = None
     row_fraction: Mapping[str, FloatArray] = field(default_factory=dict)
     relative_poses: tuple[RelativePose, ...] = ()
+    inertial: Mapping[str, InertialCamera] = field(default_factory=dict)
     log: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

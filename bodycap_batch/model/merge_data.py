@@ -12,6 +12,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import Similarity
+from bodycap_batch.model.inertial_camera import ForceWindows
 from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
@@ -85,6 +86,8 @@ class MergeInputs:
             from, as a fraction of the image height; NaN if the frame is not localised. Without an entry for
             the camera, each pose is valid at the exposure of the middle row.
         board_views: Observations of the job's marker board in keyframes.
+        force_windows: By camera name, what the camera's accelerometer measures along the trajectory, in the
+            gauge of the trajectory. Only cameras with a usable accelerometer have an entry.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -97,6 +100,7 @@ class MergeInputs:
     map_points: Mapping[str, FloatArray] = field(default_factory=dict)
     row_fraction: Mapping[str, FloatArray] = field(default_factory=dict)
     board_views: tuple[BoardView, ...] = ()
+    force_windows: Mapping[str, ForceWindows] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         cameras = [trajectory.camera for trajectory in self.trajectories]

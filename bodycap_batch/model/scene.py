@@ -237,6 +237,11 @@ class Trajectory:
         """Mask (N,) that is True for the frames with a measured pose."""
         return np.array([status.localised for status in self.status], dtype=bool)
 
+    @property
+    def seconds(self) -> FloatArray:
+        """Time (N,) of each frame on the clock of the camera, seconds."""
+        return np.asarray(self.times_ns * 1e-9, dtype=np.float64)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapResult:

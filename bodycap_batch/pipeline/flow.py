@@ -22,6 +22,7 @@ from bodycap_batch.pipeline.inputs import (
     has_body,
     optional_ref,
     refs_by_camera,
+    samples_input,
 )
 from bodycap_batch.pipeline.settings import Settings
 from bodycap_batch.pipeline.stage_results import StageResults, preview_task, report_task
@@ -38,6 +39,7 @@ from bodycap_batch.tasks.clocks import (
     ClocksTask,
 )
 from bodycap_batch.tasks.export import EXPORT, ExportTask
+from bodycap_batch.tasks.inertial import INERTIAL, InertialTask
 from bodycap_batch.tasks.inputs import BodyInput, stated_clocks
 from bodycap_batch.tasks.keyframes import KEYFRAMES, KeyframesTask
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE, ExtendTask, MapTask, RefineTask
@@ -71,6 +73,7 @@ class Flow:
         self._threads = settings.threads
         self._cameras: dict[str, str] = {}
         self._map_round = 0
+        self._with_telemetry = frozenset[str]()
 
     def __enter__(self) -> Flow:
         self.runner.__enter__()
@@ -93,6 +96,7 @@ class Flow:
         artefact = self.runner.run(task, [KEYFRAMES.modules] * (self.runner.parallel_tasks - 1))
         summary = read_summary(artefact.path)
         self.runner.expect_frames(int(summary["frames"]), int(summary.get("large_frames", 0)))
+        self._with_telemetry = frozenset(summary.get("telemetry", ()))
         self.runner.report_notes(artefact, "check")
         if len(self._capture.cameras) > 1:
             self._sound = self._start_sound()
@@ -243,6 +247,31 @@ class Flow:
         artefact = self.runner.run(make_task(CLOCKS, task))
         self.runner.report_notes(artefact, "clocks")
         return artefact
+
+    def use_sensors(self, registrations: ByCamera) -> ByCamera:
+        """Use the inertial sensors of the cameras that have telemetry, and report notes to the user.
+
+        Without telemetry, or if all uses are switched off, the registrations are returned unchanged.
+        """
+        options = self._job.telemetry
+        if not any(options.model_dump().values()):
+            return registrations
+        tasks = []
+        for camera in self._capture.cameras:
+            samples = samples_input(camera, self._settings.store.digests)
+            if samples is None and camera.name not in self._with_telemetry:
+                continue
+            task = InertialTask(
+                options=options,
+                capture=capture_ref(self._capture, self._cameras, [camera]),
+                registration=artefact_ref(registrations[camera.name]),
+                samples=samples,
+            )
+            tasks.append(make_task(INERTIAL, task, camera=camera.name))
+        used = self.runner.run_all(tasks)
+        for artefact in used.values():
+            self.runner.report_notes(artefact, "registration")
+        return {**registrations, **used}
 
     def merge(
         self, scene_map: Artefact, registrations: ByCamera, clocks: Artefact, keyframes: ByCamera

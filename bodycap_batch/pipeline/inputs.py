@@ -7,6 +7,7 @@ from pathlib import Path
 
 from bodycap_batch.capture.video import MAY_READ
 from bodycap_batch.config.models import CameraConfig, CaptureConfig, Job
+from bodycap_batch.config.sample_files import samples_beside
 from bodycap_batch.core.errors import Cancelled, CaptureError, JobError
 from bodycap_batch.core.progress import Event, Listener
 from bodycap_batch.store.artefacts import DISK_ERRORS, Artefact, store_error
@@ -126,6 +127,20 @@ def optional_ref(artefact: Artefact | None) -> ArtefactRef | None:
 def refs_by_camera(artefacts: Mapping[str, Artefact]) -> dict[str, ArtefactRef]:
     """Return the reference to the artefact of each camera, by camera name, as input of a task."""
     return {name: artefact_ref(artefact) for name, artefact in artefacts.items()}
+
+
+def samples_input(camera: CameraConfig, digests: FileDigests) -> FileRef | None:
+    """Return the file with inertial samples beside a camera's videos, as input of a task.
+
+    Returns:
+        The file; None if there is none.
+
+    Raises:
+        CaptureError: The file cannot be read.
+        StoreError: The disk fails.
+    """
+    path = samples_beside(camera.video, camera.name)
+    return None if path is None else FileRef(path=path, digest=_footage_digest(path, digests, None))
 
 
 def body_input(job: Job, digests: FileDigests) -> BodyInput:

@@ -116,6 +116,7 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     found = flow.solve_rigs(results.map, found, keyframes)
     results.registrations = flow.recover(results.map, found, keyframes)
     results.clocks = flow.clocks(results.map, results.registrations)
+    results.registrations = flow.use_sensors(results.registrations)
     yield "registration"
     results.stage = "merge"
     results.merged, results.failure = _merge(job, flow, results)

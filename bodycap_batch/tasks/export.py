@@ -61,6 +61,7 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
         merge=None if task.merge is None else read_dataclass(MergeResult, task.merge.path, "merge"),
         partial_reason=task.failure,
         row_fraction=found.row_fraction,
+        inertial=found.inertial,
         relative_poses=found.relative_poses(paths, task.segments),
         log={**scene.log, "reach": read_summary(task.clocks.path)["distances"]},
     )

@@ -94,6 +94,9 @@ def _merge_inputs(task: MergeTask) -> MergeInputs:
         activity=task.body.activity,
         map_points={item.gauge: item.points for item in scene.maps},
         row_fraction=found.row_fraction,
+        force_windows={
+            name: item.windows for name, item in found.inertial.items() if item.windows is not None
+        },
     )
 
 

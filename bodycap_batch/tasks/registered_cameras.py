@@ -13,11 +13,15 @@ from bodycap_batch.tasks.loading import load_registration
 if TYPE_CHECKING:
     from bodycap_batch.core.arrays import FloatArray
     from bodycap_batch.model.camera_clock import CameraClock, CaptureClocks
+    from bodycap_batch.model.inertial_camera import InertialCamera
     from bodycap_batch.model.relative_pose import RelativePose
     from bodycap_batch.model.scene import Map, Trajectory
 
 RIG_POSES = "rig"
 """Name of the file, without suffix, that holds the relative poses of a rig's cameras."""
+
+INERTIAL_CAMERA = "inertial"
+"""Name of the file, without suffix, that holds what the inertial sensor of a camera gives."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,11 +34,14 @@ class RegisteredCameras:
         row_fraction: For each camera name, the (N,) result of `mean_row_fraction` for the camera's frames.
             Only cameras with a known rolling shutter are included, and only if their poses are not corrected
             for the rolling shutter.
+        inertial: By camera name, what the inertial sensor of the camera gives. Only cameras with telemetry
+            have an entry.
     """
 
     trajectories: tuple[Trajectory, ...]
     clocks: Mapping[str, CameraClock]
     row_fraction: Mapping[str, FloatArray]
+    inertial: Mapping[str, InertialCamera]
 
     @staticmethod
     def load(paths: Sequence[Path], maps: Sequence[Map], clocks: CaptureClocks) -> RegisteredCameras:
@@ -48,12 +55,14 @@ class RegisteredCameras:
         from bodycap_batch.formats.dataclass_files import read_dataclass
         from bodycap_batch.model.camera import Camera
         from bodycap_batch.model.camera_clock import FrameTiming
+        from bodycap_batch.model.inertial_camera import InertialCamera
         from bodycap_batch.model.rolling_shutter import mean_row_fraction
 
         corrected = {name for each in maps for name in each.readout_s}
         trajectories: list[Trajectory] = []
         timings: dict[str, FrameTiming] = {}
         rows: dict[str, FloatArray] = {}
+        inertial: dict[str, InertialCamera] = {}
         for path in paths:
             # Only one registration is in memory at a time: the tracks of a long video need much memory.
             found = load_registration(path)
@@ -62,8 +71,13 @@ class RegisteredCameras:
             timings[name] = read_dataclass(FrameTiming, path, "timing")
             if timings[name].rolling_shutter_s and name not in corrected:
                 rows[name] = mean_row_fraction(found, read_dataclass(Camera, path, "camera"))
+            if (path / f"{INERTIAL_CAMERA}.json").exists():
+                inertial[name] = read_dataclass(InertialCamera, path, INERTIAL_CAMERA)
         return RegisteredCameras(
-            trajectories=tuple(trajectories), clocks=clocks.with_timing(timings), row_fraction=rows
+            trajectories=tuple(trajectories),
+            clocks=clocks.with_timing(timings),
+            row_fraction=rows,
+            inertial=inertial,
         )
 
     def relative_poses(

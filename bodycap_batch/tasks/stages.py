@@ -8,6 +8,7 @@ from typing import Any
 from bodycap_batch.tasks.check import CHECK
 from bodycap_batch.tasks.clocks import CLOCKS
 from bodycap_batch.tasks.export import EXPORT
+from bodycap_batch.tasks.inertial import INERTIAL
 from bodycap_batch.tasks.keyframes import KEYFRAMES
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE
 from bodycap_batch.tasks.merge import MERGE
@@ -34,6 +35,7 @@ STAGES: Mapping[str, Stage[Any]] = {
         RECOVER,
         SOUND,
         CLOCKS,
+        INERTIAL,
         MERGE,
         EXPORT,
         REPORT,

@@ -86,7 +86,7 @@ def compare_picture_and_gyro(camera: CaptureCamera, telemetry: CameraTelemetry) 
 
 
 def judge_rotations(
-    picture: PictureRotation, gyro: Stream, telemetry: CameraTelemetry
+    picture: PictureRotation, gyro: Stream, telemetry: CameraTelemetry, *, focal_known: bool = False
 ) -> PictureGyroComparison:
     """Compare measured rotations of pictures with a gyroscope.
 
@@ -94,8 +94,9 @@ def judge_rotations(
         picture: The rotations of the pictures.
         gyro: The gyroscope.
         telemetry: The telemetry with the orientations of the image, if the camera recorded them.
+        focal_known: Whether the focal length behind the rotations is exact.
     """
-    fit = fit_gyro(picture, gyro, axes_known=telemetry.axes_known)
+    fit = fit_gyro(picture, gyro, axes_known=telemetry.axes_known, focal_known=focal_known)
     if fit is None:
         reason = "too few pictures with texture have samples of the gyroscope"
         return PictureGyroComparison(verdict="unknown", reason=reason)
@@ -116,7 +117,7 @@ def judge_rotations(
             "samples may belong to another video, or the pictures show too little of the room",
             fit=fit,
         )
-    undone = _undone_fit(picture, gyro, telemetry)
+    undone = _undone_fit(picture, gyro, telemetry, focal_known=focal_known)
     return PictureGyroComparison(
         verdict="stabilised",
         reason=f"the camera stabilised the video: the pictures show {100 * share:.0f} % of the shaking that "
@@ -142,7 +143,9 @@ def _undo_text(undone: GyroFit | None) -> str:
     )
 
 
-def _undone_fit(picture: PictureRotation, gyro: Stream, telemetry: CameraTelemetry) -> GyroFit | None:
+def _undone_fit(
+    picture: PictureRotation, gyro: Stream, telemetry: CameraTelemetry, *, focal_known: bool
+) -> GyroFit | None:
     """Return the fit after the orientations of the image undid the stabilisation; None without them."""
     orientations = telemetry.streams.get(IMAGE_ORIENTATION)
     if orientations is None:
@@ -150,7 +153,7 @@ def _undone_fit(picture: PictureRotation, gyro: Stream, telemetry: CameraTelemet
     ratio, best = 1.0, None
     for _ in range(_UNDO_ROUNDS):
         undone = undo_stabilisation(picture, orientations, ratio)
-        fit = fit_gyro(undone, gyro, axes_known=telemetry.axes_known)
+        fit = fit_gyro(undone, gyro, axes_known=telemetry.axes_known, focal_known=focal_known)
         if fit is None:
             break
         best = fit

@@ -297,6 +297,16 @@ def gpmf_payloads(path: Path) -> Iterator[tuple[bytes, float, float]]:
             return
 
 
+def has_telemetry_track(path: Path) -> bool:
+    """Return True if a video has a track that GoPro cameras write their telemetry to.
+
+    Raises:
+        CaptureError: The file cannot be opened.
+    """
+    with open_container(path) as container:
+        return any(_HANDLER in each.metadata.get("handler_name", "") for each in container.streams.data)
+
+
 def gopro_telemetry(
     track: GpmfTrack, settings: Mapping[str, str], firmware: str, frame_rate_hz: float
 ) -> CameraTelemetry:

@@ -42,6 +42,8 @@ was fitted to the clip. Evidence: none."""
 _LOG_RATIO_SIGMA = 0.25
 """Standard deviation of the natural logarithm of the focal ratio. Origin: without a calibration, focal
 lengths are assumed from 0.6 to 1.6 times the true ones."""
+_KNOWN_LOG_RATIO_SIGMA = 1e-3
+"""The same if the rotations come from the poses of a map, whose focal length was adjusted. Evidence: none."""
 _RATIO_RANGE = (0.6, 1.6)
 """Least and largest focal ratio that corrects the size of fast changes. Without an agreement, the fitted
 ratio is meaningless. Origin: as for `_LOG_RATIO_SIGMA`."""
@@ -65,6 +67,7 @@ class GyroFit:
         delay_s: Time of the gyroscope's samples = time of the frame + delay, seconds.
         delay_sigma_s: Standard deviation of the delay, seconds.
         drift: Change of the delay per second, no unit.
+        middle_s: Time of a frame at which `delay_s` holds without the drift, seconds.
         drift_sigma: Standard deviation of the drift.
         cam_from_sensor: (3,3) rotation from the stated axes of the sensor to the camera.
         rotation_sigma_rad: (3,) standard deviations of this rotation about the axes of the camera, radians.
@@ -72,6 +75,7 @@ class GyroFit:
             camera moves close to things, the rotations of the pictures are wrong in common, and the result
             may be wrong by degrees.
         bias_rad_s: (3,) bias of the gyroscope in its axes, rad/s.
+        bias_sigma_rad_s: (3,) standard deviations of the bias, rad/s.
         focal_ratio: True focal length divided by the one that was assumed for the pictures, as a small-angle
             estimate.
         r_squared: Share of the variance of the pictures' rotations that the gyroscope explains.
@@ -86,10 +90,12 @@ class GyroFit:
     delay_s: float
     delay_sigma_s: float
     drift: float
+    middle_s: float
     drift_sigma: float
     cam_from_sensor: FloatArray
     rotation_sigma_rad: FloatArray
     bias_rad_s: FloatArray
+    bias_sigma_rad_s: FloatArray
     focal_ratio: float
     r_squared: float
     typical_r_squared: float
@@ -117,13 +123,16 @@ class _Integral:
         return out
 
 
-def fit_gyro(picture: PictureRotation, gyro: Stream, *, axes_known: bool) -> GyroFit | None:
+def fit_gyro(
+    picture: PictureRotation, gyro: Stream, *, axes_known: bool, focal_known: bool = False
+) -> GyroFit | None:
     """Fit a gyroscope to the rotations of the pictures.
 
     Args:
         picture: The rotations of the pictures.
         gyro: The gyroscope.
         axes_known: Whether the vectors of the gyroscope are nearly in the axes of the camera.
+        focal_known: Whether the focal length behind the rotations is exact, so that the ratio is 1.
 
     Returns:
         The fit; None if there are too few pairs of frames with samples.
@@ -132,7 +141,7 @@ def fit_gyro(picture: PictureRotation, gyro: Stream, *, axes_known: bool) -> Gyr
     if inside.sum() < _MIN_PAIRS:
         return None
     picture = picture.chosen(np.flatnonzero(inside))
-    problem = _Problem(picture, _Integral(gyro), axes_known=axes_known)
+    problem = _Problem(picture, _Integral(gyro), axes_known=axes_known, focal_known=focal_known)
     delays = np.arange(-_MAX_DELAY_S, _MAX_DELAY_S + 1e-9, _DELAY_STEP_S)
     tried = [problem.first_solution(float(delay)) for delay in delays]
     shares = np.array([each.r_squared for each in tried])
@@ -172,12 +181,15 @@ class _Solution:
 class _Problem:
     """The rotations of the pictures as rates, and the gyroscope's rates for any delay."""
 
-    def __init__(self, picture: PictureRotation, integral: _Integral, *, axes_known: bool) -> None:
+    def __init__(
+        self, picture: PictureRotation, integral: _Integral, *, axes_known: bool, focal_known: bool
+    ) -> None:
         self._start_s, self._end_s = picture.start_s, picture.end_s
         self._interval_s = (self._end_s - self._start_s)[:, None]
         self._seen = picture.turn_rad / self._interval_s
         self._integral = integral
         self._axes_known = axes_known
+        self._log_ratio_sigma = _KNOWN_LOG_RATIO_SIGMA if focal_known else _LOG_RATIO_SIGMA
         self._middle_s = 0.5 * float(self._start_s[0] + self._end_s[-1])
 
     def measured(self, delay_s: float, drift: float = 0.0) -> FloatArray:
@@ -219,7 +231,7 @@ class _Problem:
             [
                 np.full(3, 1.0 / _AXES_SIGMA_RAD if self._axes_known else 0.0),
                 np.full(3, 1.0 / _BIAS_SIGMA_RAD_S),
-                [0.0, 1.0 / _DRIFT_SIGMA, 1.0 / _LOG_RATIO_SIGMA],
+                [0.0, 1.0 / _DRIFT_SIGMA, 1.0 / self._log_ratio_sigma],
             ]
         )
         start_rotation = Rotation.from_matrix(first.rotation)
@@ -250,10 +262,12 @@ class _Problem:
             delay_s=float(found.x[6]),
             delay_sigma_s=float(sigma[6]),
             drift=float(found.x[7]),
+            middle_s=self._middle_s,
             drift_sigma=float(sigma[7]),
             cam_from_sensor=(Rotation.from_rotvec(found.x[:3]) * start_rotation).as_matrix(),
             rotation_sigma_rad=sigma[:3],
             bias_rad_s=np.asarray(found.x[3:6]),
+            bias_sigma_rad_s=sigma[3:6],
             focal_ratio=ratio,
             r_squared=1.0 - float((error[kept] ** 2).sum() / ((seen - seen.mean(axis=0)) ** 2).sum()),
             typical_r_squared=typical,
@@ -287,7 +301,7 @@ def _typical_shake(rates: FloatArray, start_s: FloatArray, end_s: FloatArray) ->
         start_s: (N,) start of each pair, seconds.
         end_s: (N,) end of each pair, seconds.
     """
-    width = max(3, round(_SHAKE_WINDOW_S / float(np.median(end_s - start_s))))
+    width = max(3, round(_SHAKE_WINDOW_S / float(np.median(np.diff(start_s)))))
     breaks = np.flatnonzero(start_s[1:] - end_s[:-1] > 1e-6) + 1
     sizes = [np.zeros(0)]
     for part in np.split(rates, breaks):

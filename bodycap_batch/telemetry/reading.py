@@ -10,6 +10,7 @@ import numpy as np
 
 from bodycap_batch.capture.timeline import ChapterClock, clock_of_chapter
 from bodycap_batch.capture.video import VideoFile
+from bodycap_batch.config.sample_files import samples_beside
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.telemetry.gopro import gaps_of, read_gopro_file
 from bodycap_batch.telemetry.streams import (
@@ -20,7 +21,7 @@ from bodycap_batch.telemetry.streams import (
     GpsTrack,
     Stream,
 )
-from bodycap_batch.telemetry.text_files import read_imu_file, sidecar_of
+from bodycap_batch.telemetry.text_files import read_imu_file
 
 _TURNED = (GYROSCOPE, ACCELEROMETER, GRAVITY)
 
@@ -48,16 +49,8 @@ def read_telemetry(videos: Sequence[VideoFile], times_ns: IntArray, camera: str 
         chapter = _on_camera_clock(read_gopro_file(video.path, video.fps), clock)
         chapters.append(_turned(chapter, video))
     joined = _joined(chapters)
-    sidecar = next(
-        (path for place in _places(videos) if (path := sidecar_of(place, camera)) is not None), None
-    )
+    sidecar = samples_beside([video.path for video in videos], camera)
     return joined if sidecar is None else _with_samples(joined, read_imu_file(sidecar), sidecar)
-
-
-def _places(videos: Sequence[VideoFile]) -> list[Path]:
-    """Return the paths beside which a file of samples may be: the first video, and a folder of chapters."""
-    path = videos[0].path
-    return [path, path.parent] if len(videos) > 1 else [path]
 
 
 def _with_samples(video: CameraTelemetry, samples: CameraTelemetry, path: Path) -> CameraTelemetry:

@@ -14,13 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from bodycap_batch.config.sample_files import GYROFLOW_SUFFIX
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.telemetry.gopro import gaps_of
 from bodycap_batch.telemetry.streams import ACCELEROMETER, GYROSCOPE, CameraTelemetry, Stream
 
-IMU_SUFFIX, GYROFLOW_SUFFIX = ".imu.csv", ".gcsv"
-"""Ends of the names of the files."""
 IMU_COLUMNS = ("t_s", "gx", "gy", "gz", "ax", "ay", "az")
 """Columns of a file ``.imu.csv``: time, angular rate along three axes, specific force along three axes."""
 _GYROFLOW_TITLES = ("GYROFLOW IMU LOG", "CAMERA IMU LOG")
@@ -36,22 +35,6 @@ _MAX_ABS_VALUE = 1e6
 """Maximum absolute rate (rad/s) or acceleration (m/s²) that is read; sensors end near 70 and 160."""
 _SHOWN = 40
 """Maximum number of characters of a faulty line in an error."""
-
-
-def sidecar_of(video: Path, camera: str) -> Path | None:
-    """Return the file with inertial samples beside a video or a folder of chapters; None if there is none.
-
-    Args:
-        video: Path of the video or of the folder.
-        camera: Name of the camera; "" if it is unknown.
-    """
-    stems = [stem for stem in dict.fromkeys((video.stem, video.name, camera)) if stem]
-    for stem in stems:
-        for suffix in (IMU_SUFFIX, GYROFLOW_SUFFIX):
-            path = video.with_name(stem + suffix)
-            if path.is_file():
-                return path
-    return None
 
 
 def read_imu_file(path: Path) -> CameraTelemetry:

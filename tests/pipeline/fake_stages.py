@@ -19,7 +19,7 @@ Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
-"rolling": true, "real": [stages that are no stand-ins]}.
+"rolling": true, "telemetry": [cameras], "real": [stages that are no stand-ins]}.
 "fail" may be a list of stages."""
 
 
@@ -88,6 +88,18 @@ def summary(options: Json, arguments: Json, files: Path) -> None:
     (files / "summary.json").write_text(json.dumps({"notes": ["a note"], "frames": 20}))
 
 
+def with_sensor(options: Json, arguments: Json, files: Path) -> None:
+    before = Path(arguments["registration"]["path"])
+    (files / "summary.json").write_bytes((before / "summary.json").read_bytes())
+
+
+def checked(options: Json, arguments: Json, files: Path) -> None:
+    telemetry = orders().get("telemetry", [])
+    (files / "summary.json").write_text(
+        json.dumps({"notes": ["a note"], "frames": 20, "telemetry": telemetry})
+    )
+
+
 def registered(options: Json, arguments: Json, files: Path) -> None:
     before = arguments["previous"]
     again = json.loads((Path(before["path"]) / "summary.json").read_text())["round"] + 1 if before else 0
@@ -138,6 +150,8 @@ def rendered(options: Json, arguments: Json, files: Path) -> None:
 
 
 EXTRA = {
+    "check": checked,
+    "inertial": with_sensor,
     "registration": registered,
     "export": exported,
     "report": reported,
@@ -155,6 +169,7 @@ NAMES = (
     "recover",
     "sound",
     "clocks",
+    "inertial",
     "merge",
     "export",
     "preview",

@@ -336,6 +336,37 @@ def test_a_round_that_withdraws_wrong_poses_loses_no_frames(
     assert (used[2]["previous"] is not None) == bool(extensions_used)
 
 
+@pytest.mark.parametrize("name", ["torso.imu.csv", "torso.gcsv"])
+def test_sensors_are_used_where_there_are_samples(bench: Bench, name: str) -> None:
+    (bench.folder / name).write_text("samples")
+    assert set(bench.executed()) == {*ALL, "inertial torso"}
+    used = json.loads((bench.out / "result.ply").read_text())["registrations"]
+    assert {camera: json.loads(content)[0] for camera, content in used.items()} == {
+        "torso": "inertial",
+        "left_palm": "registration",
+    }
+    (bench.folder / name).write_text("other samples")
+    assert bench.executed() == ["inertial torso"]
+    (bench.folder / name).unlink()
+    assert bench.executed() == LAST
+    assert "inertial" not in {
+        stage["stage"] for stage in json.loads((bench.out / "run.json").read_text())["stages"]
+    }
+
+
+def test_sensors_are_used_where_the_video_has_telemetry(bench: Bench) -> None:
+    bench.order(telemetry=["left_palm"])
+    assert "inertial left_palm" in bench.executed()
+
+
+def test_telemetry_that_is_switched_off_changes_nothing(bench: Bench) -> None:
+    bench.run()
+    before = {name: data for name, data in bench.results().items() if name != "job.yaml"}
+    (bench.folder / "torso.imu.csv").write_text("samples")
+    assert bench.executed(telemetry={"gravity": False}) == []
+    assert {name: data for name, data in bench.results().items() if name != "job.yaml"} == before
+
+
 def test_rounds_limit_the_extensions(bench: Bench) -> None:
     bench.order(wanted=[[5]] * 5, localised=[1, 2, 3, 4, 5, 6])
     assert bench.executed(registration={"rounds": 1}).count("extend") == 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -12,17 +12,20 @@ from scipy.spatial.transform import Rotation
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import Cancelled, EstimationError
+from bodycap_batch.inertial import align_sensor, force_windows
 from bodycap_batch.merging import merge_trajectories
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
 from bodycap_batch.merging.graph.windows import solve_windows, split_timeline
 from bodycap_batch.model.camera_clock import CameraClock
-from bodycap_batch.model.geometry import Similarity, align_points
+from bodycap_batch.model.geometry import Similarity, align_points, make_transform, so3_exp
+from bodycap_batch.model.inertial_camera import ForceWindows
 from bodycap_batch.model.merge_data import MergeResult
-from bodycap_batch.model.scene import FrameStatus
+from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.posed import posed
+from tests.inertial import Sensor
 from tests.stages.walker import FPS, ROLES, Walk, make_inputs, make_walk, record
 
 GAUGE = Similarity(0.37, Rotation.from_rotvec([1.0, -0.7, 0.4]).as_matrix(), np.array([2.0, -1.0, 0.5]))
@@ -119,6 +122,71 @@ def test_world_is_upright_on_the_floor_and_faces_the_first_second(base):
     head, foot = (base.skeleton.roles.index(role) for role in ("Head", "LeftFoot"))
     assert (base.graph_world_from_joint[:, head, 2, 3] > 1.3).all()
     assert (np.abs(base.graph_world_from_joint[:, foot, 2, 3]) < 0.2).all()
+
+
+@pytest.mark.parametrize("bend_deg", [pytest.param(35.0, marks=pytest.mark.slow), 80.0])
+def test_a_bent_person_is_upright_with_accelerometers(context, bend_deg):
+    """Without walls, floor and walk, the body alone is wrong by tens of degrees."""
+    upright = make_walk(np.random.default_rng(1))
+    bent = Bent(upright.skeleton, upright.mounts, float(np.radians(bend_deg)))
+    rng = np.random.default_rng(7)
+    paths = [record(bent, name, rng, gauge=GAUGE, seconds=BENT_S) for name in ROLES]
+    windows = {path.camera: _force_windows(bent, path) for path in paths}
+    inputs = make_inputs(bent, paths)
+    plain, measured = (
+        merge_trajectories(each, MergeOptions(), context)
+        for each in (inputs, replace(inputs, force_windows=windows))
+    )
+    off_deg = [_tilt_deg(each) for each in (plain, measured)]
+    assert off_deg[0] > 10.0
+    assert off_deg[1] < 1.0
+    assert measured.report.up.source == "accelerometers"
+    assert measured.report.up.sigma_deg < 1.0
+    assert off_deg[1] < 3.0 * measured.report.up.sigma_deg
+
+
+BENT_S = 5.0
+
+
+@dataclass(frozen=True)
+class Bent(Walk):
+    """The same person on the spot, who turns to both sides and bends forward all the time."""
+
+    bend_rad: float
+
+    def joints(self, seconds: np.ndarray) -> np.ndarray:
+        """Return world_from_joint (T,J,4,4) at any times (T,)."""
+        joints = Walk.joints(self, seconds)
+        turn = so3_exp(np.outer(0.9 * np.sin(0.5 * seconds), [0.0, 0.0, 1.0]))
+        bend = turn @ so3_exp([self.bend_rad, 0.0, 0.0]) @ np.swapaxes(turn, 1, 2)
+        moved = joints[..., :3, 3] - joints[:, :1, :3, 3]
+        return make_transform(bend[:, None] @ joints[..., :3, :3], np.einsum("tij,tkj->tki", bend, moved))
+
+
+@dataclass(frozen=True)
+class Carried:
+    """A camera that a person carries."""
+
+    walk: Walk
+    name: str
+
+    def poses(self, times_s: np.ndarray) -> np.ndarray:
+        """Return world_from_cam (T,4,4)."""
+        return self.walk.camera(self.name, times_s)
+
+
+def _tilt_deg(result: MergeResult) -> float:
+    up = result.world_from_map["map-0"].rotation @ GAUGE.rotation[:, 2]
+    return float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0))))
+
+
+def _force_windows(walk: Walk, path: Trajectory) -> ForceWindows:
+    """Return what a consumer's sensor on the camera measures."""
+    telemetry = Sensor().samples(Carried(walk, path.camera), BENT_S, seed=list(ROLES).index(path.camera))
+    aligned = align_sensor(path, telemetry)
+    assert aligned.fit is not None
+    assert aligned.samples is not None
+    return force_windows(path, aligned.samples, aligned.fit.rotation_sigma_rad)
 
 
 def test_another_gauge_gives_the_same_motion(walk, base, context):

@@ -45,6 +45,7 @@ from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.error_modes import ErrorModes
 from bodycap_batch.merging.graph.posture import is_mostly_walking
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO, floor_beside_path, standing_height
+from bodycap_batch.merging.world.measured_gravity import verticals_from_accelerometers
 from bodycap_batch.merging.world.vertical import SceneContext, Vertical, VerticalHypothesis, estimate_vertical
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs
@@ -162,7 +163,12 @@ def calibrate_body(
     tracks, provisional = data.tracks, data.provisional
     t_pose_ns = _t_pose_interval(inputs.skeleton, options.t_pose_s, bones, data)
     board = locate_board(inputs.trajectories, inputs.board_views, options.marker_board, data.main_from_gauge)
-    verticals = stated_verticals(options.marker_board, board)
+    main = next(each.gauge for each in inputs.trajectories if each.camera == tracks[0].camera)
+    gauges = data.main_from_gauge or {main: Similarity(1.0, np.eye(3), np.zeros(3))}
+    verticals = (
+        *stated_verticals(options.marker_board, board),
+        *verticals_from_accelerometers(inputs, gauges),
+    )
     inputs, hints, rolls = _resolve_camera_rolls(inputs, bones, data, t_pose_ns, verticals, step)
     priors = inputs.mount_by_camera()
     samples = take_samples(tracks, provisional, _SAMPLES, hints.vertical, t_pose_ns)
@@ -265,7 +271,7 @@ def reference_camera_roll(
         bones: Bones of the graph.
         tracks: Cleaned tracks in one map. The track of the reference camera is the first.
         provisional: Approximate scale, metres per map unit.
-        stated: Possible verticals from the marker board that the job describes.
+        stated: Possible verticals from the marker board that the job describes, and from accelerometers.
 
     Returns:
         The roll and the vertical.
@@ -309,7 +315,7 @@ def preliminary_vertical(
         reference: Track of the reference camera, metres.
         mount: Mount prior of the reference camera.
         points_m: (P,3) points of the reference camera's map, metres.
-        stated: Possible verticals from the marker board that the job describes.
+        stated: Possible verticals from the marker board that the job describes, and from accelerometers.
 
     Returns:
         The vertical. None if the vertical is ambiguous, or if it could be estimated only from the posture of

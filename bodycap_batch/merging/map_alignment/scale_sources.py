@@ -17,6 +17,7 @@ from bodycap_batch.merging.body_calibration.scale import ScaleSource, scale_from
 from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
 from bodycap_batch.merging.graph.posture import find_posture
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO, floor_beside_path, standing_height
+from bodycap_batch.merging.world.measured_gravity import verticals_from_accelerometers
 from bodycap_batch.merging.world.vertical import Vertical, VerticalHypothesis
 from bodycap_batch.model.geometry import Similarity, invert
 from bodycap_batch.model.merge_data import MergeInputs
@@ -31,7 +32,7 @@ class StatedConstraints:
 
     Attributes:
         scales: Scales from a known distance or a marker board in the map.
-        verticals: Verticals from a marker board of known placement.
+        verticals: Verticals from a marker board of known placement, and from accelerometers.
     """
 
     scales: tuple[ScaleSource, ...] = ()
@@ -58,7 +59,11 @@ def stated_constraints(inputs: MergeInputs, options: MergeOptions, gauge: str) -
         board = locate_board(inputs.trajectories, inputs.board_views, options.marker_board, own_map)
     scales = (distance, None if board is None else board.scale)
     return StatedConstraints(
-        tuple(each for each in scales if each is not None), stated_verticals(options.marker_board, board)
+        tuple(each for each in scales if each is not None),
+        (
+            *stated_verticals(options.marker_board, board),
+            *verticals_from_accelerometers(inputs, own_map),
+        ),
     )
 
 

@@ -25,6 +25,8 @@ from bodycap_batch.merging.world.planes import (
     vertical_from_planes,
 )
 
+ACCELEROMETERS = "accelerometers"
+"""Source of a vertical that the accelerometers of the cameras measure."""
 _LEAN_SAMPLES = 3.0
 """The tilt of the trunk (its lean) over a whole capture counts as this number of independent observations.
 The number is small because the posture's systematic bias is equal at all instants. Evidence: none."""
@@ -75,7 +77,8 @@ class VerticalHypothesis:
     """A direction that may be the vertical. The most likely hypothesis becomes the vertical.
 
     Attributes:
-        source: Origin of the direction: "map" (planes of the map), "walk", "body" or "marker board".
+        source: Origin of the direction: "map" (planes of the map), "walk", "body", "marker board" or
+            "accelerometers".
         up: (3,) unit vector in the solved frame of reference.
         sigma_deg: Sigma (degrees) of the direction, if this hypothesis is the right one.
         share: Fraction of the planes' points that agree with the direction; 0 if the direction does not come
@@ -161,6 +164,8 @@ def estimate_vertical(
 ) -> Vertical:
     """Select the most likely vertical among hypotheses from the planes, the walk, the body and the job.
 
+    A vertical that accelerometers measure is preferred to all others.
+
     The planes of a room are compatible with six or more directions. Three observations show which direction
     is up. The first is the tilt of the trunk: often forward, seldom backward or sideways. The second is how
     far the trunk rises and falls. The third is whether the map has a floor at the expected height.
@@ -169,9 +174,10 @@ def estimate_vertical(
         body: Orientation of the trunk over time.
         scene: The map and the path of the trunk.
         rng: Random generator for the search for planes.
-        stated: Verticals given in the job. If there are any, the most likely of them is selected, even if
-            another hypothesis is more likely. If a vertical from planes agrees with the selected vertical,
-            the vertical from planes is used.
+        stated: Verticals given in the job, or measured by accelerometers. If there are any, the measured one
+            is selected, else the most likely of them, even if another hypothesis is more likely. If a
+            vertical from planes agrees with the selected vertical, the vertical from planes is used, unless
+            the selected one was measured with a smaller sigma.
     """
     planes = find_planes(scene.points_m, rng)
     hints = [body.modal_up(), body.mean_up(), body.upright_up()]
@@ -219,13 +225,19 @@ def _select(hypotheses: Sequence[VerticalHypothesis], stated: Collection[str]) -
     """Return the hypothesis with the lowest negative log-likelihood.
 
     If the job gives verticals, only these verticals are candidates. A hypothesis from planes that agrees
-    with the best candidate within 3 sigma then replaces this candidate.
+    with the best candidate within 3 sigma then replaces this candidate. A vertical from accelerometers is the
+    best candidate, and only a hypothesis from planes with a smaller sigma replaces it.
     """
-    best = min((each for each in hypotheses if not stated or each.source in stated), key=_cost)
+    measured = [each for each in hypotheses if each.source == ACCELEROMETERS]
+    candidates = measured or [each for each in hypotheses if not stated or each.source in stated]
+    best = min(candidates, key=_cost)
     agreeing = [
         each
         for each in hypotheses
-        if stated and each.source == "map" and angle_deg(each.up, best.up) < _STATED_SIGMAS * best.sigma_deg
+        if stated
+        and each.source == "map"
+        and angle_deg(each.up, best.up) < _STATED_SIGMAS * best.sigma_deg
+        and (not measured or each.sigma_deg < best.sigma_deg)
     ]
     return min(agreeing, key=_cost, default=best)
 

@@ -171,6 +171,31 @@ def test_a_stated_vertical_is_selected_and_the_others_are_compared_with_it(hung_
     assert "body" in off_deg
 
 
+@pytest.mark.parametrize(
+    ("sigma_deg", "off_deg", "taken"),
+    [
+        (0.3, 0.5, "accelerometers"),
+        (0.3, 40.0, "accelerometers"),
+        (2.0, 0.5, "map"),
+        (2.0, 40.0, "accelerometers"),
+    ],
+)
+def test_a_measured_vertical_comes_before_the_planes_and_the_board(sigma_deg, off_deg, taken):
+    """Planes that agree with it are used if they are more exact."""
+    rng = np.random.default_rng(1)
+    tilted = TURN @ so3_exp([np.radians(off_deg), 0.0, 0.0]) @ UP
+    stated = [
+        VerticalHypothesis(source="marker board", up=TURN @ UP, sigma_deg=1.5),
+        VerticalHypothesis(source="accelerometers", up=tilted, sigma_deg=sigma_deg),
+    ]
+    axes, path = _leaning(rng, 40.0, 1.0)
+    found = _found(axes, path, _box_room(rng), stated=stated)
+    assert found.source == taken
+    assert _off_deg(found) == pytest.approx(off_deg if taken == "accelerometers" else 0.0, abs=0.3)
+    assert {"marker board", "body"} <= {each.source for each in found.alternatives}
+    assert f"estimated from the {taken}" in describe_vertical(found)
+
+
 def test_a_board_on_the_floor_reveals_an_upside_down_body():
     rng = np.random.default_rng(1)
     axes, path = _leaning(rng, 0.0, 1.0)

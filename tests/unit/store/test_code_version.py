@@ -103,7 +103,8 @@ CAMERAS = READ_BY_ALL | {"capture", "presets"}
 BODY = CAMERAS
 HASHED = {
     "synth": BODY | {"synthetic"},
-    "check": BODY | {"check", "store"},
+    "check": BODY | {"check", "store", "telemetry"},
+    "inertial": CAMERAS | {"inertial", "telemetry"},
     "sound": CAMERAS | {"clocks"},
     # The clocks stage compares the distances between the cameras with the reach of the body.
     "clocks": CAMERAS | {"clocks", "mapping"},

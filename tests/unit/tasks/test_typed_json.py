@@ -17,6 +17,7 @@ from bodycap_batch.config.options import (
     MapOptions,
     MergeOptions,
     RegistrationOptions,
+    TelemetryOptions,
 )
 from bodycap_batch.pipeline.inputs import capture_ref
 from bodycap_batch.pipeline.task_keys import artefact_key, make_task
@@ -25,6 +26,7 @@ from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.check import CheckTask
 from bodycap_batch.tasks.clocks import CameraDistance, ClocksTask
 from bodycap_batch.tasks.export import ExportTask
+from bodycap_batch.tasks.inertial import InertialTask
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, FileRef, MountInput, StatedClock
 from bodycap_batch.tasks.keyframes import KeyframesTask
 from bodycap_batch.tasks.mapping import ExtendTask, MapTask, RefineTask
@@ -109,6 +111,12 @@ def tasks(folder: Path) -> dict[str, Any]:
         ),
         "rig": CameraGroupTask(**poses),
         "recover": CameraGroupTask(**poses),
+        "inertial": InertialTask(
+            options=TelemetryOptions(gravity=False),
+            capture=capture,
+            registration=scene_map,
+            samples=FileRef(path=folder / "torso.imu.csv", digest="of the samples"),
+        ),
         "sound": SoundTask(capture=capture),
         "clocks": ClocksTask(
             capture=capture,

@@ -1,0 +1,54 @@
+"""Use the inertial sensor of one camera after its frames are registered."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodycap_batch.config.options import TelemetryOptions
+from bodycap_batch.inertial.alignment import align_sensor
+from bodycap_batch.inertial.force_windows import force_windows
+from bodycap_batch.model.inertial_camera import InertialCamera, SensorRelation
+from bodycap_batch.model.scene import Trajectory
+from bodycap_batch.telemetry.gyro_fit import GyroFit
+from bodycap_batch.telemetry.streams import CameraTelemetry
+
+
+def use_sensor(
+    trajectory: Trajectory, telemetry: CameraTelemetry, options: TelemetryOptions
+) -> InertialCamera:
+    """Estimate how the sensor of a camera relates to its solved poses, and what it measures.
+
+    Args:
+        trajectory: The poses of the camera's frames.
+        telemetry: The telemetry of the camera.
+        options: Which uses of the telemetry are on.
+    """
+    aligned = align_sensor(trajectory, telemetry)
+    windows = None
+    if options.gravity and aligned.fit is not None and aligned.samples is not None:
+        found = force_windows(trajectory, aligned.samples, aligned.fit.rotation_sigma_rad)
+        windows = found if len(found.times_s) else None
+    return InertialCamera(
+        camera=trajectory.camera,
+        gauge=trajectory.gauge,
+        source=telemetry.source,
+        verdict=aligned.comparison.verdict,
+        reason=aligned.comparison.reason,
+        relation=None if aligned.fit is None else _relation(aligned.fit),
+        windows=windows,
+    )
+
+
+def _relation(fit: GyroFit) -> SensorRelation:
+    return SensorRelation(
+        delay_s=fit.delay_s,
+        delay_sigma_s=fit.delay_sigma_s,
+        drift=fit.drift,
+        drift_sigma=fit.drift_sigma,
+        cam_from_sensor=fit.cam_from_sensor,
+        rotation_sigma_rad=np.asarray(fit.rotation_sigma_rad),
+        bias_rad_s=fit.bias_rad_s,
+        bias_sigma_rad_s=np.asarray(fit.bias_sigma_rad_s),
+        r_squared=fit.r_squared,
+        pairs=fit.pairs,
+    )

@@ -1,0 +1,118 @@
+"""Samples of an inertial sensor in the axes and on the clock of its camera, and rotations from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray, set_array
+from bodycap_batch.model.geometry import so3_exp, so3_log
+from bodycap_batch.telemetry.gyro_fit import GyroFit
+from bodycap_batch.telemetry.streams import Stream
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InertialSamples:
+    """Samples of an inertial sensor in the axes and on the clock of its camera.
+
+    Attributes:
+        times_s: (N,) time of each sample on the clock of the camera's frames, seconds.
+        rate_rad_s: (N,3) angular rate in the axes of the camera, without the estimated bias, rad/s.
+        force_m_s2: (N,3) specific force in the axes of the camera, m/s²; at rest, 9.81 upwards. NaN where
+            the accelerometer has no sample near.
+        gaps_s: Start and end of each stretch without samples, seconds.
+    """
+
+    times_s: FloatArray
+    rate_rad_s: FloatArray
+    force_m_s2: FloatArray
+    gaps_s: tuple[tuple[float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        count = len(self.times_s)
+        set_array(self, "times_s", (count,))
+        set_array(self, "rate_rad_s", (count, 3))
+        set_array(self, "force_m_s2", (count, 3), finite=False)
+
+    def covers(self, start_s: FloatArray, end_s: FloatArray) -> BoolArray:
+        """Return for each interval (N,) whether samples without a gap cover it."""
+        inside = (start_s >= self.times_s[0]) & (end_s <= self.times_s[-1])
+        for first_s, last_s in self.gaps_s:
+            inside &= (end_s <= first_s) | (start_s >= last_s)
+        return np.asarray(inside)
+
+
+def samples_of_fit(gyro: Stream, accelerometer: Stream | None, fit: GyroFit) -> InertialSamples:
+    """Return the samples of a sensor in the axes and on the clock of its camera.
+
+    Args:
+        gyro: The gyroscope.
+        accelerometer: The accelerometer; None if there is none.
+        fit: The relation of the gyroscope to the camera.
+    """
+    delay_s = fit.delay_s + fit.drift * (gyro.times_s - fit.middle_s)
+    gaps_s = gyro.gaps_s
+    force = np.full(gyro.values.shape, np.nan)
+    if accelerometer is not None and len(accelerometer.times_s) > 1:
+        gaps_s += accelerometer.gaps_s
+        inside = (gyro.times_s >= accelerometer.times_s[0]) & (gyro.times_s <= accelerometer.times_s[-1])
+        for axis in range(3):
+            force[inside, axis] = np.interp(
+                gyro.times_s[inside], accelerometer.times_s, accelerometer.values[:, axis]
+            )
+    return InertialSamples(
+        times_s=gyro.times_s - delay_s,
+        rate_rad_s=(gyro.values - fit.bias_rad_s) @ fit.cam_from_sensor.T,
+        force_m_s2=force @ fit.cam_from_sensor.T,
+        gaps_s=tuple((start_s - fit.delay_s, end_s - fit.delay_s) for start_s, end_s in gaps_s),
+    )
+
+
+class GyroOrientation:
+    """The orientation of a camera that its gyroscope alone gives, relative to the first sample.
+
+    Args:
+        times_s: (N,) times of the samples, seconds.
+        rate_rad_s: (N,3) angular rates in the axes of the camera, rad/s.
+    """
+
+    def __init__(self, times_s: FloatArray, rate_rad_s: FloatArray) -> None:
+        self.times_s, self._rate = times_s, rate_rad_s
+        steps = 0.5 * (rate_rad_s[1:] + rate_rad_s[:-1]) * np.diff(times_s)[:, None]
+        self.rotation = np.concatenate([np.eye(3)[None], so3_exp(steps)])
+        shift = 1
+        while shift < len(self.rotation):  # products of all steps before each sample, by doubling
+            self.rotation[shift:] = self.rotation[:-shift] @ self.rotation[shift:]
+            shift *= 2
+
+    def at(self, times_s: FloatArray) -> FloatArray:
+        """Return the rotations (T,3,3) at times (T,), seconds. Outside the samples, the rate is constant."""
+        before = np.clip(np.searchsorted(self.times_s, times_s, side="right") - 1, 0, len(self.times_s) - 2)
+        step_s = times_s - self.times_s[before]
+        slope = np.diff(self._rate, axis=0)[before] / np.diff(self.times_s)[before, None]
+        inside = np.clip(step_s, 0.0, np.diff(self.times_s)[before])[:, None]
+        turned = self._rate[before] * step_s[:, None] + 0.5 * slope * inside**2
+        return np.asarray(self.rotation[before] @ so3_exp(turned))
+
+
+def pinned_orientations(
+    gyro: GyroOrientation, frame_s: FloatArray, rotation: FloatArray, times_s: FloatArray
+) -> FloatArray:
+    """Return orientations (T,3,3) that equal solved ones at the frames and follow the gyroscope between them.
+
+    The difference at the next frame is distributed evenly over the time: the most likely course for white
+    noise.
+
+    Args:
+        gyro: The orientation from the gyroscope alone.
+        frame_s: (N,) times of the frames with a pose, increasing, seconds.
+        rotation: (N,3,3) solved rotations gauge_from_cam.
+        times_s: (T,) requested times, seconds. Outside the frames, the nearest difference holds.
+    """
+    correction = rotation @ np.swapaxes(gyro.at(frame_s), 1, 2)
+    after = np.clip(np.searchsorted(frame_s, times_s), 1, len(frame_s) - 1)
+    before = after - 1
+    share = np.clip((times_s - frame_s[before]) / (frame_s[after] - frame_s[before]), 0.0, 1.0)
+    turn = so3_log(np.swapaxes(correction[before], 1, 2) @ correction[after])
+    return np.asarray(correction[before] @ so3_exp(share[:, None] * turn) @ gyro.at(times_s))
