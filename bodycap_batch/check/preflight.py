@@ -19,6 +19,7 @@ from bodycap_batch.check.overview import with_first_guess
 from bodycap_batch.check.picture_quality import PictureQuality, check_picture_quality, stands_still
 from bodycap_batch.check.recording_advice import advise
 from bodycap_batch.config.bounds import MAX_TICKS
+from bodycap_batch.config.export_targets import export_target
 from bodycap_batch.config.job import Overrides, load_job_with_origins
 from bodycap_batch.config.models import (
     NO_SKELETON,
@@ -40,7 +41,7 @@ from bodycap_batch.core.errors import (
     one_error,
 )
 from bodycap_batch.formats.bvh import RigOptions, read_rig
-from bodycap_batch.formats.optional_libraries import require_libraries
+from bodycap_batch.formats.optional_libraries import require_formats
 from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.store.disk_space import require_room
 
@@ -368,12 +369,10 @@ def _check_formats(job: Job, _findings: list[CameraSummary]) -> list[str]:
     """
     if job.skeleton == NO_SKELETON:
         return []
-    require_libraries(job.export.formats)
-    if "fbx" in job.export.formats:
-        from bodycap_batch.formats.fbx import require_blender  # this import takes as long as all other code
-
-        require_blender()
-    if job.export.names != "hik" and job.skeleton not in SKELETON_PRESETS:
+    require_formats(job.export.formats)
+    target = job.export.target
+    of_target = None if target is None else export_target(target).options["names"]
+    if job.export.names not in ("hik", of_target) and job.skeleton not in SKELETON_PRESETS:
         raise JobError(
             f"`names: {job.export.names}` cannot be used with a skeleton file, because the joints keep the "
             "names in the file",

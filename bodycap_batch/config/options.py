@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from bodycap_batch.config.bounds import MAX_CAPTURE_S, MAX_FPS, MAX_MOTION_FPS, MAX_SEED, MIN_FPS
+from bodycap_batch.config.export_targets import Target, export_target
 
 FrameName = Annotated[str, StringConstraints(pattern=r"^.+:\d{1,9}$")]
 """Name of one frame: ``camera:frame``. Frame 0 is the first frame of the camera's first chapter; the count
 continues through all chapters. ``start_s`` does not change the count."""
 
-FileFormat = Literal["ply", "bvh", "glb", "fbx", "usd", "c3d", "trc", "tum", "csv", "npz", "colmap"]
-NamePreset = Literal["hik", "mixamo", "biped", "unreal"]
+FileFormat = Literal[
+    "ply", "bvh", "glb", "fbx", "usd", "c3d", "trc", "tum", "csv", "npz", "colmap", "blender"
+]
+NamePreset = Literal["hik", "mixamo", "biped", "unreal", "unity"]
 RootMode = Literal["hips", "ground", "in_place"]
 
 
@@ -245,10 +248,19 @@ class TelemetryOptions(Options):
 
 
 class ExportOptions(Options):
-    """Options of stage 5, the export of the result files."""
+    """Options of stage 5, the export of the result files.
 
+    A target sets the other options to what one program expects. An option that the job states is kept.
+    """
+
+    target: Target | None = Field(
+        None,
+        description="program that the files are made for; sets formats, names, root, units and tpose, "
+        "except those that the job states",
+    )
     formats: tuple[FileFormat, ...] = Field(
-        ("ply", "bvh", "glb", "tum", "csv", "colmap"), description="files to write, as a list: [ply, bvh]"
+        ("ply", "bvh", "glb", "tum", "csv", "colmap", "blender"),
+        description="files to write, as a list: [ply, bvh]",
     )
     units: Literal["cm", "m"] = Field("cm", description="unit of length in the BVH file")
     names: NamePreset = Field(
@@ -284,3 +296,12 @@ class ExportOptions(Options):
     preview: bool = Field(
         True, description="write preview.mp4, which shows the body in the room next to the videos"
     )
+
+    @model_validator(mode="after")
+    def _apply_target(self) -> ExportOptions:
+        """Set the options that the target gives and that are not stated."""
+        if self.target is not None:
+            for name, value in export_target(self.target).options.items():
+                if name not in self.model_fields_set:
+                    object.__setattr__(self, name, tuple(value) if isinstance(value, list) else value)
+        return self

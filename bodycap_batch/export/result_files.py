@@ -13,6 +13,7 @@ from typing import Any
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.export.blender_scene import collect_blender_scene
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.frame_table import write_frame_table
 from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
@@ -27,10 +28,12 @@ from bodycap_batch.export.motion_files import (
 )
 from bodycap_batch.export.scene_files import write_colmap, write_maps, write_trajectories
 from bodycap_batch.formats.atomic_files import write_text
+from bodycap_batch.formats.blender import write_blender_files
 from bodycap_batch.formats.c3d import write_c3d
 from bodycap_batch.formats.fbx import write_fbx
 from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.formats.trc import write_trc
+from bodycap_batch.model.bone_axes import align_axes_with_bones
 from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.skeleton import Motion, with_file_zero_pose
 
@@ -63,7 +66,7 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
         steps |= {"ply": lambda: write_maps(inputs), "colmap": lambda: write_colmap(inputs)}
     steps["csv"] = lambda: [write_frame_table(inputs.out_dir / "frames.csv", inputs)]
     if motion is not None:
-        steps |= _motion_writers(inputs.out_dir, motion, options, sigma_m)
+        steps |= _motion_writers(inputs, motion, options, sigma_m)
         steps["csv"] = lambda: [
             write_frame_table(inputs.out_dir / "frames.csv", inputs),
             write_joint_table(inputs.out_dir / "joints.csv", motion, sigma_m),
@@ -80,22 +83,26 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
 
 
 def _motion_writers(
-    folder: Path, motion: Motion, options: ExportOptions, sigma_m: FloatArray | None
+    inputs: ExportInputs, motion: Motion, options: ExportOptions, sigma_m: FloatArray | None
 ) -> dict[str, Callable[[], list[Path]]]:
     """Return, for each motion format, a function that writes its file.
 
-    The animation formats (BVH, GLB, FBX, USD) contain the motion in the layout that the options select. The
+    The animation formats (BVH, GLB, FBX, USD) contain the motion in the layout that the options select. In
+    GLB and FBX files, the joints' axes follow the bones, because programs draw bones along these axes. The
     measurement formats (C3D, TRC, NPZ) contain the solved motion.
     """
+    folder = inputs.out_dir
     animated, centres = apply_layout(motion, options), points_from_motion(motion)
+    aligned = align_axes_with_bones(animated)
     return {
         "bvh": lambda: [write_verified_bvh(folder / "motion.bvh", animated, options)],
-        "glb": lambda: [write_verified_glb(folder / "motion.glb", animated)],
-        "fbx": lambda: [write_fbx(folder / "motion.fbx", animated)],
+        "glb": lambda: [write_verified_glb(folder / "motion.glb", aligned)],
+        "fbx": lambda: [write_fbx(folder / "motion.fbx", aligned)],
         "usd": lambda: [write_verified_usd(folder / "motion.usd", animated)],
         "c3d": lambda: [write_c3d(folder / "joints.c3d", centres)],
         "trc": lambda: [write_trc(folder / "joints.trc", centres)],
         "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m)],
+        "blender": lambda: write_blender_files(folder, collect_blender_scene(inputs, aligned, options)),
     }
 
 

@@ -30,3 +30,20 @@ def require_libraries(formats: Iterable[str]) -> None:
                 hint="run `make extras` or `pip install 'bodycap_batch[formats]'` to install the library, "
                 "or leave the format out",
             )
+
+
+def require_formats(formats: Iterable[str]) -> None:
+    """Check that the libraries of all formats are installed, and that Blender starts if a format needs it.
+
+    Args:
+        formats: Names of the formats of the job (`export.formats`).
+
+    Raises:
+        JobError: A library or Blender is missing. The hint explains how to install it.
+    """
+    names = tuple(formats)
+    require_libraries(names)
+    if "fbx" in names:
+        from bodycap_batch.formats.fbx import require_blender  # this import takes as long as all other code
+
+        require_blender()

@@ -1,4 +1,4 @@
-"""USD files: a skeleton, its animation and a skinned stick figure, in metres and in world axes."""
+"""USD files: a skeleton, its animation and a skinned mannequin, in metres and in world axes."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.atomic_files import atomic_replacement
-from bodycap_batch.formats.stick_figure import StickFigure, make_stick_figure
+from bodycap_batch.formats.mannequin import Mannequin, make_mannequin
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, rotation_from_quat_xyzw
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
-_BODY_PATH, _SKELETON_PATH, _FIGURE_PATH = "/Body", "/Body/Skeleton", "/Body/Figure"
+_BODY_PATH, _SKELETON_PATH, _MESH_PATH = "/Body", "/Body/Skeleton", "/Body/Mannequin"
 _MOTION_PATH = "/Body/Skeleton/Motion"
-_FIGURE_COLOR_RGB = (0.86, 0.39, 0.10)
-"""Colour of the stick figure, RGB, 0 to 1."""
+_BODY_COLOR_RGB = (0.62, 0.66, 0.70)
+"""Colour of the mannequin, RGB, 0 to 1."""
 
 _EXTENT_MARGIN_M = 0.3
-"""Margin, metres, between the joint centres and the bounding box of the figure. Derivation: head, hands and
-feet extend beyond their joints by less than this margin."""
+"""Margin, metres, between the joint centres and the bounding box of the mannequin. Derivation: head, hands
+and feet extend beyond their joints by less than this margin."""
 
 
 def write_usd(path: Path, motion: Motion) -> Path:
-    """Write a motion as a skinned, animated stick figure.
+    """Write a motion as a skinned, animated mannequin.
 
     The time codes are frame numbers, counted from 0. The mesh is bound to the joints in the T-pose. The joint
     tokens are paths of names that USD allows (``mixamorig_Hips``). The original names are stored in
@@ -60,7 +60,7 @@ def write_usd(path: Path, motion: Motion) -> Path:
     skeleton = _define_skeleton(stage, motion.skeleton, tokens)
     animation = _define_animation(stage, motion, tokens)
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
-    _define_figure(stage, make_stick_figure(motion.skeleton), skeleton)
+    _define_mesh(stage, make_mannequin(motion.skeleton), skeleton)
     with atomic_replacement(path) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
             raise StoreError(
@@ -128,30 +128,30 @@ def _define_animation(stage: Any, motion: Motion, tokens: list[str]) -> Any:
     return animation
 
 
-def _define_figure(stage: Any, figure: StickFigure, skeleton: Any) -> None:
-    """Add the mesh of the stick figure to the stage. Each vertex is bound to one joint with weight 1."""
+def _define_mesh(stage: Any, body_mesh: Mannequin, skeleton: Any) -> None:
+    """Add the mesh of the mannequin to the stage. Each vertex is bound to two joints."""
     from pxr import Gf, UsdGeom, UsdSkel, Vt
 
-    mesh = UsdGeom.Mesh.Define(stage, _FIGURE_PATH)
-    vertices = figure.vertices_m.astype(np.float32)
+    mesh = UsdGeom.Mesh.Define(stage, _MESH_PATH)
+    vertices = body_mesh.vertices_m.astype(np.float32)
     mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(vertices))
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(figure.faces), 3, dtype=np.int32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(body_mesh.faces), 3, dtype=np.int32)))
     mesh.CreateFaceVertexIndicesAttr(
-        Vt.IntArray.FromNumpy(np.ascontiguousarray(figure.faces.reshape(-1), dtype=np.int32))
+        Vt.IntArray.FromNumpy(np.ascontiguousarray(body_mesh.faces.reshape(-1), dtype=np.int32))
     )
-    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(figure.normals.astype(np.float32)))
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(body_mesh.normals.astype(np.float32)))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    mesh.CreateDisplayColorAttr([Gf.Vec3f(*_FIGURE_COLOR_RGB)])
+    mesh.CreateDisplayColorAttr([Gf.Vec3f(*_BODY_COLOR_RGB)])
     low, high = vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()
     mesh.CreateExtentAttr([Gf.Vec3f(*low), Gf.Vec3f(*high)])
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
-    joints = figure.joints.astype(np.int32)
-    binding.CreateJointIndicesPrimvar(False, 1).Set(Vt.IntArray.FromNumpy(joints))
-    weights = np.ones(len(joints), dtype=np.float32)
-    binding.CreateJointWeightsPrimvar(False, 1).Set(Vt.FloatArray.FromNumpy(weights))
+    joints = np.ascontiguousarray(body_mesh.joints.reshape(-1), dtype=np.int32)
+    binding.CreateJointIndicesPrimvar(False, 2).Set(Vt.IntArray.FromNumpy(joints))
+    weights = np.ascontiguousarray(body_mesh.weights.reshape(-1), dtype=np.float32)
+    binding.CreateJointWeightsPrimvar(False, 2).Set(Vt.FloatArray.FromNumpy(weights))
 
 
 def read_usd(path: Path) -> Motion:

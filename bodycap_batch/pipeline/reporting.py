@@ -30,13 +30,15 @@ def stored_for_report(job: Job, *, out_dir: Path, settings: Settings) -> ReportT
     Raises:
         BodycapError: The videos cannot be read, the disk fails, or nothing of the job is stored.
     """
-    results, stopped_by = _find_stored(job, out_dir, settings)
+    results, stopped_by = find_stored(job, out_dir, settings)
     failure = results.describe_failure(stopped_by or results.failure)
     return report_task(job, results, {}, settings.store.digests, failure)
 
 
-def _find_stored(job: Job, out_dir: Path, settings: Settings) -> tuple[StageResults, BodycapError | None]:
-    """Return the stored results of all stages up to the export.
+def find_stored(
+    job: Job, out_dir: Path, settings: Settings, *, last: str = "export"
+) -> tuple[StageResults, BodycapError | None]:
+    """Return the stored results of all stages up to the stage `last`.
 
     If the results of a stage are not stored, the returned results end before this stage, and the second value
     is the error that names the stage. Otherwise the second value is None.
@@ -45,7 +47,7 @@ def _find_stored(job: Job, out_dir: Path, settings: Settings) -> tuple[StageResu
     with Flow(job, replace(settings, compute=False, redo=frozenset()), logs=out_dir / "logs") as flow:
         try:
             for stage in run_stages(job, flow, results):
-                if stage == "export":
+                if stage == last:
                     break
         except NotStored as error:
             if not flow.runner.records:
@@ -70,7 +72,7 @@ def remake_report(job: Job, *, out_dir: Path, settings: Settings) -> Path:
     Raises:
         BodycapError: The videos cannot be read, the disk fails, or nothing of the job is stored.
     """
-    results, stopped_by = _find_stored(job, out_dir, settings)
+    results, stopped_by = find_stored(job, out_dir, settings)
     again = replace(settings, redo=settings.redo | {"report"})
     with Flow(job, again, logs=out_dir / "logs") as flow:
         flow.check()

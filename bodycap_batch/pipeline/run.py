@@ -253,6 +253,7 @@ def _write_results(job: Job, results: StageResults, summary: RunSummary, setting
         "peak_memory_mb": max((stage.peak_memory_mb for stage in summary.stages), default=0.0),
         "stages": [asdict(stage) for stage in summary.stages],
         "files": list(summary.files),
+        "videos": {camera.name: [str(path) for path in camera.video] for camera in job.capture.cameras},
     }
     write_results_file(out_dir, RUN_FILE, checked_json(record))
 

@@ -50,6 +50,18 @@ def frames_of(body: Any) -> tuple[int, int]:
     return round(start), round(end)
 
 
+def curves(body: Any) -> list[Any]:
+    """The animation curves of the armature."""
+    action = body.animation_data.action
+    return [
+        curve
+        for layer in action.layers
+        for strip in layer.strips
+        for bag in strip.channelbags
+        for curve in bag.fcurves
+    ]
+
+
 def report() -> dict[str, Any]:
     """What the scene holds."""
     rate = bpy.context.scene.render
@@ -64,6 +76,13 @@ def report() -> dict[str, Any]:
     out["armature"] = rows(body.matrix_world)
     out["joints"] = [bone.name for bone in body.data.bones]
     out["parents"] = {bone.name: bone.parent.name if bone.parent else None for bone in body.data.bones}
+    out["objects"] = sorted(
+        f"{item.type} {item.name}"
+        for item in bpy.data.objects
+        if not any(c.name == "glTF_not_exported" for c in item.users_collection)
+    )
+    out["keys"] = sorted({point.co.x for curve in curves(body) for point in curve.keyframe_points})
+    out["tails"] = {bone.name: list(body.matrix_world @ bone.tail_local) for bone in body.data.bones}
     out["rest"] = {bone.name: rows(body.matrix_world @ bone.matrix_local) for bone in body.data.bones}
     out["frames"] = first, last = frames_of(body)
     out["world"] = {bone.name: [] for bone in body.pose.bones}

@@ -72,6 +72,9 @@ def test_all_files_are_there(tmp_path: Path) -> None:
         "joints.csv",
         "frames.csv",
         "metrics.json",
+        "blender_scene.json",
+        "blender_scene.py",
+        "bodycap_blender.zip",
     }
     expected |= {f"trajectories/{camera}.tum" for camera in CAMERAS}
     expected |= {f"colmap/{n}/{name}.bin" for n in (0, 1) for name in ("cameras", "images", "points3D")}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.export.layout.joint_names import rename_joints
+from bodycap_batch.export.layout.joint_names import rename_joints, rename_roles
 from bodycap_batch.export.layout.resampling import resample, smooth
 from bodycap_batch.export.layout.root_motion import apply_root_mode, floor_root_name, prepend_tpose
 from bodycap_batch.model.skeleton import Motion
@@ -15,7 +15,8 @@ def apply_layout(motion: Motion, options: ExportOptions) -> Motion:
     """Return the motion with the layout of the files for animation (BVH, GLB, FBX, USD).
 
     New joint names and additional spine joints do not move the existing joints in the world. A user's
-    own skeleton keeps its joint names and gets no spine joints; only ``root: ground`` adds a joint, the root.
+    own skeleton gets no spine joints, and keeps its joint names unless the files are made for a program; the
+    root on the floor is added for ``root: ground`` or if the names require it.
 
     Args:
         motion: The solved motion in the world.
@@ -28,8 +29,9 @@ def apply_layout(motion: Motion, options: ExportOptions) -> Motion:
     is_user_skeleton = any(motion.skeleton.bvh_channels)
     if not is_user_skeleton:
         motion = rename_joints(motion, options.names)
+    elif options.target is not None:
+        motion = rename_roles(motion, options.names)
     if options.tpose:
         motion = prepend_tpose(motion)
-    return apply_root_mode(
-        motion, options.root, floor_root_name("hik" if is_user_skeleton else options.names, options.root)
-    )
+    names = "hik" if is_user_skeleton and options.target is None else options.names
+    return apply_root_mode(motion, options.root, floor_root_name(names, options.root))

@@ -36,15 +36,47 @@ def rename_joints(motion: Motion, preset: str) -> Motion:
     """
     chosen = naming_preset(preset)
     prefix, spine, neck = chosen.get("prefix", ""), chosen["spine"], chosen["neck"]
-    trunk_names = {"Spine": spine[0], "Spine1": spine[-1], "Neck": neck[0]}
-    skeleton = motion.skeleton
     joints = tuple(
-        prefix + (trunk_names.get(role) or _joint_name(role, chosen) if role else name)
-        for name, role in zip(skeleton.joints, skeleton.roles, strict=True)
+        _name_of_role(role, chosen) if role else prefix + name
+        for name, role in zip(motion.skeleton.joints, motion.skeleton.roles, strict=True)
     )
-    motion = replace(motion, skeleton=replace(skeleton, joints=joints))
+    motion = replace(motion, skeleton=replace(motion.skeleton, joints=joints))
     motion = _insert_joints(motion, "Spine", "Spine1", [prefix + name for name in spine[1:-1]])
     return _insert_joints(motion, "Neck", "Head", [prefix + name for name in neck[1:]])
+
+
+def rename_roles(motion: Motion, preset: str) -> Motion:
+    """Return the motion with the joint names of a naming preset for all joints that have a role.
+
+    Joints without a role keep their names; a number is appended to a name that another joint has now. No
+    joints are added. This suits a skeleton of the user, whose hierarchy must stay.
+
+    Args:
+        motion: The motion.
+        preset: Name of the naming preset.
+    """
+    chosen = naming_preset(preset)
+    skeleton = motion.skeleton
+    used = {_name_of_role(role, chosen) for role in skeleton.roles if role}
+    joints: list[str] = []
+    for name, role in zip(skeleton.joints, skeleton.roles, strict=True):
+        unique, number = (_name_of_role(role, chosen), 2) if role else (name, 2)
+        while not role and unique in used:
+            unique, number = f"{name}_{number}", number + 1
+        used.add(unique)
+        joints.append(unique)
+    return replace(motion, skeleton=replace(skeleton, joints=tuple(joints)))
+
+
+def _name_of_role(role: str, chosen: dict[str, Any]) -> str:
+    """Return the name of the joint with a role, with the preset's prefix.
+
+    Args:
+        role: The role of the joint.
+        chosen: The settings of the naming preset.
+    """
+    trunk = {"Spine": chosen["spine"][0], "Spine1": chosen["spine"][-1], "Neck": chosen["neck"][0]}
+    return str(chosen.get("prefix", "")) + (trunk.get(role) or _joint_name(role, chosen))
 
 
 def _joint_name(role: str, chosen: dict[str, Any]) -> str:

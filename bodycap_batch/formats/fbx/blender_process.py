@@ -46,7 +46,9 @@ def find_blender() -> Path:
         python = folder / ".venv-blender" / "bin" / "python"
         if python.is_file():
             return python
-    raise JobError("FBX files need Blender, which was not found", field="export.formats", hint=_HINT)
+    raise JobError(
+        "FBX and .blend files need Blender, which was not found", field="export.formats", hint=_HINT
+    )
 
 
 def require_blender() -> None:

@@ -16,6 +16,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+GLB_FPS = 30.0
+"""Frames per second of the GLB file to convert, whatever the rate of the motion is. Derivation: Blender's
+glTF importer places keys on whole frames only at a whole number of frames per second."""
+
+_BIND_FRAME = -1
+"""Frame of the bind pose while Blender writes the file. Derivation: the motion starts at frame 0, and frames
+before it are not written."""
+
 _COMPARED_FRAMES = 20
 """Number of frames whose joint centres are written to the report. Evidence: none; this number of frames is
 enough to detect a wrong frame rate or a wrong axis."""
@@ -25,9 +33,9 @@ def convert(source: str, target: str, fps: float, frames: int) -> None:
     """Import the GLB file and export the FBX file, without leaf bones and with a key at every frame.
 
     Args:
-        source: Path of the GLB file.
+        source: Path of the GLB file, with a frame every 1 / `GLB_FPS` seconds.
         target: Path of the FBX file.
-        fps: Frames per second.
+        fps: Frames per second of the motion.
         frames: Number of frames.
     """
     import bpy
@@ -36,10 +44,13 @@ def convert(source: str, target: str, fps: float, frames: int) -> None:
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
-    _set_rate(scene, fps)
+    scene.name = "Motion"  # the name of the animation in the file
+    _set_rate(scene, GLB_FPS)
     scene.unit_settings.system, scene.unit_settings.scale_length = "METRIC", 0.01
     bpy.ops.import_scene.gltf(filepath=source, disable_bone_shape=True)
+    _set_rate(scene, fps)
     scene.frame_start, scene.frame_end = 0, frames - 1
+    _go_to_bind_pose(scene)
     header = export_fbx_bin.fbx_header_elements
     # Blender would write the current time into the header, and equal motions would give different bytes.
     # Therefore the time is replaced by a constant.
@@ -62,13 +73,29 @@ def convert(source: str, target: str, fps: float, frames: int) -> None:
     )
 
 
+def _go_to_bind_pose(scene: Any) -> None:
+    """Key the bind pose before the first frame, and make this frame the current one.
+
+    The exporter writes the current pose as the pose of the nodes. Programs that ignore the bind pose of the
+    skin, such as Unity, take the T-pose from the nodes.
+    """
+    import bpy
+
+    (body,) = [item for item in bpy.data.objects if item.type == "ARMATURE"]
+    for bone in body.pose.bones:
+        bone.matrix_basis.identity()
+        for channel in ("location", "rotation_quaternion", "scale"):
+            bone.keyframe_insert(channel, frame=_BIND_FRAME)
+    scene.frame_set(_BIND_FRAME)
+
+
 def read_back(target: str, fps: float) -> dict[str, Any]:
     """Import the FBX file into an empty scene and return its joint centres.
 
     Returns:
         A mapping with these keys. ``first`` and ``last``: first and last frame of the motion. ``frames``:
         numbers of the reported frames, counted from the first frame. ``joints``: by joint name, the joint
-        centres at the reported frames, metres, Z up.
+        centres at the reported frames, metres, Z up. ``rest``: by joint name, the centre in the bind pose.
     """
     import bpy
 
@@ -77,16 +104,19 @@ def read_back(target: str, fps: float) -> dict[str, Any]:
     _set_rate(scene, fps)
     bpy.ops.import_scene.fbx(filepath=target)
     (body,) = [item for item in bpy.data.objects if item.type == "ARMATURE"]
-    first, last = (round(frame) for frame in body.animation_data.action.frame_range)
-    sampled = sorted(
-        {first + round(k * (last - first) / (_COMPARED_FRAMES - 1)) for k in range(_COMPARED_FRAMES)}
-    )
+    # The importer places keys as if the rate were a whole number of frames per second.
+    frames_each = round(fps) / fps
+    first, last = (float(frame) for frame in body.animation_data.action.frame_range)
+    count = round((last - first) / frames_each)
+    sampled = sorted({round(k * count / (_COMPARED_FRAMES - 1)) for k in range(_COMPARED_FRAMES)})
     joints: dict[str, list[list[float]]] = {bone.name: [] for bone in body.pose.bones}
     for frame in sampled:
-        scene.frame_set(frame)
+        at = first + frame * frames_each
+        scene.frame_set(int(at), subframe=at - int(at))
         for bone in body.pose.bones:
             joints[bone.name].append(list(body.matrix_world @ bone.head))
-    return {"first": first, "last": last, "frames": [frame - first for frame in sampled], "joints": joints}
+    rest = {bone.name: list(body.matrix_world @ bone.head_local) for bone in body.data.bones}
+    return {"first": first, "last": first + count, "frames": sampled, "joints": joints, "rest": rest}
 
 
 def _set_rate(scene: Any, fps: float) -> None:

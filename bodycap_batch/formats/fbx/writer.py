@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,10 @@ import numpy as np
 from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.formats.fbx.blender_process import run_script
+from bodycap_batch.formats.fbx.blender_script import GLB_FPS
 from bodycap_batch.formats.gltf import write_glb
 from bodycap_batch.model.geometry import so3_exp
-from bodycap_batch.model.skeleton import Motion
+from bodycap_batch.model.skeleton import Motion, rest_pose
 
 POSITION_TOLERANCE_M = 1e-4
 """Maximum distance, metres, between a joint that is read back from the file and the same joint in the motion.
@@ -31,8 +33,8 @@ def write_fbx(path: Path, motion: Motion) -> Path:
     """Write a motion as an FBX file.
 
     Blender converts a GLB file to FBX and reads the FBX file back. Then the joint centres are compared with
-    the motion. The file is in centimetres, Y up, facing +Z. The armature has neither scale nor rotation. In
-    the T-pose, all joints have identity rotations.
+    the motion. The file is in centimetres, Y up, facing +Z. The armature has neither scale nor rotation. The
+    bind pose is the T-pose.
 
     Args:
         path: Path of the file, which is replaced atomically.
@@ -47,7 +49,7 @@ def write_fbx(path: Path, motion: Motion) -> Path:
     """
     with tempfile.TemporaryDirectory() as folder, atomic_replacement(path) as temporary:
         figure, report = Path(folder) / "figure.glb", Path(folder) / "report.json"
-        write_glb(figure, motion, file_from_up=_BEFORE_BLENDER_IMPORT)
+        write_glb(figure, replace(motion, fps=GLB_FPS), file_from_up=_BEFORE_BLENDER_IMPORT)
         frames = len(motion.root_in_world_m)
         done = run_script(
             _CONVERT_SCRIPT, [str(figure), str(temporary), str(report), repr(motion.fps), str(frames)]
@@ -69,7 +71,7 @@ def write_fbx(path: Path, motion: Motion) -> Path:
 
 
 def _max_joint_difference_m(report: dict[str, Any], motion: Motion) -> float:
-    """Return the largest distance, metres, between a joint in Blender's report and in the motion.
+    """Return the largest distance, metres, between a joint in Blender's report and in the motion or T-pose.
 
     The distance is infinite if the joint names or the frame ranges differ.
     """
@@ -78,5 +80,7 @@ def _max_joint_difference_m(report: dict[str, Any], motion: Motion) -> float:
     if set(joints) != set(motion.skeleton.joints) or (report["first"], report["last"]) != (1, count):
         return np.inf
     found = np.array([joints[name] for name in motion.skeleton.joints]).swapaxes(0, 1)
-    expected = motion.world_from_joint()[frames][..., :3, 3]
-    return float(np.linalg.norm(found - expected, axis=-1).max())
+    rest = np.array([report["rest"][name] for name in motion.skeleton.joints])
+    moving = np.linalg.norm(found - motion.world_from_joint()[frames][..., :3, 3], axis=-1)
+    bound = np.linalg.norm(rest - rest_pose(motion.skeleton)[:, :3, 3], axis=-1)
+    return float(max(moving.max(), bound.max()))

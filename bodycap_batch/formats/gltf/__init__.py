@@ -1,4 +1,4 @@
-"""Binary glTF (GLB) files in metres, Y up, facing +Z: a skinned stick figure with its motion."""
+"""Binary glTF (GLB) files in metres, Y up, facing +Z: a skinned mannequin with its motion."""
 
 from bodycap_batch.formats.gltf.reader import read_glb
 from bodycap_batch.formats.gltf.writer import write_glb

@@ -20,12 +20,15 @@ from bodycap_batch.formats.gltf.axes import (
     UINT32,
     poses_in_file_axes,
 )
-from bodycap_batch.formats.stick_figure import make_stick_figure
+from bodycap_batch.formats.mannequin import make_mannequin
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, make_transform, quat_xyzw_from_rotation
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
-_FIGURE_COLOR_RGBA = (0.86, 0.39, 0.10, 1.0)
-"""Colour of the stick figure, RGBA, 0 to 1."""
+_MAX_SHORT_VERTICES = 65_535
+"""Number of vertices below which an index fits into 16 bits. Source: glTF 2.0 specification, 3.7.2.1."""
+
+_BODY_COLOR_RGBA = (0.62, 0.66, 0.70, 1.0)
+"""Colour of the mannequin, RGBA, 0 to 1."""
 
 
 def write_glb(
@@ -34,7 +37,7 @@ def write_glb(
     *,
     file_from_up: FloatArray | None = None,
 ) -> None:
-    """Write a motion as a skinned, animated stick figure.
+    """Write a motion as a skinned, animated mannequin.
 
     The joints are nodes below a node ``Armature``. The mesh is bound to the joints in the T-pose. Every joint
     has a LINEAR rotation channel. The root also has a translation channel. If the hips move freely relative
@@ -53,7 +56,7 @@ def write_glb(
 
     buffer = _BinaryBuffer()
     turn = make_transform(np.eye(3) if file_from_up is None else file_from_up, np.zeros(3))
-    figure = _figure_primitive(motion.skeleton, turn, buffer)
+    body = _body_primitive(motion.skeleton, turn, buffer)
     animation = _motion_animation(motion, turn, buffer)
     rest = turn @ poses_in_file_axes(rest_pose(motion.skeleton))
     binds = buffer.add(np.swapaxes(invert(rest), -1, -2).reshape(-1, 16), "MAT4")
@@ -64,7 +67,7 @@ def write_glb(
         scenes=[gl.Scene(nodes=[joints + 1])],
         nodes=[
             *_joint_nodes(motion.skeleton, rest),
-            gl.Node(name="Figure", mesh=0, skin=0),
+            gl.Node(name="Mannequin", mesh=0, skin=0),
             gl.Node(name="Armature", children=[0, joints]),
         ],
         skins=[
@@ -75,12 +78,12 @@ def write_glb(
                 inverseBindMatrices=binds,
             )
         ],
-        meshes=[gl.Mesh(name="Figure", primitives=[figure])],
+        meshes=[gl.Mesh(name="Mannequin", primitives=[body])],
         materials=[
             gl.Material(
-                name="Figure",
+                name="Mannequin",
                 pbrMetallicRoughness=gl.PbrMetallicRoughness(
-                    baseColorFactor=list(_FIGURE_COLOR_RGBA), metallicFactor=0.0, roughnessFactor=0.7
+                    baseColorFactor=list(_BODY_COLOR_RGBA), metallicFactor=0.0, roughnessFactor=0.7
                 ),
             )
         ],
@@ -163,8 +166,8 @@ def _joint_nodes(skeleton: SkeletonModel, rest: FloatArray) -> list[Any]:
     ]
 
 
-def _figure_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
-    """Return the stick figure as a primitive. Each vertex is bound to one joint with weight 1.
+def _body_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
+    """Return the mannequin as a primitive. Each vertex is bound to one joint or two.
 
     Args:
         skeleton: The skeleton.
@@ -173,20 +176,24 @@ def _figure_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _Binary
     """
     import pygltflib as gl
 
-    figure = make_stick_figure(skeleton)
+    body = make_mannequin(skeleton)
     axes = (turn[:3, :3] @ FILE_FROM_WORLD).T
-    count = len(figure.vertices_m)
-    joints = np.zeros((count, 4))
-    joints[:, 0] = figure.joints
-    weights = np.zeros((count, 4))
-    weights[:, 0] = 1.0
+    joints, weights = np.zeros((2, len(body.vertices_m), 4))
+    weights[:, :2] = body.weights
+    joints[:, :2] = np.where(body.weights > 0.0, body.joints, 0)  # the joint of a zero weight must be 0
     attributes = gl.Attributes(
-        POSITION=buffer.add(figure.vertices_m @ axes, "VEC3", target=ARRAY_BUFFER),
-        NORMAL=buffer.add(figure.normals @ axes, "VEC3", target=ARRAY_BUFFER),
+        POSITION=buffer.add(body.vertices_m @ axes, "VEC3", target=ARRAY_BUFFER),
+        NORMAL=buffer.add(body.normals @ axes, "VEC3", target=ARRAY_BUFFER),
         JOINTS_0=buffer.add(joints, "VEC4", target=ARRAY_BUFFER, component=UINT16),
         WEIGHTS_0=buffer.add(weights, "VEC4", target=ARRAY_BUFFER),
     )
-    faces = buffer.add(figure.faces.reshape(-1), "SCALAR", target=ELEMENT_ARRAY_BUFFER, component=UINT32)
+    small = len(body.vertices_m) < _MAX_SHORT_VERTICES
+    faces = buffer.add(
+        body.faces.reshape(-1),
+        "SCALAR",
+        target=ELEMENT_ARRAY_BUFFER,
+        component=UINT16 if small else UINT32,
+    )
     return gl.Primitive(attributes=attributes, indices=faces, material=0)
 
 

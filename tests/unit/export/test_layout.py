@@ -20,7 +20,7 @@ from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp
 from bodycap_batch.model.skeleton import Motion
 from tests.bodies import reaching
 
-NAMES = ("hik", "mixamo", "biped", "unreal")
+NAMES = ("hik", "mixamo", "biped", "unreal", "unity")
 ROOTS = ("hips", "ground", "in_place")
 
 

@@ -121,28 +121,28 @@ def test_the_skin_binds_every_joint_at_the_t_pose(tmp_path: Path, motion: Motion
     assert by_role["LeftToeBase"][2] > by_role["LeftFoot"][2] + 0.05
 
 
-def test_every_vertex_follows_one_joint(tmp_path: Path) -> None:
+def test_every_vertex_follows_one_joint_or_two(tmp_path: Path) -> None:
     motion = reaching(3)
     write_glb(tmp_path / "a.glb", motion)
     parsed = Parsed(tmp_path / "a.glb")
     (primitive,) = parsed.json["meshes"][0]["primitives"]
     attributes = primitive["attributes"]
     weights, joints = (parsed.array(attributes[name]) for name in ("WEIGHTS_0", "JOINTS_0"))
-    np.testing.assert_array_equal(weights, np.tile([1, 0, 0, 0], (len(weights), 1)))
-    leaves = set(range(len(motion.skeleton.joints))) - set(motion.skeleton.parents.tolist())
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-6)
+    assert (weights[:, 2:] == 0).all()
+    # the specification wants joint 0 where the weight is 0
+    assert (joints[weights == 0] == 0).all()
     # every joint has a bone: to its child, or to its end
-    assert set(joints[:, 0]) == set(range(len(motion.skeleton.joints)))
-    assert leaves < set(joints[:, 0])
+    assert set(joints[weights > 0]) == set(range(len(motion.skeleton.joints)))
     normals = parsed.array(attributes["NORMAL"])
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
     corners = parsed.array(attributes["POSITION"])
     faces = parsed.array(primitive["indices"]).reshape(-1, 3)
-    # the volume of each octahedron is positive, so its faces are counter-clockwise from outside
+    # the volume is positive, so the faces are counter-clockwise from outside
     volume = np.einsum("fi,fi->f", corners[faces[:, 0]], np.cross(corners[faces[:, 1]], corners[faces[:, 2]]))
-    per_bone = volume.reshape(-1, 8).sum(axis=1) / 6
-    assert (per_bone > 0).all()
-    # a small mesh: 24 vertices per bone
-    assert len(corners) == 24 * (len(motion.skeleton.joints) - 1 + len(leaves))
+    assert 0.05 < volume.sum() / 6 < 0.08
+    # a small mesh
+    assert len(corners) < 8000
 
 
 def test_quaternions_never_jump_to_the_opposite_sign(tmp_path: Path) -> None:

@@ -1,0 +1,80 @@
+"""`bodycap export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bodycap_batch.cli.application import app
+from bodycap_batch.cli.progress_display import make_progress_display
+from bodycap_batch.cli.report import job_from_path
+from bodycap_batch.cli.shared_options import (
+    JobArgument,
+    StoreOption,
+    ThreadsOption,
+    cores,
+    default_store,
+    results_folder,
+)
+from bodycap_batch.cli.signals import event_on_signal
+from bodycap_batch.cli.terminal import print_line
+from bodycap_batch.config.bounds import MAX_FPS, MIN_FPS
+from bodycap_batch.config.export_targets import TARGETS
+
+
+@app.command(short_help="Write the files for one program: Blender, Unreal, Unity and others.")
+def export(
+    job: JobArgument,
+    target: Annotated[
+        str, typer.Option("--for", metavar="PROGRAM", help=f"The program: {', '.join(TARGETS)}.")
+    ],
+    to: Annotated[
+        Path | None,
+        typer.Option(
+            "--to", metavar="DIR", help="Folder for the files (default: a folder PROGRAM in the results)."
+        ),
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            min=MIN_FPS, max=MAX_FPS, help="Frames per second of the files (default: the rate of the motion)."
+        ),
+    ] = None,
+    threads: ThreadsOption = None,
+    store: StoreOption = None,
+) -> None:
+    """Write the files that one program expects, from the results of a finished job.
+
+    The program decides the file formats, the joint names, the root joint, the units and the T-pose. The
+    motion is not computed again. The file HOW_TO_IMPORT.txt says what to do in the program. The job may also
+    be given by its results folder. To write the same files with every run, use `export: {target: PROGRAM}` in
+    the job.
+
+    \b
+    Examples:
+      bodycap export out/my_walk --for unreal
+      bodycap export out/my_walk --for blender --to ~/scenes/walk
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.config.export_targets import export_target
+    from bodycap_batch.config.job import Overrides, load_job
+    from bodycap_batch.pipeline import Settings, export_for
+    from bodycap_batch.store.artefacts import Store
+
+    export_target(target)
+    file, folder = job_from_path(job)
+    resolved = load_job(file, Overrides(out=folder))
+    out_dir = results_folder(resolved)
+    with event_on_signal() as stop, make_progress_display(as_json=False) as display:
+        settings = Settings(
+            store=Store(store or default_store(out_dir)),
+            threads=threads or cores(),
+            listener=display,
+            cancelled=stop.is_set,
+        )
+        written = export_for(
+            resolved, target, out_dir=out_dir, folder=to or out_dir / target, fps=fps, settings=settings
+        )
+    for path in written:
+        print_line(str(path))

@@ -1,0 +1,88 @@
+"""Which parts of the body the cameras measured, over time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import pairwise
+
+import numpy as np
+
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.model.skeleton import Motion
+
+BODY_PARTS: dict[str, tuple[str, ...]] = {
+    "head": ("Head",),
+    "chest": ("Spine1",),
+    "pelvis": ("Hips",),
+    "left arm": ("LeftArm", "LeftForeArm", "LeftHand"),
+    "right arm": ("RightArm", "RightForeArm", "RightHand"),
+    "left leg": ("LeftUpLeg", "LeftLeg", "LeftFoot"),
+    "right leg": ("RightUpLeg", "RightLeg", "RightFoot"),
+}
+"""Roles of the joints of each part of the body, by name of the part."""
+
+_MIN_SPAN_S = 0.1
+"""Seconds of a change of state that is not a span of its own. Evidence: none; nobody sees a shorter span."""
+
+
+class PartState(StrEnum):
+    """How much of a part of the body the cameras measured at one tick."""
+
+    MEASURED = "measured"
+    PARTLY = "partly measured"
+    UNMEASURED = "not measured"
+
+
+_STATES = (PartState.UNMEASURED, PartState.PARTLY, PartState.MEASURED)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PartSpan:
+    """Successive ticks in which a part of the body has one state.
+
+    Attributes:
+        part: Name of the part, a key of `BODY_PARTS`.
+        state: The state of the part.
+        first: First tick.
+        last: Last tick.
+    """
+
+    part: str
+    state: PartState
+    first: int
+    last: int
+
+
+def part_states(motion: Motion) -> dict[str, IntArray]:
+    """Return the state (T,) of each part of the body: 0 unmeasured, 1 partly measured, 2 measured.
+
+    Parts without a joint in the skeleton are left out.
+    """
+    out: dict[str, IntArray] = {}
+    for part, roles in BODY_PARTS.items():
+        joints = [j for j, role in enumerate(motion.skeleton.roles) if role in roles]
+        if joints:
+            seen = motion.observed[:, joints]
+            out[part] = np.asarray(seen.any(axis=1), dtype=np.int64) + seen.all(axis=1).astype(np.int64)
+    return out
+
+
+def part_spans(motion: Motion) -> list[PartSpan]:
+    """Return the spans of all parts of the body, in the order of the parts and of time.
+
+    A change of state for less than 0.1 s is counted to the span before it.
+    """
+    least = max(1, round(_MIN_SPAN_S * motion.fps))
+    spans: list[PartSpan] = []
+    for part, states in part_states(motion).items():
+        bounds = [0, *(np.flatnonzero(np.diff(states)) + 1).tolist(), len(states)]
+        runs = [[int(states[a]), a, b - 1] for a, b in pairwise(bounds) if b > a]
+        kept: list[list[int]] = []
+        for state, first, last in runs:
+            if kept and (last - first + 1 < least or kept[-1][0] == state):
+                kept[-1][2] = last
+            else:
+                kept.append([state, first, last])
+        spans += [PartSpan(part=part, state=_STATES[s], first=a, last=b) for s, a, b in kept]
+    return spans

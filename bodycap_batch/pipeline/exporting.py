@@ -1,0 +1,97 @@
+"""Write the files for one program from the stored results of a job."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from bodycap_batch.config.export_targets import ExportTarget, export_target
+from bodycap_batch.config.models import Job
+from bodycap_batch.config.options import ExportOptions
+from bodycap_batch.core.errors import JobError
+from bodycap_batch.formats.blender import write_blend
+from bodycap_batch.formats.fbx import find_blender
+from bodycap_batch.formats.optional_libraries import require_formats
+from bodycap_batch.pipeline.flow import Flow
+from bodycap_batch.pipeline.inputs import has_body
+from bodycap_batch.pipeline.reporting import find_stored
+from bodycap_batch.pipeline.results import publish, write_results_file
+from bodycap_batch.pipeline.run import files_of
+from bodycap_batch.pipeline.settings import Settings
+from bodycap_batch.tasks.order import STAGE_ORDER
+
+GUIDE_FILE = "HOW_TO_IMPORT.txt"
+BLEND_FILE = "scene.blend"
+_NOT_FOR_PROGRAMS = ("metrics.json",)
+
+
+def export_for(
+    job: Job, target: str, *, out_dir: Path, folder: Path, fps: float | None, settings: Settings
+) -> list[Path]:
+    """Write the files for one program. Only the export stage is computed.
+
+    Args:
+        job: A resolved job. Its options `fps` and `smoothing_hz` are kept, all others follow the program.
+        target: Name of the program.
+        out_dir: Folder of the job's results.
+        folder: Folder for the files of the program.
+        fps: Rate of the files, frames per second; None for the job's rate.
+        settings: Settings of the run: store, threads, listener, cancellation.
+
+    Returns:
+        The paths of the files. ``HOW_TO_IMPORT.txt`` is the last one.
+
+    Raises:
+        BodycapError: There is no such program, the job has no body, Blender is missing, the disk fails, or
+            the store does not hold the results.
+    """
+    program = export_target(target)
+    if not has_body(job):
+        raise JobError(
+            "the job has no body, so there is no motion to export",
+            field="skeleton",
+            hint="run the job with `skeleton: auto` or `skeleton: full_body`",
+        )
+    options = ExportOptions.model_validate(
+        {"target": target, "fps": fps or job.export.fps, "smoothing_hz": job.export.smoothing_hz}
+    )
+    require_formats(options.formats)
+    results, stopped_by = find_stored(job, out_dir, settings, last="merge")
+    if results.merged is None or results.clocks is None:
+        error = results.failure or stopped_by
+        assert error is not None
+        raise error
+    asked = job.model_copy(update={"export": options})
+    with Flow(asked, replace(settings, until=STAGE_ORDER[-1]), logs=out_dir / "logs") as flow:
+        exported = flow.export(results)
+    settings.require_owner()
+    files = {name: path for name, path in files_of(exported) if name not in _NOT_FOR_PROGRAMS}
+    publish(files, folder)
+    written = [folder / name for name in files]
+    if target == "blender" and _has_blender():
+        written.append(write_blend(folder / BLEND_FILE))
+    write_results_file(folder, GUIDE_FILE, _guide(job, program, options))
+    return [*written, folder / GUIDE_FILE]
+
+
+def _has_blender() -> bool:
+    """Return True if Blender, or a Python with the module ``bpy``, is installed."""
+    try:
+        find_blender()
+    except JobError:
+        return False
+    return True
+
+
+def _guide(job: Job, program: ExportTarget, options: ExportOptions) -> str:
+    """Return the text of the file that says what to do in the program."""
+    names: str = options.names
+    if str(job.skeleton).lower().endswith(".bvh"):
+        names += ", for the joints of the skeleton file that have a role; others keep their names"
+    facts = [
+        f"The motion of {job.name}, made for {program.title}. The file to import is {program.file}.",
+        f"Joint names: {names}. Root: {options.root}. T-pose as frame 0: {'yes' if options.tpose else 'no'}.",
+        "The bind pose is a T-pose. Unit: centimetre; GLB files: metre. Up: Y. Front: +Z.",
+    ]
+    steps = [f"{number}. {step}" for number, step in enumerate(program.steps, start=1)]
+    return "\n".join([*facts, "", *steps]) + "\n"

@@ -1,0 +1,137 @@
+"""The mannequin: a closed surface around the skeleton, which bends smoothly with its joints."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from bodycap_batch.config.options import ExportOptions
+from bodycap_batch.export.layout import apply_layout
+from bodycap_batch.formats.mannequin import Mannequin, make_mannequin
+from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics, rest_pose
+from tests.bodies import reaching
+
+
+@cache
+def person(height_m: float = 1.75) -> tuple[SkeletonModel, Mannequin]:
+    body = reaching(1).skeleton
+    scale = height_m / 1.75
+    body = replace(body, offsets_m=scale * body.offsets_m, end_offsets_m=scale * body.end_offsets_m)
+    return body, make_mannequin(body)
+
+
+def volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
+
+
+def test_the_surface_is_closed_and_its_normals_point_out() -> None:
+    _, mesh = person()
+    edges = np.concatenate([mesh.faces[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))])
+    there = {tuple(edge) for edge in edges.tolist()}
+    assert len(there) == len(edges)
+    assert all((b, a) in there for a, b in there)
+    corners = mesh.vertices_m[mesh.faces]
+    faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outward = np.einsum("ij,ij->i", faces, mesh.normals[mesh.faces].sum(axis=1)) > 0
+    assert outward.mean() > 0.995
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-6)
+
+
+def test_it_has_the_size_of_a_person() -> None:
+    _, mesh = person()
+    # An adult of 1.75 m weighs 50 to 80 kg, and a body has nearly the density of water.
+    assert 0.050 < volume_m3(mesh.vertices_m, mesh.faces) < 0.080
+    low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
+    assert 1.70 < high[2] < 1.80
+    assert low[2] >= 0.0
+    assert low[2] < 0.005
+    assert abs(high[0] + low[0]) < 0.03
+
+
+def test_it_scales_with_the_person() -> None:
+    ratio = volume_m3(person(1.40)[1].vertices_m, person(1.40)[1].faces) / volume_m3(
+        person()[1].vertices_m, person()[1].faces
+    )
+    assert ratio == pytest.approx((1.40 / 1.75) ** 3, rel=0.03)
+
+
+def test_every_joint_is_inside() -> None:
+    body, mesh = person()
+    for joint, at in enumerate(rest_pose(body)[:, :3, 3]):
+        nearest = np.argmin(np.linalg.norm(mesh.vertices_m - at, axis=1))
+        assert (at - mesh.vertices_m[nearest]) @ mesh.normals[nearest] < 0.0, body.joints[joint]
+
+
+def test_weights_are_shared_by_neighbours_and_smooth() -> None:
+    body, mesh = person()
+    np.testing.assert_allclose(mesh.weights.sum(axis=1), 1.0)
+    assert mesh.weights.min() >= 0.0
+    for first, second in np.unique(mesh.joints[mesh.weights[:, 1] > 0], axis=0).tolist():
+        assert body.parents[first] == second
+    dense = np.zeros((len(mesh.vertices_m), len(body.joints)))
+    np.add.at(dense, (np.arange(len(dense))[:, None], mesh.joints), mesh.weights)
+    edges = np.unique(np.sort(np.concatenate([mesh.faces[:, :2], mesh.faces[:, 1:]]), axis=1), axis=0)
+    steps = np.abs(dense[edges[:, 0]] - dense[edges[:, 1]]).sum(axis=1) / 2.0
+    # The narrowest transition, at a wrist, is 7 cm wide, and an edge is some 3 cm long.
+    assert np.percentile(steps, 97) < 0.55
+
+
+def test_bent_limbs_keep_their_surface() -> None:
+    """With elbows and knees bent by 90°, no edge is torn, and the volume stays."""
+    body, mesh = person()
+    local = np.tile(np.eye(3), (1, len(body.joints), 1, 1))
+    for role, turn in (
+        ("LeftForeArm", [0, 0, -1.57]),
+        ("RightForeArm", [0, 0, 1.57]),
+        ("LeftLeg", [1.57, 0, 0]),
+        ("RightArm", [0, 1.2, 0]),
+    ):
+        local[:, body.roles.index(role)] = so3_exp(turn)
+    posed = forward_kinematics(body, body.offsets_m[:1], local)[0]
+    moved = posed @ np.linalg.inv(rest_pose(body))
+    at = np.concatenate([mesh.vertices_m, np.ones((len(mesh.vertices_m), 1))], axis=1)
+    bent = np.einsum("vk,vkab,vb->va", mesh.weights, moved[mesh.joints], at)[:, :3]
+    edges = np.unique(np.sort(np.concatenate([mesh.faces[:, :2], mesh.faces[:, 1:]]), axis=1), axis=0)
+    before, after = (np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (mesh.vertices_m, bent))
+    assert after.max() < 0.13
+    assert np.percentile(after / before, 99) < 2.5
+    assert volume_m3(bent, mesh.faces) == pytest.approx(volume_m3(mesh.vertices_m, mesh.faces), rel=0.06)
+
+
+@pytest.mark.parametrize("target", ["unreal", "unity", "mixamo"])
+def test_other_layouts_have_the_same_body(target: str) -> None:
+    motion = apply_layout(reaching(1), ExportOptions.model_validate({"target": target}))
+    mesh = make_mannequin(motion.skeleton)
+    assert volume_m3(mesh.vertices_m, mesh.faces) == pytest.approx(
+        volume_m3(person()[1].vertices_m, person()[1].faces), rel=0.05
+    )
+    if motion.skeleton.roles[0] == "":
+        assert 0 not in mesh.joints[mesh.weights > 0]
+
+
+def test_a_skeleton_without_roles_has_a_body() -> None:
+    body = reaching(1).skeleton
+    bare = replace(body, roles=("",) * len(body.joints))
+    mesh = make_mannequin(bare)
+    assert np.isfinite(mesh.vertices_m).all()
+    assert len(mesh.faces) > 100
+
+
+def test_a_skeleton_without_lengths_is_refused() -> None:
+    body = reaching(1).skeleton
+    point = replace(
+        body,
+        joints=("a",),
+        parents=np.array([-1]),
+        offsets_m=np.zeros((1, 3)),
+        end_offsets_m=np.full((1, 3), np.nan),
+        roles=("",),
+        bvh_channels=((),),
+    )
+    with pytest.raises(ValueError, match="no bone has a length"):
+        make_mannequin(point)
