@@ -1,0 +1,313 @@
+"""Which feet stand at each tick: a hidden semi-Markov model of steps, solved by Viterbi's algorithm.
+
+The states are: both feet stand still, the left or the right foot stands alone, both feet stand between two
+steps, and no foot stands. Each state except the first has a distribution of its duration. The evidence of a
+tick is linear in the signals of the trunk and the hands, and is limited, so that one wrong tick does not
+decide.
+
+Source: S. Z. Yu, "Hidden semi-Markov models", Artificial Intelligence 174, 2010.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.fill.trunk_signals import TrunkSignals
+
+STAND, LEFT, RIGHT, LEFT_TO_RIGHT, RIGHT_TO_LEFT, FLIGHT_LEFT, FLIGHT_RIGHT, FLIGHT_BOTH = range(8)
+"""The states. The names of the flights say which foot left the floor last."""
+_STATES = 8
+_STANDING = np.array(
+    [[1, 1], [1, 0], [0, 1], [1, 1], [1, 1], [0, 0], [0, 0], [0, 0]],
+    dtype=bool,
+)
+"""By state, whether the left and the right foot stand."""
+
+_REPEAT_COST = 5.0
+"""Cost (nats) of two successive steps with the same foot. Evidence: none."""
+_HOP_COST = 6.0
+"""Cost (nats) of a flight that ends on the foot that it started from, or on both. Evidence: none."""
+_RUN_COST = 3.0
+"""Cost (nats) of a flight between two steps. Evidence: none."""
+_START_COST = 1.0
+"""Cost (nats) of a change between standing and stepping. Evidence: none."""
+
+_EVIDENCE_HZ = 10.0
+"""Independent samples of evidence per second. Derivation: the signals have no frequencies above 4 Hz."""
+_RISE_SCALE = 1.2
+"""Acceleration (m/s²) of the trunk that is one nat of evidence for both feet on the floor, and downward for
+one foot. Derivation: a rise and fall of ± 1.2 cm at 1.6 steps a second."""
+_SWAY_SCALE = 0.5
+"""Acceleration (m/s²) of the hips to the left that is one nat of evidence that the right foot stands alone.
+Derivation: a sway of ± 1.6 cm at 0.8 strides a second, halved because the trunk's lean disturbs it."""
+_TWIST_SCALE = 0.35
+"""Rate (rad/s) of the trunk's yaw to the left that is one nat of evidence that the right foot stands alone.
+Derivation: a yaw of ± 4° at 0.8 strides a second."""
+_ARM_SCALE = 1.0
+"""Velocity (m/s) of the left hand relative to the right hand, forward, that is one nat of evidence that the
+left foot stands alone. Derivation: an arm swing of ± 10 cm for each hand at 0.8 strides a second."""
+_MAX_EVIDENCE = 1.5
+"""Maximum evidence (nats) of one signal at one tick. Evidence: none."""
+_GRAVITY = 9.81
+"""Acceleration of free fall, m/s². Origin: standard gravity."""
+_FLIGHT_SIGMA = 3.0
+"""Standard deviation (m/s²) of the trunk's acceleration around free fall during a flight. Evidence: none."""
+_FLIGHT_MARGIN = 4.0
+"""Evidence (nats) against a flight at a tick without vertical acceleration beyond this. Evidence: none."""
+
+_STILL_SPEED = 0.12
+"""Speed (m/s) below which a person is taken to stand rather than to step. Evidence: none."""
+_STEPPING_SPEED = 0.3
+"""Speed (m/s) above which a person must step. Evidence: none."""
+_TURN_RADIUS_M = 0.25
+"""Radius (metres) by which the rate of a turn on the spot is converted to a speed. Evidence: none."""
+
+_STEP_HZ_AT_1_3 = 1.85
+"""Steps per second at 1.3 m/s. Source: D. W. Grieve, R. J. Gear, "The relationships between length of stride,
+step frequency, time of swing and speed of walking for children and adults", Ergonomics 9, 1966."""
+_STEP_HZ_EXPONENT = 0.42
+"""Exponent of speed in the number of steps per second. Source: as `_STEP_HZ_AT_1_3`."""
+_MIN_CADENCE_SPEED = 0.35
+"""Minimum speed (m/s) for which the number of steps per second is computed. Evidence: none."""
+_DOUBLE_SHARE = 0.24
+"""Share of a step during which both feet stand, at 1.3 m/s. Source: M. P. Murray, A. B. Drought, R. C. Kory,
+"Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964."""
+_DOUBLE_SHARE_PER_SPEED = -0.13
+"""Change of this share for each m/s of speed. Source: as `_STEP_HZ_AT_1_3`."""
+_SINGLE_LOG_SIGMA = 0.22
+"""Standard deviation of the logarithm of the time on one foot. Evidence: none."""
+_DOUBLE_LOG_SIGMA = 0.45
+"""Standard deviation of the logarithm of the time on both feet between two steps. Evidence: none."""
+_SINGLE_S = (0.2, 1.0)
+"""Minimum and maximum time (s) on one foot. Evidence: none."""
+_DOUBLE_S = (0.03, 0.6)
+"""Minimum and maximum time (s) on both feet between two steps. Evidence: none."""
+_FLIGHT_S = (0.08, 0.7)
+"""Minimum and maximum time (s) of a flight. Derivation: a jump of 0.6 m takes 0.7 s."""
+
+_SURE_NATS = 1.0
+"""Evidence (nats) for each step, in the mean over a step and its neighbours, that makes the steps certain.
+Evidence: none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contacts:
+    """Which feet stand.
+
+    Attributes:
+        state: (T,) number of the state.
+        standing: (T,2) True if the left or right foot stands.
+        is_sure: (T,) False if the signals do not determine the side or the time of the step at this tick.
+    """
+
+    state: IntArray
+    standing: BoolArray
+    is_sure: BoolArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Evidence:
+    """Log-likelihoods at T ticks.
+
+    Attributes:
+        by_state: (T,S) log-likelihood of each state.
+        side: (T,) evidence that the left foot rather than the right one stands alone.
+        single: (T,) evidence that one foot stands rather than both.
+    """
+
+    by_state: FloatArray
+    side: FloatArray
+    single: FloatArray
+
+
+def find_contacts(signals: TrunkSignals) -> Contacts:
+    """Return which feet stand at each tick, from the signals of the trunk and the hands."""
+    stride = max(1, round(signals.fps / 30.0))
+    ticks = len(signals.heading_rad)
+    chosen = np.arange(0, ticks, stride)
+    evidence = _evidence(signals, signals.fps / stride)
+    coarse = _Evidence(evidence.by_state[chosen], evidence.side[chosen], evidence.single[chosen])
+    period_s = _step_period_s(signals)[chosen]
+    share = _double_share(signals)[chosen]
+    found = _viterbi(coarse.by_state, period_s, share, signals.fps / stride)
+    sure = _sure_ticks(found, coarse)
+    nearest = np.minimum(np.round(np.arange(ticks) / stride).astype(np.int64), len(chosen) - 1)
+    state = found[nearest]
+    return Contacts(state=state, standing=_STANDING[state], is_sure=sure[nearest])
+
+
+def _evidence(signals: TrunkSignals, coarse_fps: float) -> _Evidence:
+    weight = _EVIDENCE_HZ / coarse_fps
+
+    def limited(values: FloatArray) -> FloatArray:
+        return np.asarray(_MAX_EVIDENCE * np.tanh(values / _MAX_EVIDENCE))
+
+    single = limited(-signals.rise_m_per_s2 / _RISE_SCALE)
+    side = (
+        limited(-signals.sway_m_per_s2 / _SWAY_SCALE)
+        + limited(-signals.twist_rad_per_s / _TWIST_SCALE)
+        + limited(signals.arm_m_per_s / _ARM_SCALE)
+    )
+    speed = np.hypot(signals.speed_m_per_s(), _TURN_RADIUS_M * signals.yaw_rate_rad_per_s)
+    spread = 0.5 * (_STEPPING_SPEED - _STILL_SPEED)
+    middle = 0.5 * (_STEPPING_SPEED + _STILL_SPEED)
+    stepping = np.clip((speed - middle) / spread, -2.0, 4.0)
+    flight = -0.5 * ((signals.rise_m_per_s2 + _GRAVITY) / _FLIGHT_SIGMA) ** 2 + _FLIGHT_MARGIN
+    out = np.zeros((len(speed), _STATES))
+    out[:, STAND] = -stepping
+    out[:, LEFT] = 0.5 * (single + side)
+    out[:, RIGHT] = 0.5 * (single - side)
+    out[:, LEFT_TO_RIGHT] = out[:, RIGHT_TO_LEFT] = -0.5 * single
+    out[:, FLIGHT_LEFT] = out[:, FLIGHT_RIGHT] = out[:, FLIGHT_BOTH] = np.clip(flight, -8.0, None)
+    return _Evidence(weight * out, weight * side, weight * single)
+
+
+def _step_period_s(signals: TrunkSignals) -> FloatArray:
+    """Return the expected time (T,) between two steps, seconds."""
+    speed = np.maximum(signals.speed_m_per_s(), _MIN_CADENCE_SPEED)
+    return np.asarray(1.0 / (_STEP_HZ_AT_1_3 * (speed / 1.3) ** _STEP_HZ_EXPONENT))
+
+
+def _double_share(signals: TrunkSignals) -> FloatArray:
+    """Return the expected share (T,) of a step during which both feet stand."""
+    share = _DOUBLE_SHARE + _DOUBLE_SHARE_PER_SPEED * (signals.speed_m_per_s() - 1.3)
+    return np.asarray(np.clip(share, 0.08, 0.4))
+
+
+def _transition_costs() -> FloatArray:
+    """Return the cost (S,S) of each change of state, from rows to columns; infinite for impossible ones."""
+    cost = np.full((_STATES, _STATES), np.inf)
+    cost[STAND, [LEFT, RIGHT]] = _START_COST
+    cost[STAND, FLIGHT_BOTH] = _HOP_COST
+    for own, other, between, flight in (
+        (LEFT, RIGHT, LEFT_TO_RIGHT, FLIGHT_LEFT),
+        (RIGHT, LEFT, RIGHT_TO_LEFT, FLIGHT_RIGHT),
+    ):
+        cost[own, between] = 0.0
+        cost[own, STAND] = _START_COST
+        cost[own, flight] = _RUN_COST
+        cost[between, other] = 0.0
+        cost[between, own] = _REPEAT_COST
+        cost[flight, other] = 0.0
+        cost[flight, [own, STAND]] = _HOP_COST
+    cost[FLIGHT_BOTH, STAND] = 0.0
+    cost[FLIGHT_BOTH, [LEFT, RIGHT]] = _HOP_COST
+    return cost
+
+
+def _viterbi(log_likelihood: FloatArray, period_s: FloatArray, share: FloatArray, fps: float) -> IntArray:
+    """Return the most likely state (T,) at each tick."""
+    ticks = len(log_likelihood)
+    cumulated = np.concatenate([np.zeros((1, _STATES)), np.cumsum(log_likelihood, axis=0)])
+    cost = _transition_costs()
+    durations = [_durations(state, fps) for state in range(_STATES)]
+    # `entered[t, s]` is the best score of a sequence whose segment of state s starts at tick t.
+    entered = np.full((ticks + 1, _STATES), -np.inf)
+    entered[0] = [0.0, *([-1.0] * (_STATES - 1))]
+    came_from = np.full((ticks + 1, _STATES), -1, dtype=np.int64)
+    left_at = np.full((ticks + 1, _STATES), -1, dtype=np.int64)
+    ended = np.full((ticks + 1, _STATES), -np.inf)
+    for tick in range(1, ticks + 1):
+        at = tick - 1
+        for state in range(_STATES):
+            if state == STAND:
+                # Standing has no preferred duration: a segment grows by one tick at a time.
+                grown = ended[tick - 1, STAND] + log_likelihood[at, STAND]
+                new = entered[tick - 1, STAND] + log_likelihood[at, STAND]
+                ended[tick, STAND] = max(grown, new)
+                left_at[tick, STAND] = left_at[tick - 1, STAND] if grown >= new else tick - 1
+                continue
+            lengths = durations[state]
+            lengths = lengths[lengths <= tick]
+            # A segment that the recording cuts off may be shorter than the minimum.
+            if tick < durations[state][0] or tick == ticks:
+                lengths = np.arange(1, min(tick, durations[state][-1]) + 1)
+            scores = (
+                entered[tick - lengths, state]
+                + cumulated[tick, state]
+                - cumulated[tick - lengths, state]
+                + _log_duration(state, lengths / fps, period_s[at], share[at], tick - lengths, tick == ticks)
+            )
+            best = int(np.argmax(scores))
+            ended[tick, state] = scores[best]
+            left_at[tick, state] = tick - lengths[best]
+        if tick < ticks:
+            options = ended[tick][:, None] - cost
+            came_from[tick] = np.argmax(options, axis=0)
+            entered[tick] = options.max(axis=0)
+    return _trace_back(ended[ticks], left_at, came_from, ticks)
+
+
+def _trace_back(last: FloatArray, left_at: IntArray, came_from: IntArray, ticks: int) -> IntArray:
+    out = np.zeros(ticks, dtype=np.int64)
+    state, end = int(np.argmax(last)), ticks
+    while end > 0:
+        start = int(left_at[end, state])
+        out[start:end] = state
+        state, end = int(came_from[start, state]), start
+    return out
+
+
+def _durations(state: int, fps: float) -> IntArray:
+    low, high = {
+        LEFT: _SINGLE_S, RIGHT: _SINGLE_S, LEFT_TO_RIGHT: _DOUBLE_S, RIGHT_TO_LEFT: _DOUBLE_S,
+    }.get(state, _FLIGHT_S)  # fmt: skip
+    return np.arange(max(1, round(low * fps)), max(2, round(high * fps)) + 1)
+
+
+def _log_duration(
+    state: int, seconds: FloatArray, period_s: float, share: float, starts: IntArray, is_last: bool
+) -> FloatArray:
+    """Return the log-likelihood (N,) of durations; 0 for segments that the recording cuts off."""
+    if state in (LEFT, RIGHT):
+        mean, sigma = (1.0 - share) * period_s, _SINGLE_LOG_SIGMA
+    elif state in (LEFT_TO_RIGHT, RIGHT_TO_LEFT):
+        mean, sigma = share * period_s, _DOUBLE_LOG_SIGMA
+    else:
+        return np.zeros(len(seconds))
+    deviation = np.log(seconds / mean) / sigma
+    cut = (starts == 0) | is_last
+    return np.asarray(np.where(cut & (deviation < 0.0), 0.0, -0.5 * deviation**2))
+
+
+def _sure_ticks(state: IntArray, evidence: _Evidence) -> BoolArray:
+    """Return whether the signals determine the state at each tick (T,).
+
+    Each step's evidence for its side and its time is averaged with that of the neighbouring steps of the same
+    walk. Standing is always certain: nothing is claimed about it but that no foot moves.
+    """
+    out = np.ones(len(state), dtype=bool)
+    bounds = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state)]
+    segments = list(zip(bounds[:-1], bounds[1:], strict=True))
+    walks: list[list[tuple[int, int]]] = [[]]
+    for start, end in segments:
+        if state[start] == STAND:
+            walks.append([])
+        else:
+            walks[-1].append((start, end))
+    for walk in walks:
+        singles = [each for each in walk if state[each[0]] in (LEFT, RIGHT)]
+        if not singles:
+            for start, end in walk:
+                out[start:end] = False
+            continue
+        support = np.array([_support(state, evidence, *each) for each in singles])
+        kernel = np.ones(3)
+        counts = np.convolve(np.ones(len(support)), kernel, mode="same")
+        mean = np.convolve(support, kernel, mode="same")[: len(support)] / counts[: len(support)]
+        if len(support) < 3:
+            mean = np.full(len(support), support.mean())
+        middles = np.array([0.5 * (start + end) for start, end in singles])
+        for start, end in walk:
+            nearest = int(np.argmin(np.abs(middles - 0.5 * (start + end))))
+            out[start:end] = bool(mean[nearest] >= _SURE_NATS)
+    return out
+
+
+def _support(state: IntArray, evidence: _Evidence, start: int, end: int) -> float:
+    """Return the smaller one of the evidence for the side and the evidence for the time of a step."""
+    sign = 1.0 if state[start] == LEFT else -1.0
+    return float(min(sign * evidence.side[start:end].sum(), evidence.single[start:end].sum() + 0.5))
