@@ -21,7 +21,7 @@ LAYERS = (
     {"telemetry"},
     {
         "keyframes", "mapping", "registration", "merging", "export", "report", "preview", "evaluate",
-        "synthetic", "check", "calibration", "clocks",
+        "synthetic", "check", "calibration", "clocks", "fill",
     },
     {"tasks"},
     {"pipeline"},
@@ -43,6 +43,13 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
         {"build", "extend", "refine"},
     ),
     "registration": ({"tracking"}, {"poses"}, {"recovery"}, {"stage"}),
+    "fill": (
+        {"leg_geometry", "trunk_signals"},
+        {"contacts", "head"},
+        {"foot_places", "floor_height", "pelvis", "foot_paths"},
+        {"leg_poses"},
+        {"stage"},
+    ),
     "merging": (
         {"cameras", "projection"},
         {"body"},

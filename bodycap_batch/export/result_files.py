@@ -10,10 +10,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.export_inputs import ExportInputs
+from bodycap_batch.export.fill_report import FILL_FILE, write_fill_report
 from bodycap_batch.export.frame_table import write_frame_table
 from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
 from bodycap_batch.export.layout import apply_layout
@@ -63,12 +66,15 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
         steps |= {"ply": lambda: write_maps(inputs), "colmap": lambda: write_colmap(inputs)}
     steps["csv"] = lambda: [write_frame_table(inputs.out_dir / "frames.csv", inputs)]
     if motion is not None:
-        steps |= _motion_writers(inputs.out_dir, motion, options, sigma_m)
+        steps |= _motion_writers(inputs, motion, options, sigma_m)
         steps["csv"] = lambda: [
             write_frame_table(inputs.out_dir / "frames.csv", inputs),
             write_joint_table(inputs.out_dir / "joints.csv", motion, sigma_m),
         ]
     steps = {name: write for name, write in steps.items() if name in options.formats}
+    merge = inputs.merge
+    if merge is not None and merge.fill is not None:
+        steps["fill"] = lambda: [write_fill_report(inputs.out_dir / FILL_FILE, merge)]
     steps["metrics"] = lambda: [_write_metrics(inputs, motion, gap)]
     written: list[Path] = []
     for number, (name, write) in enumerate(steps.items()):
@@ -80,23 +86,33 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
 
 
 def _motion_writers(
-    folder: Path, motion: Motion, options: ExportOptions, sigma_m: FloatArray | None
+    inputs: ExportInputs, motion: Motion, options: ExportOptions, sigma_m: FloatArray | None
 ) -> dict[str, Callable[[], list[Path]]]:
     """Return, for each motion format, a function that writes its file.
 
     The animation formats (BVH, GLB, FBX, USD) contain the motion in the layout that the options select. The
     measurement formats (C3D, TRC, NPZ) contain the solved motion.
     """
-    animated, centres = apply_layout(motion, options), points_from_motion(motion)
+    folder, measured = inputs.out_dir, _measured_joints(inputs, motion)
+    animated, centres = apply_layout(motion, options), points_from_motion(motion, measured)
+    markers = points_from_motion(motion, None if options.filled_markers else measured)
     return {
         "bvh": lambda: [write_verified_bvh(folder / "motion.bvh", animated, options)],
         "glb": lambda: [write_verified_glb(folder / "motion.glb", animated)],
         "fbx": lambda: [write_fbx(folder / "motion.fbx", animated)],
         "usd": lambda: [write_verified_usd(folder / "motion.usd", animated)],
         "c3d": lambda: [write_c3d(folder / "joints.c3d", centres)],
-        "trc": lambda: [write_trc(folder / "joints.trc", centres)],
+        "trc": lambda: [write_trc(folder / "joints.trc", markers)],
         "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m)],
     }
+
+
+def _measured_joints(inputs: ExportInputs, motion: Motion) -> BoolArray | None:
+    """Return (J,) which exported joints were measured; None without a body."""
+    if inputs.merge is None:
+        return None
+    kept = [inputs.merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
+    return np.asarray(inputs.merge.solved[kept])
 
 
 def _exported_sigma_m(merge: MergeResult, motion: Motion) -> FloatArray:
@@ -121,6 +137,7 @@ def _exported_motion(inputs: ExportInputs, options: ExportOptions) -> tuple[Moti
     if inputs.merge is None:
         return None, {}
     motion = with_file_zero_pose(inputs.merge.motion)
-    if options.hierarchy == "solved":
+    fill = inputs.merge.fill
+    if options.hierarchy == "solved" or (fill is not None and fill.mode == "none"):
         motion = without_unsolved_branches(motion, inputs.merge.solved)
     return motion, dict(inputs.merge.projection_gap)

@@ -20,6 +20,7 @@ from bodycap_batch.fill.trunk_signals import TrunkSignals
 STAND, LEFT, RIGHT, LEFT_TO_RIGHT, RIGHT_TO_LEFT, FLIGHT_LEFT, FLIGHT_RIGHT, FLIGHT_BOTH = range(8)
 """The states. The names of the flights say which foot left the floor last."""
 _STATES = 8
+"""Number of states. Derivation: the count of the names above."""
 _STANDING = np.array(
     [[1, 1], [1, 0], [0, 1], [1, 1], [1, 1], [0, 0], [0, 0], [0, 0]],
     dtype=bool,

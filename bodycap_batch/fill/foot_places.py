@@ -1,7 +1,6 @@
 """Where each foot stands, from the path of the hips and the times of the steps.
 
-Source: Y. Wang, M. Srinivasan, "Stepping in the direction of the fall: the next foot placement can be
-predicted from current upper body state in steady-state walking", Biology Letters 10, 2014: the place is
+Source: Y. Wang, M. Srinivasan, "Stepping in the direction of the fall", Biology Letters 10, 2014: the place is
 linear in the state of the hips at the middle of the time on this foot.
 """
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.camera_clock import CameraClock
+from bodycap_batch.model.fill_data import FillReport
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.scene import Trajectory
@@ -183,6 +184,7 @@ class MergeResult(SolvedBody):
         joint_covariance_m2: (T,J,3,3) covariance of the position of each joint relative to the first solved
             joint, in world axes. It contains the errors of measurements, mounts and scale, but not the error
             of the world axes. NaN if the joint was not solved.
+        fill: How the joints without cameras are posed in `motion`; None before the stage `fill`.
     """
 
     motion: Motion
@@ -191,6 +193,7 @@ class MergeResult(SolvedBody):
     unused_cameras: Mapping[str, str]
     report: MergeReport
     joint_covariance_m2: FloatArray | None = None
+    fill: FillReport | None = None
 
     def __post_init__(self) -> None:
         # With slots=True, the dataclass decorator makes a new class. super() without arguments would refer to

@@ -155,6 +155,7 @@ NAMES = (
     "sound",
     "clocks",
     "merge",
+    "fill",
     "export",
     "preview",
     "report",

@@ -28,6 +28,7 @@ from bodycap_batch.tasks.export import ExportTask
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, FileRef, MountInput, StatedClock
 from bodycap_batch.tasks.keyframes import KeyframesTask
 from bodycap_batch.tasks.mapping import ExtendTask, MapTask, RefineTask
+from bodycap_batch.tasks.fill import FillTask
 from bodycap_batch.tasks.merge import BoardFootage, MergeTask
 from bodycap_batch.tasks.preview import PreviewTask
 from bodycap_batch.tasks.registration import RegistrationTask
@@ -128,6 +129,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             body=body,
             footage=BoardFootage(capture=capture, keyframes=stored),
         ),
+        "fill": FillTask(mode="rest", merge=scene_map),
         "export": ExportTask(
             options=ExportOptions(formats=("bvh", "ply")),
             map=scene_map,
