@@ -74,9 +74,7 @@ def _spans(merge: MergeResult, mask: BoolArray) -> list[list[float]]:
     """Return the start and the end of each period in which a mask (T,) is True."""
     edges = np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))
     starts, ends = np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist()
-    return [
-        [_seconds(merge, start), _seconds(merge, end)] for start, end in zip(starts, ends, strict=True)
-    ]
+    return [[_seconds(merge, start), _seconds(merge, end)] for start, end in zip(starts, ends, strict=True)]
 
 
 def _seconds(merge: MergeResult, tick: int) -> float:

@@ -10,6 +10,7 @@ Source: S. Z. Yu, "Hidden semi-Markov models", Artificial Intelligence 174, 2010
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,9 @@ Derivation: a yaw of ± 4° at 0.8 strides a second."""
 _ARM_SCALE = 1.0
 """Velocity (m/s) of the left hand relative to the right hand, forward, that is one nat of evidence that the
 left foot stands alone. Derivation: an arm swing of ± 10 cm for each hand at 0.8 strides a second."""
+_LAG_S = 0.065
+"""Time (s) by which the signals of the trunk follow the contacts of the feet. Evidence:
+docs/decisions/filling.md."""
 _MAX_EVIDENCE = 1.5
 """Maximum evidence (nats) of one signal at one tick. Evidence: none."""
 _GRAVITY = 9.81
@@ -130,6 +134,8 @@ def find_contacts(signals: TrunkSignals) -> Contacts:
     ticks = len(signals.heading_rad)
     chosen = np.arange(0, ticks, stride)
     evidence = _evidence(signals, signals.fps / stride)
+    later = np.minimum(np.arange(ticks) + round(_LAG_S * signals.fps), ticks - 1)
+    evidence = _Evidence(evidence.by_state[later], evidence.side[later], evidence.single[later])
     coarse = _Evidence(evidence.by_state[chosen], evidence.side[chosen], evidence.single[chosen])
     period_s = _step_period_s(signals)[chosen]
     share = _double_share(signals)[chosen]
@@ -282,7 +288,7 @@ def _sure_ticks(state: IntArray, evidence: _Evidence) -> BoolArray:
     """
     out = np.ones(len(state), dtype=bool)
     bounds = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state)]
-    segments = list(zip(bounds[:-1], bounds[1:], strict=True))
+    segments = list(itertools.pairwise(bounds))
     walks: list[list[tuple[int, int]]] = [[]]
     for start, end in segments:
         if state[start] == STAND:

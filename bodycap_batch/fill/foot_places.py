@@ -1,7 +1,7 @@
 """Where each foot stands, from the path of the hips and the times of the steps.
 
-Source: Y. Wang, M. Srinivasan, "Stepping in the direction of the fall", Biology Letters 10, 2014: the place is
-linear in the state of the hips at the middle of the time on this foot.
+Source: Y. Wang, M. Srinivasan, "Stepping in the direction of the fall", Biology Letters 10, 2014: the place
+is linear in the state of the hips at the middle of the time on this foot.
 """
 
 from __future__ import annotations
@@ -84,9 +84,7 @@ def _stances(contacts: Contacts, side: int) -> list[_Stance]:
     ]
 
 
-def _split_long_stances(
-    stances: list[_Stance], contacts: Contacts, signals: TrunkSignals
-) -> list[_Stance]:
+def _split_long_stances(stances: list[_Stance], contacts: Contacts, signals: TrunkSignals) -> list[_Stance]:
     """Insert steps into periods of standing in which the hips move away from the feet or turn."""
     out: list[_Stance] = []
     hips, heading = signals.slow_hips_m[:, :2], signals.heading_rad

@@ -28,6 +28,11 @@ _FOOT_OVER_LEG = 0.152 / 0.491
 R. Contini, "Body segment parameters", 1966."""
 
 
+_HEEL_OVER_LEG = 0.05
+"""Distance from the ankle back to the heel, as a ratio to the length of the leg. Derivation: 4 cm for a leg
+of 0.8 m, a quarter of the length of the foot behind the ankle less the soft heel."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LegGeometry:
     """One leg of a skeleton. Vectors are in the axes of the zero pose: z up, −y forward, metres.
@@ -65,6 +70,41 @@ class LegGeometry:
     def length_m(self) -> float:
         """Length of the straight leg from hip to ankle, metres."""
         return float(np.linalg.norm(self.thigh_m) + np.linalg.norm(self.shin_m))
+
+    @property
+    def ball_ahead_m(self) -> float:
+        """Distance from the ankle forward to the ball of the flat foot, metres."""
+        forward = float(np.hypot(self.ball_m[0], self.ball_m[1]))
+        cos, sin = np.cos(self.flat_pitch_rad), np.sin(self.flat_pitch_rad)
+        return float(forward * cos + self.ball_m[2] * sin)
+
+    @property
+    def heel_behind_m(self) -> float:
+        """Distance from the ankle back to the heel, metres."""
+        return _HEEL_OVER_LEG * self.length_m
+
+    @property
+    def heel_m(self) -> FloatArray:
+        """Vector (3,) from the ankle to the bottom of the heel, in the axes of the zero pose, metres."""
+        cos, sin = np.cos(self.flat_pitch_rad), np.sin(self.flat_pitch_rad)
+        back, down = self.heel_behind_m, -self.ankle_height_m
+        return np.array([0.0, cos * back + sin * down, cos * down - sin * back])
+
+    def drop_m(self, pitch_rad: FloatArray, toe_rad: FloatArray) -> FloatArray:
+        """Return how far the lowest point of the foot is below the ankle (N,), metres.
+
+        Args:
+            pitch_rad: (N,) angle by which the toes are lowered against the flat foot.
+            toe_rad: (N,) angle by which the toes are raised against the foot.
+        """
+        whole = pitch_rad + self.flat_pitch_rad
+        toes = whole - toe_rad
+        ball_ahead = float(np.hypot(self.ball_m[0], self.ball_m[1]))
+        toe_ahead = float(np.hypot(self.toe_m[0], self.toe_m[1]))
+        ball = ball_ahead * np.sin(whole) - self.ball_m[2] * np.cos(whole)
+        tip = ball + toe_ahead * np.sin(toes) - self.toe_m[2] * np.cos(toes)
+        heel = self.ankle_height_m * np.cos(pitch_rad) - self.heel_behind_m * np.sin(pitch_rad)
+        return np.asarray(np.maximum.reduce([ball, tip, heel]))
 
 
 def leg_geometry(skeleton: SkeletonModel) -> tuple[LegGeometry, LegGeometry] | None:

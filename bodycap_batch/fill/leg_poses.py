@@ -11,7 +11,7 @@ from bodycap_batch.fill.foot_paths import FootPath
 from bodycap_batch.fill.leg_geometry import LegGeometry
 from bodycap_batch.model.geometry import so3_exp
 
-_SOFT_SHARE = 0.03
+_SOFT_SHARE = 0.012
 """Share of the length of the leg over which the knee is kept from a sudden stop when the leg is straight.
 Source: L. Kovar, J. Schreiner, M. Gleicher, "Footskate cleanup for motion capture editing", 2002, section 4.
 The value has no evidence."""
@@ -53,9 +53,7 @@ def pose_leg(leg: LegGeometry, hip_m: FloatArray, path: FootPath, pelvis: FloatA
     reached = soft_length(distance, thigh_m + shin_m)
     along = to_ankle / np.maximum(distance, 1e-9)[:, None]
     # The knee points where pelvis and foot point in the mean.
-    toes = np.column_stack(
-        [np.sin(path.heading_rad), -np.cos(path.heading_rad), np.zeros(len(distance))]
-    )
+    toes = np.column_stack([np.sin(path.heading_rad), -np.cos(path.heading_rad), np.zeros(len(distance))])
     ahead = toes - pelvis[:, :, 1]
     ahead = ahead - (ahead * along).sum(axis=1, keepdims=True) * along
     # A leg that points forward leaves no forward direction: the knee of a sitting person points up.

@@ -12,8 +12,8 @@ from bodycap_batch.model.geometry import interpolate_pose, make_transform, so3_e
 from bodycap_batch.model.skeleton import SkeletonModel
 
 _YAW_RAD = np.radians(4.5)
-"""Amplitude of the pelvis's yaw with each stride, at 1.3 m/s. Source: M. P. Murray, A. B. Drought, R. C. Kory,
-"Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964: 9 to 10° in all."""
+"""Amplitude of the pelvis's yaw with each stride, at 1.3 m/s. Source: M. P. Murray, A. B. Drought, R. C.
+Kory, "Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964: 9 to 10° in all."""
 _LIST_RAD = np.radians(3.5)
 """Amplitude of the pelvis's list with each stride, at 1.3 m/s. Source: as `_YAW_RAD`."""
 _FULL_SPEED = 1.3
@@ -28,13 +28,12 @@ def stride_phase_rad(steps: Footsteps, ticks: int) -> FloatArray:
     The phase is interpolated between steps, and constant before the first and after the last step.
     """
     events = [
-        (int(start), int(side))
-        for start, side in zip(steps.start_tick, steps.side, strict=True)
-        if start > 0
+        (int(start), int(side)) for start, side in zip(steps.start_tick, steps.side, strict=True) if start > 0
     ]
     if not events:
         return np.zeros(ticks)
-    at, phase = [], []
+    at: list[int] = []
+    phase: list[float] = []
     last = -np.inf
     for start, side in sorted(events):
         if at and start <= at[-1]:

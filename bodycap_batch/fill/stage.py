@@ -10,7 +10,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.fill.contacts import Contacts, find_contacts
 from bodycap_batch.fill.floor_height import FloorHeight, floor_below_legs
-from bodycap_batch.fill.foot_paths import foot_path
+from bodycap_batch.fill.foot_paths import foot_path, kept_steps, reachable_steps
 from bodycap_batch.fill.foot_places import place_feet
 from bodycap_batch.fill.head import head_rotations
 from bodycap_batch.fill.leg_geometry import LegGeometry, leg_geometry
@@ -23,6 +23,10 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
 _PROGRESS_STEPS = 4
 """Number of steps that the progress counts."""
+
+_MAX_MISS_M = 0.004
+"""Distance (metres) between the ankle and its wanted place beyond which a foot does not count as standing.
+Derivation: with it, the sole is within 1 cm of the floor."""
 
 
 def fill_motion(
@@ -67,7 +71,7 @@ def fill_motion(
         pelvis = pelvis_rotation(signals, contacts, steps, legs is not None)
         bend_spine(skeleton, first, pelvis, world, filled)
     if legs is not None:
-        _fill_legs(skeleton, legs, steps, motion.fps, world, filled)
+        steps = _fill_legs(skeleton, legs, steps, signals, world, filled)
     context.check_cancelled()
     context.progress(3, _PROGRESS_STEPS, "head")
     _fill_head(skeleton, solved, signals, world, filled)
@@ -127,18 +131,23 @@ def _fill_legs(
     skeleton: SkeletonModel,
     legs: tuple[LegGeometry, LegGeometry],
     steps: Footsteps,
-    fps: float,
+    signals: TrunkSignals,
     world: FloatArray,
     filled: BoolArray,
-) -> None:
-    """Write the poses of both legs."""
-    for side, leg in enumerate(legs):
+) -> Footsteps:
+    """Write the poses of both legs, and return the steps that the legs can reach."""
+    missed = np.zeros((len(world), len(legs)), dtype=bool)
+    for leg in legs:
         for joint in leg.chain:
             _rotate_with_parent(skeleton, joint, world)
-        path = foot_path(steps, side, leg, len(world), fps)
+    hips = np.stack([world[:, leg.hip, :3, 3] for leg in legs], axis=1)
+    steps = reachable_steps(steps, legs, hips, signals.fps)
+    for side, leg in enumerate(legs):
+        hip = world[:, leg.hip, :3, 3]
+        path = foot_path(steps, side, leg, hip, signals.velocity_m_per_s, signals.fps)
         if path is None:
             continue
-        pose = pose_leg(leg, world[:, leg.hip, :3, 3], path, world[:, 0, :3, :3])
+        pose = pose_leg(leg, hip, path, world[:, 0, :3, :3])
         for joint in leg.chain:
             filled[joint] = True
         world[:, leg.hip, :3, :3] = pose.thigh
@@ -151,6 +160,8 @@ def _fill_legs(
             _rotate_with_parent(skeleton, joint, world)
             if joint == leg.toe:
                 world[:, joint, :3, :3] = pose.toe
+        missed[:, side] = np.linalg.norm(world[:, leg.ankle, :3, 3] - path.ankle_m, axis=1) > _MAX_MISS_M
+    return kept_steps(steps, missed)
 
 
 def _fill_head(

@@ -16,8 +16,8 @@ _STEP_HZ = 4.0
 """Cutoff frequency (Hz) of the rise and fall with each step. Derivation: twice the frequency of ordinary
 steps, 2 Hz."""
 _STRIDE_HZ = 2.5
-"""Cutoff frequency (Hz) of sway, yaw and arm swing, which repeat with each stride. Derivation: more than twice
-the frequency of ordinary strides, 1 Hz."""
+"""Cutoff frequency (Hz) of sway, yaw and arm swing, which repeat with each stride. Derivation: more than
+twice the frequency of ordinary strides, 1 Hz."""
 _MIN_TICKS = 16
 """Minimum number of ticks of a filtered signal. Derivation: the padding of the filter."""
 

@@ -61,7 +61,7 @@ def write_usd(path: Path, motion: Motion) -> Path:
     skeleton = _define_skeleton(stage, motion.skeleton, tokens)
     unobserved = [
         name
-        for name, seen in zip(motion.skeleton.joints, motion.observed.any(axis=0), strict=True)
+        for name, seen in zip(motion.skeleton.joints, np.any(motion.observed, axis=0).tolist(), strict=True)
         if not seen
     ]
     skeleton.GetPrim().SetCustomDataByKey("unobservedJoints", Vt.StringArray(unobserved))

@@ -128,7 +128,8 @@ class Flow:
             capture=capture_ref(self._capture, self._cameras),
             keyframes=refs_by_camera(keyframes),
         )
-        later: list[Stage[Any]] = [*([MERGE, FILL] if has_body(self._job) else []), EXPORT, REPORT]
+        body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
+        later: list[Stage[Any]] = [*body, EXPORT, REPORT]
         # Mapping keeps one core busy. Meanwhile, another core loads the libraries of the last stages.
         preload = [[module for stage in later for module in stage.modules]] if self._threads > 1 else []
         artefact = self.runner.run(make_task(MAP, task, threads=self._threads), preload)

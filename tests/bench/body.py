@@ -7,6 +7,7 @@ stage gets the true poses of trunk and arms and the body's own skeleton, as from
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import time
@@ -26,14 +27,15 @@ from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.completion import complete_skeleton
 from bodycap_batch.model.fill_data import SIDES, FillMode, FillReport
-from bodycap_batch.model.geometry import interpolate_pose, make_transform, nearest_rotation
+from bodycap_batch.model.geometry import interpolate_pose, nearest_rotation
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions
 from tests.bench.rows import DATA
 
 MOUNTED = ("Spine1", "LeftHand", "RightHand")
 CMU_UNIT_CM = 5.644
-"""Centimetres per unit of length of a recording of the CMU Graphics Lab Motion Capture Database: 1/0.45 inch."""
+"""Centimetres per unit of length of a recording of the CMU Graphics Lab Motion Capture Database: 1/0.45
+inch."""
 FPS = 30.0
 TUNED_ON = ("02_01",)
 """Recordings that constants of the stage may be chosen on. All others are only reported."""
@@ -51,6 +53,7 @@ _STANCE_HEIGHT_M = 0.08
 _STANCE_S = 0.1
 _TRIM_S = 0.1
 _STEP_TOLERANCE_S = 0.1
+_MIN_SLOPE_M = 1.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,7 +108,9 @@ def capture_body(folder: Path, name: str) -> Body:
     alpha = np.clip((truth["t"] - times[before]) / np.diff(times)[before], 0.0, 1.0)
     poses = interpolate_pose(camera.world_from_cam[before], camera.world_from_cam[before + 1], alpha)
     chest = _chest_rotation(skeleton, joints, poses[:, :3, :3])
-    return _merged(name, skeleton, joints, chest, _arms(skeleton, joints, chest), 1.0 / np.diff(truth["t"])[0])
+    return _merged(
+        name, skeleton, joints, chest, _arms(skeleton, joints, chest), 1.0 / np.diff(truth["t"])[0]
+    )
 
 
 def recorded_body(path: Path, name: str, *, rate: float = 1.0, mirrored: bool = False) -> Body:
@@ -231,21 +236,28 @@ def _merged(
     return Body(name=name, joints=joints, merged=merged, solved=solved)
 
 
-def _on_floor(
-    skeleton: SkeletonModel, joints: Mapping[str, FloatArray], fps: float
-) -> dict[str, FloatArray]:
-    """Return the joints moved up or down so that the standing ankles are as high as on a floor at z = 0."""
+def _on_floor(skeleton: SkeletonModel, joints: Mapping[str, FloatArray], fps: float) -> dict[str, FloatArray]:
+    """Return the joints as on a level floor at z = 0.
+
+    The joints are moved up or down by the height of the standing ankles. The floor of a recording may slope
+    by some per cent, because its vertical is not exact: the slope along the path is removed if the path is
+    at least `_MIN_SLOPE_M` long.
+    """
     legs = leg_geometry(skeleton)
     assert legs is not None
-    heights = []
+    heights, along = [], []
+    way = joints["Hips"][:, :2] - joints["Hips"][0, :2]
+    length = float(np.linalg.norm(way[-1]))
+    travel = way @ (way[-1] / max(length, 1e-9))
     for side, leg in zip(SIDES, legs, strict=True):
         ankle = joints[side + "Foot"]
-        standing = _low_speed(ankle, fps) & (
-            ankle[:, 2] < np.percentile(ankle[:, 2], 10) + _STANCE_HEIGHT_M
-        )
+        standing = _low_speed(ankle, fps) & (ankle[:, 2] < np.percentile(ankle[:, 2], 10) + _STANCE_HEIGHT_M)
         heights += (ankle[standing, 2] - leg.ankle_height_m).tolist()
-    shift = np.array([0.0, 0.0, float(np.percentile(heights, 40))])
-    return {role: path - shift for role, path in joints.items()}
+        along += travel[standing].tolist()
+    slope = float(np.polyfit(along, heights, 1)[0]) if length > _MIN_SLOPE_M else 0.0
+    level = float(np.percentile(np.array(heights) - slope * np.array(along), 40))
+    floor = np.column_stack([np.zeros((len(travel), 2)), level + slope * travel])
+    return {role: path - floor for role, path in joints.items()}
 
 
 def _speed(path: FloatArray, fps: float) -> FloatArray:
@@ -270,7 +282,7 @@ def true_stances(ankle: FloatArray, fps: float) -> list[tuple[int, int]]:
 def swings(stances: Sequence[tuple[int, int]], fps: float, path: FloatArray) -> list[float]:
     """Return the middle (s) of each step between two periods of standing that are 10 cm or more apart."""
     out = []
-    for (first, end), (start, last) in zip(stances[:-1], stances[1:], strict=True):
+    for (first, end), (start, last) in itertools.pairwise(stances):
         apart = np.median(path[start:last], axis=0) - np.median(path[first:end], axis=0)
         if np.hypot(*apart[:2]) > 0.1:
             out.append(0.5 * (end + start) / fps)
@@ -307,7 +319,7 @@ def score(body: Body, mode: FillMode, *, floor_is_measured: bool = True) -> Scor
         claimed += len(found)
         recalled += sum(any(abs(a - b) <= _STEP_TOLERANCE_S for b in found) for a in wanted)
         moving = _true_swing_mask(stances, len(speed))
-        false += sum(not moving[min(int(round(b * fps)), len(moving) - 1)] for b in found)
+        false += sum(not moving[min(round(b * fps), len(moving) - 1)] for b in found)
     moving_ticks = _speed(body.joints["Hips"], fps) > 0.3
     unsure = float((~report.is_sure)[moving_ticks].mean()) if moving_ticks.any() else 0.0
     knees = [(_knee_deg(own, side), _knee_deg(body.joints, side)) for side in SIDES]
@@ -342,7 +354,7 @@ def own_swings(report: FillReport, side: int, fps: float) -> list[float]:
     steps = report.footsteps
     own = np.flatnonzero(steps.side == side)
     out = []
-    for first, second in zip(own[:-1], own[1:], strict=True):
+    for first, second in itertools.pairwise(own):
         middle = 0.5 * (steps.end_tick[first] + steps.start_tick[second])
         if report.is_sure[int(middle)]:
             out.append(float(middle / fps))
@@ -372,7 +384,7 @@ def _contact_speed(poses: FloatArray, motion: Motion, report: FillReport, side: 
     both[[0, -1]] = False
     ankle = poses[:, leg.ankle, :3, 3]
     ball = ankle + poses[:, leg.ankle, :3, :3] @ leg.ball_m
-    heel = ankle + poses[:, leg.ankle, :3, :3] @ np.array([0.0, -0.35 * leg.ball_m[1], -leg.ankle_height_m])
+    heel = ankle + poses[:, leg.ankle, :3, :3] @ leg.heel_m
     return np.minimum.reduce([_speed(p, motion.fps) for p in (ankle, ball, heel)])[both]
 
 
@@ -402,7 +414,7 @@ def _soles(motion: Motion, report: FillReport) -> tuple[float, tuple[float, floa
     poses = motion.world_from_joint()
     lowest, standing = [], []
     for side, leg in enumerate(legs):
-        points = [poses[:, leg.ankle, 2, 3]]
+        points = [poses[:, leg.ankle, 2, 3] + poses[:, leg.ankle, 2, :3] @ leg.heel_m]
         for joint in (leg.ankle, *leg.below):
             points.append(poses[:, joint, 2, 3])
             end = motion.skeleton.end_offsets_m[joint]

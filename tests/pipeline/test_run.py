@@ -204,7 +204,9 @@ def test_results_of_the_last_run_that_are_no_longer_made_vanish_and_other_files_
     assert (done.out / "my notes.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("stage", ["check", "keyframes", "map", "registration", "merge", "fill", "export", "report"])
+@pytest.mark.parametrize(
+    "stage", ["check", "keyframes", "map", "registration", "merge", "fill", "export", "report"]
+)
 def test_a_corrupt_artefact_is_rebuilt(done: Bench, stage: str) -> None:
     before = done.results()
     folder = sorted((done.folder / "store" / "artefacts" / stage).iterdir())[0]

@@ -11,6 +11,7 @@ import pytest
 from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.fill import fill_motion
+from bodycap_batch.fill.leg_geometry import leg_geometry
 from bodycap_batch.model.fill_data import FillMode, FillResult
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion
@@ -53,7 +54,9 @@ def walking(seconds: float = 6.0, fps: float = 30.0, *, speed: float = SPEED) ->
     return motion, solved
 
 
-def fill(motion: Motion, solved: BoolArray, mode: FillMode = "plausible", *, floor: bool = True) -> FillResult:
+def fill(
+    motion: Motion, solved: BoolArray, mode: FillMode = "plausible", *, floor: bool = True
+) -> FillResult:
     return fill_motion(
         motion, solved, floor_is_measured=floor, mode=mode, context=StageContext(work_dir=Path())
     )
@@ -86,17 +89,20 @@ def test_a_walk_has_its_steps_at_the_right_times_and_sides() -> None:
     assert np.abs(starts - number * STEP_S).max() < 0.1
     assert (number.astype(int) % 2 == steps.side[inside]).all()
     assert len(starts) == len(set(number.tolist())) == 11
-    assert report.is_sure.mean() > 0.9
+    assert report.is_sure.mean() > 0.85
 
 
 def test_feet_stand_still_on_the_floor_and_never_below_it() -> None:
     motion, solved = walking(8.0)
     result = fill(motion, solved)
     poses, skeleton = result.motion.world_from_joint(), motion.skeleton
+    legs = leg_geometry(skeleton)
+    assert legs is not None
     for number, side in enumerate(("Left", "Right")):
         ankle, toe = (skeleton.roles.index(side + part) for part in ("Foot", "ToeBase"))
         end = poses[:, toe, :3, 3] + poses[:, toe, :3, :3] @ skeleton.end_offsets_m[toe]
-        low = np.min([poses[:, ankle, 2, 3], poses[:, toe, 2, 3], end[:, 2]], axis=0)
+        heel = poses[:, ankle, :3, 3] + poses[:, ankle, :3, :3] @ legs[number].heel_m
+        low = np.min([heel[:, 2], poses[:, toe, 2, 3], end[:, 2]], axis=0)
         standing = result.report.standing[:, number]
         assert low.min() > -0.005
         assert low[standing].max() < 0.01
@@ -141,7 +147,7 @@ def test_a_moved_and_turned_person_is_filled_alike() -> None:
 
 def test_an_assumed_floor_has_a_sigma() -> None:
     motion, solved = walking(5.0)
-    lifted = replace(motion, root_in_world_m=motion.root_in_world_m + [0.0, 0.0, 0.3])
+    lifted = replace(motion, root_in_world_m=motion.root_in_world_m + np.array([0.0, 0.0, 0.3]))
     report = fill(lifted, solved, floor=False).report
     assert report.floor_source == "legs"
     assert abs(report.floor_m - 0.3) < 2.0 * report.floor_sigma_m

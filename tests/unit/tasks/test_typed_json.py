@@ -25,10 +25,10 @@ from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.check import CheckTask
 from bodycap_batch.tasks.clocks import CameraDistance, ClocksTask
 from bodycap_batch.tasks.export import ExportTask
+from bodycap_batch.tasks.fill import FillTask
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, FileRef, MountInput, StatedClock
 from bodycap_batch.tasks.keyframes import KeyframesTask
 from bodycap_batch.tasks.mapping import ExtendTask, MapTask, RefineTask
-from bodycap_batch.tasks.fill import FillTask
 from bodycap_batch.tasks.merge import BoardFootage, MergeTask
 from bodycap_batch.tasks.preview import PreviewTask
 from bodycap_batch.tasks.registration import RegistrationTask
