@@ -51,7 +51,7 @@ Derivation: a yaw of ± 4° at 0.8 strides a second."""
 _ARM_SCALE = 1.0
 """Velocity (m/s) of the left hand relative to the right hand, forward, that is one nat of evidence that the
 left foot stands alone. Derivation: an arm swing of ± 10 cm for each hand at 0.8 strides a second."""
-_LAG_S = 0.065
+_LAG_S = 0.055
 """Time (s) by which the signals of the trunk follow the contacts of the feet. Evidence:
 docs/decisions/filling.md."""
 _MAX_EVIDENCE = 1.5
@@ -127,6 +127,10 @@ class _Evidence:
     side: FloatArray
     single: FloatArray
 
+    def parts(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return all arrays."""
+        return self.by_state, self.side, self.single
+
 
 def find_contacts(signals: TrunkSignals) -> Contacts:
     """Return which feet stand at each tick, from the signals of the trunk and the hands."""
@@ -134,8 +138,7 @@ def find_contacts(signals: TrunkSignals) -> Contacts:
     ticks = len(signals.heading_rad)
     chosen = np.arange(0, ticks, stride)
     evidence = _evidence(signals, signals.fps / stride)
-    later = np.minimum(np.arange(ticks) + round(_LAG_S * signals.fps), ticks - 1)
-    evidence = _Evidence(evidence.by_state[later], evidence.side[later], evidence.single[later])
+    evidence = _Evidence(*(_advanced(part, signals.fps) for part in evidence.parts()))
     coarse = _Evidence(evidence.by_state[chosen], evidence.side[chosen], evidence.single[chosen])
     period_s = _step_period_s(signals)[chosen]
     share = _double_share(signals)[chosen]
@@ -144,6 +147,16 @@ def find_contacts(signals: TrunkSignals) -> Contacts:
     nearest = np.minimum(np.round(np.arange(ticks) / stride).astype(np.int64), len(chosen) - 1)
     state = found[nearest]
     return Contacts(state=state, standing=_STANDING[state], is_sure=sure[nearest])
+
+
+def _advanced(values: FloatArray, fps: float) -> FloatArray:
+    """Return values (T,...) as they are `_LAG_S` later, interpolated between ticks."""
+    last = len(values) - 1
+    at = np.minimum(np.arange(len(values)) + _LAG_S * fps, last)
+    before = np.minimum(at.astype(np.int64), max(last - 1, 0))
+    after = np.minimum(before + 1, last)
+    alpha = (at - before).reshape(-1, *([1] * (values.ndim - 1)))
+    return np.asarray((1.0 - alpha) * values[before] + alpha * values[after])
 
 
 def _evidence(signals: TrunkSignals, coarse_fps: float) -> _Evidence:

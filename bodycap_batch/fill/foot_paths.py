@@ -15,7 +15,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.fill.leg_geometry import LegGeometry
 from bodycap_batch.model.fill_data import Footsteps
 
-_HEEL_RISE_RAD = np.radians(58.0)
+_HEEL_RISE_RAD = np.radians(62.0)
 """Angle of the foot when it leaves the floor, at 1.3 m/s. Source: D. A. Winter, "Biomechanics and Motor
 Control of Human Movement", 4th ed., fig. 3.30 (foot angle)."""
 _MAX_HEEL_RISE_RAD = np.radians(70.0)
@@ -28,20 +28,22 @@ person. Evidence for the root: none."""
 _HEEL_RISE_SHARE = 0.42
 """Share of the time on the floor during which the heel is raised, before a step. Source: as
 `_HEEL_RISE_RAD`."""
+_HEEL_RISE_POWER = 3.0
+"""Exponent of time in the angle of the rising heel. Evidence: none."""
 _HEEL_RISE_S = (0.08, 0.35)
 """Minimum and maximum time (s) of this. Evidence: none."""
 _LANDING_S = 0.09
 """Time (s) from the touch of the heel until the foot is flat. Source: as `_HEEL_RISE_RAD`."""
-_OVERSHOOT = 1.12
+_OVERSHOOT = 1.15
 """Ratio of the largest angle of the foot, shortly after it leaves the floor, to the angle when it leaves the
 floor. Source: as `_HEEL_RISE_RAD`."""
-_CLEARANCE_M = 0.03
-"""Height (metres) of the lowest point of the foot above the floor at the middle of a swing. Source:
-R. Begg and others, "Minimum foot clearance during walking", Gait and Posture 25, 2007: 1 to 3 cm."""
-_REACH_SHARE = 0.992
+_CLEARANCE_M = 0.045
+"""Height (metres) of the lowest point of the foot above the floor at the middle of a swing. Evidence:
+docs/decisions/filling.md."""
+REACH_SHARE = 0.992
 """Maximum distance between hip and ankle of a standing foot, as a share of the length of the leg. With a
 longer distance, the heel is raised. Derivation: the limit at which the knee is kept from a sudden stop."""
-_TOLERANCE_M = 0.04
+_TOLERANCE_M = 0.06
 """Distance (metres) by which a place may be beyond the reach of the leg before it is moved. Derivation: the
 error of the height of hips and floor in the recordings of the benchmark `body`."""
 _MAX_DELAY_S = 0.1
@@ -92,7 +94,7 @@ def reachable_steps(
     for index, side in enumerate(steps.side):
         leg, start, end = legs[side], int(steps.start_tick[index]), int(steps.end_tick[index])
         last = start + min(round(_MAX_DELAY_S * fps), (end - start) // 3)
-        limit = _REACH_SHARE * leg.length_m
+        limit = REACH_SHARE * leg.length_m
         while start < last and start > 0 and np.linalg.norm(places[index] - hips_m[start, side]) > limit:
             start += 1
         starts[index] = start
@@ -134,7 +136,12 @@ def _within_reach(place: FloatArray, hip: FloatArray, limit_m: float) -> FloatAr
 
 
 def foot_path(
-    steps: Footsteps, side: int, leg: LegGeometry, hip_m: FloatArray, velocity: FloatArray, fps: float
+    steps: Footsteps,
+    side: int,
+    leg: LegGeometry,
+    hip_m: FloatArray | None,
+    velocity: FloatArray,
+    fps: float,
 ) -> FootPath | None:
     """Return the motion of one foot; None if it never stands.
 
@@ -142,11 +149,12 @@ def foot_path(
         steps: Where and when the feet stand.
         side: Index of the foot.
         leg: The leg.
-        hip_m: (T,3) hip joint in the world, metres.
+        hip_m: (T,3) hip joint in the world, metres: the heel is raised where the leg does not reach the
+            standing foot. None if the reach does not matter.
         velocity: (T,3) velocity of the hips without the sway of single steps, m/s.
         fps: Ticks per second.
     """
-    ticks = len(hip_m)
+    ticks = len(velocity)
     stances = _with_neighbours(steps, side, velocity, fps)
     if not stances:
         return None
@@ -208,20 +216,21 @@ def _stand(
     stance: _Stance,
     strength: tuple[float, float],
     leg: LegGeometry,
-    hip_m: FloatArray,
+    hip_m: FloatArray | None,
     fps: float,
 ) -> None:
     """Write the motion of the foot while it stands."""
-    own = np.arange(max(stance.start, 0), min(stance.end, len(hip_m)))
+    own = np.arange(max(stance.start, 0), min(stance.end, len(path.pitch_rad)))
     rise, strike = strength
     seconds = (own - stance.start) / fps
     length = (stance.end - stance.start) / fps
     before = min(float(np.clip(_HEEL_RISE_SHARE * length, *_HEEL_RISE_S)), 0.6 * length)
     after = min(_LANDING_S, 0.3 * length)
-    up = np.clip((seconds - (length - before)) / before, 0.0, 1.0) ** 2.5
+    up = np.clip((seconds - (length - before)) / before, 0.0, 1.0) ** _HEEL_RISE_POWER
     down = 1.0 - _smooth(seconds / after)
     pitch = rise * _HEEL_RISE_RAD * up - strike * _HEEL_STRIKE_RAD * down
-    pitch = _reaching_pitch(stance, pitch, leg, hip_m[own])
+    if hip_m is not None:
+        pitch = _reaching_pitch(stance, pitch, leg, hip_m[own])
     path.pitch_rad[own] = pitch
     path.toe_rad[own] = np.maximum(pitch, 0.0)
     path.heading_rad[own] = stance.heading
@@ -230,7 +239,7 @@ def _stand(
 
 def _reaching_pitch(stance: _Stance, pitch: FloatArray, leg: LegGeometry, hip_m: FloatArray) -> FloatArray:
     """Return the pitch (N,), increased where a foot behind the hip is reached only with a raised heel."""
-    limit = _REACH_SHARE * leg.length_m
+    limit = REACH_SHARE * leg.length_m
     low, high = pitch.copy(), np.maximum(pitch, _MAX_HEEL_RISE_RAD)
 
     def reaches(angle: FloatArray) -> FloatArray:
@@ -259,11 +268,11 @@ def standing_ankle(leg: LegGeometry, place: FloatArray, heading: float, pitch: F
     """
     forward = np.array([np.sin(heading), -np.cos(heading)])
     pivot = np.where(pitch >= 0.0, leg.ball_ahead_m, -leg.heel_behind_m)
-    height = leg.ankle_height_m
+    height = np.where(pitch >= 0.0, leg.ankle_over_ball_m, leg.ankle_height_m)
     ahead = pivot - pivot * np.cos(pitch) + height * np.sin(pitch)
     out = np.empty((len(pitch), 3))
     out[:, :2] = place[:2] + ahead[:, None] * forward
-    out[:, 2] = place[2] - height + leg.drop_m(pitch, np.maximum(pitch, 0.0))
+    out[:, 2] = place[2] - leg.ankle_height_m + leg.drop_m(pitch, np.maximum(pitch, 0.0))
     return out
 
 

@@ -16,7 +16,7 @@ from bodycap_batch.fill.leg_geometry import LegGeometry
 from bodycap_batch.fill.trunk_signals import TrunkSignals
 from bodycap_batch.model.fill_data import Footsteps
 
-_BEHIND_M = 0.02
+_BEHIND_M = 0.01
 """Distance (metres) of the ankle behind the middle of the hips at the middle of the time on this foot.
 Derivation: the pressure under a foot lies between heel and ball, in front of the ankle."""
 _WALKING_WIDTH = 0.115

@@ -79,6 +79,13 @@ class LegGeometry:
         return float(forward * cos + self.ball_m[2] * sin)
 
     @property
+    def ankle_over_ball_m(self) -> float:
+        """Height of the ankle above the ball of the flat foot, metres."""
+        forward = float(np.hypot(self.ball_m[0], self.ball_m[1]))
+        cos, sin = np.cos(self.flat_pitch_rad), np.sin(self.flat_pitch_rad)
+        return float(forward * sin - self.ball_m[2] * cos)
+
+    @property
     def heel_behind_m(self) -> float:
         """Distance from the ankle back to the heel, metres."""
         return _HEEL_OVER_LEG * self.length_m

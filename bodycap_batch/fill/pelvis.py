@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
@@ -18,6 +20,21 @@ _LIST_RAD = np.radians(3.5)
 """Amplitude of the pelvis's list with each stride, at 1.3 m/s. Source: as `_YAW_RAD`."""
 _FULL_SPEED = 1.3
 """Speed (m/s) for which these amplitudes hold. They are proportional to the speed."""
+_MAX_TURN_RAD = np.radians(6.0)
+"""Maximum angle by which the pelvis is turned about each axis so that a leg reaches its foot. Evidence:
+none."""
+_AXIS_WEIGHTS = np.array([1.0, 1.0, 0.3])
+"""Weights of tilt, list and yaw in this turn. The yaw is small, because the stride determines it. Evidence:
+none."""
+_DAMPING_M2 = 0.02**2
+"""Damping (m²) of this turn: a turn that moves a hip by less than 2 cm per radian is avoided. Evidence:
+none."""
+_DIFFERENCE_RAD = 1e-3
+"""Angle (radians) of the numeric derivative of the hip joints. Derivation: it moves them by 0.1 mm."""
+_CORRECTIONS = 3
+"""Number of linear corrections. Evidence: none."""
+_TURN_HZ = 4.0
+"""Cutoff frequency (Hz) of this turn. Derivation: twice the frequency of ordinary steps."""
 _FADE_HZ = 1.5
 """Cutoff frequency (Hz) of the start and the end of these rotations. Evidence: none."""
 
@@ -69,6 +86,47 @@ def pelvis_rotation(
         tilt = -_LIST_RAD * strength * np.sin(phase)
     turn = so3_exp(np.column_stack([zero, zero, yaw]))
     return np.asarray(turn @ so3_exp(np.column_stack([zero, tilt, zero])))
+
+
+def reaching_pelvis(
+    pelvis: FloatArray,
+    hips_of: Callable[[FloatArray], FloatArray],
+    ankles_m: FloatArray,
+    limits_m: FloatArray,
+    fps: float,
+) -> FloatArray:
+    """Return the pelvis (T,3,3), tilted and turned a little so that the legs reach the feet.
+
+    Where a foot is beyond the reach of its leg, the pelvis is turned by the smallest angles that bring the
+    hip nearer to it. The angles are limited and smooth over time.
+
+    Args:
+        pelvis: (T,3,3) orientation of the pelvis in the world.
+        hips_of: Returns the left and right hip joint (T,2,3) in the world, metres, for an orientation of the
+            pelvis.
+        ankles_m: (T,2,3) left and right ankle in the world, metres.
+        limits_m: (2,) maximum distance between hip and ankle of each leg, metres.
+        fps: Ticks per second.
+    """
+    turn = np.zeros((len(pelvis), 3))
+    for _ in range(_CORRECTIONS):
+        hips = hips_of(pelvis @ so3_exp(turn))
+        away = hips - ankles_m
+        distance = np.linalg.norm(away, axis=2)
+        excess = np.maximum(distance - limits_m, 0.0)
+        slopes = np.empty((len(pelvis), 2, 3))
+        for axis in range(3):
+            step = turn.copy()
+            step[:, axis] += _DIFFERENCE_RAD
+            moved = (hips_of(pelvis @ so3_exp(step)) - hips) / _DIFFERENCE_RAD
+            slopes[:, :, axis] = (moved * away).sum(axis=2) / distance
+        slopes *= (excess > 0.0)[:, :, None]
+        slopes *= _AXIS_WEIGHTS
+        damped = slopes @ np.swapaxes(slopes, 1, 2) + _DAMPING_M2 * np.eye(2)
+        solved = np.linalg.solve(damped, excess[:, :, None])[:, :, 0]
+        turn = turn - _AXIS_WEIGHTS * np.einsum("tij,ti->tj", slopes, solved)
+        turn = _MAX_TURN_RAD * np.tanh(turn / _MAX_TURN_RAD)
+    return np.asarray(pelvis @ so3_exp(low_pass(turn, _TURN_HZ, fps)))
 
 
 def bend_spine(

@@ -10,12 +10,12 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.fill.contacts import Contacts, find_contacts
 from bodycap_batch.fill.floor_height import FloorHeight, floor_below_legs
-from bodycap_batch.fill.foot_paths import foot_path, kept_steps, reachable_steps
+from bodycap_batch.fill.foot_paths import REACH_SHARE, foot_path, kept_steps, reachable_steps
 from bodycap_batch.fill.foot_places import place_feet
 from bodycap_batch.fill.head import head_rotations
 from bodycap_batch.fill.leg_geometry import LegGeometry, leg_geometry
 from bodycap_batch.fill.leg_poses import pose_leg
-from bodycap_batch.fill.pelvis import bend_spine, pelvis_rotation
+from bodycap_batch.fill.pelvis import bend_spine, pelvis_rotation, reaching_pelvis
 from bodycap_batch.fill.trunk_signals import TrunkSignals, trunk_signals
 from bodycap_batch.model.fill_data import SIDES, FillMode, FillReport, FillResult, Footsteps
 from bodycap_batch.model.geometry import make_transform
@@ -69,6 +69,8 @@ def fill_motion(
     context.progress(2, _PROGRESS_STEPS, "pelvis")
     if first != 0:
         pelvis = pelvis_rotation(signals, contacts, steps, legs is not None)
+        if legs is not None:
+            pelvis = _within_reach(skeleton, first, pelvis, world, (legs, steps, signals))
         bend_spine(skeleton, first, pelvis, world, filled)
     if legs is not None:
         steps = _fill_legs(skeleton, legs, steps, signals, world, filled)
@@ -125,6 +127,35 @@ def _hands(skeleton: SkeletonModel, solved: BoolArray) -> tuple[int | None, int 
         measured = [joint for joint in joints if joint is not None and solved[joint]]
         found.append(measured[0] if measured else None)
     return found[0], found[1]
+
+
+def _within_reach(
+    skeleton: SkeletonModel,
+    first: int,
+    pelvis: FloatArray,
+    world: FloatArray,
+    feet: tuple[tuple[LegGeometry, LegGeometry], Footsteps, TrunkSignals],
+) -> FloatArray:
+    """Return the pelvis (T,3,3), turned so that the legs reach the feet where a small turn suffices."""
+    legs, steps, signals = feet
+
+    def hips_of(rotation: FloatArray) -> FloatArray:
+        poses = world.copy()
+        bend_spine(skeleton, first, rotation, poses, np.zeros(len(skeleton.joints), dtype=bool))
+        for leg in legs:
+            for joint in leg.chain:
+                _rotate_with_parent(skeleton, joint, poses)
+        return np.stack([poses[:, leg.hip, :3, 3] for leg in legs], axis=1)
+
+    paths = [
+        foot_path(steps, side, leg, None, signals.velocity_m_per_s, signals.fps)
+        for side, leg in enumerate(legs)
+    ]
+    if paths[0] is None or paths[1] is None:
+        return pelvis
+    ankles = np.stack([path.ankle_m for path in paths if path is not None], axis=1)
+    limits = np.array([REACH_SHARE * leg.length_m for leg in legs])
+    return reaching_pelvis(pelvis, hips_of, ankles, limits, signals.fps)
 
 
 def _fill_legs(
