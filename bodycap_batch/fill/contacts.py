@@ -94,8 +94,21 @@ _FLIGHT_S = (0.08, 0.7)
 """Minimum and maximum time (s) of a flight. Derivation: a jump of 0.6 m takes 0.7 s."""
 
 _SURE_NATS = 1.0
-"""Evidence (nats) for each step, in the mean over a step and its neighbours, that makes the steps certain.
-Evidence: none."""
+"""Evidence (nats) for the side of a certain step. Evidence: none."""
+_MAX_CONTRADICTION_NATS = 1.5
+"""Maximum evidence (nats) of one signal against the side of a certain step. Evidence: none."""
+_ORDINARY_DURATION = (0.5, 1.15)
+"""Minimum and maximum time on one foot of a certain step, as a ratio to the expected time between two steps.
+Derivation: the expected time on one foot is 0.6 to 0.9 of it; three sigmas of `_SINGLE_LOG_SIGMA` are
+wider."""
+_MAX_SINKING_M = 0.06
+"""Maximum distance (metres) of the hips from their median height during a certain step. Derivation: twice the
+rise and fall of an ordinary walk. A person who bows or crouches is outside."""
+_MAX_TWIST = 1.2
+"""Maximum rate (rad/s) of the trunk's yaw with the stride during a certain step. Derivation: three times
+`_TWIST_SCALE`, rounded up."""
+_MIN_STEPS = 2
+"""Minimum number of successive steps that can be certain. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,17 +132,35 @@ class _Evidence:
 
     Attributes:
         by_state: (T,S) log-likelihood of each state.
-        side: (T,) evidence that the left foot rather than the right one stands alone.
-        single: (T,) evidence that one foot stands rather than both.
+        by_signal: (T,3) evidence of sway, yaw and arms that the left foot rather than the right one stands
+            alone.
     """
 
     by_state: FloatArray
-    side: FloatArray
-    single: FloatArray
+    by_signal: FloatArray
 
-    def parts(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def parts(self) -> tuple[FloatArray, FloatArray]:
         """Return all arrays."""
-        return self.by_state, self.side, self.single
+        return self.by_state, self.by_signal
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _StepSignals:
+    """What decides whether a step is ordinary, at T ticks.
+
+    Attributes:
+        fps: Ticks per second.
+        period_s: (T,) expected time between two steps, seconds.
+        speed: (T,) speed of the slow path, m/s.
+        sinking: (T,) height of the slow path over its median, metres.
+        twist: (T,) rate of the trunk's yaw without the slow heading, rad/s.
+    """
+
+    fps: float
+    period_s: FloatArray
+    speed: FloatArray
+    sinking: FloatArray
+    twist: FloatArray
 
 
 def find_contacts(signals: TrunkSignals) -> Contacts:
@@ -139,11 +170,19 @@ def find_contacts(signals: TrunkSignals) -> Contacts:
     chosen = np.arange(0, ticks, stride)
     evidence = _evidence(signals, signals.fps / stride)
     evidence = _Evidence(*(_advanced(part, signals.fps) for part in evidence.parts()))
-    coarse = _Evidence(evidence.by_state[chosen], evidence.side[chosen], evidence.single[chosen])
+    coarse = _Evidence(evidence.by_state[chosen], evidence.by_signal[chosen])
     period_s = _step_period_s(signals)[chosen]
     share = _double_share(signals)[chosen]
     found = _viterbi(coarse.by_state, period_s, share, signals.fps / stride)
-    sure = _sure_ticks(found, coarse)
+    height = signals.slow_hips_m[:, 2]
+    ordinary = _StepSignals(
+        fps=signals.fps / stride,
+        period_s=period_s,
+        speed=signals.speed_m_per_s()[chosen],
+        sinking=(height - np.median(height))[chosen],
+        twist=signals.twist_rad_per_s[chosen],
+    )
+    sure = _sure_ticks(found, coarse, ordinary)
     nearest = np.minimum(np.round(np.arange(ticks) / stride).astype(np.int64), len(chosen) - 1)
     state = found[nearest]
     return Contacts(state=state, standing=_STANDING[state], is_sure=sure[nearest])
@@ -166,11 +205,14 @@ def _evidence(signals: TrunkSignals, coarse_fps: float) -> _Evidence:
         return np.asarray(_MAX_EVIDENCE * np.tanh(values / _MAX_EVIDENCE))
 
     single = limited(-signals.rise_m_per_s2 / _RISE_SCALE)
-    side = (
-        limited(-signals.sway_m_per_s2 / _SWAY_SCALE)
-        + limited(-signals.twist_rad_per_s / _TWIST_SCALE)
-        + limited(signals.arm_m_per_s / _ARM_SCALE)
+    by_signal = np.column_stack(
+        [
+            limited(-signals.sway_m_per_s2 / _SWAY_SCALE),
+            limited(-signals.twist_rad_per_s / _TWIST_SCALE),
+            limited(signals.arm_m_per_s / _ARM_SCALE),
+        ]
     )
+    side = by_signal.sum(axis=1)
     speed = np.hypot(signals.speed_m_per_s(), _TURN_RADIUS_M * signals.yaw_rate_rad_per_s)
     spread = 0.5 * (_STEPPING_SPEED - _STILL_SPEED)
     middle = 0.5 * (_STEPPING_SPEED + _STILL_SPEED)
@@ -182,7 +224,7 @@ def _evidence(signals: TrunkSignals, coarse_fps: float) -> _Evidence:
     out[:, RIGHT] = 0.5 * (single - side)
     out[:, LEFT_TO_RIGHT] = out[:, RIGHT_TO_LEFT] = -0.5 * single
     out[:, FLIGHT_LEFT] = out[:, FLIGHT_RIGHT] = out[:, FLIGHT_BOTH] = np.clip(flight, -8.0, None)
-    return _Evidence(weight * out, weight * side, weight * single)
+    return _Evidence(weight * out, weight * by_signal)
 
 
 def _step_period_s(signals: TrunkSignals) -> FloatArray:
@@ -293,41 +335,51 @@ def _log_duration(
     return np.asarray(np.where(cut & (deviation < 0.0), 0.0, -0.5 * deviation**2))
 
 
-def _sure_ticks(state: IntArray, evidence: _Evidence) -> BoolArray:
+def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> BoolArray:
     """Return whether the signals determine the state at each tick (T,).
 
-    Each step's evidence for its side and its time is averaged with that of the neighbouring steps of the same
-    walk. Standing is always certain: nothing is claimed about it but that no foot moves.
+    A step is certain if it is one of two or more successive steps of an ordinary walk: evidence for its side
+    without a strong contradiction, an ordinary duration, a trunk that neither sinks nor twists much. Standing
+    is always certain: nothing is claimed about it but that no foot moves.
     """
     out = np.ones(len(state), dtype=bool)
     bounds = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state)]
-    segments = list(itertools.pairwise(bounds))
     walks: list[list[tuple[int, int]]] = [[]]
-    for start, end in segments:
+    for start, end in itertools.pairwise(bounds):
         if state[start] == STAND:
             walks.append([])
         else:
             walks[-1].append((start, end))
     for walk in walks:
         singles = [each for each in walk if state[each[0]] in (LEFT, RIGHT)]
-        if not singles:
-            for start, end in walk:
-                out[start:end] = False
-            continue
-        support = np.array([_support(state, evidence, *each) for each in singles])
-        kernel = np.ones(3)
-        counts = np.convolve(np.ones(len(support)), kernel, mode="same")
-        mean = np.convolve(support, kernel, mode="same")[: len(support)] / counts[: len(support)]
-        if len(support) < 3:
-            mean = np.full(len(support), support.mean())
+        kept = [each for each in singles if each[0] > 0 and each[1] < len(state)]
+        sure = np.zeros(len(singles), dtype=bool)
+        if len(kept) >= _MIN_STEPS:
+            ordinary = np.array([_is_ordinary(state, evidence, signals, *each) for each in kept])
+            padded = np.concatenate([[False], ordinary, [False]])
+            ordinary &= padded[:-2] | padded[2:]
+            first = singles.index(kept[0])
+            sure[first : first + len(kept)] = ordinary
+            # A step that the recording cuts off is as certain as its neighbour.
+            sure[:first], sure[first + len(kept) :] = ordinary[0], ordinary[-1]
         middles = np.array([0.5 * (start + end) for start, end in singles])
         for start, end in walk:
-            nearest = int(np.argmin(np.abs(middles - 0.5 * (start + end))))
-            out[start:end] = bool(mean[nearest] >= _SURE_NATS)
+            nearest = np.argsort(np.abs(middles - 0.5 * (start + end)))[: 1 if (start, end) in singles else 2]
+            out[start:end] = bool(len(nearest)) and bool(sure[nearest].all())
     return out
 
 
-def _support(state: IntArray, evidence: _Evidence, start: int, end: int) -> float:
-    """Return the smaller one of the evidence for the side and the evidence for the time of a step."""
+def _is_ordinary(state: IntArray, evidence: _Evidence, signals: _StepSignals, start: int, end: int) -> bool:
+    """Return whether one time on one foot is that of an ordinary walk."""
     sign = 1.0 if state[start] == LEFT else -1.0
-    return float(min(sign * evidence.side[start:end].sum(), evidence.single[start:end].sum() + 0.5))
+    own = slice(start, end)
+    by_signal = sign * evidence.by_signal[own].sum(axis=0)
+    duration = (end - start) / signals.fps / (signals.period_s[own].mean())
+    return bool(
+        by_signal.sum() >= _SURE_NATS
+        and by_signal.min() >= -_MAX_CONTRADICTION_NATS
+        and _ORDINARY_DURATION[0] <= duration <= _ORDINARY_DURATION[1]
+        and signals.speed[own].mean() >= _STEPPING_SPEED
+        and np.abs(signals.sinking[own]).max() <= _MAX_SINKING_M
+        and np.abs(signals.twist[own]).max() <= _MAX_TWIST
+    )
