@@ -119,11 +119,15 @@ class Contacts:
         state: (T,) number of the state.
         standing: (T,2) True if the left or right foot stands.
         is_sure: (T,) False if the signals do not determine the side or the time of the step at this tick.
+        single_s: (T,) expected time on one foot at the speed of this tick, seconds.
+        double_s: (T,) expected time on both feet between two steps, seconds.
     """
 
     state: IntArray
     standing: BoolArray
     is_sure: BoolArray
+    single_s: FloatArray
+    double_s: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +189,14 @@ def find_contacts(signals: TrunkSignals) -> Contacts:
     sure = _sure_ticks(found, coarse, ordinary)
     nearest = np.minimum(np.round(np.arange(ticks) / stride).astype(np.int64), len(chosen) - 1)
     state = found[nearest]
-    return Contacts(state=state, standing=_STANDING[state], is_sure=sure[nearest])
+    period, double = _step_period_s(signals), _double_share(signals)
+    return Contacts(
+        state=state,
+        standing=_STANDING[state],
+        is_sure=sure[nearest],
+        single_s=(1.0 - double) * period,
+        double_s=double * period,
+    )
 
 
 def _advanced(values: FloatArray, fps: float) -> FloatArray:

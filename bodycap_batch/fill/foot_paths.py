@@ -37,12 +37,15 @@ _LANDING_S = 0.09
 _OVERSHOOT = 1.15
 """Ratio of the largest angle of the foot, shortly after it leaves the floor, to the angle when it leaves the
 floor. Source: as `_HEEL_RISE_RAD`."""
-_CLEARANCE_M = 0.045
-"""Height (metres) of the lowest point of the foot above the floor at the middle of a swing. Evidence:
+_CLEARANCE_M = 0.075
+"""Height (metres) of the lowest point of the foot above the floor where it is highest in a swing. Evidence:
 docs/decisions/filling.md."""
 REACH_SHARE = 0.992
 """Maximum distance between hip and ankle of a standing foot, as a share of the length of the leg. With a
 longer distance, the heel is raised. Derivation: the limit at which the knee is kept from a sudden stop."""
+_CLEARANCE_POWER = 0.65
+"""Exponent of time in the height of a swing: below 1, the foot is highest before the middle. Evidence:
+docs/decisions/filling.md."""
 _TOLERANCE_M = 0.06
 """Distance (metres) by which a place may be beyond the reach of the leg before it is moved. Derivation: the
 error of the height of hips and floor in the recordings of the benchmark `body`."""
@@ -313,7 +316,7 @@ def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg
     turn = (second.heading - first.heading + np.pi) % (2.0 * np.pi) - np.pi
     path.heading_rad[inside] = first.heading + _smooth(phase) * turn
     path.ankle_m[inside, :2] = travel
-    path.ankle_m[inside, 2] = floor + leg.drop_m(pitch, toe) + _CLEARANCE_M * np.sin(np.pi * phase) ** 2
+    path.ankle_m[inside, 2] = floor + leg.drop_m(pitch, toe) + _CLEARANCE_M * np.sin(np.pi * phase**_CLEARANCE_POWER) ** 2
 
 
 def _quintic(phase: FloatArray, start: FloatArray, speed: FloatArray, end: FloatArray) -> FloatArray:

@@ -122,7 +122,6 @@ def _place(
     ticks = np.arange(stance.start, stance.end)
     state = contacts.state[stance.start : stance.end]
     outward = 1.0 if stance.side == 0 else -1.0
-    alone: BoolArray = state == (LEFT if stance.side == 0 else RIGHT)
     still: BoolArray = state == STAND
     if still.any():
         chosen = ticks[still]
@@ -131,11 +130,36 @@ def _place(
         base = np.median(signals.hips_m[chosen, :2], axis=0)
         heading = float(np.median(signals.heading_rad[chosen]))
     else:
-        chosen = ticks[alone] if alone.any() else ticks
         width = _WALKING_WIDTH
-        base = signals.slow_hips_m[chosen, :2].mean(axis=0)
-        heading = float(signals.heading_rad[chosen].mean())
+        base, heading = _passing_hips(stance, contacts, signals)
     left = np.array([np.cos(heading), np.sin(heading)])
     forward = np.array([np.sin(heading), -np.cos(heading)])
     place = base + 0.5 * outward * width * leg.length_m * left - _BEHIND_M * forward
     return place, heading + outward * _TOE_OUT_RAD
+
+
+def _passing_hips(stance: _Stance, contacts: Contacts, signals: TrunkSignals) -> tuple[FloatArray, float]:
+    """Return the mean position (2,) and heading of the hips while the foot stands alone.
+
+    Where the recording cuts off this time, it is completed by its expected duration, and the path of the hips
+    is continued with its velocity.
+    """
+    ticks = np.arange(stance.start, stance.end)
+    state = contacts.state[stance.start : stance.end]
+    alone = ticks[state == (LEFT if stance.side == 0 else RIGHT)]
+    last = len(contacts.state) - 1
+    first, end = (int(alone[0]), int(alone[-1]) + 1) if len(alone) else (stance.start, stance.end)
+    expected = contacts.single_s[[stance.start, stance.end - 1]] * signals.fps
+    both = contacts.double_s[[stance.start, stance.end - 1]] * signals.fps
+    if stance.start == 0 and (first == 0 or not len(alone)):
+        # Without a time alone, the recording starts while both feet stand, at the end of this stance.
+        stop = end if len(alone) else stance.end - both[0]
+        first, end = min(first, round(stop - expected[0])), round(stop)
+    elif stance.end > last and (end > last or not len(alone)):
+        begin = first if len(alone) else stance.start + both[1]
+        first, end = round(begin), max(end, round(begin + expected[1]))
+    at = np.arange(first, max(end, first + 1))
+    inside = np.clip(at, 0, last)
+    beyond = ((at - inside) / signals.fps)[:, None]
+    path = signals.slow_hips_m[inside, :2] + beyond * signals.velocity_m_per_s[inside, :2]
+    return np.asarray(path.mean(axis=0)), float(signals.heading_rad[inside].mean())
