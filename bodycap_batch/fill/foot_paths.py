@@ -316,7 +316,9 @@ def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg
     turn = (second.heading - first.heading + np.pi) % (2.0 * np.pi) - np.pi
     path.heading_rad[inside] = first.heading + _smooth(phase) * turn
     path.ankle_m[inside, :2] = travel
-    path.ankle_m[inside, 2] = floor + leg.drop_m(pitch, toe) + _CLEARANCE_M * np.sin(np.pi * phase**_CLEARANCE_POWER) ** 2
+    path.ankle_m[inside, 2] = (
+        floor + leg.drop_m(pitch, toe) + _CLEARANCE_M * np.sin(np.pi * phase**_CLEARANCE_POWER) ** 2
+    )
 
 
 def _quintic(phase: FloatArray, start: FloatArray, speed: FloatArray, end: FloatArray) -> FloatArray:

@@ -26,6 +26,9 @@ walking", Proceedings of the Royal Society B 268, 2001: 0.12 times the leg lengt
 _STANDING_WIDTH = 0.2
 """Distance between the ankles while standing, as a ratio to the length of the leg. Source: W. E. McIlroy,
 B. E. Maki, "Preferred placement of the feet during quiet stance", Clinical Biomechanics 12, 1997: 17 cm."""
+_MIN_WIDTH = 0.06
+"""Minimum distance sideways between a foot that is put down and the standing foot, as a ratio to the length of
+the leg. Derivation: half of `_WALKING_WIDTH`."""
 _TOE_OUT_RAD = np.radians(7.0)
 """Angle by which the toes point outward. Source: as `_STANDING_WIDTH`, halved: 14° between the feet."""
 _MAX_SHIFT_M = 0.22
@@ -63,6 +66,7 @@ def place_feet(
     stances.sort(key=lambda each: (each.start, each.side))
     places = [_place(each, contacts, signals, legs[each.side]) for each in stances]
     out = np.array([place for place, _ in places]).reshape(-1, 2)
+    _keep_apart(out, stances, signals, 0.5 * (legs[0].length_m + legs[1].length_m))
     heights = np.array([floor_m + legs[each.side].ankle_height_m for each in stances])
     return Footsteps(
         side=np.array([each.side for each in stances], dtype=np.int64),
@@ -72,6 +76,22 @@ def place_feet(
         heading_rad=np.array([heading for _, heading in places]).reshape(-1),
         is_sure=np.array([each.is_sure for each in stances], dtype=bool),
     )
+
+
+def _keep_apart(places: FloatArray, stances: list[_Stance], signals: TrunkSignals, leg_m: float) -> None:
+    """Move places (N,2) outward where a foot would be put down across the other foot, which still stands.
+
+    Source: A. L. Hof, "The 'extrapolated center of mass' concept suggests a simple control of balance in
+    walking", Human Movement Science 27, 2008: a foot is placed outward of the path by a margin.
+    """
+    left = signals.left()
+    for index, stance in enumerate(stances):
+        outward = (1.0 if stance.side == 0 else -1.0) * left[stance.start]
+        for other in range(index):
+            if stances[other].side == stance.side or stances[other].end <= stance.start:
+                continue
+            width = float((places[index] - places[other]) @ outward)
+            places[index] += max(_MIN_WIDTH * leg_m - width, 0.0) * outward
 
 
 def _stances(contacts: Contacts, side: int) -> list[_Stance]:
