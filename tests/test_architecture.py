@@ -22,7 +22,7 @@ LAYERS = (
     {"inertial"},
     {
         "keyframes", "mapping", "registration", "merging", "export", "report", "preview", "evaluate",
-        "synthetic", "check", "calibration", "clocks",
+        "synthetic", "check", "calibration", "clocks", "fill",
     },
     {"tasks"},
     {"pipeline"},
@@ -44,6 +44,13 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
         {"build", "extend", "refine"},
     ),
     "registration": ({"tracking"}, {"poses"}, {"recovery"}, {"stage"}),
+    "fill": (
+        {"leg_geometry", "trunk_signals"},
+        {"contacts", "head"},
+        {"foot_places", "floor_height", "pelvis", "foot_paths"},
+        {"leg_poses"},
+        {"stage"},
+    ),
     "merging": (
         {"cameras", "projection"},
         {"body"},

@@ -31,6 +31,7 @@ from bodycap_batch.config.options import (
 )
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
+from bodycap_batch.model.fill_data import FillMode
 from bodycap_batch.model.geometry import make_transform, rotation_from_quat_xyzw
 
 NO_SKELETON = "none"
@@ -310,4 +311,9 @@ class Job(_Block):
     registration: RegistrationOptions = RegistrationOptions()
     telemetry: TelemetryOptions = TelemetryOptions()
     merge: MergeOptions = MergeOptions()
+    fill: FillMode = Field(
+        "plausible",
+        description="pose of joints that no camera measures; plausible: legs, pelvis and head move as fits "
+        "the measured joints, rest: they are held in the rest pose, none: they are left out of the files",
+    )
     export: ExportOptions = ExportOptions()

@@ -293,6 +293,9 @@ class ExportOptions(Options):
     hierarchy: Literal["full", "solved"] = Field(
         "full", description="joints in the files: the whole body, or only the solved joints"
     )
+    filled_markers: bool = Field(
+        False, description="write joints that no camera measured to the TRC file; default: blank"
+    )
     preview: bool = Field(
         True, description="write preview.mp4, which shows the body in the room next to the videos"
     )

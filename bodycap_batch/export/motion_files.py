@@ -70,10 +70,18 @@ def write_verified_usd(path: Path, motion: Motion) -> Path:
     return path
 
 
-def points_from_motion(motion: Motion) -> LabelledPoints:
-    """Return the joint centres of a motion as labelled points in the world."""
+def points_from_motion(motion: Motion, measured: BoolArray | None = None) -> LabelledPoints:
+    """Return the joint centres of a motion as labelled points in the world.
+
+    Args:
+        motion: The motion, with J joints.
+        measured: (J,) False for a joint that no camera measured; None if all joints are measured.
+    """
     return LabelledPoints(
-        names=motion.skeleton.joints, fps=motion.fps, x_in_world_m=motion.world_from_joint()[..., :3, 3]
+        names=motion.skeleton.joints,
+        fps=motion.fps,
+        x_in_world_m=motion.world_from_joint()[..., :3, 3],
+        measured=measured,
     )
 
 

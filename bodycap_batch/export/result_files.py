@@ -10,11 +10,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.blender_scene import collect_blender_scene
 from bodycap_batch.export.export_inputs import ExportInputs
+from bodycap_batch.export.fill_report import FILL_FILE, write_fill_report
 from bodycap_batch.export.frame_table import write_frame_table
 from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
 from bodycap_batch.export.layout import apply_layout
@@ -72,6 +75,9 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
             write_joint_table(inputs.out_dir / "joints.csv", motion, sigma_m),
         ]
     steps = {name: write for name, write in steps.items() if name in options.formats}
+    merge = inputs.merge
+    if merge is not None and merge.fill is not None:
+        steps["fill"] = lambda: [write_fill_report(inputs.out_dir / FILL_FILE, merge)]
     steps["metrics"] = lambda: [_write_metrics(inputs, motion, gap)]
     written: list[Path] = []
     for number, (name, write) in enumerate(steps.items()):
@@ -91,19 +97,28 @@ def _motion_writers(
     GLB and FBX files, the joints' axes follow the bones, because programs draw bones along these axes. The
     measurement formats (C3D, TRC, NPZ) contain the solved motion.
     """
-    folder = inputs.out_dir
-    animated, centres = apply_layout(motion, options), points_from_motion(motion)
+    folder, measured = inputs.out_dir, _measured_joints(inputs, motion)
+    animated, centres = apply_layout(motion, options), points_from_motion(motion, measured)
     aligned = align_axes_with_bones(animated)
+    markers = points_from_motion(motion, None if options.filled_markers else measured)
     return {
         "bvh": lambda: [write_verified_bvh(folder / "motion.bvh", animated, options)],
         "glb": lambda: [write_verified_glb(folder / "motion.glb", aligned)],
         "fbx": lambda: [write_fbx(folder / "motion.fbx", aligned)],
         "usd": lambda: [write_verified_usd(folder / "motion.usd", animated)],
         "c3d": lambda: [write_c3d(folder / "joints.c3d", centres)],
-        "trc": lambda: [write_trc(folder / "joints.trc", centres)],
+        "trc": lambda: [write_trc(folder / "joints.trc", markers)],
         "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m)],
         "blender": lambda: write_blender_files(folder, collect_blender_scene(inputs, aligned, options)),
     }
+
+
+def _measured_joints(inputs: ExportInputs, motion: Motion) -> BoolArray | None:
+    """Return (J,) which exported joints were measured; None without a body."""
+    if inputs.merge is None:
+        return None
+    kept = [inputs.merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
+    return np.asarray(inputs.merge.solved[kept])
 
 
 def _exported_sigma_m(merge: MergeResult, motion: Motion) -> FloatArray:
@@ -128,6 +143,7 @@ def _exported_motion(inputs: ExportInputs, options: ExportOptions) -> tuple[Moti
     if inputs.merge is None:
         return None, {}
     motion = with_file_zero_pose(inputs.merge.motion)
-    if options.hierarchy == "solved":
+    fill = inputs.merge.fill
+    if options.hierarchy == "solved" or (fill is not None and fill.mode == "none"):
         motion = without_unsolved_branches(motion, inputs.merge.solved)
     return motion, dict(inputs.merge.projection_gap)

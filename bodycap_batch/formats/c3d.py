@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray, set_array
+from bodycap_batch.core.arrays import BoolArray, FloatArray, set_array
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.atomic_files import atomic_replacement
 
 _MM_PER_M = 1000.0
 """Millimetres per metre."""
+
+_INVALID = -1.0
+"""Residual of an invalid point. Source: the C3D file format user guide, "Invalid 3D point data"."""
 
 _TOLERANCE_M = 1e-5
 """Maximum difference, metres, between a coordinate that is read back and the coordinate that was written.
@@ -26,19 +29,30 @@ class LabelledPoints:
     Attributes:
         names: (N,) labels of the points.
         fps: Frames per second.
-        x_in_world_m: (T,N,3) positions of the points in the world, metres.
+        x_in_world_m: (T,N,3) positions of the points in the world, metres; NaN for a point that was read
+            from a file and is not measured.
+        measured: (N,) False for a point that no camera measured; None if all points are measured.
     """
 
     names: tuple[str, ...]
     fps: float
     x_in_world_m: FloatArray
+    measured: BoolArray | None = None
 
     def __post_init__(self) -> None:
-        set_array(self, "x_in_world_m", (None, len(self.names), 3))
+        set_array(self, "x_in_world_m", (None, len(self.names), 3), finite=False)
+        if self.measured is not None:
+            set_array(self, "measured", (len(self.names),), np.bool_)
+
+    def measured_points(self) -> BoolArray:
+        """Return (N,) whether each point is measured."""
+        return np.ones(len(self.names), dtype=bool) if self.measured is None else self.measured
 
 
 def write_c3d(path: Path, points: LabelledPoints) -> Path:
-    """Write points as a C3D file, read the file back and compare the points.
+    """Write points as a C3D file, read the file back and compare the measured points.
+
+    The residual of a point that is not measured is −1, which marks the point as invalid.
 
     Returns:
         The path of the file.
@@ -59,17 +73,26 @@ def write_c3d(path: Path, points: LabelledPoints) -> Path:
     data = np.ones((4, count, frames))
     data[:3] = _MM_PER_M * points.x_in_world_m.transpose(2, 1, 0)
     content["data"]["points"] = data
+    residuals = np.zeros((1, count, frames))
+    residuals[0, ~points.measured_points()] = _INVALID
+    content["data"]["meta_points"]["residuals"] = residuals
     with atomic_replacement(path) as temporary:
         content.write(str(temporary))
         back = read_c3d(temporary)
         same = back.names == points.names and back.x_in_world_m.shape == points.x_in_world_m.shape
-        if not same or np.abs(back.x_in_world_m - points.x_in_world_m).max(initial=0.0) > _TOLERANCE_M:
+        kept = points.measured_points()
+        if not same or _differ(back.x_in_world_m[:, kept], points.x_in_world_m[:, kept]):
             raise StoreError(
                 "the points in the written file differ from the solved points",
                 path=path,
                 hint="check that the disk is not full",
             )
     return path
+
+
+def _differ(back: FloatArray, written: FloatArray) -> bool:
+    """Return True if points that were read back differ by more than the tolerance, or are not numbers."""
+    return not bool((np.abs(back - written) <= _TOLERANCE_M).all())
 
 
 def read_c3d(path: Path) -> LabelledPoints:
@@ -89,8 +112,10 @@ def read_c3d(path: Path) -> LabelledPoints:
             hint="run the job again to write a new file",
         ) from error
     group = content["parameters"]["POINT"]
+    residuals = content["data"]["meta_points"]["residuals"][0]
     return LabelledPoints(
         names=tuple(group["LABELS"]["value"]),
         fps=float(group["RATE"]["value"][0]),
         x_in_world_m=content["data"]["points"][:3].transpose(2, 1, 0) / _MM_PER_M,
+        measured=~(residuals < 0.0).all(axis=1),
     )

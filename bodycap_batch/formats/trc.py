@@ -23,7 +23,7 @@ def write_trc(path: Path, points: LabelledPoints) -> Path:
     """Write points as a TRC file.
 
     The times in the file start at 0. The coordinates have three decimals, so the resolution is one
-    micrometre.
+    micrometre. The coordinates of a point that is not measured are blank.
 
     Returns:
         The path of the file.
@@ -43,7 +43,8 @@ def write_trc(path: Path, points: LabelledPoints) -> Path:
         "",
     ]
     table = (_MM_PER_M * points.x_in_world_m @ _FILE_FROM_WORLD.T + 0.0).reshape(frames, 3 * count)
-    row = "%d\t%.6f" + "\t%.3f" * (3 * count)
+    cell = np.where(np.repeat(points.measured_points(), 3), "\t%.3f", "\t%.0s")
+    row = "%d\t%.6f" + "".join(cell.tolist())
     seconds = np.arange(frames) / points.fps
     lines += [row % (index + 1, seconds[index], *values) for index, values in enumerate(table)]
     write_text(path, "\n".join(lines) + "\n")

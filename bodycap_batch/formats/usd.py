@@ -29,7 +29,8 @@ def write_usd(path: Path, motion: Motion) -> Path:
 
     The time codes are frame numbers, counted from 0. The mesh is bound to the joints in the T-pose. The joint
     tokens are paths of names that USD allows (``mixamorig_Hips``). The original names are stored in
-    ``jointNames``. Translations, rotations and scales are written for every frame.
+    ``jointNames``. The custom data ``unobservedJoints`` of the skeleton lists the joints that no camera
+    measured. Translations, rotations and scales are written for every frame.
 
     Args:
         path: Path of the file (``.usd``, ``.usda``, ``.usdc``), which is replaced atomically.
@@ -58,6 +59,12 @@ def write_usd(path: Path, motion: Motion) -> Path:
     body.CreateExtentAttr(Vt.Vec3fArray([Gf.Vec3f(*corner.tolist()) for corner in corners]))
     tokens = _joint_tokens(motion.skeleton)
     skeleton = _define_skeleton(stage, motion.skeleton, tokens)
+    unobserved = [
+        name
+        for name, seen in zip(motion.skeleton.joints, np.any(motion.observed, axis=0).tolist(), strict=True)
+        if not seen
+    ]
+    skeleton.GetPrim().SetCustomDataByKey("unobservedJoints", Vt.StringArray(unobserved))
     animation = _define_animation(stage, motion, tokens)
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
     _define_mesh(stage, make_mannequin(motion.skeleton), skeleton)

@@ -11,6 +11,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.camera_clock import CameraClock
+from bodycap_batch.model.fill_data import FillReport
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.inertial_camera import ForceWindows
 from bodycap_batch.model.merge_report import MergeReport
@@ -189,6 +190,7 @@ class MergeResult(SolvedBody):
             of the world axes. NaN if the joint was not solved.
         flexion_sigma_rad: (T,J) sigma of the flexion of each elbow and knee that was solved, radians; NaN for
             other joints. It contains the same errors.
+        fill: How the joints without cameras are posed in `motion`; None before the stage `fill`.
     """
 
     motion: Motion
@@ -198,6 +200,7 @@ class MergeResult(SolvedBody):
     report: MergeReport
     joint_covariance_m2: FloatArray | None = None
     flexion_sigma_rad: FloatArray | None = None
+    fill: FillReport | None = None
 
     def __post_init__(self) -> None:
         # With slots=True, the dataclass decorator makes a new class. super() without arguments would refer to

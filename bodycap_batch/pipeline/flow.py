@@ -39,6 +39,7 @@ from bodycap_batch.tasks.clocks import (
     ClocksTask,
 )
 from bodycap_batch.tasks.export import EXPORT, ExportTask
+from bodycap_batch.tasks.fill import FILL, FillTask
 from bodycap_batch.tasks.inertial import INERTIAL, InertialTask
 from bodycap_batch.tasks.inputs import BodyInput, stated_clocks
 from bodycap_batch.tasks.keyframes import KEYFRAMES, KeyframesTask
@@ -131,7 +132,8 @@ class Flow:
             capture=capture_ref(self._capture, self._cameras),
             keyframes=refs_by_camera(keyframes),
         )
-        later: list[Stage[Any]] = [*([MERGE] if has_body(self._job) else []), EXPORT, REPORT]
+        body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
+        later: list[Stage[Any]] = [*body, EXPORT, REPORT]
         # Mapping keeps one core busy. Meanwhile, another core loads the libraries of the last stages.
         preload = [[module for stage in later for module in stage.modules]] if self._threads > 1 else []
         artefact = self.runner.run(make_task(MAP, task, threads=self._threads), preload)
@@ -298,11 +300,16 @@ class Flow:
         self.runner.report_notes(artefact, "merge")
         return artefact
 
+    def fill(self, merged: Artefact) -> Artefact:
+        """Pose the joints that no camera measured, and return the artefact of the motion of all joints."""
+        task = FillTask(mode=self._job.fill, merge=artefact_ref(merged))
+        return self.runner.run(make_task(FILL, task, threads=self._threads))
+
     def export(self, results: StageResults) -> Artefact:
         """Write the result files and return their artefact.
 
         Args:
-            results: The results of the stages up to the merge.
+            results: The results of the stages before the export.
         """
         assert results.map is not None
         assert results.clocks is not None
@@ -313,7 +320,7 @@ class Flow:
             registrations=refs_by_camera(results.registrations),
             clocks=artefact_ref(results.clocks),
             keyframes=refs_by_camera(results.keyframes),
-            merge=optional_ref(results.merged),
+            merge=optional_ref(results.filled),
             failure=None if results.failure is None else results.failure.message,
             segments=tuple(tuple(camera.name for camera in cameras) for cameras in segments),
         )

@@ -121,6 +121,10 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     results.stage = "merge"
     results.merged, results.failure = _merge(job, flow, results)
     yield "merge"
+    if results.merged is not None:
+        results.stage = "fill"
+        results.filled = flow.fill(results.merged)
+    yield "fill"
     results.preview = flow.start_preview(results) if job.export.preview else None
     results.exported = flow.export(results)
     yield "export"

@@ -34,6 +34,7 @@ class StageResults:
         registrations: The registration of each camera, by camera name.
         clocks: The artefact of the clocks of all cameras.
         merged: The artefact of the skeleton's motion.
+        filled: The artefact of the motion with the joints that no camera measured.
         exported: The artefact of the result files.
         reported: The artefact of the report.
         preview: The future of the artefact with the results' video. The video is rendered while later stages
@@ -48,6 +49,7 @@ class StageResults:
     registrations: Mapping[str, Artefact] = field(default_factory=dict)
     clocks: Artefact | None = None
     merged: Artefact | None = None
+    filled: Artefact | None = None
     exported: Artefact | None = None
     reported: Artefact | None = None
     preview: Future[Artefact] | None = None
@@ -75,7 +77,7 @@ def report_task(
         digests: Cache of the digests of files.
         failure: The error that stopped the job, from `StageResults.describe_failure`; None without an error.
     """
-    with_body = has_body(job) and results.merged is not None
+    with_body = has_body(job) and results.filled is not None
     return ReportTask(
         name=job.name,
         failure=failure,
@@ -85,7 +87,7 @@ def report_task(
         registrations=refs_by_camera(results.registrations),
         clocks=optional_ref(results.clocks),
         map=optional_ref(results.map),
-        merge=optional_ref(results.merged),
+        merge=optional_ref(results.filled),
         export=optional_ref(results.exported),
         body=body_input(job, digests) if with_body else None,
     )
@@ -109,6 +111,6 @@ def preview_task(
         registrations=refs_by_camera(results.registrations),
         map=artefact_ref(scene_map),
         clocks=artefact_ref(clocks),
-        merge=optional_ref(results.merged),
+        merge=optional_ref(results.filled),
         failure=None if results.failure is None else results.failure.message,
     )

@@ -107,7 +107,7 @@ def _depends_on(stage: str, first: str, job: Job) -> bool:
     """Return True if the job includes the stage `stage`, and this stage uses the results of `first`."""
     if stage == "preview":
         return job.export.preview and first not in ("export", "report")
-    return stage != "merge" or has_body(job)
+    return stage not in ("merge", "fill") or has_body(job)
 
 
 def _position(stage: str) -> int:

@@ -31,6 +31,7 @@ _PROGRESS_AT_FAILURE = {
     "map": "the keyframes were selected; the map could not be built",
     "registration": "the map was built; the registration of frames was not finished",
     "merge": "the map and the camera paths are finished; the body could not be solved",
+    "fill": "the body was solved; the joints without cameras could not be posed",
 }
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-StageName = Literal["check", "keyframes", "map", "registration", "merge", "export", "report", "preview"]
+StageName = Literal[
+    "check", "keyframes", "map", "registration", "merge", "fill", "export", "report", "preview"
+]
 STAGE_ORDER: tuple[StageName, ...] = get_args(StageName)
 """The stages of a job in the order in which they run."""
 _BESIDE_KEYFRAMES = frozenset({"sound"})

@@ -8,6 +8,7 @@ from typing import Any
 from bodycap_batch.tasks.check import CHECK
 from bodycap_batch.tasks.clocks import CLOCKS
 from bodycap_batch.tasks.export import EXPORT
+from bodycap_batch.tasks.fill import FILL
 from bodycap_batch.tasks.inertial import INERTIAL
 from bodycap_batch.tasks.keyframes import KEYFRAMES
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE
@@ -37,6 +38,7 @@ STAGES: Mapping[str, Stage[Any]] = {
         CLOCKS,
         INERTIAL,
         MERGE,
+        FILL,
         EXPORT,
         REPORT,
         PREVIEW,

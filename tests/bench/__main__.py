@@ -17,6 +17,7 @@ from typing import Any
 
 from tests.bench import (
     batch,
+    body,
     clocks,
     field,
     joining,
@@ -43,6 +44,7 @@ _WITH_OPTIONS = {
     "long": long.main,
     "clocks": clocks.main,
     "sync": sync.main,
+    "body": body.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
 

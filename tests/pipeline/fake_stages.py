@@ -171,6 +171,7 @@ NAMES = (
     "clocks",
     "inertial",
     "merge",
+    "fill",
     "export",
     "preview",
     "report",

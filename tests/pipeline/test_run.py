@@ -111,7 +111,7 @@ def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done_once: Path) -> Be
 
 PER_CAMERA = ["keyframes left_palm", "keyframes torso"]
 REGISTERED = ["registration left_palm", "registration torso"]
-LAST = ["export", "merge", "preview", "report"]
+LAST = ["export", "fill", "merge", "preview", "report"]
 """The stages after the clocks."""
 CLOCKED = ["clocks", *LAST]
 ALL = sorted(["check", "sound", *PER_CAMERA, "map", *REGISTERED, *CLOCKED])
@@ -160,10 +160,11 @@ def test_moving_the_capture_executes_nothing(done: Bench) -> None:
     [
         ({"export": {"units": "m"}}, ["export", "report"]),
         ({"export": {"preview": False}}, []),
-        ({"merge": {"max_gap_s": 0.5}}, ["export", "merge", "preview", "report"]),
-        ({"height_m": 1.8}, ["check", "export", "merge", "preview", "report"]),
-        ({"activity": "walk"}, ["check", "export", "merge", "preview", "report"]),
-        ({"torso": {"sigma_deg": 3.0}}, ["check", "export", "merge", "preview", "report"]),
+        ({"merge": {"max_gap_s": 0.5}}, ["export", "fill", "merge", "preview", "report"]),
+        ({"fill": "rest"}, ["export", "fill", "preview", "report"]),
+        ({"height_m": 1.8}, ["check", "export", "fill", "merge", "preview", "report"]),
+        ({"activity": "walk"}, ["check", "export", "fill", "merge", "preview", "report"]),
+        ({"torso": {"sigma_deg": 3.0}}, ["check", "export", "fill", "merge", "preview", "report"]),
         ({"registration": {"min_inliers": 20}}, [*CLOCKED, *REGISTERED]),
         ({"registration": {"rounds": 1}}, []),
         ({"map": {"features": 1024}}, ["map", *CLOCKED, *REGISTERED]),
@@ -203,7 +204,9 @@ def test_results_of_the_last_run_that_are_no_longer_made_vanish_and_other_files_
     assert (done.out / "my notes.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("stage", ["check", "keyframes", "map", "registration", "merge", "export", "report"])
+@pytest.mark.parametrize(
+    "stage", ["check", "keyframes", "map", "registration", "merge", "fill", "export", "report"]
+)
 def test_a_corrupt_artefact_is_rebuilt(done: Bench, stage: str) -> None:
     before = done.results()
     folder = sorted((done.folder / "store" / "artefacts" / stage).iterdir())[0]
@@ -225,7 +228,7 @@ def test_a_result_edited_by_the_user_is_restored(done: Bench) -> None:
 
 
 def test_no_skeleton_no_merge(bench: Bench) -> None:
-    assert bench.executed(skeleton="none") == sorted(set(ALL) - {"merge"})
+    assert bench.executed(skeleton="none") == sorted(set(ALL) - {"merge", "fill"})
 
 
 def test_a_failed_stage_leaves_earlier_results_intact(done: Bench) -> None:

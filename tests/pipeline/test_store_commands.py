@@ -124,7 +124,7 @@ def test_why_a_finished_job_would_do_nothing(done: Bench) -> None:
             {"map": {"features": 1024}},
             "map",
             "features: 512 -> 1024",
-            ["registration", "merge", "export", "report", "preview"],
+            ["registration", "merge", "fill", "export", "report", "preview"],
         ),
         ({"height_m": 1.8}, "check", "the body: height_m changed", None),
         ({"export": {"units": "m"}}, "export", 'units: "cm" -> "m"', ["report"]),
@@ -192,7 +192,8 @@ def test_why_of_a_job_never_run_and_of_a_damaged_artefact(bench: Bench) -> None:
     assert steps(bench) == {
         "check": "this stage has not been computed before",
         **dict.fromkeys(
-            ("keyframes", "map", "registration", "merge", "export", "preview", "report"), "after check"
+            ("keyframes", "map", "registration", "merge", "fill", "export", "preview", "report"),
+            "after check",
         ),
     }
     bench.run()
@@ -233,6 +234,7 @@ def test_garbage_is_what_no_finished_job_used(alone: Bench) -> None:
         "registration",
         "clocks",
         "merge",
+        "fill",
         "export",
         "preview",
         "report",

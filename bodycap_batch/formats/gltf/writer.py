@@ -66,7 +66,7 @@ def write_glb(
         scene=0,
         scenes=[gl.Scene(nodes=[joints + 1])],
         nodes=[
-            *_joint_nodes(motion.skeleton, rest),
+            *_joint_nodes(motion, rest),
             gl.Node(name="Mannequin", mesh=0, skin=0),
             gl.Node(name="Armature", children=[0, joints]),
         ],
@@ -142,15 +142,16 @@ class _BinaryBuffer:
         return len(self.accessors) - 1
 
 
-def _joint_nodes(skeleton: SkeletonModel, rest: FloatArray) -> list[Any]:
+def _joint_nodes(motion: Motion, rest: FloatArray) -> list[Any]:
     """Return one node per joint, in the T-pose.
 
     Args:
-        skeleton: The skeleton, with J joints.
+        motion: The motion, with J joints.
         rest: (J,4,4) joint poses in the T-pose, in file axes.
     """
     import pygltflib as gl
 
+    skeleton = motion.skeleton
     parents = skeleton.parents.tolist()
     local = np.array([rest[j] if p < 0 else invert(rest[p]) @ rest[j] for j, p in enumerate(parents)])
     quats = quat_xyzw_from_rotation(local[:, :3, :3])
@@ -160,10 +161,19 @@ def _joint_nodes(skeleton: SkeletonModel, rest: FloatArray) -> list[Any]:
             translation=local[joint, :3, 3].tolist(),
             rotation=quats[joint].tolist(),
             children=[child for child, parent in enumerate(parents) if parent == joint],
-            extras={"role": skeleton.roles[joint]} if skeleton.roles[joint] else {},
+            extras=_properties(motion, joint),
         )
         for joint, name in enumerate(skeleton.joints)
     ]
+
+
+def _properties(motion: Motion, joint: int) -> dict[str, Any]:
+    """Return the custom properties of a joint: its role, and ``observed: false`` if it was never measured."""
+    role = motion.skeleton.roles[joint]
+    out: dict[str, Any] = {"role": role} if role else {}
+    if not motion.observed[:, joint].any():
+        out["observed"] = False
+    return out
 
 
 def _body_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _BinaryBuffer) -> Any:

@@ -26,6 +26,7 @@ from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.check import CheckTask
 from bodycap_batch.tasks.clocks import CameraDistance, ClocksTask
 from bodycap_batch.tasks.export import ExportTask
+from bodycap_batch.tasks.fill import FillTask
 from bodycap_batch.tasks.inertial import InertialTask
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, FileRef, MountInput, StatedClock
 from bodycap_batch.tasks.keyframes import KeyframesTask
@@ -136,6 +137,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             body=body,
             footage=BoardFootage(capture=capture, keyframes=stored),
         ),
+        "fill": FillTask(mode="rest", merge=scene_map),
         "export": ExportTask(
             options=ExportOptions(formats=("bvh", "ply")),
             map=scene_map,

@@ -1,0 +1,396 @@
+"""Which feet stand at each tick: a hidden semi-Markov model of steps, solved by Viterbi's algorithm.
+
+The states are: both feet stand still, the left or the right foot stands alone, both feet stand between two
+steps, and no foot stands. Each state except the first has a distribution of its duration. The evidence of a
+tick is linear in the signals of the trunk and the hands, and is limited, so that one wrong tick does not
+decide.
+
+Source: S. Z. Yu, "Hidden semi-Markov models", Artificial Intelligence 174, 2010.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.fill.trunk_signals import TrunkSignals
+
+STAND, LEFT, RIGHT, LEFT_TO_RIGHT, RIGHT_TO_LEFT, FLIGHT_LEFT, FLIGHT_RIGHT, FLIGHT_BOTH = range(8)
+"""The states. The names of the flights say which foot left the floor last."""
+_STATES = 8
+"""Number of states. Derivation: the count of the names above."""
+_STANDING = np.array(
+    [[1, 1], [1, 0], [0, 1], [1, 1], [1, 1], [0, 0], [0, 0], [0, 0]],
+    dtype=bool,
+)
+"""By state, whether the left and the right foot stand."""
+
+_REPEAT_COST = 5.0
+"""Cost (nats) of two successive steps with the same foot. Evidence: none."""
+_HOP_COST = 6.0
+"""Cost (nats) of a flight that ends on the foot that it started from, or on both. Evidence: none."""
+_RUN_COST = 3.0
+"""Cost (nats) of a flight between two steps. Evidence: none."""
+_START_COST = 1.0
+"""Cost (nats) of a change between standing and stepping. Evidence: none."""
+
+_EVIDENCE_HZ = 10.0
+"""Independent samples of evidence per second. Derivation: the signals have no frequencies above 4 Hz."""
+_RISE_SCALE = 1.2
+"""Acceleration (m/s²) of the trunk that is one nat of evidence for both feet on the floor, and downward for
+one foot. Derivation: a rise and fall of ± 1.2 cm at 1.6 steps a second."""
+_SWAY_SCALE = 0.5
+"""Acceleration (m/s²) of the hips to the left that is one nat of evidence that the right foot stands alone.
+Derivation: a sway of ± 1.6 cm at 0.8 strides a second, halved because the trunk's lean disturbs it."""
+_TWIST_SCALE = 0.35
+"""Rate (rad/s) of the trunk's yaw to the left that is one nat of evidence that the right foot stands alone.
+Derivation: a yaw of ± 4° at 0.8 strides a second."""
+_ARM_SCALE = 1.0
+"""Velocity (m/s) of the left hand relative to the right hand, forward, that is one nat of evidence that the
+left foot stands alone. Derivation: an arm swing of ± 10 cm for each hand at 0.8 strides a second."""
+_LAG_S = 0.055
+"""Time (s) by which the signals of the trunk follow the contacts of the feet. Evidence:
+docs/decisions/filling.md."""
+_MAX_EVIDENCE = 1.5
+"""Maximum evidence (nats) of one signal at one tick. Evidence: none."""
+_GRAVITY = 9.81
+"""Acceleration of free fall, m/s². Origin: standard gravity."""
+_FLIGHT_SIGMA = 3.0
+"""Standard deviation (m/s²) of the trunk's acceleration around free fall during a flight. Evidence: none."""
+_FLIGHT_MARGIN = 4.0
+"""Evidence (nats) against a flight at a tick without vertical acceleration beyond this. Evidence: none."""
+
+_STILL_SPEED = 0.12
+"""Speed (m/s) below which a person is taken to stand rather than to step. Evidence: none."""
+_STEPPING_SPEED = 0.3
+"""Speed (m/s) above which a person must step. Evidence: none."""
+_TURN_RADIUS_M = 0.25
+"""Radius (metres) by which the rate of a turn on the spot is converted to a speed. Evidence: none."""
+
+_STEP_HZ_AT_1_3 = 1.85
+"""Steps per second at 1.3 m/s. Source: D. W. Grieve, R. J. Gear, "The relationships between length of stride,
+step frequency, time of swing and speed of walking for children and adults", Ergonomics 9, 1966."""
+_STEP_HZ_EXPONENT = 0.42
+"""Exponent of speed in the number of steps per second. Source: as `_STEP_HZ_AT_1_3`."""
+_MIN_CADENCE_SPEED = 0.35
+"""Minimum speed (m/s) for which the number of steps per second is computed. Evidence: none."""
+_DOUBLE_SHARE = 0.24
+"""Share of a step during which both feet stand, at 1.3 m/s. Source: M. P. Murray, A. B. Drought, R. C. Kory,
+"Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964."""
+_DOUBLE_SHARE_PER_SPEED = -0.13
+"""Change of this share for each m/s of speed. Source: as `_STEP_HZ_AT_1_3`."""
+_SINGLE_LOG_SIGMA = 0.22
+"""Standard deviation of the logarithm of the time on one foot. Evidence: none."""
+_DOUBLE_LOG_SIGMA = 0.45
+"""Standard deviation of the logarithm of the time on both feet between two steps. Evidence: none."""
+_SINGLE_S = (0.2, 1.0)
+"""Minimum and maximum time (s) on one foot. Evidence: none."""
+_DOUBLE_S = (0.03, 0.6)
+"""Minimum and maximum time (s) on both feet between two steps. Evidence: none."""
+_FLIGHT_S = (0.08, 0.7)
+"""Minimum and maximum time (s) of a flight. Derivation: a jump of 0.6 m takes 0.7 s."""
+
+_SURE_NATS = 1.0
+"""Evidence (nats) for the side of a certain step. Evidence: none."""
+_MAX_CONTRADICTION_NATS = 1.5
+"""Maximum evidence (nats) of one signal against the side of a certain step. Evidence: none."""
+_ORDINARY_DURATION = (0.5, 1.15)
+"""Minimum and maximum time on one foot of a certain step, as a ratio to the expected time between two steps.
+Derivation: the expected time on one foot is 0.6 to 0.9 of it; three sigmas of `_SINGLE_LOG_SIGMA` are
+wider."""
+_MAX_SINKING_M = 0.06
+"""Maximum distance (metres) of the hips from their median height during a certain step. Derivation: twice the
+rise and fall of an ordinary walk. A person who bows or crouches is outside."""
+_MAX_TWIST = 1.2
+"""Maximum rate (rad/s) of the trunk's yaw with the stride during a certain step. Derivation: three times
+`_TWIST_SCALE`, rounded up."""
+_MIN_STEPS = 2
+"""Minimum number of successive steps that can be certain. Evidence: none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contacts:
+    """Which feet stand.
+
+    Attributes:
+        state: (T,) number of the state.
+        standing: (T,2) True if the left or right foot stands.
+        is_sure: (T,) False if the signals do not determine the side or the time of the step at this tick.
+        single_s: (T,) expected time on one foot at the speed of this tick, seconds.
+        double_s: (T,) expected time on both feet between two steps, seconds.
+    """
+
+    state: IntArray
+    standing: BoolArray
+    is_sure: BoolArray
+    single_s: FloatArray
+    double_s: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Evidence:
+    """Log-likelihoods at T ticks.
+
+    Attributes:
+        by_state: (T,S) log-likelihood of each state.
+        by_signal: (T,3) evidence of sway, yaw and arms that the left foot rather than the right one stands
+            alone.
+    """
+
+    by_state: FloatArray
+    by_signal: FloatArray
+
+    def parts(self) -> tuple[FloatArray, FloatArray]:
+        """Return all arrays."""
+        return self.by_state, self.by_signal
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _StepSignals:
+    """What decides whether a step is ordinary, at T ticks.
+
+    Attributes:
+        fps: Ticks per second.
+        period_s: (T,) expected time between two steps, seconds.
+        speed: (T,) speed of the slow path, m/s.
+        sinking: (T,) height of the slow path over its median, metres.
+        twist: (T,) rate of the trunk's yaw without the slow heading, rad/s.
+    """
+
+    fps: float
+    period_s: FloatArray
+    speed: FloatArray
+    sinking: FloatArray
+    twist: FloatArray
+
+
+def find_contacts(signals: TrunkSignals) -> Contacts:
+    """Return which feet stand at each tick, from the signals of the trunk and the hands."""
+    stride = max(1, round(signals.fps / 30.0))
+    ticks = len(signals.heading_rad)
+    chosen = np.arange(0, ticks, stride)
+    evidence = _evidence(signals, signals.fps / stride)
+    evidence = _Evidence(*(_advanced(part, signals.fps) for part in evidence.parts()))
+    coarse = _Evidence(evidence.by_state[chosen], evidence.by_signal[chosen])
+    period_s = _step_period_s(signals)[chosen]
+    share = _double_share(signals)[chosen]
+    found = _viterbi(coarse.by_state, period_s, share, signals.fps / stride)
+    height = signals.slow_hips_m[:, 2]
+    ordinary = _StepSignals(
+        fps=signals.fps / stride,
+        period_s=period_s,
+        speed=signals.speed_m_per_s()[chosen],
+        sinking=(height - np.median(height))[chosen],
+        twist=signals.twist_rad_per_s[chosen],
+    )
+    sure = _sure_ticks(found, coarse, ordinary)
+    nearest = np.minimum(np.round(np.arange(ticks) / stride).astype(np.int64), len(chosen) - 1)
+    state = found[nearest]
+    period, double = _step_period_s(signals), _double_share(signals)
+    return Contacts(
+        state=state,
+        standing=_STANDING[state],
+        is_sure=sure[nearest],
+        single_s=(1.0 - double) * period,
+        double_s=double * period,
+    )
+
+
+def _advanced(values: FloatArray, fps: float) -> FloatArray:
+    """Return values (T,...) as they are `_LAG_S` later, interpolated between ticks."""
+    last = len(values) - 1
+    at = np.minimum(np.arange(len(values)) + _LAG_S * fps, last)
+    before = np.minimum(at.astype(np.int64), max(last - 1, 0))
+    after = np.minimum(before + 1, last)
+    alpha = (at - before).reshape(-1, *([1] * (values.ndim - 1)))
+    return np.asarray((1.0 - alpha) * values[before] + alpha * values[after])
+
+
+def _evidence(signals: TrunkSignals, coarse_fps: float) -> _Evidence:
+    weight = _EVIDENCE_HZ / coarse_fps
+
+    def limited(values: FloatArray) -> FloatArray:
+        return np.asarray(_MAX_EVIDENCE * np.tanh(values / _MAX_EVIDENCE))
+
+    single = limited(-signals.rise_m_per_s2 / _RISE_SCALE)
+    by_signal = np.column_stack(
+        [
+            limited(-signals.sway_m_per_s2 / _SWAY_SCALE),
+            limited(-signals.twist_rad_per_s / _TWIST_SCALE),
+            limited(signals.arm_m_per_s / _ARM_SCALE),
+        ]
+    )
+    side = by_signal.sum(axis=1)
+    speed = np.hypot(signals.speed_m_per_s(), _TURN_RADIUS_M * signals.yaw_rate_rad_per_s)
+    spread = 0.5 * (_STEPPING_SPEED - _STILL_SPEED)
+    middle = 0.5 * (_STEPPING_SPEED + _STILL_SPEED)
+    stepping = np.clip((speed - middle) / spread, -2.0, 4.0)
+    flight = -0.5 * ((signals.rise_m_per_s2 + _GRAVITY) / _FLIGHT_SIGMA) ** 2 + _FLIGHT_MARGIN
+    out = np.zeros((len(speed), _STATES))
+    out[:, STAND] = -stepping
+    out[:, LEFT] = 0.5 * (single + side)
+    out[:, RIGHT] = 0.5 * (single - side)
+    out[:, LEFT_TO_RIGHT] = out[:, RIGHT_TO_LEFT] = -0.5 * single
+    out[:, FLIGHT_LEFT] = out[:, FLIGHT_RIGHT] = out[:, FLIGHT_BOTH] = np.clip(flight, -8.0, None)
+    return _Evidence(weight * out, weight * by_signal)
+
+
+def _step_period_s(signals: TrunkSignals) -> FloatArray:
+    """Return the expected time (T,) between two steps, seconds."""
+    speed = np.maximum(signals.speed_m_per_s(), _MIN_CADENCE_SPEED)
+    return np.asarray(1.0 / (_STEP_HZ_AT_1_3 * (speed / 1.3) ** _STEP_HZ_EXPONENT))
+
+
+def _double_share(signals: TrunkSignals) -> FloatArray:
+    """Return the expected share (T,) of a step during which both feet stand."""
+    share = _DOUBLE_SHARE + _DOUBLE_SHARE_PER_SPEED * (signals.speed_m_per_s() - 1.3)
+    return np.asarray(np.clip(share, 0.08, 0.4))
+
+
+def _transition_costs() -> FloatArray:
+    """Return the cost (S,S) of each change of state, from rows to columns; infinite for impossible ones."""
+    cost = np.full((_STATES, _STATES), np.inf)
+    cost[STAND, [LEFT, RIGHT]] = _START_COST
+    cost[STAND, FLIGHT_BOTH] = _HOP_COST
+    for own, other, between, flight in (
+        (LEFT, RIGHT, LEFT_TO_RIGHT, FLIGHT_LEFT),
+        (RIGHT, LEFT, RIGHT_TO_LEFT, FLIGHT_RIGHT),
+    ):
+        cost[own, between] = 0.0
+        cost[own, STAND] = _START_COST
+        cost[own, flight] = _RUN_COST
+        cost[between, other] = 0.0
+        cost[between, own] = _REPEAT_COST
+        cost[flight, other] = 0.0
+        cost[flight, [own, STAND]] = _HOP_COST
+    cost[FLIGHT_BOTH, STAND] = 0.0
+    cost[FLIGHT_BOTH, [LEFT, RIGHT]] = _HOP_COST
+    return cost
+
+
+def _viterbi(log_likelihood: FloatArray, period_s: FloatArray, share: FloatArray, fps: float) -> IntArray:
+    """Return the most likely state (T,) at each tick."""
+    ticks = len(log_likelihood)
+    cumulated = np.concatenate([np.zeros((1, _STATES)), np.cumsum(log_likelihood, axis=0)])
+    cost = _transition_costs()
+    durations = [_durations(state, fps) for state in range(_STATES)]
+    # `entered[t, s]` is the best score of a sequence whose segment of state s starts at tick t.
+    entered = np.full((ticks + 1, _STATES), -np.inf)
+    entered[0] = [0.0, *([-1.0] * (_STATES - 1))]
+    came_from = np.full((ticks + 1, _STATES), -1, dtype=np.int64)
+    left_at = np.full((ticks + 1, _STATES), -1, dtype=np.int64)
+    ended = np.full((ticks + 1, _STATES), -np.inf)
+    for tick in range(1, ticks + 1):
+        at = tick - 1
+        for state in range(_STATES):
+            if state == STAND:
+                # Standing has no preferred duration: a segment grows by one tick at a time.
+                grown = ended[tick - 1, STAND] + log_likelihood[at, STAND]
+                new = entered[tick - 1, STAND] + log_likelihood[at, STAND]
+                ended[tick, STAND] = max(grown, new)
+                left_at[tick, STAND] = left_at[tick - 1, STAND] if grown >= new else tick - 1
+                continue
+            lengths = durations[state]
+            lengths = lengths[lengths <= tick]
+            # A segment that the recording cuts off may be shorter than the minimum.
+            if tick < durations[state][0] or tick == ticks:
+                lengths = np.arange(1, min(tick, durations[state][-1]) + 1)
+            scores = (
+                entered[tick - lengths, state]
+                + cumulated[tick, state]
+                - cumulated[tick - lengths, state]
+                + _log_duration(state, lengths / fps, period_s[at], share[at], tick - lengths, tick == ticks)
+            )
+            best = int(np.argmax(scores))
+            ended[tick, state] = scores[best]
+            left_at[tick, state] = tick - lengths[best]
+        if tick < ticks:
+            options = ended[tick][:, None] - cost
+            came_from[tick] = np.argmax(options, axis=0)
+            entered[tick] = options.max(axis=0)
+    return _trace_back(ended[ticks], left_at, came_from, ticks)
+
+
+def _trace_back(last: FloatArray, left_at: IntArray, came_from: IntArray, ticks: int) -> IntArray:
+    out = np.zeros(ticks, dtype=np.int64)
+    state, end = int(np.argmax(last)), ticks
+    while end > 0:
+        start = int(left_at[end, state])
+        out[start:end] = state
+        state, end = int(came_from[start, state]), start
+    return out
+
+
+def _durations(state: int, fps: float) -> IntArray:
+    low, high = {
+        LEFT: _SINGLE_S, RIGHT: _SINGLE_S, LEFT_TO_RIGHT: _DOUBLE_S, RIGHT_TO_LEFT: _DOUBLE_S,
+    }.get(state, _FLIGHT_S)  # fmt: skip
+    return np.arange(max(1, round(low * fps)), max(2, round(high * fps)) + 1)
+
+
+def _log_duration(
+    state: int, seconds: FloatArray, period_s: float, share: float, starts: IntArray, is_last: bool
+) -> FloatArray:
+    """Return the log-likelihood (N,) of durations; 0 for segments that the recording cuts off."""
+    if state in (LEFT, RIGHT):
+        mean, sigma = (1.0 - share) * period_s, _SINGLE_LOG_SIGMA
+    elif state in (LEFT_TO_RIGHT, RIGHT_TO_LEFT):
+        mean, sigma = share * period_s, _DOUBLE_LOG_SIGMA
+    else:
+        return np.zeros(len(seconds))
+    deviation = np.log(seconds / mean) / sigma
+    cut = (starts == 0) | is_last
+    return np.asarray(np.where(cut & (deviation < 0.0), 0.0, -0.5 * deviation**2))
+
+
+def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> BoolArray:
+    """Return whether the signals determine the state at each tick (T,).
+
+    A step is certain if it is one of two or more successive steps of an ordinary walk: evidence for its side
+    without a strong contradiction, an ordinary duration, a trunk that neither sinks nor twists much. Standing
+    is always certain: nothing is claimed about it but that no foot moves.
+    """
+    out = np.ones(len(state), dtype=bool)
+    bounds = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state)]
+    walks: list[list[tuple[int, int]]] = [[]]
+    for start, end in itertools.pairwise(bounds):
+        if state[start] == STAND:
+            walks.append([])
+        else:
+            walks[-1].append((start, end))
+    for walk in walks:
+        singles = [each for each in walk if state[each[0]] in (LEFT, RIGHT)]
+        kept = [each for each in singles if each[0] > 0 and each[1] < len(state)]
+        sure = np.zeros(len(singles), dtype=bool)
+        if len(kept) >= _MIN_STEPS:
+            ordinary = np.array([_is_ordinary(state, evidence, signals, *each) for each in kept])
+            padded = np.concatenate([[False], ordinary, [False]])
+            ordinary &= padded[:-2] | padded[2:]
+            first = singles.index(kept[0])
+            sure[first : first + len(kept)] = ordinary
+            # A step that the recording cuts off is as certain as its neighbour.
+            sure[:first], sure[first + len(kept) :] = ordinary[0], ordinary[-1]
+        middles = np.array([0.5 * (start + end) for start, end in singles])
+        for start, end in walk:
+            nearest = np.argsort(np.abs(middles - 0.5 * (start + end)))[: 1 if (start, end) in singles else 2]
+            out[start:end] = bool(len(nearest)) and bool(sure[nearest].all())
+    return out
+
+
+def _is_ordinary(state: IntArray, evidence: _Evidence, signals: _StepSignals, start: int, end: int) -> bool:
+    """Return whether one time on one foot is that of an ordinary walk."""
+    sign = 1.0 if state[start] == LEFT else -1.0
+    own = slice(start, end)
+    by_signal = sign * evidence.by_signal[own].sum(axis=0)
+    duration = (end - start) / signals.fps / (signals.period_s[own].mean())
+    return bool(
+        by_signal.sum() >= _SURE_NATS
+        and by_signal.min() >= -_MAX_CONTRADICTION_NATS
+        and _ORDINARY_DURATION[0] <= duration <= _ORDINARY_DURATION[1]
+        and signals.speed[own].mean() >= _STEPPING_SPEED
+        and np.abs(signals.sinking[own]).max() <= _MAX_SINKING_M
+        and np.abs(signals.twist[own]).max() <= _MAX_TWIST
+    )

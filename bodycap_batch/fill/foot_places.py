@@ -1,0 +1,185 @@
+"""Where each foot stands, from the path of the hips and the times of the steps.
+
+Source: Y. Wang, M. Srinivasan, "Stepping in the direction of the fall", Biology Letters 10, 2014: the place
+is linear in the state of the hips at the middle of the time on this foot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.fill.contacts import LEFT, RIGHT, STAND, Contacts
+from bodycap_batch.fill.leg_geometry import LegGeometry
+from bodycap_batch.fill.trunk_signals import TrunkSignals
+from bodycap_batch.model.fill_data import Footsteps
+
+_BEHIND_M = 0.01
+"""Distance (metres) of the ankle behind the middle of the hips at the middle of the time on this foot.
+Derivation: the pressure under a foot lies between heel and ball, in front of the ankle."""
+_WALKING_WIDTH = 0.115
+"""Distance between the paths of the two ankles while walking, as a ratio to the length of the leg. Source:
+J. M. Donelan, R. Kram, A. D. Kuo, "Mechanical and metabolic determinants of the preferred step width in human
+walking", Proceedings of the Royal Society B 268, 2001: 0.12 times the leg length."""
+_STANDING_WIDTH = 0.2
+"""Distance between the ankles while standing, as a ratio to the length of the leg. Source: W. E. McIlroy,
+B. E. Maki, "Preferred placement of the feet during quiet stance", Clinical Biomechanics 12, 1997: 17 cm."""
+_MIN_WIDTH = 0.06
+"""Minimum distance sideways between a foot that is put down and the standing foot, as a ratio to the length of
+the leg. Derivation: half of `_WALKING_WIDTH`."""
+_TOE_OUT_RAD = np.radians(7.0)
+"""Angle by which the toes point outward. Source: as `_STANDING_WIDTH`, halved: 14° between the feet."""
+_MAX_SHIFT_M = 0.22
+"""Distance (metres) that the hips may move over standing feet before a foot takes a step. Derivation: the
+length of a foot from the ankle to the ball, with a margin."""
+_MAX_TURN_RAD = np.radians(35.0)
+"""Angle by which the trunk may turn over standing feet before a foot takes a step. Evidence: none."""
+_ADJUSTING_S = 0.4
+"""Time (s) of a step that brings a foot back below the hips. Evidence: none."""
+
+
+@dataclass(slots=True)
+class _Stance:
+    """A period in which a foot stands."""
+
+    side: int
+    start: int
+    end: int
+    is_sure: bool
+
+
+def place_feet(
+    contacts: Contacts,
+    signals: TrunkSignals,
+    legs: tuple[LegGeometry, LegGeometry],
+    floor_m: float,
+) -> Footsteps:
+    """Return the periods in which each foot stands, and where it stands.
+
+    If the hips leave standing feet, further steps are inserted. They are never certain.
+    """
+    stances: list[_Stance] = []
+    for side in (0, 1):
+        stances += _split_long_stances(_stances(contacts, side), contacts, signals)
+    stances.sort(key=lambda each: (each.start, each.side))
+    places = [_place(each, contacts, signals, legs[each.side]) for each in stances]
+    out = np.array([place for place, _ in places]).reshape(-1, 2)
+    _keep_apart(out, stances, signals, 0.5 * (legs[0].length_m + legs[1].length_m))
+    heights = np.array([floor_m + legs[each.side].ankle_height_m for each in stances])
+    return Footsteps(
+        side=np.array([each.side for each in stances], dtype=np.int64),
+        start_tick=np.array([each.start for each in stances], dtype=np.int64),
+        end_tick=np.array([each.end for each in stances], dtype=np.int64),
+        ankle_in_world_m=np.column_stack([out, heights]).reshape(-1, 3),
+        heading_rad=np.array([heading for _, heading in places]).reshape(-1),
+        is_sure=np.array([each.is_sure for each in stances], dtype=bool),
+    )
+
+
+def _keep_apart(places: FloatArray, stances: list[_Stance], signals: TrunkSignals, leg_m: float) -> None:
+    """Move places (N,2) outward where a foot would be put down across the other foot, which still stands.
+
+    Source: A. L. Hof, "The 'extrapolated center of mass' concept suggests a simple control of balance in
+    walking", Human Movement Science 27, 2008: a foot is placed outward of the path by a margin.
+    """
+    left = signals.left()
+    for index, stance in enumerate(stances):
+        outward = (1.0 if stance.side == 0 else -1.0) * left[stance.start]
+        for other in range(index):
+            if stances[other].side == stance.side or stances[other].end <= stance.start:
+                continue
+            width = float((places[index] - places[other]) @ outward)
+            places[index] += max(_MIN_WIDTH * leg_m - width, 0.0) * outward
+
+
+def _stances(contacts: Contacts, side: int) -> list[_Stance]:
+    mask = contacts.standing[:, side]
+    padded = np.concatenate([[False], mask, [False]]).astype(np.int8)
+    starts, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)
+    return [
+        _Stance(side, int(start), int(end), bool(contacts.is_sure[start:end].all()))
+        for start, end in zip(starts, ends, strict=True)
+    ]
+
+
+def _split_long_stances(stances: list[_Stance], contacts: Contacts, signals: TrunkSignals) -> list[_Stance]:
+    """Insert steps into periods of standing in which the hips move away from the feet or turn."""
+    out: list[_Stance] = []
+    hips, heading = signals.slow_hips_m[:, :2], signals.heading_rad
+    gap = max(2, round(_ADJUSTING_S * signals.fps))
+    for stance in stances:
+        start = stance.start
+        still = contacts.state[stance.start : stance.end] == STAND
+        if not still.any():
+            out.append(stance)
+            continue
+        anchor = stance.start + int(np.argmax(still))
+        tick = anchor
+        sure = stance.is_sure
+        # The left foot steps first: both feet must not leave the floor at the same time.
+        delay = gap * stance.side
+        while tick < stance.end:
+            moved = np.hypot(*(hips[tick] - hips[anchor])) > _MAX_SHIFT_M
+            turned = abs(heading[tick] - heading[anchor]) > _MAX_TURN_RAD
+            if (moved or turned) and tick + delay + 2 * gap < stance.end:
+                lift = tick + delay
+                if lift > start:
+                    out.append(_Stance(stance.side, start, lift, False))
+                start = lift + gap
+                anchor, sure = start, False
+                tick = start
+            tick += 1
+        out.append(_Stance(stance.side, start, stance.end, sure))
+    return out
+
+
+def _place(
+    stance: _Stance, contacts: Contacts, signals: TrunkSignals, leg: LegGeometry
+) -> tuple[FloatArray, float]:
+    """Return the position (2,) of the ankle and the direction of the foot of a period of standing."""
+    ticks = np.arange(stance.start, stance.end)
+    state = contacts.state[stance.start : stance.end]
+    outward = 1.0 if stance.side == 0 else -1.0
+    still: BoolArray = state == STAND
+    if still.any():
+        chosen = ticks[still]
+        # A foot that stands for long was placed at the start and is lifted at the end: the middle is robust.
+        width = _STANDING_WIDTH
+        base = np.median(signals.hips_m[chosen, :2], axis=0)
+        heading = float(np.median(signals.heading_rad[chosen]))
+    else:
+        width = _WALKING_WIDTH
+        base, heading = _passing_hips(stance, contacts, signals)
+    left = np.array([np.cos(heading), np.sin(heading)])
+    forward = np.array([np.sin(heading), -np.cos(heading)])
+    place = base + 0.5 * outward * width * leg.length_m * left - _BEHIND_M * forward
+    return place, heading + outward * _TOE_OUT_RAD
+
+
+def _passing_hips(stance: _Stance, contacts: Contacts, signals: TrunkSignals) -> tuple[FloatArray, float]:
+    """Return the mean position (2,) and heading of the hips while the foot stands alone.
+
+    Where the recording cuts off this time, it is completed by its expected duration, and the path of the hips
+    is continued with its velocity.
+    """
+    ticks = np.arange(stance.start, stance.end)
+    state = contacts.state[stance.start : stance.end]
+    alone = ticks[state == (LEFT if stance.side == 0 else RIGHT)]
+    last = len(contacts.state) - 1
+    first, end = (int(alone[0]), int(alone[-1]) + 1) if len(alone) else (stance.start, stance.end)
+    expected = contacts.single_s[[stance.start, stance.end - 1]] * signals.fps
+    both = contacts.double_s[[stance.start, stance.end - 1]] * signals.fps
+    if stance.start == 0 and (first == 0 or not len(alone)):
+        # Without a time alone, the recording starts while both feet stand, at the end of this stance.
+        stop = end if len(alone) else stance.end - both[0]
+        first, end = min(first, round(stop - expected[0])), round(stop)
+    elif stance.end > last and (end > last or not len(alone)):
+        begin = first if len(alone) else stance.start + both[1]
+        first, end = round(begin), max(end, round(begin + expected[1]))
+    at = np.arange(first, max(end, first + 1))
+    inside = np.clip(at, 0, last)
+    beyond = ((at - inside) / signals.fps)[:, None]
+    path = signals.slow_hips_m[inside, :2] + beyond * signals.velocity_m_per_s[inside, :2]
+    return np.asarray(path.mean(axis=0)), float(signals.heading_rad[inside].mean())

@@ -1,0 +1,38 @@
+"""Neck and head: level, and turned to where the person goes or turns next."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.fill.trunk_signals import TrunkSignals, low_pass
+from bodycap_batch.model.geometry import interpolate_pose, make_transform, so3_exp
+
+_AHEAD_S = 0.25
+"""Time (s) by which the head turns before the trunk. Source: R. Grasso and others, "Eye-head coordination for
+the steering of locomotion in humans", Neuroscience Letters 253, 1998: 0.2 to 0.3 s."""
+_MAX_TURN_RAD = np.radians(35.0)
+"""Maximum angle between head and trunk. Evidence: none."""
+_SMOOTH_HZ = 0.8
+"""Cutoff frequency (Hz) of the head's yaw. Evidence: none."""
+_NECK_SHARE = 0.5
+"""Share of the head's rotation against the trunk that the neck takes. Evidence: none."""
+
+
+def head_rotations(signals: TrunkSignals, trunk: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the orientations (T,3,3) of neck and head in the world.
+
+    Args:
+        signals: The signals of the trunk.
+        trunk: (T,3,3) orientation of the joint that the neck starts from.
+    """
+    ticks = len(trunk)
+    later = np.minimum(np.arange(ticks) + round(_AHEAD_S * signals.fps), ticks - 1)
+    look = low_pass(signals.heading_rad, _SMOOTH_HZ, signals.fps)[later]
+    turn = np.clip(look - signals.heading_rad, -_MAX_TURN_RAD, _MAX_TURN_RAD)
+    zero = np.zeros(ticks)
+    head = so3_exp(np.column_stack([zero, zero, signals.heading_rad + turn]))
+    neck = interpolate_pose(
+        make_transform(trunk, np.zeros(3)), make_transform(head, np.zeros(3)), np.full(ticks, _NECK_SHARE)
+    )[:, :3, :3]
+    return np.asarray(neck), np.asarray(head)

@@ -1,0 +1,158 @@
+"""The pelvis and the lower spine: between the measured trunk and the feet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.fill.contacts import STAND, Contacts
+from bodycap_batch.fill.trunk_signals import TrunkSignals, low_pass
+from bodycap_batch.model.fill_data import Footsteps
+from bodycap_batch.model.geometry import interpolate_pose, make_transform, so3_exp
+from bodycap_batch.model.skeleton import SkeletonModel
+
+_YAW_RAD = np.radians(4.5)
+"""Amplitude of the pelvis's yaw with each stride, at 1.3 m/s. Source: M. P. Murray, A. B. Drought, R. C.
+Kory, "Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964: 9 to 10° in all."""
+_LIST_RAD = np.radians(3.5)
+"""Amplitude of the pelvis's list with each stride, at 1.3 m/s. Source: as `_YAW_RAD`."""
+_FULL_SPEED = 1.3
+"""Speed (m/s) for which these amplitudes hold. They are proportional to the speed."""
+_MAX_TURN_RAD = np.radians(6.0)
+"""Maximum angle by which the pelvis is turned about each axis so that a leg reaches its foot. Evidence:
+none."""
+_AXIS_WEIGHTS = np.array([1.0, 1.0, 0.3])
+"""Weights of tilt, list and yaw in this turn. The yaw is small, because the stride determines it. Evidence:
+none."""
+_DAMPING_M2 = 0.02**2
+"""Damping (m²) of this turn: a turn that moves a hip by less than 2 cm per radian is avoided. Evidence:
+none."""
+_DIFFERENCE_RAD = 1e-3
+"""Angle (radians) of the numeric derivative of the hip joints. Derivation: it moves them by 0.1 mm."""
+_CORRECTIONS = 3
+"""Number of linear corrections. Evidence: none."""
+_TURN_HZ = 4.0
+"""Cutoff frequency (Hz) of this turn. Derivation: twice the frequency of ordinary steps."""
+_FADE_HZ = 1.5
+"""Cutoff frequency (Hz) of the start and the end of these rotations. Evidence: none."""
+
+
+def stride_phase_rad(steps: Footsteps, ticks: int) -> FloatArray:
+    """Return the phase (T,) of the stride: 0 when the left foot touches the floor, π when the right one does.
+
+    The phase is interpolated between steps, and constant before the first and after the last step.
+    """
+    events = [
+        (int(start), int(side)) for start, side in zip(steps.start_tick, steps.side, strict=True) if start > 0
+    ]
+    if not events:
+        return np.zeros(ticks)
+    at: list[int] = []
+    phase: list[float] = []
+    last = -np.inf
+    for start, side in sorted(events):
+        if at and start <= at[-1]:
+            continue
+        wanted = np.pi * side
+        while wanted <= last:
+            wanted += 2.0 * np.pi
+        at.append(start)
+        phase.append(wanted)
+        last = wanted
+    return np.asarray(np.interp(np.arange(ticks), at, phase))
+
+
+def pelvis_rotation(
+    signals: TrunkSignals, contacts: Contacts, steps: Footsteps, has_gait: bool
+) -> FloatArray:
+    """Return the orientation (T,3,3) of the pelvis in the world.
+
+    Args:
+        signals: The signals of the trunk.
+        contacts: Which feet stand.
+        steps: Where the feet stand.
+        has_gait: Whether the legs are filled.
+    """
+    ticks = len(signals.heading_rad)
+    zero = np.zeros(ticks)
+    yaw, tilt = signals.heading_rad, zero
+    if has_gait:
+        phase = stride_phase_rad(steps, ticks)
+        walking = low_pass((contacts.state != STAND).astype(np.float64), _FADE_HZ, signals.fps)
+        strength = np.clip(walking, 0.0, 1.0) * np.clip(signals.speed_m_per_s() / _FULL_SPEED, 0.0, 1.3)
+        yaw = yaw - _YAW_RAD * strength * np.cos(phase)
+        tilt = -_LIST_RAD * strength * np.sin(phase)
+    turn = so3_exp(np.column_stack([zero, zero, yaw]))
+    return np.asarray(turn @ so3_exp(np.column_stack([zero, tilt, zero])))
+
+
+def reaching_pelvis(
+    pelvis: FloatArray,
+    hips_of: Callable[[FloatArray], FloatArray],
+    ankles_m: FloatArray,
+    limits_m: FloatArray,
+    fps: float,
+) -> FloatArray:
+    """Return the pelvis (T,3,3), tilted and turned a little so that the legs reach the feet.
+
+    Where a foot is beyond the reach of its leg, the pelvis is turned by the smallest angles that bring the
+    hip nearer to it. The angles are limited and smooth over time.
+
+    Args:
+        pelvis: (T,3,3) orientation of the pelvis in the world.
+        hips_of: Returns the left and right hip joint (T,2,3) in the world, metres, for an orientation of the
+            pelvis.
+        ankles_m: (T,2,3) left and right ankle in the world, metres.
+        limits_m: (2,) maximum distance between hip and ankle of each leg, metres.
+        fps: Ticks per second.
+    """
+    turn = np.zeros((len(pelvis), 3))
+    for _ in range(_CORRECTIONS):
+        hips = hips_of(pelvis @ so3_exp(turn))
+        away = hips - ankles_m
+        distance = np.linalg.norm(away, axis=2)
+        excess = np.maximum(distance - limits_m, 0.0)
+        slopes = np.empty((len(pelvis), 2, 3))
+        for axis in range(3):
+            step = turn.copy()
+            step[:, axis] += _DIFFERENCE_RAD
+            moved = (hips_of(pelvis @ so3_exp(step)) - hips) / _DIFFERENCE_RAD
+            slopes[:, :, axis] = (moved * away).sum(axis=2) / distance
+        slopes *= (excess > 0.0)[:, :, None]
+        slopes *= _AXIS_WEIGHTS
+        damped = slopes @ np.swapaxes(slopes, 1, 2) + _DAMPING_M2 * np.eye(2)
+        solved = np.linalg.solve(damped, excess[:, :, None])[:, :, 0]
+        turn = turn - _AXIS_WEIGHTS * np.einsum("tij,ti->tj", slopes, solved)
+        turn = _MAX_TURN_RAD * np.tanh(turn / _MAX_TURN_RAD)
+    return np.asarray(pelvis @ so3_exp(low_pass(turn, _TURN_HZ, fps)))
+
+
+def bend_spine(
+    skeleton: SkeletonModel, first: int, pelvis: FloatArray, world: FloatArray, filled: BoolArray
+) -> None:
+    """Write the poses of the joints above the first measured joint: root, lower spine and their helpers.
+
+    Args:
+        skeleton: The skeleton.
+        first: Index of the first measured joint.
+        pelvis: (T,3,3) orientation of the pelvis.
+        world: (T,J,4,4) poses in the world; changed in place.
+        filled: (J,) which joints are filled; changed in place.
+    """
+    chain = [first]
+    while chain[-1] != 0:
+        chain.append(int(skeleton.parents[chain[-1]]))
+    last = len(chain) - 1
+    bending = [step for step in range(1, len(chain)) if skeleton.roles[chain[step]] or step == last]
+    trunk = make_transform(world[:, first, :3, :3], np.zeros(3))
+    target = make_transform(pelvis, np.zeros(3))
+    for step in range(1, len(chain)):
+        child, joint = chain[step - 1], chain[step]
+        fraction = np.full(len(world), (np.searchsorted(bending, step) + 1) / len(bending))
+        rotation = interpolate_pose(trunk, target, fraction)[:, :3, :3]
+        world[:, joint] = make_transform(
+            rotation, world[:, child, :3, 3] - rotation @ skeleton.offsets_m[child]
+        )
+        filled[joint] = True

@@ -1,0 +1,272 @@
+"""The fill stage: compute the pose of every joint that no camera measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.fill.contacts import Contacts, find_contacts
+from bodycap_batch.fill.floor_height import FloorHeight, floor_below_legs
+from bodycap_batch.fill.foot_paths import REACH_SHARE, foot_path, kept_steps, reachable_steps
+from bodycap_batch.fill.foot_places import place_feet
+from bodycap_batch.fill.head import head_rotations
+from bodycap_batch.fill.leg_geometry import LegGeometry, leg_geometry
+from bodycap_batch.fill.leg_poses import pose_leg
+from bodycap_batch.fill.pelvis import bend_spine, pelvis_rotation, reaching_pelvis
+from bodycap_batch.fill.trunk_signals import TrunkSignals, trunk_signals
+from bodycap_batch.model.fill_data import SIDES, FillMode, FillReport, FillResult, Footsteps
+from bodycap_batch.model.geometry import make_transform
+from bodycap_batch.model.skeleton import Motion, SkeletonModel
+
+_PROGRESS_STEPS = 4
+"""Number of steps that the progress counts."""
+
+_MAX_MISS_M = 0.004
+"""Distance (metres) between the ankle and its wanted place beyond which a foot does not count as standing.
+Derivation: with it, the sole is within 1 cm of the floor."""
+
+
+def fill_motion(
+    motion: Motion,
+    solved: BoolArray,
+    *,
+    floor_is_measured: bool,
+    mode: FillMode,
+    context: StageContext,
+) -> FillResult:
+    """Return the motion with plausible poses of the joints that no camera measured.
+
+    Measured joints keep their poses in the world. The pelvis, the legs, the neck and the head are each filled
+    only if none of their joints is measured.
+
+    Args:
+        motion: The motion from merging, with J joints at T ticks. The floor is at z = 0.
+        solved: (J,) True for a measured joint.
+        floor_is_measured: True if the height of the floor was measured; False if it was assumed.
+        mode: How unmeasured joints are posed.
+        context: Context of the stage.
+    """
+    nothing = _empty_report(motion, mode)
+    if mode != "plausible" or not solved.any() or len(motion.root_in_world_m) == 0:
+        return FillResult(motion=motion, report=nothing)
+    skeleton = motion.skeleton
+    first = int(np.argmax(solved))
+    world, filled = motion.world_from_joint(), np.zeros(len(solved), dtype=bool)
+    signals = trunk_signals(motion, first, _hands(skeleton, solved))
+    legs = leg_geometry(skeleton)
+    if legs is not None and any(solved[[leg.hip, leg.knee, leg.ankle]].any() for leg in legs):
+        legs = None
+    contacts = find_contacts(signals)
+    context.check_cancelled()
+    context.progress(1, _PROGRESS_STEPS, "steps")
+    floor = FloorHeight(0.0, 0.0, "measured")
+    if legs is not None and not floor_is_measured:
+        floor = floor_below_legs(world, contacts, legs)
+    steps = nothing.footsteps if legs is None else place_feet(contacts, signals, legs, floor.height_m)
+    context.progress(2, _PROGRESS_STEPS, "pelvis")
+    if first != 0:
+        pelvis = pelvis_rotation(signals, contacts, steps, legs is not None)
+        if legs is not None:
+            pelvis = _within_reach(skeleton, first, pelvis, world, (legs, steps, signals))
+        bend_spine(skeleton, first, pelvis, world, filled)
+    if legs is not None:
+        steps = _fill_legs(skeleton, legs, steps, signals, world, filled)
+    context.check_cancelled()
+    context.progress(3, _PROGRESS_STEPS, "head")
+    _fill_head(skeleton, solved, signals, world, filled)
+    _follow_parents(skeleton, solved, filled, motion.local_rotation, world)
+    local = _local_rotations(skeleton, world)
+    local[:, solved & _parent_kept(skeleton, filled)] = motion.local_rotation[
+        :, solved & _parent_kept(skeleton, filled)
+    ]
+    context.progress(_PROGRESS_STEPS, _PROGRESS_STEPS, "filled")
+    return FillResult(
+        motion=replace(motion, root_in_world_m=world[:, 0, :3, 3], local_rotation=local),
+        report=replace(
+            nothing,
+            filled=filled,
+            standing=_standing(steps, contacts, legs is not None),
+            is_sure=_sure(steps, contacts) if legs is not None else nothing.is_sure,
+            footsteps=steps,
+            floor_m=floor.height_m,
+            floor_sigma_m=floor.sigma_m,
+            floor_source=floor.source,
+        ),
+    )
+
+
+def _empty_report(motion: Motion, mode: FillMode) -> FillReport:
+    ticks, joints = motion.observed.shape
+    return FillReport(
+        mode=mode,
+        filled=np.zeros(joints, dtype=bool),
+        standing=np.zeros((ticks, len(SIDES)), dtype=bool),
+        is_sure=np.zeros(ticks, dtype=bool),
+        footsteps=Footsteps(
+            side=np.zeros(0, dtype=np.int64),
+            start_tick=np.zeros(0, dtype=np.int64),
+            end_tick=np.zeros(0, dtype=np.int64),
+            ankle_in_world_m=np.zeros((0, 3)),
+            heading_rad=np.zeros(0),
+            is_sure=np.zeros(0, dtype=bool),
+        ),
+        floor_m=0.0,
+        floor_sigma_m=0.0,
+        floor_source="measured",
+    )
+
+
+def _hands(skeleton: SkeletonModel, solved: BoolArray) -> tuple[int | None, int | None]:
+    """Return the measured joint of each arm that is farthest from the trunk."""
+    found: list[int | None] = []
+    for side in SIDES:
+        joints = [skeleton.index_of_role(side + part) for part in ("Hand", "ForeArm")]
+        measured = [joint for joint in joints if joint is not None and solved[joint]]
+        found.append(measured[0] if measured else None)
+    return found[0], found[1]
+
+
+def _within_reach(
+    skeleton: SkeletonModel,
+    first: int,
+    pelvis: FloatArray,
+    world: FloatArray,
+    feet: tuple[tuple[LegGeometry, LegGeometry], Footsteps, TrunkSignals],
+) -> FloatArray:
+    """Return the pelvis (T,3,3), turned so that the legs reach the feet where a small turn suffices."""
+    legs, steps, signals = feet
+
+    def hips_of(rotation: FloatArray) -> FloatArray:
+        poses = world.copy()
+        bend_spine(skeleton, first, rotation, poses, np.zeros(len(skeleton.joints), dtype=bool))
+        for leg in legs:
+            for joint in leg.chain:
+                _rotate_with_parent(skeleton, joint, poses)
+        return np.stack([poses[:, leg.hip, :3, 3] for leg in legs], axis=1)
+
+    paths = [
+        foot_path(steps, side, leg, None, signals.velocity_m_per_s, signals.fps)
+        for side, leg in enumerate(legs)
+    ]
+    if paths[0] is None or paths[1] is None:
+        return pelvis
+    ankles = np.stack([path.ankle_m for path in paths if path is not None], axis=1)
+    limits = np.array([REACH_SHARE * leg.length_m for leg in legs])
+    return reaching_pelvis(pelvis, hips_of, ankles, limits, signals.fps)
+
+
+def _fill_legs(
+    skeleton: SkeletonModel,
+    legs: tuple[LegGeometry, LegGeometry],
+    steps: Footsteps,
+    signals: TrunkSignals,
+    world: FloatArray,
+    filled: BoolArray,
+) -> Footsteps:
+    """Write the poses of both legs, and return the steps that the legs can reach."""
+    missed = np.zeros((len(world), len(legs)), dtype=bool)
+    for leg in legs:
+        for joint in leg.chain:
+            _rotate_with_parent(skeleton, joint, world)
+    hips = np.stack([world[:, leg.hip, :3, 3] for leg in legs], axis=1)
+    steps = reachable_steps(steps, legs, hips, signals.fps)
+    for side, leg in enumerate(legs):
+        hip = world[:, leg.hip, :3, 3]
+        path = foot_path(steps, side, leg, hip, signals.velocity_m_per_s, signals.fps)
+        if path is None:
+            continue
+        pose = pose_leg(leg, hip, path, world[:, 0, :3, :3])
+        for joint in leg.chain:
+            filled[joint] = True
+        world[:, leg.hip, :3, :3] = pose.thigh
+        _place_below(skeleton, leg.hip, leg.knee, world)
+        world[:, leg.knee, :3, :3] = pose.shin
+        _place_below(skeleton, leg.knee, leg.ankle, world)
+        world[:, leg.ankle, :3, :3] = pose.foot
+        filled[[leg.hip, leg.knee, leg.ankle, *leg.below]] = True
+        for joint in leg.below:
+            _rotate_with_parent(skeleton, joint, world)
+            if joint == leg.toe:
+                world[:, joint, :3, :3] = pose.toe
+        missed[:, side] = np.linalg.norm(world[:, leg.ankle, :3, 3] - path.ankle_m, axis=1) > _MAX_MISS_M
+    return kept_steps(steps, missed)
+
+
+def _fill_head(
+    skeleton: SkeletonModel,
+    solved: BoolArray,
+    signals: TrunkSignals,
+    world: FloatArray,
+    filled: BoolArray,
+) -> None:
+    """Write the poses of neck and head if neither is measured."""
+    neck, head = skeleton.index_of_role("Neck"), skeleton.index_of_role("Head")
+    if head is None or solved[head] or (neck is not None and solved[neck]):
+        return
+    start = skeleton.parents[head] if neck is None else skeleton.parents[neck]
+    rotations = head_rotations(signals, world[:, start, :3, :3])
+    for joint, rotation in ((neck, rotations[0]), (head, rotations[1])):
+        if joint is not None:
+            _rotate_with_parent(skeleton, joint, world)
+            world[:, joint, :3, :3] = rotation
+            filled[joint] = True
+
+
+def _rotate_with_parent(skeleton: SkeletonModel, joint: int, world: FloatArray) -> None:
+    """Write the pose of a joint without rotation relative to its parent."""
+    parent = int(skeleton.parents[joint])
+    world[:, joint] = world[:, parent] @ make_transform(np.eye(3), skeleton.offsets_m[joint])
+
+
+def _place_below(skeleton: SkeletonModel, upper: int, lower: int, world: FloatArray) -> None:
+    """Write the pose of each joint between two joints, the lower one included, without rotation."""
+    chain = [lower]
+    while chain[-1] != upper:
+        chain.append(int(skeleton.parents[chain[-1]]))
+    for joint in reversed(chain[:-1]):
+        _rotate_with_parent(skeleton, joint, world)
+
+
+def _follow_parents(
+    skeleton: SkeletonModel, solved: BoolArray, filled: BoolArray, local: FloatArray, world: FloatArray
+) -> None:
+    """Write the poses of all other joints: they keep their rotation relative to the parent."""
+    for joint in range(1, len(solved)):
+        if not solved[joint] and not filled[joint]:
+            parent = int(skeleton.parents[joint])
+            own = make_transform(local[:, joint], skeleton.offsets_m[joint])
+            world[:, joint] = world[:, parent] @ own
+
+
+def _local_rotations(skeleton: SkeletonModel, world: FloatArray) -> FloatArray:
+    rotation = world[..., :3, :3]
+    out = rotation.copy()
+    parents = skeleton.parents[1:]
+    out[:, 1:] = np.swapaxes(rotation[:, parents], -1, -2) @ rotation[:, 1:]
+    return out
+
+
+def _parent_kept(skeleton: SkeletonModel, filled: BoolArray) -> BoolArray:
+    """Return (J,) True for a joint whose parent was not filled, so that its local rotation is unchanged."""
+    out = np.ones(len(filled), dtype=bool)
+    out[1:] = ~filled[skeleton.parents[1:]]
+    return out
+
+
+def _standing(steps: Footsteps, contacts: Contacts, has_legs: bool) -> BoolArray:
+    out = np.zeros_like(contacts.standing)
+    if has_legs:
+        for side, start, end in zip(steps.side, steps.start_tick, steps.end_tick, strict=True):
+            out[start:end, side] = True
+    return out
+
+
+def _sure(steps: Footsteps, contacts: Contacts) -> BoolArray:
+    out = contacts.is_sure.copy()
+    for start, end, sure in zip(steps.start_tick, steps.end_tick, steps.is_sure, strict=True):
+        if not sure:
+            out[start:end] = False
+    return out

@@ -1,0 +1,171 @@
+"""The fill stage: measured joints are constants, feet stand on the floor, and what is unknown is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodycap_batch.core.arrays import BoolArray
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.fill import fill_motion
+from bodycap_batch.fill.leg_geometry import leg_geometry
+from bodycap_batch.model.fill_data import FillMode, FillResult
+from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.skeleton import Motion
+from bodycap_batch.model.skeleton_presets import load_skeleton
+from tests.bodies import ARMS
+
+SPEED = 1.2
+STEP_S = 0.55
+
+
+def walking(seconds: float = 6.0, fps: float = 30.0, *, speed: float = SPEED) -> tuple[Motion, BoolArray]:
+    """Return a trunk that goes to −y, rises and sways with each step, and swings its arms; legs at rest.
+
+    At time 0 the left foot touches the floor. The motion is made of sinusoids, not by the model of the stage.
+    """
+    body = load_skeleton("upper_body", 1.75)
+    time = np.arange(round(seconds * fps)) / fps
+    stride = np.pi * time / STEP_S if speed else 0.0 * time
+    local = np.tile(np.eye(3), (len(time), len(body.joints), 1, 1))
+    strength = min(speed, 1.0)
+    zero = 0.0 * time
+    local[:, 0] = so3_exp(np.column_stack([zero, zero, 0.06 * strength * np.cos(stride)]))
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        joint = body.roles.index(side + "Arm")
+        swing = -sign * 0.35 * strength * np.cos(stride)
+        hang = so3_exp(np.array([0.0, sign * 1.4, 0.0]))
+        local[:, joint] = so3_exp(np.column_stack([-swing, zero, zero])) @ hang
+    rise = -0.015 * strength * np.cos(2.0 * stride - 0.6)
+    sway = 0.018 * strength * np.sin(stride)
+    root = np.column_stack([sway, -speed * time, 0.53 * 1.75 * 0.985 + rise])
+    solved = np.array([role == "Spine1" or role in ARMS or "Shoulder" in role for role in body.roles])
+    motion = Motion(
+        skeleton=body,
+        fps=fps,
+        start_ns=0,
+        root_in_world_m=root,
+        local_rotation=local,
+        observed=np.tile(solved, (len(time), 1)),
+    )
+    return motion, solved
+
+
+def fill(
+    motion: Motion, solved: BoolArray, mode: FillMode = "plausible", *, floor: bool = True
+) -> FillResult:
+    return fill_motion(
+        motion, solved, floor_is_measured=floor, mode=mode, context=StageContext(work_dir=Path())
+    )
+
+
+def test_measured_joints_keep_their_poses() -> None:
+    motion, solved = walking()
+    before, after = motion.world_from_joint(), fill(motion, solved).motion.world_from_joint()
+    np.testing.assert_allclose(after[:, solved], before[:, solved], atol=1e-9)
+    assert np.abs(after[:, ~solved] - before[:, ~solved]).max() > 0.1
+
+
+@pytest.mark.parametrize("mode", ["rest", "none"])
+def test_other_modes_leave_the_motion_as_it_is(mode: FillMode) -> None:
+    motion, solved = walking(2.0)
+    result = fill(motion, solved, mode)
+    assert result.motion is motion
+    assert result.report.mode == mode
+    assert not result.report.filled.any()
+
+
+def test_a_walk_has_its_steps_at_the_right_times_and_sides() -> None:
+    motion, solved = walking(8.0)
+    report = fill(motion, solved).report
+    steps = report.footsteps
+    inside = (steps.start_tick > 30) & (steps.start_tick < len(report.is_sure) - 30)
+    starts = steps.start_tick[inside] / motion.fps
+    # The left foot touches the floor at even multiples of the time of a step, the right one at odd multiples.
+    number = np.round(starts / STEP_S)
+    assert np.abs(starts - number * STEP_S).max() < 0.1
+    assert (number.astype(int) % 2 == steps.side[inside]).all()
+    assert len(starts) == len(set(number.tolist())) == 11
+    assert report.is_sure.mean() > 0.85
+
+
+def test_feet_stand_still_on_the_floor_and_never_below_it() -> None:
+    motion, solved = walking(8.0)
+    result = fill(motion, solved)
+    poses, skeleton = result.motion.world_from_joint(), motion.skeleton
+    legs = leg_geometry(skeleton)
+    assert legs is not None
+    for number, side in enumerate(("Left", "Right")):
+        ankle, toe = (skeleton.roles.index(side + part) for part in ("Foot", "ToeBase"))
+        end = poses[:, toe, :3, 3] + poses[:, toe, :3, :3] @ skeleton.end_offsets_m[toe]
+        heel = poses[:, ankle, :3, 3] + poses[:, ankle, :3, :3] @ legs[number].heel_m
+        low = np.min([heel[:, 2], poses[:, toe, 2, 3], end[:, 2]], axis=0)
+        standing = result.report.standing[:, number]
+        assert low.min() > -0.005
+        assert low[standing].max() < 0.01
+        assert 0.5 < standing.mean() < 0.75
+
+
+def test_every_filled_joint_moves_without_jumps() -> None:
+    motion, solved = walking(8.0)
+    poses = fill(motion, solved).motion.world_from_joint()[..., :3, 3]
+    # A swinging foot moves at 4 m/s or less.
+    assert np.linalg.norm(np.diff(poses, axis=0), axis=-1).max() * motion.fps < 5.0
+
+
+def test_a_standing_person_takes_no_step() -> None:
+    motion, solved = walking(4.0, speed=0.0)
+    report = fill(motion, solved).report
+    assert report.standing.all()
+    assert len(report.footsteps.side) == 2
+
+
+def test_the_result_is_the_same_each_time_and_at_another_rate() -> None:
+    motion, solved = walking(5.0)
+    first, second = fill(motion, solved), fill(motion, solved)
+    np.testing.assert_array_equal(first.motion.local_rotation, second.motion.local_rotation)
+    double, _ = walking(5.0, fps=60.0)
+    steps, other = first.report.footsteps, fill(double, solved).report.footsteps
+    assert len(steps.side) == len(other.side)
+    np.testing.assert_allclose(steps.start_tick / 30.0, other.start_tick / 60.0, atol=0.07)
+
+
+def test_a_moved_and_turned_person_is_filled_alike() -> None:
+    motion, solved = walking(5.0)
+    turn = so3_exp(np.array([0.0, 0.0, 2.0]))
+    local = motion.local_rotation.copy()
+    local[:, 0] = turn @ local[:, 0]
+    moved = replace(
+        motion, root_in_world_m=motion.root_in_world_m @ turn.T + [3.0, -4.0, 0.0], local_rotation=local
+    )
+    one, other = (fill(each, solved).motion.world_from_joint()[..., :3, 3] for each in (motion, moved))
+    np.testing.assert_allclose(one @ turn.T + [3.0, -4.0, 0.0], other, atol=1e-6)
+
+
+def test_an_assumed_floor_has_a_sigma() -> None:
+    motion, solved = walking(5.0)
+    lifted = replace(motion, root_in_world_m=motion.root_in_world_m + np.array([0.0, 0.0, 0.3]))
+    report = fill(lifted, solved, floor=False).report
+    assert report.floor_source == "legs"
+    assert abs(report.floor_m - 0.3) < 2.0 * report.floor_sigma_m
+    assert 0.005 < report.floor_sigma_m < 0.05
+
+
+def test_measured_legs_are_left_alone() -> None:
+    motion, solved = walking(3.0)
+    with_leg = solved.copy()
+    with_leg[[0, motion.skeleton.roles.index("LeftLeg")]] = True
+    result = fill(motion, with_leg)
+    roles = np.array(motion.skeleton.roles)[result.report.filled].tolist()
+    assert roles == ["Neck", "Head"]
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 5, 20])
+def test_short_motions_are_filled(ticks: int) -> None:
+    motion, solved = walking(ticks / 30.0)
+    result = fill(motion, solved)
+    assert np.isfinite(result.motion.local_rotation).all()
+    assert result.report.filled.any()
