@@ -8,14 +8,14 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.job_places import find_store, load_last_run
 from bodycap_batch.cli.progress_display import make_progress_display
-from bodycap_batch.cli.report import job_from_path
 from bodycap_batch.cli.shared_options import (
     JobArgument,
     StoreOption,
     ThreadsOption,
     cores,
-    default_store,
+    make_overrides,
     results_folder,
 )
 from bodycap_batch.cli.signals import event_on_signal
@@ -58,17 +58,15 @@ def export(
       bodycap export out/my_walk --for blender --to ~/scenes/walk
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.export_targets import export_target
-    from bodycap_batch.config.job import Overrides, load_job
     from bodycap_batch.pipeline import Settings, export_for
     from bodycap_batch.store.artefacts import Store
 
     export_target(target)
-    file, folder = job_from_path(job)
-    resolved = load_job(file, Overrides(out=folder))
+    resolved = load_last_run(job, make_overrides())
     out_dir = results_folder(resolved)
     with event_on_signal() as stop, make_progress_display(as_json=False) as display:
         settings = Settings(
-            store=Store(store or default_store(out_dir)),
+            store=Store(store or find_store(out_dir)),
             threads=threads or cores(),
             listener=display,
             cancelled=stop.is_set,

@@ -27,8 +27,8 @@ _STANDING_WIDTH = 0.2
 """Distance between the ankles while standing, as a ratio to the length of the leg. Source: W. E. McIlroy,
 B. E. Maki, "Preferred placement of the feet during quiet stance", Clinical Biomechanics 12, 1997: 17 cm."""
 _MIN_WIDTH = 0.06
-"""Minimum distance sideways between a foot that is put down and the standing foot, as a ratio to the length of
-the leg. Derivation: half of `_WALKING_WIDTH`."""
+"""Minimum distance sideways between a foot that is put down and the standing foot, as a ratio to the length
+of the leg. Derivation: half of `_WALKING_WIDTH`."""
 _TOE_OUT_RAD = np.radians(7.0)
 """Angle by which the toes point outward. Source: as `_STANDING_WIDTH`, halved: 14° between the feet."""
 _MAX_SHIFT_M = 0.22
