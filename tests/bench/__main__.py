@@ -19,6 +19,7 @@ from tests.bench import (
     batch,
     clocks,
     field,
+    inertial,
     joining,
     long,
     ours,
@@ -41,6 +42,7 @@ _WITH_OPTIONS = {
     "seeds": seeds.main,
     "long": long.main,
     "clocks": clocks.main,
+    "inertial": inertial.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
 
@@ -57,8 +59,8 @@ def main() -> int:
         "`cameras`, `size` of it), `field` (rendered captures recorded as by phones), `batch`, "
         "`spool`, `viewer`; with options of their own: `simulation`, "
         "`uncertainty`, `joining` or `solving` (the merge stage on simulated poses), `seeds` (the map "
-        "with several seeds), `clocks` (from generated sound and motion), and `long` "
-        "(ten minutes of three cameras)",
+        "with several seeds), `clocks` (from generated sound and motion), "
+        "`inertial` (gaps filled from a sensor), and `long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)
