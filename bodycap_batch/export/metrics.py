@@ -63,7 +63,7 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
         contradicted = [name for name, clock in inputs.clocks.items() if clock.is_contradicted]
         out["contradicted_clocks"] = contradicted
     if inputs.inertial:
-        out["telemetry"] = {name: item.to_dict() for name, item in inputs.inertial.items()}
+        out["telemetry"] = {name: item.figures() for name, item in inputs.inertial.items()}
     if inputs.relative_poses:
         out["relative_poses"] = [_relative_pose_metrics(inputs, item) for item in inputs.relative_poses]
     if inputs.merge is not None:

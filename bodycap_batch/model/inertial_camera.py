@@ -91,7 +91,7 @@ class SensorRelation:
         for name in ("rotation_sigma_rad", "bias_rad_s", "bias_sigma_rad_s"):
             set_array(self, name, (3,))
 
-    def to_dict(self) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
         """Return the relation as plain JSON values for ``metrics.json``."""
         return {
             "delay_s": round(self.delay_s, 6),
@@ -135,9 +135,9 @@ class InertialCamera:
     filled: int = 0
     refused: int = 0
 
-    def to_dict(self) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
         """Return verdict and relation as plain JSON values for ``metrics.json``."""
-        relation: Mapping[str, Any] = {} if self.relation is None else self.relation.to_dict()
+        relation: Mapping[str, Any] = {} if self.relation is None else self.relation.figures()
         return {
             "source": self.source,
             "verdict": self.verdict,

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from bodycap_batch.config.options import TelemetryOptions
+from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
 from bodycap_batch.inertial import use_sensor
 from bodycap_batch.inertial.gap_solver import CONSTANTS, Constants, Stretch, solve_stretch
 from bodycap_batch.inertial.preintegration import SensorNoise, preintegrate, steps_between
 from bodycap_batch.inertial.samples import InertialSamples
 from bodycap_batch.model.geometry import Similarity, rotation_angle_rad, so3_exp, so3_log
+from bodycap_batch.model.inertial_camera import InertialCamera
 from bodycap_batch.model.scene import FrameStatus
 from tests.inertial import NOISE_M, Hand, Sensor, solved
 
@@ -192,3 +195,19 @@ def test_the_derivatives_of_the_solver_lead_to_the_constants():
     assert (np.abs(solution.constants - wanted) < tolerance).all()
     off_m = (solution.gauge_from_cam - hand.poses(times_s))[~known, :3, 3]
     assert np.linalg.norm(off_m, axis=1).max() < 0.001
+
+
+def test_what_a_sensor_gives_is_stored_and_read_back(tmp_path):
+    _, used = _used(Hand(1), Sensor(), _lost(10))
+    write_dataclass(used.camera, tmp_path, "inertial")
+    read = read_dataclass(InertialCamera, tmp_path, "inertial")
+    assert read.figures() == used.camera.figures()
+    assert read.windows is not None
+    assert used.camera.windows is not None
+    assert (read.windows.force == used.camera.windows.force).all()
+    figures = json.loads(json.dumps(read.figures()))
+    assert figures["delay_s"] == pytest.approx(0.008, abs=0.001)
+    assert figures["frames_filled"] == read.filled > 0
+    unknown = InertialCamera(camera="torso", gauge="map-0", source="GPMF", verdict="unknown", reason="dark")
+    write_dataclass(unknown, tmp_path, "unknown")
+    assert read_dataclass(InertialCamera, tmp_path, "unknown").figures() == unknown.figures()
