@@ -259,8 +259,8 @@ class _Filler:
             known = self._known.copy()
             known[gap.first : gap.last] = False
             solved = self._solve(gap, known)
-            if solved is None:
-                continue
+            if solved is None or solved.worst_fix > _MAX_WORST_FIX:
+                continue  # wrong poses beside it say nothing about the sensor
             inner = slice(gap.first - gap.start, gap.last - gap.start)
             worst.append(
                 self._normalised_errors(

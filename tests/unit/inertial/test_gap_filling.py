@@ -35,9 +35,10 @@ def _used(hand, sensor, lost, options=TelemetryOptions(), seed=2):  # noqa: B008
     return path, use_sensor(path, sensor.samples(hand, SECONDS, seed), options)
 
 
-def _errors(hand, found, frames):
+def _errors(hand, found, frames, gauge=GAUGE):
     """Return position errors (N,3) (gauge units, axes of the camera) and rotation errors (N,3), radians."""
-    truth = GAUGE.apply_to_poses(hand.poses(found.seconds))[frames]
+    truth = hand.poses(found.seconds)[frames]
+    truth = truth if gauge is None else gauge.apply_to_poses(truth)
     mine_t = np.swapaxes(found.gauge_from_cam[frames][:, :3, :3], 1, 2)
     shift = np.einsum("nij,nj->ni", mine_t, truth[:, :3, 3] - found.gauge_from_cam[frames][:, :3, 3])
     return shift, so3_log(mine_t @ truth[:, :3, :3])
@@ -110,6 +111,10 @@ def test_a_wrong_pose_beside_a_gap_is_no_base_for_others():
     )
     assert {used.trajectory.status[frame] for frame in range(130, 140)} == {FrameStatus.BLUR}
     assert used.camera.refused == 10
+    # The other gaps are filled: the wrong poses do not count as errors of the sensor.
+    assert used.camera.filled == len(lost) - 10
+    shift, _ = _errors(hand, used.trajectory, [frame for frame in lost if not 130 <= frame < 140], None)
+    assert np.linalg.norm(shift, axis=1).max() < 0.01
 
 
 def test_filling_is_switched_off_and_needs_an_accelerometer_that_agrees():
