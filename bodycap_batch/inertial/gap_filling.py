@@ -64,6 +64,8 @@ _FACTOR_RANGE = (0.01, 100.0)
 motion, and nothing is filled."""
 _MAX_SIGMA_M, _MAX_SIGMA_DEG = 0.05, 2.0
 """Maximum sigmas, per axis, of a pose that is used. Evidence: none."""
+_MAX_WRONG = 2
+"""Maximum number of wrong poses beside a gap that are left out. Evidence: none."""
 _MAX_WORST_FIX = 8.0
 """Maximum residual of a localised pose beside a gap, in sigmas of six axes. With a larger one, poses beside
 the gap are wrong. Evidence: none."""
@@ -192,8 +194,8 @@ class _Filler:
         factors = self._factors_of(float(self._times_s[gap.last] - self._times_s[gap.first - 1]))
         if factors is None:
             return None
-        solved = self._solve(gap, self._known)
-        if solved is None or solved.worst_fix > _MAX_WORST_FIX:
+        solved = self._solve_without_wrong(gap)
+        if solved is None:
             return None
         lost = slice(gap.first - gap.start, gap.last - gap.start)
         grown = np.repeat(np.sqrt(factors), 3)
@@ -204,6 +206,24 @@ class _Filler:
         if np.sqrt(variance[:, 3:].max()) > _MAX_SIGMA_M:
             return None
         return solved.gauge_from_cam[lost], covariance
+
+    def _solve_without_wrong(self, gap: _Gap) -> SolvedStretch | None:
+        """Return the solution of a gap; None if poses beside it are wrong.
+
+        A few isolated wrong poses are left out. They must not be at the ends of the stretch.
+        """
+        known = self._known.copy()
+        for _ in range(_MAX_WRONG + 1):
+            solved = self._solve(gap, known)
+            if solved is None or solved.worst_fix <= _MAX_WORST_FIX:
+                return solved
+            known[gap.start + solved.worst_frame] = False
+            if self._with_margins(gap.first, gap.last, known) is None:
+                return None
+            inside = np.flatnonzero(known[gap.start : gap.end])
+            if inside[0] != 0 or inside[-1] != gap.end - gap.start - 1:
+                return None
+        return None
 
     def _with_margins(self, first: int, last: int, known: BoolArray) -> _Gap | None:
         """Return a gap with the frames beside it; None if there are too few, or samples are missing."""

@@ -82,6 +82,7 @@ class SolvedStretch:
         covariance: (N,6,6) covariance in the axes of the camera, rotation before translation (gauge units).
         chi2_per_dof: Weighted sum of squared residuals per degree of freedom; 1 is ideal.
         worst_fix: Largest residual of a solved pose, in sigmas of six axes together.
+        worst_frame: Index of the frame with this residual.
         constants: (17,) the constants of the stretch.
     """
 
@@ -89,6 +90,7 @@ class SolvedStretch:
     covariance: FloatArray
     chi2_per_dof: float
     worst_fix: float
+    worst_frame: int
     constants: FloatArray
 
 
@@ -135,8 +137,8 @@ def solve_stretch(
         state = state.moved(step / scale)
         if float(np.abs(step).max()) < _CONVERGED * max(float(scale.max()), 1.0):
             break
-    information, _, cost, worst = problem.linearise(state)
-    return problem.result(state, information, cost, worst)
+    information, _, cost, sizes = problem.linearise(state)
+    return problem.result(state, information, cost, sizes)
 
 
 class _Problem:
@@ -175,8 +177,8 @@ class _Problem:
         position = path(times_s) + rotation @ mean[LEVER]
         return _State(rotation, position, np.asarray(path(times_s, 1)), mean.copy())
 
-    def linearise(self, state: _State) -> tuple[FloatArray, FloatArray, float, float]:
-        """Return information, vector, cost, and the largest residual of a solved pose in sigmas."""
+    def linearise(self, state: _State) -> tuple[FloatArray, FloatArray, float, FloatArray]:
+        """Return information, vector, cost, and the residuals (F,) of the solved poses in sigmas."""
         size = _NODE * self._nodes + CONSTANTS
         information, vector = np.zeros((size, size)), np.zeros(size)
         tail = slice(size - CONSTANTS, size)
@@ -198,11 +200,11 @@ class _Problem:
             vector[columns] -= weighted @ residual[node]
             cost += float(residual[node] @ weight[node] @ residual[node])
         residual, first, common = self._fix_rows(state)
-        worst = 0.0
+        sizes = np.zeros(len(self._fixes))
         for index, node in enumerate(self._fixes.tolist()):
             start, weights = _NODE * node, self._weights[index]
             size2 = float(residual[index] @ weights @ residual[index])
-            worst = max(worst, float(np.sqrt(size2)))
+            sizes[index] = np.sqrt(size2)
             limit = _HUBER_SIGMAS * np.sqrt(6.0)
             share = min(1.0, limit / max(np.sqrt(size2), 1e-12))
             jacobian = np.concatenate([first[index], common[index]], axis=1)
@@ -211,7 +213,7 @@ class _Problem:
             information[np.ix_(columns, columns)] += weighted @ jacobian
             vector[columns] -= weighted @ residual[index]
             cost += share * size2
-        return information, vector, cost, worst
+        return information, vector, cost, sizes
 
     def _span_rows(
         self, state: _State, spans: Preintegrated
@@ -285,7 +287,7 @@ class _Problem:
             rows[:, :3], rows[:, 3:] = right @ rows[:, :3], back @ rows[:, 3:]
         return np.concatenate([turn, shift], axis=1), first, common
 
-    def result(self, state: _State, information: FloatArray, cost: float, worst: float) -> SolvedStretch:
+    def result(self, state: _State, information: FloatArray, cost: float, sizes: FloatArray) -> SolvedStretch:
         """Return the poses of the camera with their covariances."""
         nodes = np.arange(self._nodes)
         rotation, position = self._camera(state, nodes)
@@ -303,6 +305,7 @@ class _Problem:
             gauge_from_cam=make_transform(rotation, position + self._origin),
             covariance=0.5 * (out + np.swapaxes(out, 1, 2)),
             chi2_per_dof=cost / max(rows - size, 1),
-            worst_fix=worst,
+            worst_fix=float(sizes.max()),
+            worst_frame=int(self._fixes[int(np.argmax(sizes))]),
             constants=state.constants,
         )

@@ -101,11 +101,11 @@ def test_gaps_without_samples_stay_lost():
     assert {found.status[frame] for frame in lost if frame > 100} == {FrameStatus.INERTIAL}
 
 
-def test_a_wrong_pose_beside_a_gap_is_no_base_for_others():
+def test_wrong_poses_beside_a_gap_are_no_base_for_others():
     hand, lost = Hand(1), _lost(10)
     path = solved(hand, SECONDS, lost=lost)
     poses = path.gauge_from_cam.copy()
-    poses[140:142, :3, 3] += 0.3  # the frames after the second gap
+    poses[140:146, :3, 3] += 0.3  # the frames after the second gap
     used = use_sensor(
         replace(path, gauge_from_cam=poses), Sensor().samples(hand, SECONDS), TelemetryOptions()
     )
@@ -114,6 +114,19 @@ def test_a_wrong_pose_beside_a_gap_is_no_base_for_others():
     # The other gaps are filled: the wrong poses do not count as errors of the sensor.
     assert used.camera.filled == len(lost) - 10
     shift, _ = _errors(hand, used.trajectory, [frame for frame in lost if not 130 <= frame < 140], None)
+    assert np.linalg.norm(shift, axis=1).max() < 0.01
+
+
+def test_an_isolated_wrong_pose_beside_a_gap_is_left_out():
+    hand, lost = Hand(1), [*range(130, 133), 134, *range(200, 210)]
+    path = solved(hand, SECONDS, lost=lost)
+    poses = path.gauge_from_cam.copy()
+    poses[133, :3, 3] += 0.1  # between two gaps
+    used = use_sensor(
+        replace(path, gauge_from_cam=poses), Sensor().samples(hand, SECONDS), TelemetryOptions()
+    )
+    assert used.camera.filled == len(lost)
+    shift, _ = _errors(hand, used.trajectory, lost, None)
     assert np.linalg.norm(shift, axis=1).max() < 0.01
 
 
