@@ -122,3 +122,24 @@ def write_gopro(
             packet.duration = round(1000 * duration)
             container.mux(packet)
     return path
+
+
+CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
+"""Boxes of an MP4 file that lead to the tables of offsets."""
+
+
+def with_wide_offsets(data: bytes) -> bytes:
+    """Return an MP4 file whose tables of offsets have 64 bits. Its samples must come before the tables."""
+    out, place = b"", 0
+    while place + 8 <= len(data):
+        size, kind = struct.unpack_from(">I4s", data, place)
+        content = data[place + 8 : place + size]
+        if kind in CONTAINERS:
+            content = with_wide_offsets(content)
+        elif kind == b"stco":
+            count = struct.unpack_from(">I", content, 4)[0]
+            offsets = struct.unpack_from(f">{count}I", content, 8)
+            kind, content = b"co64", content[:8] + struct.pack(f">{count}Q", *offsets)
+        out += struct.pack(">I4s", len(content) + 8, kind) + content
+        place += size
+    return out

@@ -1,7 +1,7 @@
-"""Read when a recording started from its container: the creation time and the timecode.
+"""Read when a recording started from its file: the creation time, the timecode and the time of GPS.
 
-The clocks of cameras are set by hand, so these times only tell where to search first, and whether two
-recordings can belong together.
+The clocks of cameras are set by hand, and GPS time is written to some tenths of a second, so these times only
+tell where to search first, and whether two recordings can belong together.
 """
 
 from __future__ import annotations
@@ -11,10 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bodycap_batch.capture.video import VideoFile, open_container
+from bodycap_batch.telemetry.gopro import gps_time_s, has_telemetry_track, read_gopro_file
 
 CLOCK_SIGMA_S = 2.0
 """Standard deviation, seconds, of the difference between the clocks of two cameras that were set alike, and
 between the creation of a file and its first frame. Evidence: none."""
+_GPS_SIGMA_S = 0.7
+"""Standard deviation, seconds, of the difference between the GPS times of two cameras. Origin: receivers
+write the time of a fix up to a second late; half a second for each camera. Evidence: none."""
 _CREATION_RESOLUTION_S = 1.0
 """Resolution of a creation time, seconds. Origin: the format of the container."""
 _RANGE_SIGMAS = 4.0
@@ -35,12 +39,14 @@ class ContainerTime:
         created_s: Creation time, Unix seconds; None if it is unknown.
         timecode_s: Time of day from the timecode, seconds; None if it is unknown or was not set.
         frame_s: Resolution of the timecode, seconds.
+        gps_s: Unix time of the first frame according to GPS, seconds; None if it is unknown.
     """
 
     first_frame_s: float
     created_s: float | None
     timecode_s: float | None
     frame_s: float
+    gps_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +92,15 @@ def read_container_time(videos: Sequence[VideoFile], first_frame_s: float) -> Co
         created_s=video.created_s,
         timecode_s=timecode_seconds(timecode, fps),
         frame_s=1.0 / fps,
+        gps_s=_gps_start_s(video),
     )
+
+
+def _gps_start_s(video: VideoFile) -> float | None:
+    """Return the Unix time of the first frame of a file according to GPS; None if it is unknown."""
+    if not has_telemetry_track(video.path):
+        return None
+    return gps_time_s(read_gopro_file(video.path, video.fps), float(video.times_ns()[0]) * 1e-9)
 
 
 def timecode_seconds(text: str, fps: float) -> float | None:
@@ -102,9 +116,12 @@ def timecode_seconds(text: str, fps: float) -> float | None:
 def expected_offset(first: ContainerTime, second: ContainerTime) -> ExpectedOffset | None:
     """Return the offset between two cameras according to their containers; None if it is unknown.
 
-    The timecode is used if it agrees with the creation times, or without these: it has no date.
+    GPS time is used if both cameras have it. The timecode is used if it agrees with the creation times, or
+    without these: it has no date.
     """
     frames = first.first_frame_s - second.first_frame_s
+    if first.gps_s is not None and second.gps_s is not None:
+        return ExpectedOffset(second.gps_s - first.gps_s + frames, _GPS_SIGMA_S)
     created = None
     if first.created_s is not None and second.created_s is not None:
         created = ExpectedOffset(

@@ -245,6 +245,11 @@ class TelemetryOptions(Options):
     """Uses of the inertial sensors of the cameras. Without telemetry, these options have no effect."""
 
     gravity: bool = Field(True, description="the accelerometers determine the vertical of the world")
+    gaps: bool = Field(
+        True,
+        description="frames that are lost for up to a second get poses from the inertial sensor, with the "
+        "status INERTIAL",
+    )
 
 
 class ExportOptions(Options):

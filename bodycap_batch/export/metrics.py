@@ -63,7 +63,7 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
         contradicted = [name for name, clock in inputs.clocks.items() if clock.is_contradicted]
         out["contradicted_clocks"] = contradicted
     if inputs.inertial:
-        out["telemetry"] = {name: item.to_dict() for name, item in inputs.inertial.items()}
+        out["telemetry"] = {name: item.figures() for name, item in inputs.inertial.items()}
     if inputs.relative_poses:
         out["relative_poses"] = [_relative_pose_metrics(inputs, item) for item in inputs.relative_poses]
     if inputs.merge is not None:
@@ -146,7 +146,7 @@ def _camera_metrics(
         errors: For each map, the (M,) reprojection errors of its observations, pixels at the work size.
     """
     name = trajectory.camera
-    localised = trajectory.localised
+    registered = trajectory.registered
     own_observations = [
         (
             np.array([camera == name for camera in scene.keyframe_camera], dtype=bool)[scene.obs_keyframe],
@@ -159,9 +159,9 @@ def _camera_metrics(
     selected = [len(item.frames) for item in inputs.selections if item.camera == name]
     return {
         "frame": trajectory.gauge,
-        "frames": len(localised),
-        "frames_registered": int(localised.sum()),
-        "coverage": float(localised.mean()) if len(localised) else 0.0,
+        "frames": len(registered),
+        "frames_registered": int(registered.sum()),
+        "coverage": float(registered.mean()) if len(registered) else 0.0,
         "status": dict(sorted(Counter(status.value for status in trajectory.status).items())),
         "keyframes_selected": sum(selected) if selected else None,
         "keyframes": sum(scene.keyframe_camera.count(name) for scene in inputs.maps),

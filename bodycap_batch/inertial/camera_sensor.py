@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from bodycap_batch.config.options import TelemetryOptions
 from bodycap_batch.inertial.alignment import align_sensor
 from bodycap_batch.inertial.force_windows import force_windows
+from bodycap_batch.inertial.gap_filling import FilledGaps, constants_of_clip, fill_gaps
+from bodycap_batch.model.gravity import fit_gravity
 from bodycap_batch.model.inertial_camera import InertialCamera, SensorRelation
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.telemetry.gyro_fit import GyroFit
 from bodycap_batch.telemetry.streams import CameraTelemetry
 
 
-def use_sensor(
-    trajectory: Trajectory, telemetry: CameraTelemetry, options: TelemetryOptions
-) -> InertialCamera:
-    """Estimate how the sensor of a camera relates to its solved poses, and what it measures.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UsedSensor:
+    """What the sensor of a camera gives.
+
+    Attributes:
+        camera: Its relation to the camera, and what it measures.
+        trajectory: The poses of the camera, with the frames that the sensor added.
+    """
+
+    camera: InertialCamera
+    trajectory: Trajectory
+
+
+def use_sensor(trajectory: Trajectory, telemetry: CameraTelemetry, options: TelemetryOptions) -> UsedSensor:
+    """Estimate how the sensor of a camera relates to its solved poses, and use what it measures.
 
     Args:
         trajectory: The poses of the camera's frames.
@@ -24,19 +39,25 @@ def use_sensor(
         options: Which uses of the telemetry are on.
     """
     aligned = align_sensor(trajectory, telemetry)
-    windows = None
-    if options.gravity and aligned.fit is not None and aligned.samples is not None:
-        found = force_windows(trajectory, aligned.samples, aligned.fit.rotation_sigma_rad)
-        windows = found if len(found.times_s) else None
-    return InertialCamera(
+    windows, filled = None, FilledGaps(trajectory=trajectory, filled=0, refused=0)
+    if aligned.fit is not None and aligned.samples is not None:
+        windows = force_windows(trajectory, aligned.samples, aligned.fit.rotation_sigma_rad)
+        gravity = fit_gravity([windows]) if options.gaps else None
+        constants = None if gravity is None else constants_of_clip(aligned.fit, gravity)
+        if constants is not None:
+            filled = fill_gaps(trajectory, aligned.samples, constants)
+    camera = InertialCamera(
         camera=trajectory.camera,
         gauge=trajectory.gauge,
         source=telemetry.source,
         verdict=aligned.comparison.verdict,
         reason=aligned.comparison.reason,
         relation=None if aligned.fit is None else _relation(aligned.fit),
-        windows=windows,
+        windows=windows if options.gravity and windows is not None and len(windows.times_s) else None,
+        filled=filled.filled,
+        refused=filled.refused,
     )
+    return UsedSensor(camera=camera, trajectory=filled.trajectory)
 
 
 def _relation(fit: GyroFit) -> SensorRelation:

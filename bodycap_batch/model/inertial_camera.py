@@ -91,7 +91,7 @@ class SensorRelation:
         for name in ("rotation_sigma_rad", "bias_rad_s", "bias_sigma_rad_s"):
             set_array(self, name, (3,))
 
-    def to_dict(self) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
         """Return the relation as plain JSON values for ``metrics.json``."""
         return {
             "delay_s": round(self.delay_s, 6),
@@ -120,6 +120,9 @@ class InertialCamera:
         reason: Sentence that explains the verdict.
         relation: How the sensor relates to the camera; None if it cannot be used.
         windows: Means of the specific force, for the vertical; None if there is no usable accelerometer.
+        filled: Number of lost frames that got a pose from the sensor.
+        refused: Number of lost frames in short gaps whose poses were too uncertain, or contradicted the poses
+            beside them.
     """
 
     camera: str
@@ -129,8 +132,17 @@ class InertialCamera:
     reason: str
     relation: SensorRelation | None = None
     windows: ForceWindows | None = None
+    filled: int = 0
+    refused: int = 0
 
-    def to_dict(self) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
         """Return verdict and relation as plain JSON values for ``metrics.json``."""
-        relation: Mapping[str, Any] = {} if self.relation is None else self.relation.to_dict()
-        return {"source": self.source, "verdict": self.verdict, "reason": self.reason, **relation}
+        relation: Mapping[str, Any] = {} if self.relation is None else self.relation.figures()
+        return {
+            "source": self.source,
+            "verdict": self.verdict,
+            "reason": self.reason,
+            **relation,
+            "frames_filled": self.filled,
+            "frames_refused": self.refused,
+        }

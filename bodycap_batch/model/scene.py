@@ -31,6 +31,8 @@ class FrameStatus(StrEnum):
     REGISTERED: The pose was estimated from the frame's own observations.
     RIG: The pose was computed from other cameras of a hardware-synchronised rig, because the frame itself has
         too few observations.
+    INERTIAL: The frame itself gave no pose. The pose follows from the inertial sensor of the camera, between
+        localised frames before and after.
     BLUR: Lost; too few tracks reach the frame, and the image is blurred.
     FEW_TRACKS: Lost; too few tracks reach the frame, although the image is sharp.
     FEW_INLIERS: Lost; too few observations agree with any pose.
@@ -46,6 +48,7 @@ class FrameStatus(StrEnum):
     KEYFRAME = "KEYFRAME"
     REGISTERED = "REGISTERED"
     RIG = "RIG"
+    INERTIAL = "INERTIAL"
     BLUR = "BLUR"
     FEW_TRACKS = "FEW_TRACKS"
     FEW_INLIERS = "FEW_INLIERS"
@@ -60,7 +63,12 @@ class FrameStatus(StrEnum):
     @property
     def localised(self) -> bool:
         """True if the frame has a measured pose."""
-        return self in (FrameStatus.KEYFRAME, FrameStatus.REGISTERED, FrameStatus.RIG)
+        return self in (
+            FrameStatus.KEYFRAME,
+            FrameStatus.REGISTERED,
+            FrameStatus.RIG,
+            FrameStatus.INERTIAL,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -236,6 +244,13 @@ class Trajectory:
     def localised(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """Mask (N,) that is True for the frames with a measured pose."""
         return np.array([status.localised for status in self.status], dtype=bool)
+
+    @property
+    def registered(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        """Mask (N,) that is True for the frames with a pose from pictures, not from an inertial sensor."""
+        return np.array(
+            [status.localised and status is not FrameStatus.INERTIAL for status in self.status], dtype=bool
+        )
 
     @property
     def seconds(self) -> FloatArray:

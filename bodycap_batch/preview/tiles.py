@@ -183,6 +183,8 @@ def describe_status(status: FrameStatus, points: ObservedPoints | None) -> tuple
     """Return the text about a frame's pose, and the colour of this text."""
     if not status.localised or points is None:
         return f"lost: {_LOSS_REASONS.get(status, status.value)}", RED
+    if status is FrameStatus.INERTIAL:
+        return "pose from the inertial sensor", AMBER
     name = {FrameStatus.KEYFRAME: "keyframe", FrameStatus.RIG: "pose from the other camera of the rig"}.get(
         status, ""
     )

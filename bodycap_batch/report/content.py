@@ -126,7 +126,7 @@ def _cameras(
                     inputs, name, span, camera_losses, inputs.max_gap_s if name in used else 0.0, budget.share
                 ),
                 "frames": 0 if path is None else len(path.status),
-                "registered": 0 if path is None else int(path.localised.sum()),
+                "registered": 0 if path is None else int(path.registered.sum()),
                 "losses": len(camera_losses),
                 "causes": [(cause.value, frames) for cause, frames in causes.get(name, {}).items()],
             }

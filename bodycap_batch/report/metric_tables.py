@@ -62,6 +62,7 @@ def make_tables(inputs: ReportInputs) -> dict[str, Table]:
     tables = {
         "frames": _frames_table(metrics),
         "clocks": _clocks_table(metrics),
+        "sensors": _sensors_table(metrics),
         "map": _map_table(metrics),
     }
     if "merge" in metrics:
@@ -159,6 +160,39 @@ def _clocks_table(metrics: Mapping[str, Any]) -> Table:
         rows=tuple(rows) if len(rows) > 1 else (),
         note="Common time = camera time · (1 + drift) + offset. The offset is relative to the reference "
         "camera, whose offset is 0.",
+    )
+
+
+_SENSOR_VERDICTS = {
+    "agrees": "agrees with the pictures",
+    "stabilised": "not used: the camera stabilised the video",
+    "unknown": "not used",
+}
+"""Text for the user, by the verdict of the comparison of a gyroscope with the pictures."""
+
+
+def _sensors_table(metrics: Mapping[str, Any]) -> Table:
+    rows, reasons = [], []
+    for name, sensor in metrics.get("telemetry", {}).items():
+        path = metric_path("telemetry", name)
+        if sensor["verdict"] != "agrees":
+            reasons.append(f"{name}: {sensor['reason']}.")
+        rows.append(
+            (
+                Cell(text=name),
+                Cell(text=_SENSOR_VERDICTS.get(sensor["verdict"], str(sensor["verdict"]))),
+                metric_cell(metrics, f"{path}.delay_s", "{:+.1f} ms", 1000.0),
+                metric_cell(metrics, f"{path}.delay_sigma_s", "{:.1f} ms", 1000.0),
+                metric_cell(metrics, f"{path}.turned_deg", "{:.1f}°"),
+                metric_cell(metrics, f"{path}.rate_ppm", "{:+.0f} ppm"),
+                metric_cell(metrics, f"{path}.frames_filled"),
+            )
+        )
+    return Table(
+        caption="Inertial sensors",
+        heads=("Camera", "Sensor", "Delay", "Sigma", "Turned by", "Clock rate", "Lost frames with a pose"),
+        rows=tuple(rows),
+        note=" ".join(["Time of a sample = time of the frame + delay.", *reasons]),
     )
 
 

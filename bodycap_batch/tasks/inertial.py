@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bodycap_batch.config.options import TelemetryOptions
@@ -50,10 +50,11 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
     registration = load_registration(before)
     found = use_sensor(registration.trajectory, telemetry, task.options)
     notes = [f"{camera.name}: {note}" for note in telemetry.notes]
-    if telemetry.gyro is not None and found.relation is None:
-        notes.append(f"{camera.name}: the inertial sensor is not used: {found.reason}")
+    if telemetry.gyro is not None and found.camera.relation is None:
+        notes.append(f"{camera.name}: the inertial sensor is not used: {found.camera.reason}")
+    registration = replace(registration, trajectory=found.trajectory)
     save_registration(registration, camera, files, rolling=read_summary(before)["rolling"], notes=notes)
-    write_dataclass(found, files, INERTIAL_CAMERA)
+    write_dataclass(found.camera, files, INERTIAL_CAMERA)
     if (before / f"{RIG_POSES}.json").exists():
         write_dataclass(read_dataclass(RigPoses, before, RIG_POSES), files, RIG_POSES)
 

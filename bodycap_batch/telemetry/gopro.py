@@ -94,6 +94,9 @@ interval.
 Origin: inertial sensors of cameras give 100 to 800 samples per second."""
 _MAX_DAYS = 36_525
 """Maximum number of days since the year 2000 of a plausible GPS time: a hundred years."""
+_MIN_FIX = 2
+"""Minimum kind of a GPS fix whose time is right: 2 is a fix without altitude. Without a fix, the receiver
+gives the time of its own clock, which may be years wrong."""
 _MAX_OTHER = 500
 """Maximum number of streams that are listed although they are not read. Real files have some twenty."""
 _HANDLER = "GoPro MET"
@@ -378,6 +381,19 @@ def read_gopro_file(path: Path, frame_rate_hz: float) -> CameraTelemetry:
         firmware = str(container.metadata.get("firmware", ""))
     track = read_gpmf_payloads(gpmf_payloads(path))
     return gopro_telemetry(track, gopro_settings(path), firmware, frame_rate_hz)
+
+
+def gps_time_s(telemetry: CameraTelemetry, at_s: float) -> float | None:
+    """Return the Unix time of an instant according to the GPS receiver; None without a fix.
+
+    Args:
+        telemetry: The telemetry of one file.
+        at_s: Time of the instant in the file, seconds.
+    """
+    gps = telemetry.gps
+    if gps is None or not len(gps.fix) or gps.fix[0] < _MIN_FIX or not gps.start_utc:
+        return None
+    return datetime.fromisoformat(gps.start_utc).timestamp() + at_s - float(gps.times_s[0])
 
 
 def cam_from_stored(raw: _RawStream, model: str) -> FloatArray | None:

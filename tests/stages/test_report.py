@@ -242,6 +242,29 @@ def test_an_unknown_clock_is_in_the_first_line_and_poor(inputs: ReportInputs, tm
     assert note in page
 
 
+def test_sensors_are_listed_and_a_stabilised_video_is_named(inputs: ReportInputs, tmp_path: Path) -> None:
+    assert "Inertial sensors" not in written(inputs, tmp_path)
+    metrics = json.loads(json.dumps(inputs.metrics))
+    reason = "the camera stabilised the video: the pictures show 8 % of the shaking"
+    metrics["telemetry"] = {
+        "torso": {"verdict": "stabilised", "reason": reason, "frames_filled": 0},
+        "left_palm": {
+            "verdict": "agrees",
+            "reason": "",
+            "delay_s": 0.0081,
+            "delay_sigma_s": 0.0002,
+            "turned_deg": 2.06,
+            "rate_ppm": 12.0,
+            "frames_filled": 14,
+        },
+    }
+    page = written(replace(inputs, metrics=metrics), tmp_path)
+    assert "Inertial sensors" in page
+    assert reason in page
+    for text in ("+8.1 ms", "2.1°", "not used: the camera stabilised the video"):
+        assert text in page
+
+
 @pytest.mark.parametrize(("sigma_s", "grade"), [(0.002, Grade.GOOD), (0.025, Grade.FAIR), (0.06, Grade.POOR)])
 def test_the_sigma_of_an_estimated_clock_is_graded(
     inputs: ReportInputs, sigma_s: float, grade: Grade

@@ -169,8 +169,8 @@ def x_from_time(time_s: float | FloatArray, span_s: tuple[float, float]) -> Floa
 def _summary(path: Trajectory | None) -> str:
     if path is None:
         return "keyframes and sharpness"
-    localised = path.localised
-    return f"{int(localised.sum())} of {len(localised)} frames registered"
+    registered = path.registered
+    return f"{int(registered.sum())} of {len(registered)} frames registered"
 
 
 def _make_curves(path: Trajectory) -> list[_Curve]:

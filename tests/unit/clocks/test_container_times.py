@@ -4,22 +4,59 @@ from __future__ import annotations
 
 import pytest
 
+from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.clocks.container_times import (
     ContainerTime,
     are_dates_apart,
     duration_text,
     expected_offset,
+    read_container_time,
     timecode_seconds,
 )
 from bodycap_batch.clocks.recorders import Recorder
+from tests.gpmf import Sensor, item, nested, payloads, write_gopro
+from tests.videos import textured_frame
 
 DAY_S = 86_400.0
 
 
-def start(created_s=None, timecode_s=None, first_frame_s=0.0):
+def start(created_s=None, timecode_s=None, first_frame_s=0.0, gps_s=None):
     return ContainerTime(
-        first_frame_s=first_frame_s, created_s=created_s, timecode_s=timecode_s, frame_s=1 / 30
+        first_frame_s=first_frame_s,
+        created_s=created_s,
+        timecode_s=timecode_s,
+        frame_s=1 / 30,
+        gps_s=gps_s,
     )
+
+
+def test_gps_time_comes_before_clocks_that_were_set_by_hand():
+    one = start(1000.0, 3600.0, first_frame_s=2.0, gps_s=50_000.0)
+    found = expected_offset(one, start(5000.0, 7200.0, gps_s=50_003.5))
+    assert found is not None
+    assert found.offset_s == 5.5
+    assert found.sigma_s < 1.0
+    alone = expected_offset(one, start(1005.0))
+    assert alone is not None
+    assert alone.offset_s == 7.0
+
+
+@pytest.mark.parametrize(("fix", "known"), [(3, True), (2, True), (0, False)])
+def test_gps_time_of_the_first_frame(tmp_path, fix, known):
+    gps = nested(
+        "STRM",
+        *(item("GPSF", "L", [fix]), item("GPSU", "c", "240131120000.250"), item("GPSP", "S", [150])),
+        item("SCAL", "l", [10_000_000, 10_000_000, 1000, 1000, 100]),
+        item("GPS5", "l", [[425000000, -87000000, 58512, 1200, 150]] * 10, 5),
+    )
+    frames = [textured_frame(index) for index in range(30)]
+    path = write_gopro(tmp_path / "GX010001.MP4", frames, payloads(Sensor(), 3, extra=[gps]))
+    found = read_container_time([index_video(path)], 0.0)
+    if known:
+        # The first fix is at the start of the file.
+        assert found.gps_s == pytest.approx(1_706_702_400.25, abs=0.1)
+    else:
+        assert found.gps_s is None
 
 
 def test_the_camera_that_started_later_has_the_larger_offset():

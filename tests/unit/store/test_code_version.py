@@ -104,10 +104,10 @@ BODY = CAMERAS
 HASHED = {
     "synth": BODY | {"synthetic"},
     "check": BODY | {"check", "store", "telemetry"},
-    "inertial": CAMERAS | {"inertial", "telemetry"},
-    "sound": CAMERAS | {"clocks"},
+    "inertial": CAMERAS | {"inertial", "registration", "telemetry"},
+    "sound": CAMERAS | {"clocks", "telemetry"},
     # The clocks stage compares the distances between the cameras with the reach of the body.
-    "clocks": CAMERAS | {"clocks", "mapping"},
+    "clocks": CAMERAS | {"clocks", "mapping", "telemetry"},
     "keyframes": CAMERAS | {"keyframes"},
     **dict.fromkeys(("map", "extend", "refine"), CAMERAS | {"mapping"}),
     **dict.fromkeys(("registration", "rig", "recover"), CAMERAS | {"registration"}),

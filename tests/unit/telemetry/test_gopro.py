@@ -11,8 +11,8 @@ from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.capture.timeline import join_chapters
 from bodycap_batch.formats.gpmf import Damage, gopro_model, read_items
 from bodycap_batch.telemetry import read_telemetry
-from bodycap_batch.telemetry.gopro import gopro_telemetry, read_gpmf_payloads
-from tests.gpmf import Sensor, header, item, nested, payloads, raw, write_gopro
+from bodycap_batch.telemetry.gopro import gopro_telemetry, has_telemetry_track, read_gpmf_payloads
+from tests.gpmf import Sensor, header, item, nested, payloads, raw, with_wide_offsets, write_gopro
 from tests.videos import textured_frame
 
 FPS = 30000 / 1001
@@ -161,6 +161,27 @@ def test_gps_exposure_and_other_streams():
     assert new.gps.fix[0] == 2
     assert new.gps.dilution[0] == pytest.approx(1.2)
     assert new.gps.start_utc == "2024-01-31T12:00:00.250Z"
+
+
+def test_tables_of_64_bit_offsets_are_read(tmp_path):
+    """Files over 4 GB have co64 instead of stco."""
+    frames = [textured_frame(index % 40) for index in range(90)]
+    short = write_gopro(tmp_path / "GX010001.MP4", frames, payloads(Sensor(), 3, _turn))
+    wide = tmp_path / "GX020001.MP4"
+    wide.write_bytes(with_wide_offsets(short.read_bytes()))
+    assert b"stco" not in wide.read_bytes()
+    assert wide.read_bytes().count(b"co64") == short.read_bytes().count(b"stco") >= 2
+    one, other = (_telemetry(path) for path in (short, wide))
+    assert one.gyro is not None
+    assert other.gyro is not None
+    np.testing.assert_array_equal(other.gyro.values, one.gyro.values)
+    np.testing.assert_array_equal(other.gyro.times_s, one.gyro.times_s)
+    assert has_telemetry_track(wide)
+
+
+def _telemetry(path):
+    video = index_video(path)
+    return read_telemetry([video], video.times_ns())
 
 
 def test_a_video_with_a_track_and_its_chapters(tmp_path):
