@@ -300,7 +300,7 @@ def _trunk_parts(
         centre = first + place * (end - first)
         fraction = (centre[2] - low[2]) / (top - low[2])
         wide, deep = (float(np.interp(fraction, _TRUNK[:, 0], _TRUNK[:, k])) * stature for k in (1, 2))
-        parts.append(_Part("Trunk", joint, _ellipsoid(centre, np.eye(3), [wide, deep, 0.045 * stature])))
+        parts.append(_Part("Trunk", joint, _ellipsoid(centre, np.eye(3), [wide, deep, 0.060 * stature])))
     return parts
 
 

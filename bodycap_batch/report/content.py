@@ -7,11 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from bodycap_batch.model.measured_parts import PartState, part_states
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
+from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.report.drawn_scene import DrawnScene, common_times_s
 from bodycap_batch.report.figures.before_after import draw_before_and_after, find_unoptimised_bones
 from bodycap_batch.report.figures.camera_landmark_matrix import draw_camera_landmark_matrix
 from bodycap_batch.report.figures.camera_timeline import MAX_COLUMNS, column_count, draw_camera_timeline
+from bodycap_batch.report.figures.motion_curves import Take, draw_motion_curves
+from bodycap_batch.report.figures.pictogram import draw_pictogram
 from bodycap_batch.report.figures.shared_landmarks import draw_shared_landmarks
 from bodycap_batch.report.frame_losses import FAST_DEG, PLAIN_RATIO, LossCause
 from bodycap_batch.report.frame_pictures import DARK_BRIGHTNESS
@@ -21,10 +25,13 @@ from bodycap_batch.report.metric_tables import headline_figures, make_tables
 from bodycap_batch.report.packing import PageBudget
 from bodycap_batch.report.recommendations import recommend_changes
 from bodycap_batch.report.report_inputs import ReportInputs
+from bodycap_batch.report.result_links import describe_files
 from bodycap_batch.report.verdict import judge
 
 _SHEET_PICTURES = 24
 """Maximum number of pictures of lost frames on the page: six rows of four pictures on a wide screen."""
+_WHOLE_SHARE = 0.95
+"""Share of ticks from which a part of the body counts as measured or as not measured. Evidence: none."""
 _PROGRESS_AT_FAILURE = {
     "check": "no video was read",
     "keyframes": "the videos were opened; the selection of keyframes was not finished",
@@ -57,6 +64,9 @@ def page_content(
     verdict = judge(inputs.metrics, inputs.failure)
     return {
         "name": inputs.name,
+        "person": None if inputs.merge is None else _person(inputs.merge.motion),
+        "curves": _motion_curves(inputs, budget),
+        "files": describe_files(inputs.files),
         "verdict": verdict,
         "grades": Grade,
         "failure": inputs.failure,
@@ -80,6 +90,29 @@ def page_content(
         "before": _distances_before_optimisation(inputs),
         "thinned": budget.thinned_lines(),
     }
+
+
+def _person(motion: Motion) -> dict[str, Any]:
+    """Return the pictogram, and for each part of the body the shares of ticks in each state."""
+    states = part_states(motion)
+    parts = []
+    for name, values in states.items():
+        measured, partly = float((values == 2).mean()), float((values == 1).mean())
+        state = PartState.MEASURED if measured >= _WHOLE_SHARE else PartState.PARTLY
+        state = PartState.UNMEASURED if measured + partly <= 1.0 - _WHOLE_SHARE else state
+        parts.append({"name": name, "measured": measured, "partly": partly, "state": state})
+    unmeasured = [part["name"] for part in parts if part["state"] == PartState.UNMEASURED]
+    return {"pictogram": draw_pictogram(motion), "parts": parts, "unmeasured": unmeasured}
+
+
+def _motion_curves(inputs: ReportInputs, budget: PageBudget) -> str:
+    """Draw the joint angles and foot contacts of the body; "" without a body."""
+    merge = inputs.merge
+    if merge is None:
+        return ""
+    take = Take(name=inputs.name, motion=merge.motion, start_s=merge.motion.start_ns / 1e9)
+    times = take.times_s()
+    return draw_motion_curves([take], (float(times[0]), float(times[-1])), budget.share)
 
 
 _CAUSE_CRITERIA = {

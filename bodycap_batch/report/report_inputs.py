@@ -33,6 +33,7 @@ class ReportInputs:
             None if no error stopped the job.
         max_gap_s: Maximum time (seconds) between two measurements that the body's motion bridges
             (``merge.max_gap_s``).
+        files: Paths of the result files, relative to the folder of the page.
     """
 
     name: str
@@ -48,6 +49,7 @@ class ReportInputs:
     capture: Capture | None = None
     failure: Mapping[str, Any] | None = None
     max_gap_s: float = 1.0
+    files: tuple[str, ...] = ()
 
     def registration(self, camera: str) -> Registration | None:
         """Return the registration of a camera, or None if the camera was not registered."""

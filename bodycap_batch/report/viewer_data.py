@@ -10,6 +10,7 @@ import numpy.typing as npt
 from bodycap_batch.core.arrays import FloatArray, evenly_spaced
 from bodycap_batch.model.geometry import quat_xyzw_from_rotation
 from bodycap_batch.model.merge_data import MergeResult
+from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.report.drawn_scene import DrawnPath, DrawnScene
 from bodycap_batch.report.packing import PageBudget, affordable_count, pack_bytes, pack_scaled
 from bodycap_batch.report.report_inputs import ReportInputs
@@ -126,11 +127,21 @@ def _pack_body(merge: MergeResult, budget: PageBudget) -> dict[str, Any]:
         "parents": [*(int(parent) for parent in skeleton.parents), *(int(joint) for joint in end_joints)],
         "solved": [bool(solved) for solved in merge.solved],
         "fps": merge.fps,
+        "across": _across(skeleton),
         "time": [round(float(time), 6) for time in times[kept]],
         "centres": {**pack_scaled(centres.reshape(-1, 3)), "shape": list(centres.shape)},
         "observed": pack_bytes(merge.observed[kept].astype(np.uint8)),
         "sigma": None if sigma is None else pack_scaled(sigma[kept]),
     }
+
+
+def _across(skeleton: SkeletonModel) -> list[int] | None:
+    """Return a joint of the left side and the same joint of the right side; None without such a pair."""
+    for part in ("UpLeg", "Arm", "Shoulder"):
+        pair = [skeleton.index_of_role(f"{side}{part}") for side in ("Left", "Right")]
+        if pair[0] is not None and pair[1] is not None:
+            return [pair[0], pair[1]]
+    return None
 
 
 def known_joint_sigma_m(merge: MergeResult) -> FloatArray | None:

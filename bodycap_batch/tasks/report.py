@@ -97,7 +97,14 @@ def load_inputs(task: ReportTask, threads: int = 0) -> ReportInputs:
         capture=_open_capture(task, clocks, threads),
         failure=task.failure,
         max_gap_s=task.max_gap_s,
+        files=() if task.export is None else _result_files(task.export),
     )
+
+
+def _result_files(export: ArtefactRef) -> tuple[str, ...]:
+    """Return the paths of the result files of the export, relative to the results folder."""
+    folder = export.path / RESULTS_FOLDER
+    return tuple(sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()))
 
 
 def _load_merge(merge: ArtefactRef | None) -> MergeResult | None:

@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import subprocess
+import tomllib
+import zipfile
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -360,3 +362,32 @@ def test_fbx_is_the_same_twice(case: Case, tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_fbx(tmp_path / f"{name}.fbx", case.motion)
     assert (tmp_path / "a.fbx").read_bytes() == (tmp_path / "b.fbx").read_bytes()
+
+
+def test_the_extension_imports_a_results_folder(case: Case, blender: Path, tmp_path: Path) -> None:
+    """The ZIP file holds a manifest and the same code as the script; its operator builds the scene."""
+    with zipfile.ZipFile(case.folder / "bodycap_blender.zip") as archive:
+        manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
+        code = archive.read("__init__.py")
+    assert code == (case.folder / "blender_scene.py").read_bytes()
+    needed = {"schema_version", "id", "version", "name", "tagline", "maintainer", "type", "license"}
+    assert needed | {"blender_version_min"} <= set(manifest)
+    assert manifest["blender_version_min"] == "4.2.0"
+    (tmp_path / "bodycap_results").mkdir()
+    (tmp_path / "bodycap_results" / "__init__.py").write_bytes(code)
+    used = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "import bpy, bodycap_results\n"
+        "bpy.ops.wm.read_factory_settings(use_empty=True)\n"
+        "bodycap_results.register()\n"
+        f"bpy.ops.import_scene.bodycap(filepath={str(case.folder / 'blender_scene.json')!r})\n"
+        "print('found', *sorted(item.type for item in bpy.data.objects))\n"
+        "bodycap_results.unregister()\n"
+        "print('left', hasattr(bpy.types, 'IMPORT_SCENE_OT_bodycap'))\n"
+    )
+    done = subprocess.run(
+        [str(blender), "-c", used], capture_output=True, text=True, check=False, timeout=300, env=clean()
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "found ARMATURE CAMERA CAMERA MESH MESH" in done.stdout
+    assert "left False" in done.stdout

@@ -50,11 +50,52 @@ SCREEN_EXTENT = """() => {
 }"""
 
 
+PERSON_EXTENT = """() => {
+  const { view } = bodycap;
+  const p = new view.three.Vector3();
+  const ends = [0, 0];
+  for (let i = 0; i < view.centres.length; i += 3) {
+    p.fromArray(view.centres, i).project(view.camera);
+    ends[0] = Math.max(ends[0], Math.abs(p.x));
+    ends[1] = Math.max(ends[1], Math.abs(p.y));
+  }
+  return ends;
+}"""
+
+
 @pytest.mark.parametrize("width", [1400, 400])
-def test_it_starts_with_the_whole_body_and_all_paths_in_view(pages: Pages, report: Path, width: int) -> None:
+def test_it_starts_with_the_person_who_fills_the_view(pages: Pages, report: Path, width: int) -> None:
     page = pages.open(report.as_uri())
     page.set_viewport_size({"width": width, "height": 900})
     page.wait_for_selector("section.viewer[data-mode=webgl]")
+    page.wait_for_timeout(400)
+    assert page.is_checked("[data-layer=follow]")
+    for look in ("", "front", "side", "top"):
+        if look:
+            page.click(f"[data-look={look}]")
+            page.wait_for_timeout(200)
+        across, up = page.evaluate(PERSON_EXTENT)
+        assert max(across, up) < 1.0, look
+        assert max(across, up) > (0.2 if look == "top" else 0.6), look
+
+
+def test_front_and_side_follow_the_direction_of_the_person(pages: Pages, report: Path) -> None:
+    """The person faces −Y at the start, so the front view looks from −Y and the side view from +X."""
+    page = pages.open(report.as_uri())
+    page.wait_for_selector("section.viewer[data-mode=webgl]")
+    away = "() => bodycap.view.orbit.eye().map((value, i) => value - bodycap.view.orbit.target[i])"
+    for look, axis, sign in (("front", 1, -1), ("side", 0, 1), ("top", 2, 1)):
+        page.click(f"[data-look={look}]")
+        way = page.evaluate(away)
+        assert sign * way[axis] > 0.95 * sum(value**2 for value in way) ** 0.5, look
+
+
+@pytest.mark.parametrize("width", [1400, 400])
+def test_the_whole_room_shows_the_body_and_all_paths(pages: Pages, report: Path, width: int) -> None:
+    page = pages.open(report.as_uri())
+    page.set_viewport_size({"width": width, "height": 900})
+    page.wait_for_selector("section.viewer[data-mode=webgl]")
+    page.click("#reset")
     page.wait_for_timeout(400)
     across, up = page.evaluate(SCREEN_EXTENT)
     # Everything is visible, and not too small.

@@ -751,3 +751,15 @@ def test_known_joint_uncertainty_is_shown(inputs: ReportInputs, tmp_path: Path) 
     assert "1.4 cm" in written(inputs, tmp_path)
     unknown = replace(inputs, merge=replace(inputs.merge, joint_covariance_m2=None))
     assert make_viewer_data(unknown, make_drawn_scene(unknown), PageBudget())["body"]["sigma"] is None
+
+
+def test_the_page_leads_with_the_person_and_links_the_files(inputs: ReportInputs, tmp_path: Path) -> None:
+    text = written(replace(inputs, files=("motion.bvh", "metrics.json")), tmp_path)
+    places = [text.index(f'id="{name}"') for name in ("person", "verdict", "viewer-title", "motion", "files")]
+    assert places == sorted(places)
+    assert "No camera measured: head, pelvis, left leg, right leg." in text
+    assert '<a href="motion.bvh">' in text
+    assert 'class="strip motion"' in text
+    without = written(ReportInputs(name="x"), tmp_path)
+    assert 'id="person"' not in without
+    assert 'id="files"' not in without

@@ -16,7 +16,7 @@ import json
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 SCENE_FILE = "blender_scene.json"
 SCRIPT_FILE = "blender_scene.py"
@@ -395,9 +395,12 @@ def register() -> None:
 
         bl_idname = "import_scene.bodycap"
         bl_label = "Import bodycap results"
-        bl_options: ClassVar = {"REGISTER", "UNDO"}
+        bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender reads the class
         filename_ext = ".json"
-        filter_glob: bpy.props.StringProperty(default=SCENE_FILE, options={"HIDDEN"})  # type: ignore[valid-type]
+        # Blender evaluates annotations, which this module keeps as text, so this one is given as a value.
+        __annotations__ = {
+            "filter_glob": bpy.props.StringProperty(default=f"*{Path(SCENE_FILE).suffix}", options={"HIDDEN"})
+        }
 
         def execute(self, _context: Any) -> set[str]:
             """Build the scene from the chosen file's folder."""

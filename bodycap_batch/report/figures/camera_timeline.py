@@ -114,7 +114,7 @@ def draw_camera_timeline(
     for curve in curves:
         parts.append(_draw_curve(curve, times, span_s, top, columns))
         top += _CURVE_HEIGHT + _MARGIN
-    parts.append(_draw_axis(span_s, top))
+    parts.append(draw_axis(span_s, top))
     parts.append(element("line", class_="now", x1=LEFT, x2=LEFT, y1=2.0, y2=top))
     return svg_image(
         WIDTH,
@@ -312,7 +312,13 @@ def _range_path(x: FloatArray, y: FloatArray) -> str:
     return "".join(f"M{number(x[i])} {number(y[i, 0])}V{number(y[i, 2])}" for i in np.flatnonzero(visible))
 
 
-def _draw_axis(span_s: tuple[float, float], top: float) -> str:
+def draw_axis(span_s: tuple[float, float], top: float) -> str:
+    """Draw the labels of a time axis.
+
+    Args:
+        span_s: First and last time of the axis, seconds.
+        top: Upper end of the labels, SVG units.
+    """
     length = max(span_s[1] - span_s[0], 1e-6)
     interval = next((each for each in _TICK_INTERVALS_S if length / each <= _MAX_TICKS), 3600)
     first, last = np.ceil(span_s[0] / interval), np.floor(span_s[1] / interval + 1e-9)

@@ -77,7 +77,19 @@ function wireControls(view, timeline) {
   slider.addEventListener("input", () => timeline.go(Number(slider.value)));
   play.addEventListener("click", () => timeline.toggle());
   document.getElementById("speed").addEventListener("change", (event) => (timeline.speed = Number(event.target.value)));
-  document.getElementById("reset").addEventListener("click", () => view.orbit.reset());
+  const follow = section.querySelector("[data-layer=follow]");
+  document.getElementById("reset").addEventListener("click", () => {
+    follow.checked = false;
+    view.show("follow", false);
+    view.orbit.reset();
+  });
+  for (const button of section.querySelectorAll("[data-look]")) {
+    button.disabled = !view.look;
+    button.addEventListener("click", () => {
+      follow.checked = true;
+      view.look(button.dataset.look);
+    });
+  }
   for (const box of section.querySelectorAll("[data-layer]")) {
     box.addEventListener("change", () => {
       view.show(box.dataset.layer, box.checked);
@@ -168,6 +180,10 @@ if (section) {
     list.append(item);
   }
   timeline.go(0);
+  if (data.body && view.look) {
+    section.querySelector("[data-layer=follow]").checked = true;
+    view.look("person");
+  }
   if (location.protocol !== "file:" && new URLSearchParams(location.search).has("videos")) {
     fetch("videos.json").then((answer) => answer.json()).then((videos) => {
       picture.useVideos(videos);

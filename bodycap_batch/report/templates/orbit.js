@@ -39,6 +39,12 @@ class Orbit {
     this.onChange();
   }
 
+  // Look at a place from a direction and a distance.
+  look(target, distance, azimuth, height) {
+    Object.assign(this, { target: [...target], distance, azimuth, height, untouched: false });
+    this.onChange();
+  }
+
   turn(azimuth, height) {
     this.untouched = false;
     this.azimuth += azimuth;

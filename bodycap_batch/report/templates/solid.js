@@ -29,6 +29,8 @@ function styleColour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
+const PERSON_MARGIN = 1.35; // height of the view of a person, in heights of the person
+
 class Solid {
   constructor(holder, data, three) {
     this.three = three;
@@ -265,6 +267,30 @@ class Solid {
     this.dirty = true;
   }
 
+  // Show the person alone, from the front, the left side, above, or obliquely.
+  look(name) {
+    const { centres, orbit } = this;
+    const { across, joints } = this.data.body;
+    let [forward, height] = [-0.5 * Math.PI, 0];
+    if (across) {
+      const [left, right] = across.map((joint) => centres.subarray(3 * joint, 3 * joint + 3));
+      forward = Math.atan2(right[0] - left[0], left[1] - right[1]);
+    }
+    let [low, high] = [Infinity, -Infinity];
+    for (let joint = 0; joint < joints.length; joint++) {
+      low = Math.min(low, centres[3 * joint + 2]);
+      high = Math.max(high, centres[3 * joint + 2]);
+    }
+    height = Math.max(high - low, 0.5 * this.unit);
+    const wide = Math.max(1, 0.8 / this.camera.aspect);
+    const distance = (PERSON_MARGIN * 0.5 * height * wide) / Math.tan((0.5 * this.camera.fov * Math.PI) / 180);
+    const turned = { front: 0, side: 0.5 * Math.PI, top: 0, person: 0.6 }[name];
+    const raised = { front: 0.08, side: 0.08, top: 1.5, person: 0.2 }[name];
+    this.centre = 0.5 * (low + high) - centres[2];
+    this.show("follow", true);
+    orbit.look([centres[0], centres[1], centres[2] + this.centre], distance, forward + turned, raised);
+  }
+
   go(time) {
     const { data } = this;
     this.moveFrusta(time);
@@ -272,7 +298,7 @@ class Solid {
     if (this.follow) {
       const path = data.paths[0];
       const i = path ? poseAt(path, time) : -1;
-      if (data.body) this.orbit.target = [...this.centres.subarray(0, 3)];
+      if (data.body) this.orbit.target = [this.centres[0], this.centres[1], this.centres[2] + (this.centre ?? 0)];
       else if (i >= 0) this.orbit.target = [...path.centre.subarray(3 * i, 3 * i + 3)];
     }
     this.dirty = true;
