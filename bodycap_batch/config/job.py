@@ -25,6 +25,7 @@ from bodycap_batch.config.folder import (
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import NO_SKELETON, SKELETON_PRESETS, CaptureConfig, Job
 from bodycap_batch.config.mounts import TRUNK_ROLES
+from bodycap_batch.config.options import GAIT
 from bodycap_batch.config.origins import LoadedJob
 from bodycap_batch.config.resolved_camera import ResolvedCamera, resolved_camera, with_found_calibrations
 from bodycap_batch.config.rules import problems_in, skeleton_of
@@ -405,7 +406,7 @@ def _prepare_synthetic(job: Job, base: Path, path: Path, prepare: Prepare | None
     folder = synthetic_folder(job, base)
     if prepare is not None:
         options = dict(job.capture.synthetic or {})
-        if isinstance(options.get("motion"), str):
+        if isinstance(options.get("motion"), str) and options["motion"] != GAIT:
             options["motion"] = str((base / options["motion"]).resolve())
         prepare(options, folder)
     missing = [v for camera in job.capture.cameras for v in camera.video if not (base / v).is_file()]

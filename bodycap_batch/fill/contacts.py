@@ -366,7 +366,10 @@ def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> 
         kept = [each for each in singles if each[0] > 0 and each[1] < len(state)]
         sure = np.zeros(len(singles), dtype=bool)
         if len(kept) >= _MIN_STEPS:
-            ordinary = np.array([_is_ordinary(state, evidence, signals, *each) for each in kept])
+            support = _mean_of_three(np.array([_support(state, evidence, *each) for each in kept]))
+            ordinary = np.array([_is_ordinary(signals, *each) for each in kept])
+            ordinary &= support.sum(axis=1) >= _SURE_NATS
+            ordinary &= support.min(axis=1) >= -_MAX_CONTRADICTION_NATS
             padded = np.concatenate([[False], ordinary, [False]])
             ordinary &= padded[:-2] | padded[2:]
             first = singles.index(kept[0])
@@ -380,16 +383,30 @@ def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> 
     return out
 
 
-def _is_ordinary(state: IntArray, evidence: _Evidence, signals: _StepSignals, start: int, end: int) -> bool:
-    """Return whether one time on one foot is that of an ordinary walk."""
+def _support(state: IntArray, evidence: _Evidence, start: int, end: int) -> FloatArray:
+    """Return the evidence (3,) of each signal for the side of one time on one foot."""
     sign = 1.0 if state[start] == LEFT else -1.0
+    return np.asarray(sign * evidence.by_signal[start:end].sum(axis=0))
+
+
+def _mean_of_three(values: FloatArray) -> FloatArray:
+    """Return the mean (N,K) of each row of values (N,K) and its neighbours.
+
+    The sides of successive steps alternate, so the evidence for one step is evidence for the others.
+    """
+    padded = np.concatenate([np.zeros((1, values.shape[1])), values, np.zeros((1, values.shape[1]))])
+    counts = np.full(len(values), 3.0)
+    counts[0] -= 1.0
+    counts[-1] -= 1.0
+    return np.asarray((padded[:-2] + padded[1:-1] + padded[2:]) / counts[:, None])
+
+
+def _is_ordinary(signals: _StepSignals, start: int, end: int) -> bool:
+    """Return whether duration, speed and trunk of one time on one foot are those of an ordinary walk."""
     own = slice(start, end)
-    by_signal = sign * evidence.by_signal[own].sum(axis=0)
     duration = (end - start) / signals.fps / (signals.period_s[own].mean())
     return bool(
-        by_signal.sum() >= _SURE_NATS
-        and by_signal.min() >= -_MAX_CONTRADICTION_NATS
-        and _ORDINARY_DURATION[0] <= duration <= _ORDINARY_DURATION[1]
+        _ORDINARY_DURATION[0] <= duration <= _ORDINARY_DURATION[1]
         and signals.speed[own].mean() >= _STEPPING_SPEED
         and np.abs(signals.sinking[own]).max() <= _MAX_SINKING_M
         and np.abs(signals.twist[own]).max() <= _MAX_TWIST

@@ -24,6 +24,9 @@ from bodycap_batch.model.skeleton import Motion, SkeletonModel
 _PROGRESS_STEPS = 4
 """Number of steps that the progress counts."""
 
+_LOW_SHARE = 0.6
+"""Height of the hips over the floor, as a share of the length of the leg, below which the person may kneel,
+sit on the floor or lie. Derivation: on a chair the hips are at 0.6 to 0.7, on the knees at 0.5."""
 _MAX_MISS_M = 0.004
 """Distance (metres) between the ankle and its wanted place beyond which a foot does not count as standing.
 Derivation: with it, the sole is within 1 cm of the floor."""
@@ -89,7 +92,9 @@ def fill_motion(
             nothing,
             filled=filled,
             standing=_standing(steps, contacts, legs is not None),
-            is_sure=_sure(steps, contacts) if legs is not None else nothing.is_sure,
+            is_sure=nothing.is_sure
+            if legs is None
+            else _sure(steps, contacts, _low_hips(world, legs, floor)),
             footsteps=steps,
             floor_m=floor.height_m,
             floor_sigma_m=floor.sigma_m,
@@ -264,8 +269,21 @@ def _standing(steps: Footsteps, contacts: Contacts, has_legs: bool) -> BoolArray
     return out
 
 
-def _sure(steps: Footsteps, contacts: Contacts) -> BoolArray:
-    out = contacts.is_sure.copy()
+def _low_hips(world: FloatArray, legs: tuple[LegGeometry, LegGeometry], floor: FloorHeight) -> BoolArray:
+    """Return (T,) True if the hips are so low that the person may kneel, sit on the floor or lie."""
+    height = 0.5 * (world[:, legs[0].hip, 2, 3] + world[:, legs[1].hip, 2, 3]) - floor.height_m
+    return np.asarray(height < _LOW_SHARE * 0.5 * (legs[0].length_m + legs[1].length_m))
+
+
+def _sure(steps: Footsteps, contacts: Contacts, low: BoolArray) -> BoolArray:
+    """Return (T,) False where it is unknown what the feet do.
+
+    Args:
+        steps: Where and when the feet stand.
+        contacts: Which feet stand.
+        low: (T,) True if the hips are too low for standing feet.
+    """
+    out = contacts.is_sure & ~low
     for start, end, sure in zip(steps.start_tick, steps.end_tick, steps.is_sure, strict=True):
         if not sure:
             out[start:end] = False

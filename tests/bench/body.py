@@ -29,7 +29,8 @@ from bodycap_batch.merging.body.completion import complete_skeleton
 from bodycap_batch.model.fill_data import SIDES, FillMode, FillReport
 from bodycap_batch.model.geometry import interpolate_pose, nearest_rotation
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
-from bodycap_batch.model.skeleton_presets import rest_positions
+from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions
+from bodycap_batch.synthetic.planted_walk import PlantedWalk, draw_style
 from tests.bench.rows import DATA
 
 MOUNTED = ("Spine1", "LeftHand", "RightHand")
@@ -39,6 +40,8 @@ inch."""
 FPS = 30.0
 TUNED_ON = ("02_01",)
 """Recordings that constants of the stage may be chosen on. All others are only reported."""
+DRAWN = range(8)
+"""Seeds of the drawn walks."""
 WALKS = ("walk12", "room12", "02_01")
 _ROLES = {
     "Hips": "root", "Spine1": "torso",
@@ -128,6 +131,25 @@ def recorded_body(path: Path, name: str, *, rate: float = 1.0, mirrored: bool = 
     motion = resample(motion, FPS)
     if mirrored:
         motion = mirror(motion)
+    return motion_body(motion, name)
+
+
+def drawn_body(seed: int, seconds: float = 20.0) -> Body:
+    """Return a body that walks as `bodycap_batch.synthetic.planted_walk` draws it, of a drawn stature."""
+    rng = np.random.default_rng(seed)
+    skeleton = load_skeleton("full_body", float(rng.uniform(1.55, 1.95)))
+    walk = PlantedWalk(skeleton, seconds, draw_style(seconds, rng))
+    times = np.arange(round(seconds * FPS)) / FPS
+    root, local = walk.pose(times)
+    motion = Motion(
+        skeleton=skeleton, fps=FPS, start_ns=0, root_in_world_m=root, local_rotation=local,
+        observed=np.ones(local.shape[:2], dtype=bool),
+    )  # fmt: skip
+    return motion_body(motion, f"drawn_{seed}")
+
+
+def motion_body(motion: Motion, name: str) -> Body:
+    """Return the body of a motion whose legs are known."""
     poses = motion.world_from_joint()
     roles = motion.skeleton.roles
     joints = {role: poses[:, roles.index(role), :3, 3] for role in _ROLES}
@@ -137,7 +159,7 @@ def recorded_body(path: Path, name: str, *, rate: float = 1.0, mirrored: bool = 
         if role.endswith(("Shoulder", "Arm", "ForeArm", "Hand"))
     }
     chest = poses[:, roles.index("Spine1"), :3, :3]
-    return _merged(name, motion.skeleton, joints, chest, arms, FPS)
+    return _merged(name, motion.skeleton, joints, chest, arms, motion.fps)
 
 
 def mirror(motion: Motion) -> Motion:
@@ -440,6 +462,8 @@ def bodies(data: Path) -> Iterator[Body]:
     if walk.exists():
         for rate in (0.7, 0.85, 1.15):
             yield recorded_body(walk, f"02_01_at_{rate}", rate=rate)
+    for seed in DRAWN:
+        yield drawn_body(seed)
 
 
 def line_of(result: Score) -> str:
