@@ -20,6 +20,7 @@ from bodycap_batch.fill.trunk_signals import TrunkSignals, trunk_signals
 from bodycap_batch.model.fill_data import SIDES, FillMode, FillReport, FillResult, Footsteps
 from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
+from bodycap_batch.model.skeleton_presets import split_side
 
 _PROGRESS_STEPS = 4
 """Number of steps that the progress counts."""
@@ -85,6 +86,10 @@ def fill_motion(
     local[:, solved & _parent_kept(skeleton, filled)] = motion.local_rotation[
         :, solved & _parent_kept(skeleton, filled)
     ]
+    sure = nothing.is_sure
+    if legs is not None:
+        known = _trunk_is_seen(motion, solved) & ~_low_hips(world, legs, floor)
+        sure = _sure(steps, contacts, known)
     context.progress(_PROGRESS_STEPS, _PROGRESS_STEPS, "filled")
     return FillResult(
         motion=replace(motion, root_in_world_m=world[:, 0, :3, 3], local_rotation=local),
@@ -92,9 +97,7 @@ def fill_motion(
             nothing,
             filled=filled,
             standing=_standing(steps, contacts, legs is not None),
-            is_sure=nothing.is_sure
-            if legs is None
-            else _sure(steps, contacts, _low_hips(world, legs, floor)),
+            is_sure=sure,
             footsteps=steps,
             floor_m=floor.height_m,
             floor_sigma_m=floor.sigma_m,
@@ -269,21 +272,31 @@ def _standing(steps: Footsteps, contacts: Contacts, has_legs: bool) -> BoolArray
     return out
 
 
+def _trunk_is_seen(motion: Motion, solved: BoolArray) -> BoolArray:
+    """Return (T,) True if cameras measured the trunk at the tick.
+
+    Where no camera is on the trunk at all, it follows from the limbs and counts as seen.
+    """
+    trunk = np.array([split_side(role)[0] == "" for role in motion.skeleton.roles]) & solved
+    seen = motion.observed[:, trunk].any(axis=1)
+    return np.asarray(seen if seen.any() else np.ones_like(seen))
+
+
 def _low_hips(world: FloatArray, legs: tuple[LegGeometry, LegGeometry], floor: FloorHeight) -> BoolArray:
     """Return (T,) True if the hips are so low that the person may kneel, sit on the floor or lie."""
     height = 0.5 * (world[:, legs[0].hip, 2, 3] + world[:, legs[1].hip, 2, 3]) - floor.height_m
     return np.asarray(height < _LOW_SHARE * 0.5 * (legs[0].length_m + legs[1].length_m))
 
 
-def _sure(steps: Footsteps, contacts: Contacts, low: BoolArray) -> BoolArray:
+def _sure(steps: Footsteps, contacts: Contacts, known: BoolArray) -> BoolArray:
     """Return (T,) False where it is unknown what the feet do.
 
     Args:
         steps: Where and when the feet stand.
         contacts: Which feet stand.
-        low: (T,) True if the hips are too low for standing feet.
+        known: (T,) False if the trunk is not measured, or too low for standing feet.
     """
-    out = contacts.is_sure & ~low
+    out = contacts.is_sure & known
     for start, end, sure in zip(steps.start_tick, steps.end_tick, steps.is_sure, strict=True):
         if not sure:
             out[start:end] = False

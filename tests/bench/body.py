@@ -302,12 +302,12 @@ def true_stances(ankle: FloatArray, fps: float) -> list[tuple[int, int]]:
 
 
 def swings(stances: Sequence[tuple[int, int]], fps: float, path: FloatArray) -> list[float]:
-    """Return the middle (s) of each step between two periods of standing that are 10 cm or more apart."""
+    """Return the landing (s) of each step between two periods of standing that are 10 cm or more apart."""
     out = []
     for (first, end), (start, last) in itertools.pairwise(stances):
         apart = np.median(path[start:last], axis=0) - np.median(path[first:end], axis=0)
         if np.hypot(*apart[:2]) > 0.1:
-            out.append(0.5 * (end + start) / fps)
+            out.append(start / fps)
     return out
 
 
@@ -339,9 +339,12 @@ def score(body: Body, mode: FillMode, *, floor_is_measured: bool = True) -> Scor
         found = own_swings(report, side, fps)
         steps += len(wanted)
         claimed += len(found)
-        recalled += sum(any(abs(a - b) <= _STEP_TOLERANCE_S for b in found) for a in wanted)
+        recalled += sum(any(abs(a - b) <= _STEP_TOLERANCE_S + 1e-9 for b in found) for a in wanted)
         moving = _true_swing_mask(stances, len(speed))
-        false += sum(not moving[min(round(b * fps), len(moving) - 1)] for b in found)
+        early = round(_STEP_TOLERANCE_S * fps)
+        false += sum(
+            not moving[max(round(b * fps) - 2 * early, 0) : round(b * fps) + early].any() for b in found
+        )
     moving_ticks = _speed(body.joints["Hips"], fps) > 0.3
     unsure = float((~report.is_sure)[moving_ticks].mean()) if moving_ticks.any() else 0.0
     knees = [(_knee_deg(own, side), _knee_deg(body.joints, side)) for side in SIDES]
@@ -372,14 +375,14 @@ def score(body: Body, mode: FillMode, *, floor_is_measured: bool = True) -> Scor
 
 
 def own_swings(report: FillReport, side: int, fps: float) -> list[float]:
-    """Return the middle (s) of each certain step of a filled foot."""
+    """Return the landing (s) of each certain step of a filled foot."""
     steps = report.footsteps
     own = np.flatnonzero(steps.side == side)
     out = []
     for first, second in itertools.pairwise(own):
         middle = 0.5 * (steps.end_tick[first] + steps.start_tick[second])
         if report.is_sure[int(middle)]:
-            out.append(float(middle / fps))
+            out.append(float(steps.start_tick[second] / fps))
     return out
 
 

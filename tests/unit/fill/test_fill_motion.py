@@ -154,6 +154,16 @@ def test_an_assumed_floor_has_a_sigma() -> None:
     assert 0.005 < report.floor_sigma_m < 0.05
 
 
+def test_steps_are_not_certain_while_no_camera_sees_the_trunk() -> None:
+    motion, solved = walking(8.0)
+    observed = motion.observed.copy()
+    observed[90:150, motion.skeleton.roles.index("Spine1")] = False
+    complete, gap = fill(motion, solved), fill(replace(motion, observed=observed), solved)
+    assert not gap.report.is_sure[90:150].any()
+    np.testing.assert_array_equal(gap.report.is_sure[:80], complete.report.is_sure[:80])
+    np.testing.assert_array_equal(gap.motion.local_rotation, complete.motion.local_rotation)
+
+
 def test_a_lowered_person_has_bent_knees_and_is_unsure() -> None:
     motion, solved = walking(4.0, speed=0.0)
     low = replace(motion, root_in_world_m=motion.root_in_world_m * [1.0, 1.0, 0.5])
