@@ -9,7 +9,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.fill.contacts import Contacts, find_contacts
-from bodycap_batch.fill.floor_height import FloorHeight, floor_below_legs
+from bodycap_batch.fill.floor_height import FloorHeight, floor_below_legs, lifted_steps
 from bodycap_batch.fill.foot_paths import REACH_SHARE, foot_path, kept_steps, reachable_steps
 from bodycap_batch.fill.foot_places import place_feet
 from bodycap_batch.fill.head import head_rotations
@@ -69,7 +69,10 @@ def fill_motion(
     floor = FloorHeight(0.0, 0.0, "measured")
     if legs is not None and not floor_is_measured:
         floor = floor_below_legs(world, contacts, legs)
-    steps = nothing.footsteps if legs is None else place_feet(contacts, signals, legs, floor.height_m)
+    steps = nothing.footsteps
+    if legs is not None:
+        steps = place_feet(contacts, signals, legs, floor.height_m)
+        steps, floor = lifted_steps(steps, floor, world, contacts, legs)
     context.progress(2, _PROGRESS_STEPS, "pelvis")
     if first != 0:
         pelvis = pelvis_rotation(signals, contacts, steps, legs is not None)
