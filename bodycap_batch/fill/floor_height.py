@@ -24,7 +24,7 @@ _HIGH_PERCENTILE = 75.0
 is lower. Evidence: none."""
 
 
-_MAX_LIFT_M = {"measured": 0.007, "legs": 0.03}
+_MAX_LIFT_M = {"measured": 0.005, "legs": 0.03}
 """By origin of the floor, maximum height (metres) by which the feet stand above it so that the legs reach
 them. Derivation: for a measured floor, a sole stays within 1 cm of it; else, 1.5 sigmas of the floor."""
 _LIFT_PERCENTILE = 75.0

@@ -79,8 +79,9 @@ def fill_motion(
         if legs is not None:
             pelvis = _within_reach(skeleton, first, pelvis, world, (legs, steps, signals))
         bend_spine(skeleton, first, pelvis, world, filled)
+    missed = np.ones_like(contacts.standing)
     if legs is not None:
-        steps = _fill_legs(skeleton, legs, steps, signals, world, filled)
+        steps, missed = _fill_legs(skeleton, legs, steps, signals, world, filled)
     context.check_cancelled()
     context.progress(3, _PROGRESS_STEPS, "head")
     _fill_head(skeleton, solved, signals, world, filled)
@@ -99,7 +100,7 @@ def fill_motion(
         report=replace(
             nothing,
             filled=filled,
-            standing=_standing(steps, contacts, legs is not None),
+            standing=_standing(steps, missed),
             is_sure=sure,
             footsteps=steps,
             floor_m=floor.height_m,
@@ -176,8 +177,12 @@ def _fill_legs(
     signals: TrunkSignals,
     world: FloatArray,
     filled: BoolArray,
-) -> Footsteps:
-    """Write the poses of both legs, and return the steps that the legs can reach."""
+) -> tuple[Footsteps, BoolArray]:
+    """Write the poses of both legs.
+
+    Returns:
+        The steps that the legs can reach, and (T,2) True where a foot is not at its wanted place.
+    """
     missed = np.zeros((len(world), len(legs)), dtype=bool)
     for leg in legs:
         for joint in leg.chain:
@@ -203,7 +208,7 @@ def _fill_legs(
             if joint == leg.toe:
                 world[:, joint, :3, :3] = pose.toe
         missed[:, side] = np.linalg.norm(world[:, leg.ankle, :3, 3] - path.ankle_m, axis=1) > _MAX_MISS_M
-    return kept_steps(steps, missed)
+    return kept_steps(steps, missed), missed
 
 
 def _fill_head(
@@ -267,12 +272,12 @@ def _parent_kept(skeleton: SkeletonModel, filled: BoolArray) -> BoolArray:
     return out
 
 
-def _standing(steps: Footsteps, contacts: Contacts, has_legs: bool) -> BoolArray:
-    out = np.zeros_like(contacts.standing)
-    if has_legs:
-        for side, start, end in zip(steps.side, steps.start_tick, steps.end_tick, strict=True):
-            out[start:end, side] = True
-    return out
+def _standing(steps: Footsteps, missed: BoolArray) -> BoolArray:
+    """Return (T,2) True while the left or right foot stands and is at its wanted place."""
+    out = np.zeros_like(missed)
+    for side, start, end in zip(steps.side, steps.start_tick, steps.end_tick, strict=True):
+        out[start:end, side] = True
+    return out & ~missed
 
 
 def _trunk_is_seen(motion: Motion, solved: BoolArray) -> BoolArray:
