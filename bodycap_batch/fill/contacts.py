@@ -86,6 +86,14 @@ _SINGLE_LOG_SIGMA = 0.22
 """Standard deviation of the logarithm of the time on one foot. Evidence: none."""
 _DOUBLE_LOG_SIGMA = 0.45
 """Standard deviation of the logarithm of the time on both feet between two steps. Evidence: none."""
+_FIRMNESS = 1.6
+"""Ratio of the spread of durations among people to that of one person in one walk. Evidence:
+docs/decisions/filling.md."""
+_MIN_INTERVALS = 3
+"""Minimum number of times between steps that determine the rhythm of a walk. Evidence: none."""
+_MAX_IRREGULARITY = 0.25
+"""Maximum standard deviation of the logarithm of these times, of a walk with a rhythm. Derivation: slightly
+more than `_SINGLE_LOG_SIGMA`."""
 _SINGLE_S = (0.2, 1.0)
 """Minimum and maximum time (s) on one foot. Evidence: none."""
 _DOUBLE_S = (0.03, 0.6)
@@ -149,6 +157,25 @@ class _Evidence:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class _Rhythm:
+    """The expected durations at T ticks.
+
+    Attributes:
+        period_s: (T,) time between two steps, seconds.
+        share: (T,) share of this time during which both feet stand.
+        firmness: (T,) ratio by which the spread of durations is smaller than that among people.
+    """
+
+    period_s: FloatArray
+    share: FloatArray
+    firmness: FloatArray
+
+    def at(self, tick: int) -> tuple[float, float, float]:
+        """Return the period, the share and the firmness at a tick."""
+        return float(self.period_s[tick]), float(self.share[tick]), float(self.firmness[tick])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _StepSignals:
     """What decides whether a step is ordinary, at T ticks.
 
@@ -177,7 +204,11 @@ def find_contacts(signals: TrunkSignals) -> Contacts:
     coarse = _Evidence(evidence.by_state[chosen], evidence.by_signal[chosen])
     period_s = _step_period_s(signals)[chosen]
     share = _double_share(signals)[chosen]
-    found = _viterbi(coarse.by_state, period_s, share, signals.fps / stride)
+    rhythm = _Rhythm(period_s=period_s, share=share, firmness=np.ones(len(chosen)))
+    found = _viterbi(coarse.by_state, rhythm, signals.fps / stride)
+    # The second pass expects the person's own rhythm, which the first pass has found.
+    rhythm = _own_rhythm(found, rhythm, signals.fps / stride)
+    found = _viterbi(coarse.by_state, rhythm, signals.fps / stride)
     height = signals.slow_hips_m[:, 2]
     ordinary = _StepSignals(
         fps=signals.fps / stride,
@@ -244,6 +275,25 @@ def _step_period_s(signals: TrunkSignals) -> FloatArray:
     return np.asarray(1.0 / (_STEP_HZ_AT_1_3 * (speed / 1.3) ** _STEP_HZ_EXPONENT))
 
 
+def _own_rhythm(state: IntArray, rhythm: _Rhythm, fps: float) -> _Rhythm:
+    """Return the rhythm of each walk from its steps, relative to what people do at its speed."""
+    period, firmness = rhythm.period_s.copy(), rhythm.firmness.copy()
+    bounds = np.flatnonzero(np.diff(state, prepend=-1))
+    steps = bounds[np.isin(state[bounds], (LEFT, RIGHT)) & (bounds > 0)]
+    walks = np.cumsum(state == STAND)
+    for walk in np.unique(walks[steps]):
+        own = steps[walks[steps] == walk]
+        if len(own) <= _MIN_INTERVALS:
+            continue
+        ratios = np.diff(own) / fps / rhythm.period_s[own[:-1]]
+        if np.std(np.log(ratios)) > _MAX_IRREGULARITY:
+            continue
+        ticks = (walks == walk) & (state != STAND)
+        period[ticks] *= float(np.median(ratios))
+        firmness[ticks] = _FIRMNESS
+    return _Rhythm(period_s=period, share=rhythm.share, firmness=firmness)
+
+
 def _double_share(signals: TrunkSignals) -> FloatArray:
     """Return the expected share (T,) of a step during which both feet stand."""
     share = _DOUBLE_SHARE + _DOUBLE_SHARE_PER_SPEED * (signals.speed_m_per_s() - 1.3)
@@ -271,7 +321,7 @@ def _transition_costs() -> FloatArray:
     return cost
 
 
-def _viterbi(log_likelihood: FloatArray, period_s: FloatArray, share: FloatArray, fps: float) -> IntArray:
+def _viterbi(log_likelihood: FloatArray, rhythm: _Rhythm, fps: float) -> IntArray:
     """Return the most likely state (T,) at each tick."""
     ticks = len(log_likelihood)
     cumulated = np.concatenate([np.zeros((1, _STATES)), np.cumsum(log_likelihood, axis=0)])
@@ -302,7 +352,7 @@ def _viterbi(log_likelihood: FloatArray, period_s: FloatArray, share: FloatArray
                 entered[tick - lengths, state]
                 + cumulated[tick, state]
                 - cumulated[tick - lengths, state]
-                + _log_duration(state, lengths / fps, period_s[at], share[at], tick - lengths, tick == ticks)
+                + _log_duration(state, lengths / fps, rhythm.at(at), tick - lengths, tick == ticks)
             )
             best = int(np.argmax(scores))
             ended[tick, state] = scores[best]
@@ -332,13 +382,14 @@ def _durations(state: int, fps: float) -> IntArray:
 
 
 def _log_duration(
-    state: int, seconds: FloatArray, period_s: float, share: float, starts: IntArray, is_last: bool
+    state: int, seconds: FloatArray, rhythm: tuple[float, float, float], starts: IntArray, is_last: bool
 ) -> FloatArray:
     """Return the log-likelihood (N,) of durations; 0 for segments that the recording cuts off."""
+    period_s, share, firmness = rhythm
     if state in (LEFT, RIGHT):
-        mean, sigma = (1.0 - share) * period_s, _SINGLE_LOG_SIGMA
+        mean, sigma = (1.0 - share) * period_s, _SINGLE_LOG_SIGMA / firmness
     elif state in (LEFT_TO_RIGHT, RIGHT_TO_LEFT):
-        mean, sigma = share * period_s, _DOUBLE_LOG_SIGMA
+        mean, sigma = share * period_s, _DOUBLE_LOG_SIGMA / firmness
     else:
         return np.zeros(len(seconds))
     deviation = np.log(seconds / mean) / sigma
@@ -366,7 +417,10 @@ def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> 
         kept = [each for each in singles if each[0] > 0 and each[1] < len(state)]
         sure = np.zeros(len(singles), dtype=bool)
         if len(kept) >= _MIN_STEPS:
-            ordinary = np.array([_is_ordinary(state, evidence, signals, *each) for each in kept])
+            support = _mean_of_three(np.array([_support(state, evidence, *each) for each in kept]))
+            ordinary = np.array([_is_ordinary(signals, *each) for each in kept])
+            ordinary &= support.sum(axis=1) >= _SURE_NATS
+            ordinary &= support.min(axis=1) >= -_MAX_CONTRADICTION_NATS
             padded = np.concatenate([[False], ordinary, [False]])
             ordinary &= padded[:-2] | padded[2:]
             first = singles.index(kept[0])
@@ -380,16 +434,30 @@ def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> 
     return out
 
 
-def _is_ordinary(state: IntArray, evidence: _Evidence, signals: _StepSignals, start: int, end: int) -> bool:
-    """Return whether one time on one foot is that of an ordinary walk."""
+def _support(state: IntArray, evidence: _Evidence, start: int, end: int) -> FloatArray:
+    """Return the evidence (3,) of each signal for the side of one time on one foot."""
     sign = 1.0 if state[start] == LEFT else -1.0
+    return np.asarray(sign * evidence.by_signal[start:end].sum(axis=0))
+
+
+def _mean_of_three(values: FloatArray) -> FloatArray:
+    """Return the mean (N,K) of each row of values (N,K) and its neighbours.
+
+    The sides of successive steps alternate, so the evidence for one step is evidence for the others.
+    """
+    padded = np.concatenate([np.zeros((1, values.shape[1])), values, np.zeros((1, values.shape[1]))])
+    counts = np.full(len(values), 3.0)
+    counts[0] -= 1.0
+    counts[-1] -= 1.0
+    return np.asarray((padded[:-2] + padded[1:-1] + padded[2:]) / counts[:, None])
+
+
+def _is_ordinary(signals: _StepSignals, start: int, end: int) -> bool:
+    """Return whether duration, speed and trunk of one time on one foot are those of an ordinary walk."""
     own = slice(start, end)
-    by_signal = sign * evidence.by_signal[own].sum(axis=0)
     duration = (end - start) / signals.fps / (signals.period_s[own].mean())
     return bool(
-        by_signal.sum() >= _SURE_NATS
-        and by_signal.min() >= -_MAX_CONTRADICTION_NATS
-        and _ORDINARY_DURATION[0] <= duration <= _ORDINARY_DURATION[1]
+        _ORDINARY_DURATION[0] <= duration <= _ORDINARY_DURATION[1]
         and signals.speed[own].mean() >= _STEPPING_SPEED
         and np.abs(signals.sinking[own]).max() <= _MAX_SINKING_M
         and np.abs(signals.twist[own]).max() <= _MAX_TWIST

@@ -313,8 +313,7 @@ def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg
     floor = (first.place[2] + _smooth(phase) * (second.place[2] - first.place[2])) - leg.ankle_height_m
     path.pitch_rad[inside] = pitch
     path.toe_rad[inside] = toe
-    turn = (second.heading - first.heading + np.pi) % (2.0 * np.pi) - np.pi
-    path.heading_rad[inside] = first.heading + _smooth(phase) * turn
+    path.heading_rad[inside] = first.heading + _smooth(phase) * (second.heading - first.heading)
     path.ankle_m[inside, :2] = travel
     path.ankle_m[inside, 2] = (
         floor + leg.drop_m(pitch, toe) + _CLEARANCE_M * np.sin(np.pi * phase**_CLEARANCE_POWER) ** 2

@@ -31,6 +31,12 @@ _MIN_WIDTH = 0.06
 of the leg. Derivation: half of `_WALKING_WIDTH`."""
 _TOE_OUT_RAD = np.radians(7.0)
 """Angle by which the toes point outward. Source: as `_STANDING_WIDTH`, halved: 14° between the feet."""
+_LOW_SHARE = 0.9
+"""Height of the hips, as a share of that of a standing person, below which the person crouches or sits.
+Derivation: a walking person is above 0.95."""
+_CROUCHING_AHEAD = 0.45
+"""Distance by which the feet are placed ahead of the hips, as a ratio to the distance by which the hips are
+lower than `_LOW_SHARE`. Derivation: the ankles of a person on a chair are some 15 cm ahead of the hips."""
 _MAX_SHIFT_M = 0.22
 """Distance (metres) that the hips may move over standing feet before a foot takes a step. Derivation: the
 length of a foot from the ankle to the ball, with a margin."""
@@ -64,7 +70,7 @@ def place_feet(
     for side in (0, 1):
         stances += _split_long_stances(_stances(contacts, side), contacts, signals)
     stances.sort(key=lambda each: (each.start, each.side))
-    places = [_place(each, contacts, signals, legs[each.side]) for each in stances]
+    places = [_place(each, contacts, signals, legs[each.side], floor_m) for each in stances]
     out = np.array([place for place, _ in places]).reshape(-1, 2)
     _keep_apart(out, stances, signals, 0.5 * (legs[0].length_m + legs[1].length_m))
     heights = np.array([floor_m + legs[each.side].ankle_height_m for each in stances])
@@ -136,7 +142,7 @@ def _split_long_stances(stances: list[_Stance], contacts: Contacts, signals: Tru
 
 
 def _place(
-    stance: _Stance, contacts: Contacts, signals: TrunkSignals, leg: LegGeometry
+    stance: _Stance, contacts: Contacts, signals: TrunkSignals, leg: LegGeometry, floor_m: float
 ) -> tuple[FloatArray, float]:
     """Return the position (2,) of the ankle and the direction of the foot of a period of standing."""
     ticks = np.arange(stance.start, stance.end)
@@ -149,12 +155,14 @@ def _place(
         width = _STANDING_WIDTH
         base = np.median(signals.hips_m[chosen, :2], axis=0)
         heading = float(np.median(signals.heading_rad[chosen]))
+        hips_m = float(np.median(signals.hips_m[chosen, 2])) - floor_m
+        ahead_m = _CROUCHING_AHEAD * max(_LOW_SHARE * (leg.length_m + leg.ankle_height_m) - hips_m, 0.0)
     else:
-        width = _WALKING_WIDTH
+        width, ahead_m = _WALKING_WIDTH, 0.0
         base, heading = _passing_hips(stance, contacts, signals)
     left = np.array([np.cos(heading), np.sin(heading)])
     forward = np.array([np.sin(heading), -np.cos(heading)])
-    place = base + 0.5 * outward * width * leg.length_m * left - _BEHIND_M * forward
+    place = base + 0.5 * outward * width * leg.length_m * left + (ahead_m - _BEHIND_M) * forward
     return place, heading + outward * _TOE_OUT_RAD
 
 

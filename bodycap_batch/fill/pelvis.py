@@ -13,9 +13,10 @@ from bodycap_batch.model.fill_data import Footsteps
 from bodycap_batch.model.geometry import interpolate_pose, make_transform, so3_exp
 from bodycap_batch.model.skeleton import SkeletonModel
 
-_YAW_RAD = np.radians(4.5)
+_YAW_RAD = np.radians(3.0)
 """Amplitude of the pelvis's yaw with each stride, at 1.3 m/s. Source: M. P. Murray, A. B. Drought, R. C.
-Kory, "Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964: 9 to 10° in all."""
+Kory, "Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964: ± 3 to 5°. The smaller
+value, because the turn that reaches the feet is added."""
 _LIST_RAD = np.radians(3.5)
 """Amplitude of the pelvis's list with each stride, at 1.3 m/s. Source: as `_YAW_RAD`."""
 _FULL_SPEED = 1.3

@@ -9,7 +9,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.fill.contacts import Contacts, find_contacts
-from bodycap_batch.fill.floor_height import FloorHeight, floor_below_legs
+from bodycap_batch.fill.floor_height import FloorHeight, floor_below_legs, lifted_steps
 from bodycap_batch.fill.foot_paths import REACH_SHARE, foot_path, kept_steps, reachable_steps
 from bodycap_batch.fill.foot_places import place_feet
 from bodycap_batch.fill.head import head_rotations
@@ -20,10 +20,14 @@ from bodycap_batch.fill.trunk_signals import TrunkSignals, trunk_signals
 from bodycap_batch.model.fill_data import SIDES, FillMode, FillReport, FillResult, Footsteps
 from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
+from bodycap_batch.model.skeleton_presets import split_side
 
 _PROGRESS_STEPS = 4
 """Number of steps that the progress counts."""
 
+_LOW_SHARE = 0.6
+"""Height of the hips over the floor, as a share of the length of the leg, below which the person may kneel,
+sit on the floor or lie. Derivation: on a chair the hips are at 0.6 to 0.7, on the knees at 0.5."""
 _MAX_MISS_M = 0.004
 """Distance (metres) between the ankle and its wanted place beyond which a foot does not count as standing.
 Derivation: with it, the sole is within 1 cm of the floor."""
@@ -65,15 +69,19 @@ def fill_motion(
     floor = FloorHeight(0.0, 0.0, "measured")
     if legs is not None and not floor_is_measured:
         floor = floor_below_legs(world, contacts, legs)
-    steps = nothing.footsteps if legs is None else place_feet(contacts, signals, legs, floor.height_m)
+    steps = nothing.footsteps
+    if legs is not None:
+        steps = place_feet(contacts, signals, legs, floor.height_m)
+        steps, floor = lifted_steps(steps, floor, world, contacts, legs)
     context.progress(2, _PROGRESS_STEPS, "pelvis")
     if first != 0:
         pelvis = pelvis_rotation(signals, contacts, steps, legs is not None)
         if legs is not None:
             pelvis = _within_reach(skeleton, first, pelvis, world, (legs, steps, signals))
         bend_spine(skeleton, first, pelvis, world, filled)
+    missed = np.ones_like(contacts.standing)
     if legs is not None:
-        steps = _fill_legs(skeleton, legs, steps, signals, world, filled)
+        steps, missed = _fill_legs(skeleton, legs, steps, signals, world, filled)
     context.check_cancelled()
     context.progress(3, _PROGRESS_STEPS, "head")
     _fill_head(skeleton, solved, signals, world, filled)
@@ -82,14 +90,18 @@ def fill_motion(
     local[:, solved & _parent_kept(skeleton, filled)] = motion.local_rotation[
         :, solved & _parent_kept(skeleton, filled)
     ]
+    sure = nothing.is_sure
+    if legs is not None:
+        known = _trunk_is_seen(motion, solved) & ~_low_hips(world, legs, floor)
+        sure = _sure(steps, contacts, known)
     context.progress(_PROGRESS_STEPS, _PROGRESS_STEPS, "filled")
     return FillResult(
         motion=replace(motion, root_in_world_m=world[:, 0, :3, 3], local_rotation=local),
         report=replace(
             nothing,
             filled=filled,
-            standing=_standing(steps, contacts, legs is not None),
-            is_sure=_sure(steps, contacts) if legs is not None else nothing.is_sure,
+            standing=_standing(steps, missed),
+            is_sure=sure,
             footsteps=steps,
             floor_m=floor.height_m,
             floor_sigma_m=floor.sigma_m,
@@ -165,8 +177,12 @@ def _fill_legs(
     signals: TrunkSignals,
     world: FloatArray,
     filled: BoolArray,
-) -> Footsteps:
-    """Write the poses of both legs, and return the steps that the legs can reach."""
+) -> tuple[Footsteps, BoolArray]:
+    """Write the poses of both legs.
+
+    Returns:
+        The steps that the legs can reach, and (T,2) True where a foot is not at its wanted place.
+    """
     missed = np.zeros((len(world), len(legs)), dtype=bool)
     for leg in legs:
         for joint in leg.chain:
@@ -192,7 +208,7 @@ def _fill_legs(
             if joint == leg.toe:
                 world[:, joint, :3, :3] = pose.toe
         missed[:, side] = np.linalg.norm(world[:, leg.ankle, :3, 3] - path.ankle_m, axis=1) > _MAX_MISS_M
-    return kept_steps(steps, missed)
+    return kept_steps(steps, missed), missed
 
 
 def _fill_head(
@@ -256,16 +272,39 @@ def _parent_kept(skeleton: SkeletonModel, filled: BoolArray) -> BoolArray:
     return out
 
 
-def _standing(steps: Footsteps, contacts: Contacts, has_legs: bool) -> BoolArray:
-    out = np.zeros_like(contacts.standing)
-    if has_legs:
-        for side, start, end in zip(steps.side, steps.start_tick, steps.end_tick, strict=True):
-            out[start:end, side] = True
-    return out
+def _standing(steps: Footsteps, missed: BoolArray) -> BoolArray:
+    """Return (T,2) True while the left or right foot stands and is at its wanted place."""
+    out = np.zeros_like(missed)
+    for side, start, end in zip(steps.side, steps.start_tick, steps.end_tick, strict=True):
+        out[start:end, side] = True
+    return out & ~missed
 
 
-def _sure(steps: Footsteps, contacts: Contacts) -> BoolArray:
-    out = contacts.is_sure.copy()
+def _trunk_is_seen(motion: Motion, solved: BoolArray) -> BoolArray:
+    """Return (T,) True if cameras measured the trunk at the tick.
+
+    Where no camera is on the trunk at all, it follows from the limbs and counts as seen.
+    """
+    trunk = np.array([split_side(role)[0] == "" for role in motion.skeleton.roles]) & solved
+    seen = motion.observed[:, trunk].any(axis=1)
+    return np.asarray(seen if seen.any() else np.ones_like(seen))
+
+
+def _low_hips(world: FloatArray, legs: tuple[LegGeometry, LegGeometry], floor: FloorHeight) -> BoolArray:
+    """Return (T,) True if the hips are so low that the person may kneel, sit on the floor or lie."""
+    height = 0.5 * (world[:, legs[0].hip, 2, 3] + world[:, legs[1].hip, 2, 3]) - floor.height_m
+    return np.asarray(height < _LOW_SHARE * 0.5 * (legs[0].length_m + legs[1].length_m))
+
+
+def _sure(steps: Footsteps, contacts: Contacts, known: BoolArray) -> BoolArray:
+    """Return (T,) False where it is unknown what the feet do.
+
+    Args:
+        steps: Where and when the feet stand.
+        contacts: Which feet stand.
+        known: (T,) False if the trunk is not measured, or too low for standing feet.
+    """
+    out = contacts.is_sure & known
     for start, end, sure in zip(steps.start_tick, steps.end_tick, steps.is_sure, strict=True):
         if not sure:
             out[start:end] = False

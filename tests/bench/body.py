@@ -29,7 +29,8 @@ from bodycap_batch.merging.body.completion import complete_skeleton
 from bodycap_batch.model.fill_data import SIDES, FillMode, FillReport
 from bodycap_batch.model.geometry import interpolate_pose, nearest_rotation
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
-from bodycap_batch.model.skeleton_presets import rest_positions
+from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions
+from bodycap_batch.synthetic.planted_walk import PlantedWalk, draw_style
 from tests.bench.rows import DATA
 
 MOUNTED = ("Spine1", "LeftHand", "RightHand")
@@ -39,6 +40,8 @@ inch."""
 FPS = 30.0
 TUNED_ON = ("02_01",)
 """Recordings that constants of the stage may be chosen on. All others are only reported."""
+DRAWN = range(8)
+"""Seeds of the drawn walks."""
 WALKS = ("walk12", "room12", "02_01")
 _ROLES = {
     "Hips": "root", "Spine1": "torso",
@@ -128,6 +131,25 @@ def recorded_body(path: Path, name: str, *, rate: float = 1.0, mirrored: bool = 
     motion = resample(motion, FPS)
     if mirrored:
         motion = mirror(motion)
+    return motion_body(motion, name)
+
+
+def drawn_body(seed: int, seconds: float = 20.0) -> Body:
+    """Return a body that walks as `bodycap_batch.synthetic.planted_walk` draws it, of a drawn stature."""
+    rng = np.random.default_rng(seed)
+    skeleton = load_skeleton("full_body", float(rng.uniform(1.55, 1.95)))
+    walk = PlantedWalk(skeleton, seconds, draw_style(seconds, rng))
+    times = np.arange(round(seconds * FPS)) / FPS
+    root, local = walk.pose(times)
+    motion = Motion(
+        skeleton=skeleton, fps=FPS, start_ns=0, root_in_world_m=root, local_rotation=local,
+        observed=np.ones(local.shape[:2], dtype=bool),
+    )  # fmt: skip
+    return motion_body(motion, f"drawn_{seed}")
+
+
+def motion_body(motion: Motion, name: str) -> Body:
+    """Return the body of a motion whose legs are known."""
     poses = motion.world_from_joint()
     roles = motion.skeleton.roles
     joints = {role: poses[:, roles.index(role), :3, 3] for role in _ROLES}
@@ -137,7 +159,7 @@ def recorded_body(path: Path, name: str, *, rate: float = 1.0, mirrored: bool = 
         if role.endswith(("Shoulder", "Arm", "ForeArm", "Hand"))
     }
     chest = poses[:, roles.index("Spine1"), :3, :3]
-    return _merged(name, motion.skeleton, joints, chest, arms, FPS)
+    return _merged(name, motion.skeleton, joints, chest, arms, motion.fps)
 
 
 def mirror(motion: Motion) -> Motion:
@@ -280,12 +302,12 @@ def true_stances(ankle: FloatArray, fps: float) -> list[tuple[int, int]]:
 
 
 def swings(stances: Sequence[tuple[int, int]], fps: float, path: FloatArray) -> list[float]:
-    """Return the middle (s) of each step between two periods of standing that are 10 cm or more apart."""
+    """Return the landing (s) of each step between two periods of standing that are 10 cm or more apart."""
     out = []
     for (first, end), (start, last) in itertools.pairwise(stances):
         apart = np.median(path[start:last], axis=0) - np.median(path[first:end], axis=0)
         if np.hypot(*apart[:2]) > 0.1:
-            out.append(0.5 * (end + start) / fps)
+            out.append(start / fps)
     return out
 
 
@@ -317,9 +339,12 @@ def score(body: Body, mode: FillMode, *, floor_is_measured: bool = True) -> Scor
         found = own_swings(report, side, fps)
         steps += len(wanted)
         claimed += len(found)
-        recalled += sum(any(abs(a - b) <= _STEP_TOLERANCE_S for b in found) for a in wanted)
+        recalled += sum(any(abs(a - b) <= _STEP_TOLERANCE_S + 1e-9 for b in found) for a in wanted)
         moving = _true_swing_mask(stances, len(speed))
-        false += sum(not moving[min(round(b * fps), len(moving) - 1)] for b in found)
+        early = round(_STEP_TOLERANCE_S * fps)
+        false += sum(
+            not moving[max(round(b * fps) - 2 * early, 0) : round(b * fps) + early].any() for b in found
+        )
     moving_ticks = _speed(body.joints["Hips"], fps) > 0.3
     unsure = float((~report.is_sure)[moving_ticks].mean()) if moving_ticks.any() else 0.0
     knees = [(_knee_deg(own, side), _knee_deg(body.joints, side)) for side in SIDES]
@@ -350,14 +375,14 @@ def score(body: Body, mode: FillMode, *, floor_is_measured: bool = True) -> Scor
 
 
 def own_swings(report: FillReport, side: int, fps: float) -> list[float]:
-    """Return the middle (s) of each certain step of a filled foot."""
+    """Return the landing (s) of each certain step of a filled foot."""
     steps = report.footsteps
     own = np.flatnonzero(steps.side == side)
     out = []
     for first, second in itertools.pairwise(own):
         middle = 0.5 * (steps.end_tick[first] + steps.start_tick[second])
         if report.is_sure[int(middle)]:
-            out.append(float(middle / fps))
+            out.append(float(steps.start_tick[second] / fps))
     return out
 
 
@@ -440,6 +465,8 @@ def bodies(data: Path) -> Iterator[Body]:
     if walk.exists():
         for rate in (0.7, 0.85, 1.15):
             yield recorded_body(walk, f"02_01_at_{rate}", rate=rate)
+    for seed in DRAWN:
+        yield drawn_body(seed)
 
 
 def line_of(result: Score) -> str:

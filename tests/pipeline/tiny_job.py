@@ -32,7 +32,7 @@ capture:
   synthetic: {seconds: 2, width: 320, height: 240, cameras: [torso, left_palm]}
 height_m: 1.75
 """
-STAGES = ("check", "keyframes", "map", "registration", "merge", "export")
+STAGES = ("check", "keyframes", "map", "registration", "merge", "fill", "export")
 
 
 class Place:

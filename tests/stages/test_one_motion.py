@@ -26,6 +26,7 @@ from bodycap_batch.report.drawn_scene import make_drawn_scene
 from bodycap_batch.report.frame_overlays import bones_from_merge
 from bodycap_batch.report.packing import PageBudget
 from bodycap_batch.report.viewer_data import make_viewer_data
+from tests.bodies import ARMS
 from tests.reports import report_inputs
 from tests.stages.test_export import inputs_of, run
 
@@ -79,10 +80,15 @@ READERS = {
 
 
 def difference_m(found: dict[str, FloatArray], motion: Motion) -> float:
-    """Largest distance of a joint's centre in an output from the motion; all its joints must be there."""
+    """Largest distance of a joint's centre in an output from the motion; all its joints must be there.
+
+    C3D readers give no numbers for joints that no camera measured.
+    """
     expected = centres_of(motion)
     assert set(found) == set(expected)
-    return max(float(np.linalg.norm(found[name] - expected[name], axis=1).max()) for name in expected)
+    given = [name for name in expected if np.isfinite(found[name]).all()]
+    assert len(given) >= len(ARMS)
+    return max(float(np.linalg.norm(found[name] - expected[name], axis=1).max()) for name in given)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +106,7 @@ def test_the_graph_differs_from_the_motion(folder: Path) -> None:
 @pytest.mark.parametrize("name", FORMATS)
 def test_each_file_holds_the_motion(folder: Path, name: str) -> None:
     inputs = inputs_of(folder / name)
-    run(inputs, formats=(name,))
+    run(inputs, formats=(name,), filled_markers=True)
     file, read = READERS[name]
     assert inputs.merge is not None
     assert difference_m(read(inputs.out_dir / file), inputs.merge.motion) < TOLERANCE_M
@@ -112,7 +118,7 @@ def test_only_files_for_animation_follow_the_layout(
     folder: Path, name: str, option: dict[str, float]
 ) -> None:
     inputs = inputs_of(folder / f"{name}_{next(iter(option))}")
-    run(inputs, formats=(name,), **option)
+    run(inputs, formats=(name,), filled_markers=True, **option)
     file, read = READERS[name]
     assert inputs.merge is not None
     found, motion = read(inputs.out_dir / file), inputs.merge.motion

@@ -154,6 +154,44 @@ def test_an_assumed_floor_has_a_sigma() -> None:
     assert 0.005 < report.floor_sigma_m < 0.05
 
 
+def test_steps_are_not_certain_while_no_camera_sees_the_trunk() -> None:
+    motion, solved = walking(8.0)
+    observed = motion.observed.copy()
+    observed[90:150, motion.skeleton.roles.index("Spine1")] = False
+    complete, gap = fill(motion, solved), fill(replace(motion, observed=observed), solved)
+    assert not gap.report.is_sure[90:150].any()
+    np.testing.assert_array_equal(gap.report.is_sure[:80], complete.report.is_sure[:80])
+    np.testing.assert_array_equal(gap.motion.local_rotation, complete.motion.local_rotation)
+
+
+def test_a_lowered_person_has_bent_knees_and_is_unsure() -> None:
+    motion, solved = walking(4.0, speed=0.0)
+    low = replace(motion, root_in_world_m=motion.root_in_world_m * [1.0, 1.0, 0.5])
+    result = fill(low, solved)
+    assert result.report.standing.all()
+    assert not result.report.is_sure.any()
+    roles = motion.skeleton.roles
+    poses = result.motion.world_from_joint()[..., :3, 3]
+    hip, knee, ankle = (poses[:, roles.index("Left" + part)] for part in ("UpLeg", "Leg", "Foot"))
+    assert (knee[:, 1] < hip[:, 1] - 0.1).all(), "the knee points forward, to -y"
+    assert (ankle[:, 2] < 0.1).all()
+
+
+@pytest.mark.parametrize("turns", [0.25, -0.5])
+def test_turning_on_the_spot_takes_steps_that_are_not_certain(turns: float) -> None:
+    motion, solved = walking(6.0, speed=0.0)
+    angle = 2.0 * np.pi * turns * np.clip(np.arange(180) / 30.0 - 1.5, 0.0, 3.0) / 3.0
+    zero = np.zeros(180)
+    local = motion.local_rotation.copy()
+    local[:, 0] = so3_exp(np.column_stack([zero, zero, angle]))
+    result = fill(replace(motion, local_rotation=local), solved)
+    poses = result.motion.world_from_joint()
+    foot = motion.skeleton.roles.index("LeftFoot")
+    turned = np.unwrap(np.arctan2(poses[:, foot, 1, 0], poses[:, foot, 0, 0]))
+    assert turned[-1] - turned[0] == pytest.approx(2.0 * np.pi * turns, abs=0.35)
+    assert not result.report.is_sure[60:130].all()
+
+
 def test_measured_legs_are_left_alone() -> None:
     motion, solved = walking(3.0)
     with_leg = solved.copy()
