@@ -42,9 +42,7 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
     motion: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.bvh",
-            help="BVH file with the motion to use instead of the built-in walk; or gait, a walk whose feet "
-            "stand still on the floor.",
+            metavar="FILE.bvh", help="BVH file with the motion to use instead of the built-in walk."
         ),
     ] = None,
     poses: Annotated[

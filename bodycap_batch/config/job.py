@@ -36,7 +36,6 @@ from bodycap_batch.config.models import (
     Job,
 )
 from bodycap_batch.config.mounts import TRUNK_ROLES, mount_of
-from bodycap_batch.config.options import GAIT
 from bodycap_batch.config.origins import LoadedJob
 from bodycap_batch.config.places import Places
 from bodycap_batch.config.resolved_camera import ResolvedCamera, resolved_camera, with_found_calibrations
@@ -517,7 +516,7 @@ def _prepare_synthetic(job: Job, stated: _StatedJob, prepare: Prepare | None) ->
     folder = synthetic_folder(job, base)
     if prepare is not None:
         options = dict(job.capture.synthetic or {})
-        if isinstance(options.get("motion"), str) and options["motion"] != GAIT:
+        if isinstance(options.get("motion"), str):
             options["motion"] = str((base / options["motion"]).resolve())
         prepare(options, folder, _out(job, stated))
     missing = [v for camera in job.capture.cameras for v in camera.video if not (base / v).is_file()]

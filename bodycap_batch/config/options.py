@@ -20,9 +20,6 @@ NamePreset = Literal["hik", "mixamo", "biped", "unreal", "unity"]
 RootMode = Literal["hips", "ground", "in_place"]
 
 
-GAIT: Literal["gait"] = "gait"
-"""Value of the option `motion` of a synthetic capture for a walk whose feet stand still on the floor."""
-
 _MAX_PARALLAX_PX = 640.0
 """Maximum parallax (pixels) that causes a keyframe: the long side of the image in which it is measured."""
 _MAX_WINDOW = 60

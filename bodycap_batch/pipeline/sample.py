@@ -65,8 +65,8 @@ def _synth_task(options: Mapping[str, Any], settings: Settings) -> Task:
         raise refused from error
     task = SynthTask(
         options=checked,
-        motion=_motion_ref(checked.motion_file, settings.store.digests),
-        motion_name=None if checked.motion is None else Path(checked.motion).name,
+        motion=_motion_ref(checked.motion, settings.store.digests),
+        motion_name=None if checked.motion is None else checked.motion.name,
     )
     return make_task(SYNTH, task, threads=settings.threads)
 

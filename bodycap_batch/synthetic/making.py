@@ -14,7 +14,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bodycap_batch.config.options import GAIT
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError, StoreError
@@ -32,7 +31,6 @@ from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
 from bodycap_batch.synthetic.measured import disturb_poses
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
-from bodycap_batch.synthetic.planted_walk import PlantedWalk, draw_style
 from bodycap_batch.synthetic.pressing import find_press
 from bodycap_batch.synthetic.room import BareSurfaces, build_room
 from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, triangles_from_surfaces
@@ -84,21 +82,17 @@ def draw_subject(options: SynthOptions) -> Subject:
     sigmas = options.mount_sigma_deg, options.mount_sigma_m
     mount_rng = np.random.default_rng(seeds["mounts"])
     motion: MovingBody
-    if options.motion_file is not None:
+    if options.motion is not None:
         # With free clocks, the earliest camera starts at the start of the used part of the file.
         lead_s = max(0.0, -first_s) if options.clocks == "free" else 0.0
         start_s = options.motion_start_s + lead_s
-        motion = load_clip(options.motion_file, start_s, length_s - 1.0 / options.fps)
+        motion = load_clip(options.motion, start_s, length_s - 1.0 / options.fps)
         mounts = draw_mounts(options.cameras, motion.skeleton, sigmas, mount_rng)
     else:
         body = draw_body(
             options.subject_height_m, options.proportion_range, np.random.default_rng(seeds["body"])
         )
         mounts = draw_mounts(options.cameras, body, sigmas, mount_rng)
-        if options.motion == GAIT:
-            walk_rng = np.random.default_rng(seeds["walk"])
-            gait = PlantedWalk(body, length_s, draw_style(length_s, walk_rng))
-            return Subject(motion=gait, mounts=mounts, seeds=seeds)
         style = WalkStyle(
             t_pose_s=options.t_pose_s,
             arms_ahead=options.arms_ahead,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from bodycap_batch.config.bounds import (
     MAX_ANGLE_DEG,
@@ -20,7 +20,7 @@ from bodycap_batch.config.bounds import (
     MIN_FPS,
 )
 from bodycap_batch.config.mounts import mount_of
-from bodycap_batch.config.options import GAIT, Options
+from bodycap_batch.config.options import Options
 from bodycap_batch.model.camera import CAMERA_MODELS, Camera, parameter_count
 from bodycap_batch.synthetic.imu_options import ImuOptions, imu_from_word
 
@@ -93,10 +93,8 @@ class SynthOptions(Options):
     subject_height_m: float = Field(
         1.75, ge=1.2, le=2.2, description="body height of the person in the built-in walk, in metres"
     )
-    motion: Literal["gait"] | Path | None = Field(
-        None,
-        description="motion to use instead of the built-in walk: a BVH file, or gait, a walk whose feet "
-        "stand still on the floor",
+    motion: Path | None = Field(
+        None, description="BVH file with the motion to use instead of the built-in walk"
     )
     motion_start_s: float = Field(
         0.0,
@@ -318,16 +316,6 @@ class SynthOptions(Options):
                 )
         self._check_pressed()
         return self
-
-    @field_validator("motion", mode="before")
-    @classmethod
-    def _name_gait(cls, value: object) -> object:
-        return GAIT if str(value) == GAIT else value
-
-    @property
-    def motion_file(self) -> Path | None:
-        """The BVH file with the motion; None for a built-in walk."""
-        return self.motion if isinstance(self.motion, Path) else None
 
     def _check_cameras_named(self) -> None:
         """Check the options that have a value for each camera, and the lengths of gaps.

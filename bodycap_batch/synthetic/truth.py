@@ -108,8 +108,8 @@ def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts:
         _write_clocks(truth / "clocks.json", options)
     write_text(truth / "README.txt", _README + (_CLOCKS_README if own_clocks else ""))
     settings = options.model_dump(mode="json", exclude=None if own_clocks else _CLOCK_OPTIONS)
-    if options.motion_file is not None:
-        settings["motion"] = options.motion_file.name
+    if options.motion is not None:
+        settings["motion"] = options.motion.name
     _write_json(folder / MARKER, settings)
 
 

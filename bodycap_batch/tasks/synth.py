@@ -19,8 +19,7 @@ class SynthTask:
     Attributes:
         options: The renderer's options.
         motion: The BVH file that the options name; None if they name no file.
-        motion_name: Name of this BVH file, to be written to the ground truth, or of another motion; None for
-            the built-in walk.
+        motion_name: Name of this BVH file, to be written to the ground truth; None without a file.
     """
 
     options: SynthOptions = field(metadata=omitted_from_key("motion"))
