@@ -21,11 +21,11 @@ _HALF_ROOM_M = (3.6, 3.0)
 """Largest distance (metres) of a planned walk from the middle of the room, along x and y. Evidence: none."""
 _TRIES = 40
 """Number of walks that are drawn until one stays within `_HALF_ROOM_M`. Otherwise the best one is taken."""
-_RAMP_S = 1.0
+_RAMP_S = 1.3
 """Time (seconds) from standing to full speed, and from full speed to standing. Origin: about two steps."""
 _BEND_SLOWING_M = 0.2
 """Relative loss of speed for each unit of curvature (1/m) of a bend, metres. Evidence: none."""
-_MID_STANCE = {"walk": 0.235, "back": 0.34}
+_MID_STANCE = {"walk": 0.23, "back": 0.34}
 """Time from heel strike until the body passes the ankle, as a share of the gait cycle. Origin: with it, the
 angle of the hip in walking has the published mean of `hip_flexion_deg` at heel strike and at toe off."""
 _AHEAD, _BEHIND = 0.21, 0.39
@@ -41,7 +41,7 @@ _BACK_STEP_M, _BACK_STEP_S = 0.32, 0.66
 _STRIKE_DEG = {"walk": -17.0, "back": 14.0, "aside": 8.0, "turn": 8.0}
 """Angle of the foot at its first contact, degrees; negative: the heel touches first. The angle for walking
 belongs to a stride at `REFERENCE_M_S`. Evidence for the other kinds: none."""
-_OFF_DEG = {"walk": 59.0, "back": -3.0, "aside": 16.0, "turn": 16.0}
+_OFF_DEG = {"walk": 55.0, "back": -3.0, "aside": 16.0, "turn": 16.0}
 """Angle of the foot at its last contact, degrees; positive: the toes touch last. As `_STRIKE_DEG`."""
 
 
@@ -361,7 +361,7 @@ class Plan:
                     ahead = float((place - at[0, :2]) @ _forward(at[0, 2])) / (_AHEAD * usual)
                     behind = float((at[1, :2] - foot.place_m[-1]) @ _forward(at[1, 2])) / (_BEHIND * usual)
                 foot.off_s.append(off)
-                foot.off_deg.append(_OFF_DEG[bout.kind] * float(np.clip(behind, 0.2, 1.15)))
+                foot.off_deg.append(_OFF_DEG[bout.kind] * float(np.clip(behind, 0.2, 1.15)) ** 0.7)
                 foot.strike_s.append(float(strike))
                 foot.place_m.append(place)
                 foot.yaw_deg.append(yaw)

@@ -45,22 +45,22 @@ until toe off."""
 _ROLLING_DEG = 20.0
 """Angle of the foot at toe off, degrees, above which the foot rolls over the toes as in walking. With less,
 the heel rises only while both feet stand."""
-_RISE_POWERS = (1.5, 3.5)
+_RISE_POWERS = (1.3, 3.5)
 """Smallest and largest power of the angle of the foot over time. Origin: with less, the heel would rise with
 a jerk; with more, the foot would be flat until shortly before toe off."""
 _STANDING_KNEE_DEG = 5.0
 """Flexion of the knees of a standing person, degrees. Evidence: none."""
-_STRAIGHTEST_KNEE_DEG = 1.5
+_STRAIGHTEST_KNEE_DEG = 3.0
 """Smallest flexion of a knee, degrees. Origin: a leg that is nearly straight needs fast changes of its angles
 for small changes of its length."""
 _SHIFT_SIGMA_S = 0.11
 """Standard deviation (seconds) of the smoothing of the weight between the feet. Evidence: none."""
-_RISE_SIGMA = 0.045
+_RISE_SIGMA = 0.034
 """Standard deviation of the smoothing of the height of the root, as a share of the gait cycle. Origin: the
 height then has one maximum and one minimum a step, as in recorded walks."""
 _STEPPING_KNEE_DEG = 9.0
 """Additional flexion of the knees in steps on the spot, aside and back, degrees. Evidence: none."""
-_SOFT_REACH_M = 0.003
+_SOFT_REACH_M = 0.0008
 """Width (metres) of the smooth limit of the root's height by the length of the legs. Evidence: none."""
 _SPREAD = 4
 """Standard deviation (samples of `_GRID_HZ`) of the smoothing of these limits. Evidence: none."""
@@ -73,7 +73,7 @@ _CLEARANCE_M = 0.012
 about 1 to 2 cm above the floor (Winter 1991)."""
 _SOFT_CLEARANCE_M = 0.004
 """Width (metres) of the smooth limit of the sole's height. Evidence: none."""
-_LANDING_SHARE = 0.5
+_LANDING_SHARE = 0.65
 """Speed of the foot shortly before heel strike, as a share of the speed of the body. Evidence: none."""
 _LIFT_DEG = {"hip": 15.0, "knee": 32.0}
 """Flexion (degrees) of the leg in the middle of a short step, in addition to the curves. Evidence: none."""
@@ -337,6 +337,7 @@ class StanceWalk:
             off = smooth_step((foot.off_s[index] - t_s) / both_s - 0.8)
             loads.append(on * off + 1e-6)
             late = np.maximum(0.0, np.maximum(foot.strike_s[index] - t_s, t_s - foot.off_s[index]))
+            late = np.maximum(0.0, late - 1.5 / _GRID_HZ)
             limits[-1] = limits[-1] + 40.0 * late**2 + 1.0 * late
         weights = np.array(loads) / np.sum(loads, axis=0)
         wanted = gaussian_filter1d((weights * np.array(heights)).sum(axis=0), self._rise_sigma_s * _GRID_HZ)

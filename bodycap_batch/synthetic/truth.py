@@ -52,11 +52,10 @@ clocks.json    the clock of each camera, and the time by which its sound is late
 """
 _CONTACTS_README = """
 contacts.json  stances of each foot (left, right) in ascending order. strike_s: times of heel strike, the
-first
-               contact (in steps back and aside, the toes touch first). off_s: times of toe off, the last
-               contact. null: the stance starts before, or ends after, the simulated time. Seconds on the
-               common clock. Between strike_s and off_s the foot rolls without slipping: about the heel until
-               the foot is flat, and about the tip of the toes when the heel has risen.
+               first contact (in steps back and aside, the toes touch first). off_s: times of toe off, the
+               last contact. null: the stance starts before, or ends after, the simulated time. Seconds on
+               the common clock. Between strike_s and off_s the foot rolls without slipping: about the heel
+               until the foot is flat, and about the tip of the toes when the heel has risen.
 """
 _CLOCK_OPTIONS = {"clocks", "drifts_ppm", "sound", "sound_ratio_db", "sound_skews_s", "sound_skew_range_s"}
 """Options that are left out of the truth if no camera has its own clock or sound."""
