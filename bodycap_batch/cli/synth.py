@@ -74,6 +74,7 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap synth hidden/ --set body_in_view=true --set "pressed_s={left_palm: [2, 4]}"
       bodycap synth apart/ --set clocks=free --set sound=on
       bodycap synth inertial/ --set imu=true
+      bodycap synth steps/ --poses --set walk=gait --seconds 30
       bodycap synth other/ --motion walk.bvh --cameras torso,head --size 960x540
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.core.context import StageContext

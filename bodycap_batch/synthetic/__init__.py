@@ -17,7 +17,8 @@ def synthesise(
 
     The folder holds ``<camera>.mp4`` (or ``poses/<camera>.tum``), ``calib.json``, ``skeleton.bvh`` with the
     true proportions, and the ground truth in ``gt/``: ``<camera>.tum``, ``joints.npz``, ``motion.bvh`` and
-    ``mounts.json``, and with free clocks or sound also ``clocks.json``. The file ``gt/README.txt`` explains
+    ``mounts.json``, with free clocks or sound also ``clocks.json``, and with the walk ``gait`` also
+    ``contacts.json``. The file ``gt/README.txt`` explains
     the ground truth. The true mounts differ from the nominal mounts of the camera names. The true
     proportions differ from the nominal proportions of a person of this stature. Only ``gt/`` and
     ``skeleton.bvh`` hold the true values. Equal options give equal files.

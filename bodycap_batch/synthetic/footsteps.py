@@ -6,6 +6,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.synthetic.camera_renderer import MovingBody, joint_poses_at
+from bodycap_batch.synthetic.stance_walk import StanceWalk
 
 _RATE_HZ = 100.0
 """Number of examined poses per second. Origin: a step in the sound is then right to 10 ms."""
@@ -24,6 +25,9 @@ def footstep_times(motion: MovingBody, start_s: float, end_s: float) -> FloatArr
         start_s: Start of the examined time on the common clock, seconds.
         end_s: End of this time, seconds.
     """
+    if isinstance(motion, StanceWalk):
+        strikes = np.concatenate([rows[:, 0] for rows in motion.contacts(start_s, end_s).values()])
+        return np.sort(strikes[(strikes >= start_s) & (strikes < end_s)])
     times_s = np.arange(start_s, end_s, 1.0 / _RATE_HZ)
     feet = [motion.skeleton.index_of_role(role) for role in ("LeftFoot", "RightFoot")]
     if len(times_s) < 2:

@@ -33,6 +33,7 @@ from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
 from bodycap_batch.synthetic.pressing import find_press
 from bodycap_batch.synthetic.room import BareSurfaces, build_room
+from bodycap_batch.synthetic.stance_walk import StanceWalk
 from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, triangles_from_surfaces
 from bodycap_batch.synthetic.truth import (
     MARKER,
@@ -104,7 +105,8 @@ def draw_subject(options: SynthOptions) -> Subject:
             ),
             posture=draw_posture(options.posture_spread, np.random.default_rng(seeds["posture"])),
         )
-        motion = Walk(body, length_s, style, np.random.default_rng(seeds["walk"]))
+        kind = StanceWalk if options.walk == "gait" else Walk
+        motion = kind(body, length_s, style, np.random.default_rng(seeds["walk"]))
     return Subject(motion=motion, mounts=mounts, seeds=seeds)
 
 

@@ -93,6 +93,14 @@ class SynthOptions(Options):
     subject_height_m: float = Field(
         1.75, ge=1.2, le=2.2, description="body height of the person in the built-in walk, in metres"
     )
+    walk: Literal["simple", "gait"] = Field(
+        "simple",
+        description=(
+            "kind of the built-in walk; simple: laps with arms that reach out, whose feet slide; gait: walks "
+            "with bends, turns, side and back steps and standing, whose feet stand still on the floor; the "
+            "times of the steps are written to gt/contacts.json"
+        ),
+    )
     motion: Path | None = Field(
         None, description="BVH file with the motion to use instead of the built-in walk"
     )
@@ -314,6 +322,11 @@ class SynthOptions(Options):
                     f"{key} cannot be used with motion, because the program does not change the motion of "
                     "the BVH file; leave out one of the two"
                 )
+        if self.motion is not None and self.walk != "simple":
+            raise ValueError(
+                "walk cannot be used with motion, because the motion of the BVH file replaces the built-in "
+                "walk; leave out one of the two"
+            )
         self._check_pressed()
         return self
 

@@ -20,6 +20,7 @@ from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 from bodycap_batch.synthetic.camera_renderer import MovingBody, joint_poses_at
 from bodycap_batch.synthetic.clocks import has_own_clocks, reference_name, true_clocks
 from bodycap_batch.synthetic.options import SynthOptions
+from bodycap_batch.synthetic.stance_walk import StanceWalk
 
 JOINT_ROLES = {
     "root": "Hips", "torso": "Spine1", "head": "Head", "left_palm": "LeftHand", "right_palm": "RightHand",
@@ -48,6 +49,13 @@ _CLOCKS_README = """
 clocks.json    the clock of each camera, and the time by which its sound is late against its pictures:
                common time = camera time * (1 + drifts_ppm * 1e-6) + offsets_s. These values count where
                calib.json has no offsets_s. Sound takes up to 12 ms more from its source to the microphone.
+"""
+_CONTACTS_README = """
+contacts.json  stances of each foot (left, right) in ascending order. strike_s: times of heel strike, the
+               first contact (in steps back and aside, the toes touch first). off_s: times of toe off, the
+               last contact. null: the stance starts before, or ends after, the simulated time. Seconds on
+               the common clock. Between strike_s and off_s the foot rolls without slipping: about the heel
+               until the foot is flat, and about the tip of the toes when the heel has risen.
 """
 _CLOCK_OPTIONS = {"clocks", "drifts_ppm", "sound", "sound_ratio_db", "sound_skews_s", "sound_skew_range_s"}
 """Options that are left out of the truth if no camera has its own clock or sound."""
@@ -106,8 +114,15 @@ def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts:
     own_clocks = has_own_clocks(options)
     if own_clocks:
         _write_clocks(truth / "clocks.json", options)
-    write_text(truth / "README.txt", _README + (_CLOCKS_README if own_clocks else ""))
-    settings = options.model_dump(mode="json", exclude=None if own_clocks else _CLOCK_OPTIONS)
+    readme = _README + (_CLOCKS_README if own_clocks else "")
+    hidden = set() if own_clocks else set(_CLOCK_OPTIONS)
+    if isinstance(motion, StanceWalk):
+        _write_contacts(truth / "contacts.json", motion, seconds_from_ns(ticks))
+        readme += _CONTACTS_README
+    else:
+        hidden.add("walk")
+    write_text(truth / "README.txt", readme)
+    settings = options.model_dump(mode="json", exclude=hidden)
     if options.motion is not None:
         settings["motion"] = options.motion.name
     _write_json(folder / MARKER, settings)
@@ -182,6 +197,15 @@ def _write_joints(path: Path, motion: MovingBody, ticks_ns: IntArray) -> None:
     world = joint_poses_at(motion, seconds_from_ns(ticks_ns))[:, list(present.values())][..., :3, 3]
     with atomic_replacement(path) as temporary:
         np.savez(temporary, names=np.array(list(present)), t=seconds_from_ns(ticks_ns), world=world)
+
+
+def _write_contacts(path: Path, motion: StanceWalk, times_s: FloatArray) -> None:
+    """Write the stances of both feet that overlap the given times on the common clock, seconds."""
+    content = {}
+    for side, stances in motion.contacts(float(times_s[0]), float(times_s[-1])).items():
+        rows = [[round(time, 6) if np.isfinite(time) else None for time in row] for row in stances.tolist()]
+        content[side.lower()] = {"strike_s": [row[0] for row in rows], "off_s": [row[1] for row in rows]}
+    _write_json(path, content)
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
