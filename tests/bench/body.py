@@ -42,7 +42,6 @@ TUNED_ON = ("02_01",)
 """Recordings that constants of the stage may be chosen on. All others are only reported."""
 DRAWN = range(8)
 """Seeds of the drawn walks."""
-WALKS = ("walk12", "room12", "02_01")
 _ROLES = {
     "Hips": "root", "Spine1": "torso",
     **{f"{s}{part}": f"{s.lower()}_{name}" for s in SIDES for part, name in (
