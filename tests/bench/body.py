@@ -30,7 +30,8 @@ from bodycap_batch.model.fill_data import SIDES, FillMode, FillReport
 from bodycap_batch.model.geometry import interpolate_pose, nearest_rotation
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
 from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions
-from bodycap_batch.synthetic.planted_walk import PlantedWalk, draw_style
+from bodycap_batch.synthetic.gait import WalkStyle
+from bodycap_batch.synthetic.stance_walk import StanceWalk
 from tests.bench.rows import DATA
 
 MOUNTED = ("Spine1", "LeftHand", "RightHand")
@@ -134,10 +135,10 @@ def recorded_body(path: Path, name: str, *, rate: float = 1.0, mirrored: bool = 
 
 
 def drawn_body(seed: int, seconds: float = 20.0) -> Body:
-    """Return a body that walks as `bodycap_batch.synthetic.planted_walk` draws it, of a drawn stature."""
+    """Return a body that walks as `bodycap_batch.synthetic.stance_walk` draws it, of a drawn stature."""
     rng = np.random.default_rng(seed)
     skeleton = load_skeleton("full_body", float(rng.uniform(1.55, 1.95)))
-    walk = PlantedWalk(skeleton, seconds, draw_style(seconds, rng))
+    walk = StanceWalk(skeleton, seconds, WalkStyle(), rng)
     times = np.arange(round(seconds * FPS)) / FPS
     root, local = walk.pose(times)
     motion = Motion(
