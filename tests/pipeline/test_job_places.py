@@ -93,3 +93,18 @@ def test_a_batch_leaves_out_the_folder_with_the_results_of_the_others(bench: Ben
     code, out, err = bench.run("batch", "my walk", "out")
     assert (code, out.splitlines()[-1]) == (0, "1 of 1 jobs done"), err
     assert "out is left out, because it contains results and no videos" in err
+
+
+def test_the_report_is_opened_by_job_by_videos_and_by_results(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    code, _, err = bench.run("open", "my walk")
+    assert (code, "the folder contains no report" in err) == (2, True)
+    assert bench.run("run", "my walk", "--height", "1,80")[0] == 0
+    report = bench.folder / "out" / "my_walk" / "report.html"
+    for path in ("my walk", "out/my_walk"):
+        code, out, err = bench.run("open", path)
+        assert (code, out) == (0, f"report: {report}\n"), err
+    assert opened == 2 * [report.as_uri()]
