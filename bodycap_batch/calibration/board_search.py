@@ -21,7 +21,10 @@ _MIN_SHARE = 0.5
 """Minimum fraction of a board's corners that its views must show, on average. A board with more corners than
 this is taken at once. Evidence: none."""
 _MIN_MARKERS = 4
-"""Minimum number of markers of a family in all pictures together. Fewer are found by chance. Evidence: none."""
+"""Minimum number of markers of a family in all pictures together. Fewer are found by chance.
+
+Evidence: none.
+"""
 _CHARUCO_SIZES = (
     (7, 5),
     (5, 7),
