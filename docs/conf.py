@@ -9,8 +9,9 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 sys.path.insert(0, str(HERE / "reference"))
 
-import bodycap_batch  # noqa: E402 - found through the path above
 import generate  # noqa: E402
+
+import bodycap_batch  # noqa: E402 - found through the path above
 
 project = "bodycap"
 author = "bodycap_batch contributors"

@@ -1,4 +1,7 @@
-"""Write the part of the reference that comes from the code: job file, commands, errors, results, Python API."""
+"""Write the part of the reference that comes from the code.
+
+These are the job file, the commands, the errors, the results and the Python API.
+"""
 
 from __future__ import annotations
 
@@ -177,7 +180,11 @@ def columns() -> dict[str, tuple[str, ...]]:
 
 def reports() -> list[type]:
     """Return the types of the report of merging; the report as a whole comes first."""
-    found = [item for item in vars(merge_report).values() if isinstance(item, type) and dataclasses.is_dataclass(item)]
+    found = [
+        item
+        for item in vars(merge_report).values()
+        if isinstance(item, type) and dataclasses.is_dataclass(item)
+    ]
     return sorted(found, key=lambda item: item is not merge_report.MergeReport)
 
 
