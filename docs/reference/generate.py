@@ -131,7 +131,7 @@ def commands() -> dict[str, Any]:
 
 
 def _help_lines(text: str) -> Iterator[str]:
-    """Yield the help of a command as Markdown; a paragraph after \\b keeps its lines."""
+    """Yield the help of a command as Markdown; a paragraph after a backspace keeps its lines."""
     for paragraph in text.split("\n\n"):
         if paragraph.startswith("\b"):
             title, *lines = paragraph.lstrip("\b\n").split("\n")
@@ -151,7 +151,8 @@ def _flags(parameter: Any) -> str:
 def errors() -> str:
     """Return the page of the errors, from the source."""
     return (
-        "# Errors\n\nEvery message that ends a command, with its exit code. A value of the moment is written as …. "
+        "# Errors\n\nEvery message that ends a command, with its exit code. A value of the moment is written as "
+        "…. "
         f"The meaning of the codes is in [Results](../results.md#exit-codes).\n\n{error_table.table()}\n"
     )
 
