@@ -151,8 +151,8 @@ def _flags(parameter: Any) -> str:
 def errors() -> str:
     """Return the page of the errors, from the source."""
     return (
-        "# Errors\n\nEvery message that ends a command, with its exit code. A value of the moment is written as "
-        "…. "
+        "# Errors\n\nEvery message that ends a command, with its exit code. A value of the moment is "
+        "written as …. "
         f"The meaning of the codes is in [Results](../results.md#exit-codes).\n\n{error_table.table()}\n"
     )
 
