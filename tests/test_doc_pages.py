@@ -73,6 +73,16 @@ def test_the_option_blocks_in_the_reference_show_the_defaults(tmp_path: Path) ->
         assert getattr(job, stage) == getattr(plain, stage)
 
 
+SETTINGS = sorted(set(re.findall(r"`((?:export|merge|map): \{[^`…]*\})`", TEXT)))
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_settings_named_in_a_sentence_are_valid(tmp_path: Path, setting: str) -> None:
+    path = tmp_path / "walk.yaml"
+    path.write_text(f"capture: {{cameras: [{{name: torso, video: a.mp4}}]}}\n{setting}\n", encoding="utf-8")
+    load_job(path)
+
+
 def test_the_calibration_in_the_guide_is_read(tmp_path: Path) -> None:
     (text,) = blocks("json")
     (tmp_path / "calib.json").write_text(text, encoding="utf-8")
