@@ -65,6 +65,11 @@ lint: $(VENV)/.dev ## check format, lint and types
 .PHONY: check
 check: lint test ## lint, types and the fast tests
 
+.PHONY: docs
+docs: $(VENV)/.docs ## build the documentation into build/docs (offline; a warning is an error)
+	$(BIN)/python -m sphinx -b html -W --keep-going -q docs build/docs
+	@echo "documentation: $(abspath build/docs/index.html)"
+
 .PHONY: bench
 bench: $(VENV)/.dev ## measure exactness and speed on the captures (slow)
 	$(BIN)/python -m tests.bench $(ARGS)
@@ -80,6 +85,7 @@ lock: $(VENV)/.dev ## resolve the dependencies anew into the locks
 		--output-file requirements-extras.lock
 	$(LOCK) --group dev --extra formats --extra cluster --extra web --extra viewer --constraints requirements-extras.lock \
 		--output-file requirements-dev.lock
+	$(LOCK) --group docs --constraints requirements-dev.lock --output-file requirements-docs.lock
 	$(COMPILE) --universal --python-version 3.11 --group blender --output-file requirements-blender.lock
 
 .PHONY: extras
@@ -117,6 +123,10 @@ $(VENV)/.extras: $(VENV)/.project requirements-extras.lock
 $(BLENDER)/.ready: $(VENV)/.created requirements-blender.lock
 	"$$(PYTHON=$${PYTHON:-python3.11} .ci/system-packages --python)" -m venv $(BLENDER)
 	$(BLENDER)/bin/python -m pip --disable-pip-version-check --no-input install --quiet --require-hashes -r requirements-blender.lock
+	touch $@
+
+$(VENV)/.docs: $(VENV)/.project requirements-docs.lock
+	$(PIP) install --quiet --require-hashes -r requirements-docs.lock
 	touch $@
 
 $(VENV)/.dev: $(VENV)/.project requirements-dev.lock

@@ -315,9 +315,7 @@ CASES = (
     Case("name of 300 letters", edit("capture:", f"name: {'n' * 300}\ncapture:"), 2, JOB, "at most 100"),
     Case("tab in the job", edit("  cameras", "\tcameras"), 2, JOB, "tab"),
     Case("a list for a number", edit("capture:", "height_m: [1]\ncapture:"), 2, JOB, "should be a number"),
-    Case(
-        "a height in centimetres", edit("capture:", "height_m: 175\ncapture:"), 2, JOB, "175: should be less"
-    ),
+    Case("a height of a giant", edit("capture:", "height_m: 17.5\ncapture:"), 2, JOB, "17.5: should be less"),
     Case("a key misspelt", edit("capture:", "hight_m: 1\ncapture:"), 2, JOB, "unknown key"),
     Case("a key twice", edit("capture:", "name: a\nname: b\ncapture:"), 2, JOB, "twice"),
     Case("window turned round", edit("capture:", "capture:\n  start_s: 2\n  end_s: 1"), 2, JOB, "end_s"),

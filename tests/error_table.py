@@ -1,6 +1,6 @@
-"""The table of every error message, made from the source: ``python -m tests.error_table [--write]``.
+"""The table of every error message, made from the source. `make docs` makes a page of it.
 
-``--write`` puts it into README.md between its two markers; a test holds it against the code.
+``python -m tests.error_table`` prints it.
 """
 
 from __future__ import annotations
@@ -8,15 +8,12 @@ from __future__ import annotations
 import ast
 import functools
 import re
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "bodycap_batch"
-README = ROOT / "README.md"
-BEGIN, END = "<!-- errors: made by `python -m tests.error_table --write` -->", "<!-- end of errors -->"
 CODES = {"JobError": 2, "CaptureError": 3, "EstimationError": 4, "ImplausibleBody": 4, "StoreError": 5}
 CODES |= {"Problem": 2, "error": 2}
 """Also what a job's rules find, and what the BVH parser says of a line."""
@@ -122,16 +119,5 @@ def table() -> str:
     return "\n".join([*head, *rows])
 
 
-def inserted(readme: str) -> str:
-    """The README with the table between its markers, or as it is where it has none."""
-    if BEGIN not in readme or END not in readme:
-        return readme
-    before, rest = readme.split(BEGIN, 1)
-    return f"{before}{BEGIN}\n\n{table()}\n\n{END}{rest.split(END, 1)[1]}"
-
-
 if __name__ == "__main__":
-    if "--write" in sys.argv:
-        README.write_text(inserted(README.read_text(encoding="utf-8")), encoding="utf-8")
-    else:
-        print(table())
+    print(table())

@@ -6,7 +6,7 @@ import re
 import tempfile
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +16,9 @@ from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.progress import Event
+
+if TYPE_CHECKING:
+    from bodycap_batch.calibration import CalibrationBoard
 
 
 class CameraModelOption(StrEnum):
@@ -29,7 +32,13 @@ class CameraModelOption(StrEnum):
 
 @app.command()
 def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
-    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="A video of the board.")],
+    video: Annotated[
+        Path | None, typer.Argument(metavar="[VIDEO]", help="A video of the board.", show_default=False)
+    ] = None,
+    print_: Annotated[
+        Path | None,
+        typer.Option("--print", metavar="FILE.pdf", help="Write a board to print, and calibrate nothing."),
+    ] = None,
     chessboard: Annotated[
         str | None,
         typer.Option(
@@ -78,23 +87,40 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
 ) -> None:
     """Calibrate a camera from a video of a board.
 
-    Print a board, and glue the board on something flat. Film the board with the camera settings of your
+    Print a board (--print), and glue it on something flat. Film the board with the camera settings of your
     captures: stabilisation is off; picture size, zoom and lens mode are the same. Move the board slowly to
-    every corner of the picture, near and far, and tilt the board to all sides; half a minute is enough. The
-    command writes calib.json and a picture from which the distortion is removed, so that you can check it.
+    every corner of the picture, near and far, and tilt the board to all sides; half a minute is enough. If no
+    board is named, the usual boards are tried. The command writes calib.json and a picture from which the
+    distortion is removed, so that you can check it.
 
     \b
     Examples:
+      bodycap calibrate --print board.pdf
+      bodycap calibrate my_walk/board.mp4
       bodycap calibrate my_walk/board.mp4 --charuco 7x5
       bodycap calibrate board.mp4 --chessboard 9x6 --camera torso --out my_walk/calib.json
       bodycap calibrate wide.mp4 --chessboard 9x6 --lens fisheye
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.calibration import CalibrationBoard, calibrate_clip, write_calibration, write_preview
+    from bodycap_batch.calibration import (
+        calibrate_clip,
+        find_board,
+        write_board,
+        write_calibration,
+        write_preview,
+    )
     from bodycap_batch.core.context import StageContext
 
-    kind, columns, rows = _board_size(chessboard, charuco)
-    marker_options = {"dictionary": dictionary, "marker": marker, "legacy": legacy}
-    board = CalibrationBoard(kind=kind, columns=columns, rows=rows, **marker_options)  # type: ignore[arg-type]
+    if print_ is not None:
+        write_board(print_)
+        print_line(f"board: {print_.resolve()} (print it at 100 %, and glue it on something flat)")
+        return
+    if video is None:
+        raise JobError(
+            "the video is missing",
+            field="VIDEO",
+            hint="give a video of a board; `bodycap calibrate --print board.pdf` writes a board to print",
+        )
+    stated = _stated_board(chessboard, charuco, dictionary, marker, legacy=legacy)
     target = out or video.parent / "calib.json"
     with (
         event_on_signal() as stop,
@@ -106,7 +132,7 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
             display(Event(kind="progress", stage="calibrate", done=done, total=total, what=what))
 
         context = StageContext(work_dir=Path(work), progress=progress, cancelled=stop.is_set)
-        result = calibrate_clip(video, board, lens.value, context)
+        result = calibrate_clip(video, stated or find_board(video, context), lens.value, context)
     preview = target.with_name(f"{target.stem}{f'_{camera}' if camera else ''}.png")
     write_calibration(result, target, camera)
     write_preview(result, preview)
@@ -116,18 +142,26 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
             print_line(line)
 
 
-def _board_size(
-    chessboard: str | None, charuco: str | None
-) -> tuple[Literal["chessboard", "charuco"], int, int]:
-    """Return the kind of the board in the options, its number of columns and its number of rows."""
-    if charuco is not None and chessboard is None:
-        return ("charuco", *_parse_size(charuco, "--charuco"))
-    if chessboard is not None and charuco is None:
-        return ("chessboard", *_parse_size(chessboard, "--chessboard"))
-    raise JobError(
-        "exactly one board is needed",
-        field="--charuco or --chessboard",
-        hint="give one of the two options, for example --charuco 7x5",
+def _stated_board(
+    chessboard: str | None, charuco: str | None, dictionary: str, marker: float, *, legacy: bool
+) -> CalibrationBoard | None:
+    """Return the board in the options; None if the options name none."""
+    from bodycap_batch.calibration import CalibrationBoard
+
+    if chessboard is not None and charuco is not None:
+        raise JobError(
+            "only one board can be used",
+            field="--charuco or --chessboard",
+            hint="give one of the two options, for example --charuco 7x5, or none",
+        )
+    if chessboard is not None:
+        columns, rows = _parse_size(chessboard, "--chessboard")
+        return CalibrationBoard(kind="chessboard", columns=columns, rows=rows)
+    if charuco is None:
+        return None
+    columns, rows = _parse_size(charuco, "--charuco")
+    return CalibrationBoard(
+        kind="charuco", columns=columns, rows=rows, dictionary=dictionary, marker=marker, legacy=legacy
     )
 
 

@@ -11,6 +11,7 @@ import typer
 
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.job_places import find_store, load_last_run
+from bodycap_batch.cli.open_report import REPORTS
 from bodycap_batch.cli.shared_options import (
     JobArgument,
     OutOption,
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from bodycap_batch.config.models import Job
     from bodycap_batch.report.frame_overlays import FrameOverlays
     from bodycap_batch.report.report_inputs import ReportInputs
-
-_REPORT_FILES = ("report.html", "partial/report.html")
 
 
 @app.command(short_help="Show the report of a finished job together with the videos.")
@@ -67,7 +66,7 @@ def view(
         write_recording(_stored_inputs(resolved, out_dir, store), rerun)
         print_line(f"recording: {rerun}")
         return
-    page = next((out_dir / name for name in _REPORT_FILES if (out_dir / name).is_file()), None)
+    page = next((out_dir / name for name in REPORTS if (out_dir / name).is_file()), None)
     if page is None:
         raise JobError(
             "the folder contains no report",

@@ -21,7 +21,12 @@ _EMPTY_IF_NONE = {"empty_if_none": True}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Percentiles:
-    """The median and the 95th percentile of a set of values."""
+    """The median and the 95th percentile of a set of values.
+
+    Attributes:
+        p50: The median.
+        p95: The 95th percentile.
+    """
 
     p50: float
     p95: float
@@ -108,7 +113,12 @@ class ScaleReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TPoseReport:
-    """The start and the end of a T-pose, seconds after tick 0."""
+    """The start and the end of a T-pose, seconds after tick 0.
+
+    Attributes:
+        from_s: Start of the T-pose, seconds after tick 0.
+        to_s: End of the T-pose, seconds after tick 0.
+    """
 
     from_s: float
     to_s: float
@@ -259,7 +269,12 @@ class InvertedCamerasReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlignedCameraReport:
-    """The sigmas of the pose of a map that was aligned with another map: degrees and metres, per axis."""
+    """The sigmas of the pose of a map that was aligned with another map: degrees and metres, per axis.
+
+    Attributes:
+        sigma_deg: Sigma of the map's rotation, degrees per axis.
+        sigma_m: Sigma of the map's position, metres per axis.
+    """
 
     sigma_deg: float
     sigma_m: float

@@ -89,10 +89,20 @@ def _link_or_copy(source: Path, target: Path) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def stored_name(store: Path, folder: Path) -> str:
+    """Return the path of a store as a folder of results records it.
+
+    If the folder of results lies below the folder that holds the store, the path is relative to the results.
+    Both can then be moved or copied together.
+    """
+    store, folder = store.resolve(), folder.resolve()
+    return os.path.relpath(store, folder) if folder.is_relative_to(store.parent) else str(store)
+
+
 def store_of_last_run(folder: Path) -> Path | None:
     """Return the store that a folder of results names; None if there is no record of a run, or no store."""
     try:
-        return Path(str(parse_checked_json((folder / RUN_FILE).read_bytes())["store"]))
+        return (folder / str(parse_checked_json((folder / RUN_FILE).read_bytes())["store"])).resolve()
     except (OSError, ValueError, KeyError, TypeError):  # also results of versions that did not name it
         return None
 

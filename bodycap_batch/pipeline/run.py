@@ -20,6 +20,7 @@ from bodycap_batch.pipeline.results import (
     clear_partial,
     publish,
     remove_outdated,
+    stored_name,
     write_results_file,
 )
 from bodycap_batch.pipeline.settings import Settings, StageRecord
@@ -251,7 +252,7 @@ def _write_results(job: Job, results: StageResults, summary: RunSummary, setting
     remove_outdated(out_dir, summary.files)
     record = {
         "versions": dict(summary.versions),
-        "store": str(settings.store.root),
+        "store": stored_name(settings.store.root, out_dir),
         "threads": settings.threads,
         "seconds": round(sum(stage.seconds for stage in summary.stages), 3),
         "peak_memory_mb": max((stage.peak_memory_mb for stage in summary.stages), default=0.0),

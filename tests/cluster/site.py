@@ -24,7 +24,7 @@ CALM = {
     "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "500ms",
     "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
 }
-"""What the README advises on small machines."""
+"""What docs/how-to/batch_and_cluster.md advises on small machines."""
 NAMES = ("monday", "tuesday", "wednesday")
 
 

@@ -319,7 +319,7 @@ def test_a_bug_is_exit_code_70_with_a_traceback(bench: Bench) -> None:
         (["run"], 2, "Missing argument"),
         (["fly"], 2, "No such command"),
         (["run", "nothing.yaml"], 2, "nothing.yaml"),
-        (["run", "{folder}", "--height", "175"], 2, "height"),
+        (["run", "{folder}", "--height", "17.5"], 2, "height"),
         (["run", "{folder}", "--skeleton", "centaur"], 2, "centaur"),
         (["run", "{folder}", "--threads", "0"], 2, "threads"),
         (["run", "{empty}"], 3, "no video"),

@@ -21,6 +21,7 @@ def test_a_flipped_byte_in_every_artefact_is_found_and_what_it_was_in_rebuilt(
     place: Place, reference: Place, which: str
 ) -> None:
     shutil.copytree(reference.out, place.out)
+    shutil.copytree(reference.store, place.store)
     damaged = place.manifests()
     assert {path.parts[-3] for path in damaged} >= set(STAGES)
     for path in damaged:

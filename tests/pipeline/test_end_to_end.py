@@ -96,9 +96,9 @@ def test_a_finished_job_executes_nothing(folder: Path, capfd: pytest.CaptureFixt
 
 def test_the_python_example_runs_the_job_and_reads_its_results(folder: Path) -> None:
     # the same job under another name; the stages lie in the store beside its results
-    (folder / "api.yaml").write_text(f"out: out/api\n{JOB}")
+    (folder / "api.yaml").write_text(f"out: api\n{JOB}")
     said = example("python_api.py", str(folder / "api.yaml"), cwd=folder)
-    shutil.rmtree(folder / "out" / "api")  # other tests compare what lies in there
+    shutil.rmtree(folder / "api")
     assert "reused map" in said
     assert "started map" not in said
     for words in (
@@ -130,7 +130,7 @@ def test_made_again_in_another_store_every_byte_is_the_same(folder: Path, tmp_pa
 
 def test_without_a_body_there_are_map_paths_report_and_video(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    words = ["--skeleton", "none", "--out", str(out), "--store", str(folder / "out" / ".store")]
+    words = ["--skeleton", "none", "--out", str(out), "--store", str(folder / ".store")]
     assert main(["run", str(folder / "tiny.yaml"), *words]) == 0
     names = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
     assert {"map.ply", "frames.csv", "report.html", "preview.mp4", "trajectories/torso.tum"} <= names
@@ -138,7 +138,7 @@ def test_without_a_body_there_are_map_paths_report_and_video(folder: Path, tmp_p
 
 
 def test_the_truth_of_the_mounts_is_not_used(folder: Path) -> None:
-    artefacts = folder / "out" / ".store" / "artefacts"
+    artefacts = folder / ".store" / "artefacts"
     found = artefacts.glob("*/*/manifest.json")
     manifests = [path.read_text() for path in found if path.parts[-3] != "synth"]
     assert len(manifests) >= 8

@@ -40,7 +40,7 @@ def test_the_working_folder_does_not_matter(bench: Bench, tmp_path: Path) -> Non
 def test_results_name_their_store(bench: Bench) -> None:
     assert bench.run("run", "my walk", "--store", "kept", "--out", "delivered/walk")[0] == 0
     results = bench.folder / "delivered" / "walk"
-    assert json.loads((results / "run.json").read_text())["store"] == str(bench.folder / "kept")
+    assert json.loads((results / "run.json").read_text())["store"] == "../../kept"
     assert [path.name for path in results.iterdir() if path.name.startswith(".")] == []
     assert steps(bench, "delivered/walk")[-1] == "nothing to do"
     code, out, err = bench.run("gc", "delivered/walk")
@@ -58,6 +58,18 @@ def test_results_of_an_earlier_version_keep_the_store_inside_them(bench: Bench) 
     assert find_store(results) == results / ".store"
     assert steps(bench, "delivered")[-1] == "nothing to do"
     assert "nothing to do" in bench.run("run", "my walk", "--out", "delivered")[1]
+
+
+def test_results_and_store_can_be_moved_together(bench: Bench) -> None:
+    assert bench.run("run", "my walk")[0] == 0
+    (bench.folder / "out").rename(bench.folder / "moved")
+    assert find_store(bench.folder / "moved" / "my_walk") == bench.folder / "moved" / ".store"
+
+
+def test_a_store_elsewhere_is_named_by_its_whole_path(bench: Bench, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "cache" / "store"
+    assert bench.run("run", "my walk", "--store", str(elsewhere))[0] == 0
+    assert find_store(bench.folder / "out" / "my_walk") == elsewhere
 
 
 def test_a_store_that_no_longer_exists_is_made_beside_the_results(bench: Bench) -> None:
@@ -93,3 +105,18 @@ def test_a_batch_leaves_out_the_folder_with_the_results_of_the_others(bench: Ben
     code, out, err = bench.run("batch", "my walk", "out")
     assert (code, out.splitlines()[-1]) == (0, "1 of 1 jobs done"), err
     assert "out is left out, because it contains results and no videos" in err
+
+
+def test_the_report_is_opened_by_job_by_videos_and_by_results(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    code, _, err = bench.run("open", "my walk")
+    assert (code, "the folder contains no report" in err) == (2, True)
+    assert bench.run("run", "my walk", "--height", "1,80")[0] == 0
+    report = bench.folder / "out" / "my_walk" / "report.html"
+    for path in ("my walk", "out/my_walk"):
+        code, out, err = bench.run("open", path)
+        assert (code, out) == (0, f"report: {report}\n"), err
+    assert opened == 2 * [report.as_uri()]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import time
@@ -58,7 +57,7 @@ def test_killed_at_random_moments_it_ends_with_the_same_bytes(place: Place, refe
     whole_s = time.monotonic() - started_s
     same(place, reference)
     kills = completed = 0
-    shutil.rmtree(place.out)
+    place.remove_results()
     while kills < RANDOM_KILLS:
         process = place.start()
         try:
@@ -70,7 +69,7 @@ def test_killed_at_random_moments_it_ends_with_the_same_bytes(place: Place, refe
         assert process.returncode == 0
         completed += 1
         same(place, reference)
-        shutil.rmtree(place.out)
+        place.remove_results()
     code, _, err = place.run()
     assert code == 0, err
     same(place, reference)

@@ -11,7 +11,7 @@ import pytest
 
 from bodycap_batch.cli import main
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.pipeline import Settings
+from bodycap_batch.pipeline import RunSummary, Settings
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.garbage_collection import collect_garbage
 from bodycap_batch.watch import cancel_job, commands, inbox_claim, job_worker, retry_job
@@ -221,8 +221,9 @@ def test_a_job_that_ends_during_the_cancellation_is_done(
 def test_parallel_jobs_share_their_stage_turns(bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     shared: list[object] = []
 
-    def run(job: object, *, out_dir: Path, settings: Settings) -> None:
+    def run(job: object, *, out_dir: Path, settings: Settings) -> RunSummary:
         shared.append(settings.turns)
+        return RunSummary(out_dir=out_dir, files=(), stages=(), versions={})
 
     monkeypatch.setattr(job_worker, "run_job", run)
     bench.drop("one")

@@ -53,7 +53,7 @@ class Place:
     def _name_folders(self, folder: Path) -> None:
         self.folder = folder
         self.out = folder / "out"
-        self.store = self.out / ".store"
+        self.store = folder / ".store"
 
     @classmethod
     def existing(cls, folder: Path) -> Place:
@@ -112,6 +112,11 @@ class Place:
                 "digest"
             ].encode()
         return found
+
+    def remove_results(self) -> None:
+        """Remove the results and the store."""
+        for folder in (self.out, self.store):
+            shutil.rmtree(folder)
 
     def manifests(self) -> list[Path]:
         """Of all artefacts but the rendered capture, which came from outside."""

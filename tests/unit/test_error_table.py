@@ -1,8 +1,8 @@
-"""Every error says what to do, and the README's table of them is the code's."""
+"""Every error says what to do, and the table of them is the code's."""
 
 from __future__ import annotations
 
-from tests.error_table import CODES, README, inserted, messages, table
+from tests.error_table import CODES, messages, table
 
 
 def test_the_table_holds_the_errors_of_the_code() -> None:
@@ -23,11 +23,6 @@ WITHOUT_REMEDY = {
 def test_every_error_says_what_to_do() -> None:
     bare = [f"{each.where}: {each.text}" for each in messages() if not each.remedy]
     assert not [line for line in bare if line.partition(": ")[2] not in WITHOUT_REMEDY]
-
-
-def test_the_readme_lists_them_all() -> None:
-    readme = README.read_text(encoding="utf-8")
-    assert inserted(readme) == readme, "run: python -m tests.error_table --write"
 
 
 def test_the_table_is_markdown_of_three_columns() -> None:

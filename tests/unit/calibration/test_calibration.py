@@ -7,10 +7,17 @@ import numpy as np
 import pytest
 
 from bodycap_batch import cli
-from bodycap_batch.calibration import CalibrationBoard, calibrate_clip, write_calibration, write_preview
+from bodycap_batch.calibration import (
+    CalibrationBoard,
+    calibrate_clip,
+    find_board,
+    write_calibration,
+    write_preview,
+)
 from bodycap_batch.calibration.board_detection import BoardCorners
 from bodycap_batch.calibration.clip_calibration import corner_coverage, select_diverse_views
 from bodycap_batch.calibration.intrinsics_fit import fit_intrinsics
+from bodycap_batch.calibration.printed_board import PRINTED_BOARD
 from bodycap_batch.capture import open_camera
 from bodycap_batch.config.calibration import read_calibration
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
@@ -157,8 +164,7 @@ def test_the_command_writes_calibration_and_preview(clip, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "exactly one board is needed"),
-        (["--charuco", "9x6", "--chessboard", "9x6"], "exactly one board is needed"),
+        (["--charuco", "9x6", "--chessboard", "9x6"], "only one board can be used"),
         (["--charuco", "nine"], "is not the size of a board"),
         (["--charuco", "2x2"], "too small"),
         (["--charuco", "9x6", "--dictionary", "9X9"], "no family of markers"),
@@ -236,3 +242,34 @@ def test_no_board_is_found_in_noise_of_either_polarity():
     noise = np.random.default_rng(1).integers(0, 255, (240, 320)).astype(np.uint8)
     assert board.find(noise) is None
     assert board.find(255 - noise) is None
+
+
+def test_the_board_of_a_clip_is_found_without_naming_it(clip):
+    board = find_board(clip, StageContext(work_dir=clip.parent))
+    assert (board.kind, board.columns, board.rows) == ("charuco", 9, 6)
+
+
+def test_a_clip_without_a_board_is_refused(tmp_path):
+    grey = np.full((20, 240, 320), 110, dtype=np.uint8)
+    with pytest.raises(CaptureError, match="no usual calibration board") as caught:
+        find_board(write_video(tmp_path / "wall.mp4", grey, fps=5), StageContext(work_dir=tmp_path))
+    assert "--print" in caught.value.hint
+
+
+def test_the_printed_board_is_the_one_that_is_found(tmp_path):
+    """The page is drawn again from its rectangles; every corner must be where its squares meet."""
+    assert cli.main(["calibrate", "--print", str(tmp_path / "board.pdf")]) == 0
+    text = (tmp_path / "board.pdf").read_text("ascii")
+    assert text.startswith("%PDF-1.4")
+    start = int(text.rpartition("startxref\n")[2].split()[0])
+    assert text[start:].startswith("xref")
+    page = np.full((595, 842), 255, dtype=np.uint8)  # A4 across, one pixel for a PDF unit
+    boxes = [line.split()[:4] for line in text.splitlines() if line.endswith(" re f")]
+    for x, y, width, height in np.array(boxes, dtype=float):
+        rows = slice(round(595 - y - height), round(595 - y))
+        page[rows, round(x) : round(x + width)] = 0
+    found = PRINTED_BOARD.find(page)
+    assert found is not None
+    assert len(found.px) == 24, "7 x 5 squares have 6 x 4 inner corners"
+    side = np.linalg.norm(found.px[1] - found.px[0]) * 25.4 / 72
+    assert abs(side - 36.0) < 0.5  # a pixel of the page is 0.35 mm

@@ -1,4 +1,4 @@
-"""What the README promises exists: commands, flags, targets, job fields, statuses and exit codes."""
+"""What the README and the pages of docs/ promise exists: commands, targets, job fields, statuses, codes."""
 
 from __future__ import annotations
 
@@ -18,11 +18,16 @@ from bodycap_batch.core import errors
 from bodycap_batch.model.scene import FrameStatus
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-README = re.sub(r"<!--.*?-->", "", (REPOSITORY / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL)
+DOCS = REPOSITORY / "docs"
+PAGES = (
+    REPOSITORY / "README.md",
+    *(path for path in sorted(DOCS.rglob("*.md")) if not {"generated", "decisions"} & set(path.parts)),
+)
+TEXT = "\n".join(path.read_text(encoding="utf-8") for path in PAGES)
 
 
-def blocks(language: str) -> list[str]:
-    found = re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+def blocks(language: str, text: str = TEXT) -> list[str]:
+    found = re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     assert found
     return found
 
@@ -47,7 +52,7 @@ def test_commands_and_flags_exist(words: list[str]) -> None:
     command.make_context(words[1], words[2:])
 
 
-def test_the_job_in_the_readme_loads_and_shows_every_top_level_field(tmp_path: Path) -> None:
+def test_the_job_in_the_reference_loads_and_shows_every_top_level_field(tmp_path: Path) -> None:
     (text,) = blocks("yaml")
     calibration = '{"model": "PINHOLE", "params": [1e3, 1e3, 960, 540], "width": 1920, "height": 1080}'
     (tmp_path / "calib.json").write_text(calibration, encoding="utf-8")
@@ -57,7 +62,7 @@ def test_the_job_in_the_readme_loads_and_shows_every_top_level_field(tmp_path: P
     assert set(Job.model_fields) == {*re.findall(r"^(\w+):", text, re.MULTILINE)}
 
 
-def test_the_option_blocks_in_the_readme_show_the_defaults(tmp_path: Path) -> None:
+def test_the_option_blocks_in_the_reference_show_the_defaults(tmp_path: Path) -> None:
     (text,) = blocks("yaml")
     shown = re.search(r"^keyframes:.*^export:[^\n]*\n", text, re.MULTILINE | re.DOTALL)
     assert shown is not None
@@ -68,7 +73,17 @@ def test_the_option_blocks_in_the_readme_show_the_defaults(tmp_path: Path) -> No
         assert getattr(job, stage) == getattr(plain, stage)
 
 
-def test_the_calibration_in_the_readme_is_read(tmp_path: Path) -> None:
+SETTINGS = sorted(set(re.findall(r"`((?:export|merge|map): \{[^`…]*\})`", TEXT)))
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_settings_named_in_a_sentence_are_valid(tmp_path: Path, setting: str) -> None:
+    path = tmp_path / "walk.yaml"
+    path.write_text(f"capture: {{cameras: [{{name: torso, video: a.mp4}}]}}\n{setting}\n", encoding="utf-8")
+    load_job(path)
+
+
+def test_the_calibration_in_the_guide_is_read(tmp_path: Path) -> None:
     (text,) = blocks("json")
     (tmp_path / "calib.json").write_text(text, encoding="utf-8")
     for camera in ("torso", "left_palm"):
@@ -76,7 +91,7 @@ def test_the_calibration_in_the_readme_is_read(tmp_path: Path) -> None:
 
 
 def test_exit_codes_are_those_of_the_errors() -> None:
-    table = README.partition("### Exit codes")[2].partition("## ")[0]
+    table = (DOCS / "reference" / "results.md").read_text(encoding="utf-8").partition("## Exit codes")[2]
     rows = re.findall(r"^\| ([0-9, ]+) \|", table, re.MULTILINE)
     codes = {int(code) for row in rows for code in row.split(",")}
     typed = {kind.exit_code for kind in errors.BodycapError.__subclasses__()}
@@ -84,13 +99,26 @@ def test_exit_codes_are_those_of_the_errors() -> None:
 
 
 def test_reasons_for_lost_frames_are_explained() -> None:
-    assert not [status for status in FrameStatus if not status.localised and f"`{status}`" not in README]
+    assert not [status for status in FrameStatus if not status.localised and f"`{status}`" not in TEXT]
 
 
 def test_links_and_pictures_lead_somewhere() -> None:
-    targets = re.findall(r"\]\(([^)#]+)\)", README)
-    targets += re.findall(
-        r"`((?:bodycap_batch|tests|jobs|examples|\.ci)/[\w./]+\.\w+|\.ci/\w+|LICENSE)`", README
-    )
-    assert targets
-    assert not [target for target in targets if "://" not in target and not (REPOSITORY / target).exists()]
+    named = re.findall(r"`((?:bodycap_batch|tests|jobs|examples|\.ci)/[\w./]+\.\w+|\.ci/\w+|LICENSE)`", TEXT)
+    assert named
+    assert not [name for name in named if not (REPOSITORY / name).exists()]
+    for page in PAGES:
+        links = re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8"))
+        local = [link for link in links if "://" not in link and "/generated/" not in f"/{link}"]
+        assert not [link for link in local if not (page.parent / link).exists()], page
+
+
+def test_the_readme_is_short() -> None:
+    assert len((REPOSITORY / "README.md").read_text(encoding="utf-8").splitlines()) <= 180
+
+
+def test_every_page_is_in_the_table_of_contents() -> None:
+    index = (DOCS / "index.md").read_text(encoding="utf-8")
+    pages = [
+        page.relative_to(DOCS).with_suffix("").as_posix() for page in PAGES[1:] if page.name != "index.md"
+    ]
+    assert not [page for page in pages if f"\n{page}\n" not in index]
