@@ -66,8 +66,8 @@ _SPREAD = 4
 """Standard deviation (samples of `_GRID_HZ`) of the smoothing of these limits. Evidence: none."""
 _SWAY_SHARE = 0.62
 """Share of the distance between the body's path and the standing foot by which the pelvis moves to this foot.
-Origin: the pelvis then moves 4 to 7 cm from side to side, as the centre of mass of M. S. Orendurff et al.,
-"The effect of walking speed on center of mass displacement", J. Rehabil. Res. Dev. 41, 2004."""
+Origin: the pelvis then moves 3 to 10 cm from side to side. Compare M. S. Orendurff et al., "The effect of
+walking speed on center of mass displacement", J. Rehabil. Res. Dev. 41, 2004."""
 _CLEARANCE_M = 0.012
 """Smallest height (metres) of the sole in the middle of the swing. Origin: the toes of walking people pass
 about 1 to 2 cm above the floor (Winter 1991)."""
