@@ -73,8 +73,9 @@ class Walker:
 def draw_walker(height_m: float, rng: np.random.Generator) -> Walker:
     """Draw how a person of a given stature walks.
 
-    Sources of the spreads: step width 0.10 ± 0.025 m and 5 % of the cadence between people are usual values
-    of healthy adults; the asymmetry has a standard deviation of 1.5 %.
+    The speed is uniform from 0.6 to 1.7 m/s. The standard deviations between people are 4 % of the cadence,
+    2 cm of the step width, 1.5 % of the asymmetry and 2 degrees of the lean. Evidence for these deviations:
+    none.
     """
     return Walker(
         speed_m_s=float(rng.uniform(0.6, 1.7)),

@@ -66,8 +66,8 @@ _SPREAD = 4
 """Standard deviation (samples of `_GRID_HZ`) of the smoothing of these limits. Evidence: none."""
 _SWAY_SHARE = 0.62
 """Share of the distance between the body's path and the standing foot by which the pelvis moves to this foot.
-Origin: the pelvis then moves 4 to 7 cm from side to side, as the centre of mass of M. S. Orendurff et al.,
-"The effect of walking speed on center of mass displacement", J. Rehabil. Res. Dev. 41, 2004."""
+Origin: the pelvis then moves 3 to 10 cm from side to side. Compare M. S. Orendurff et al., "The effect of
+walking speed on center of mass displacement", J. Rehabil. Res. Dev. 41, 2004."""
 _CLEARANCE_M = 0.012
 """Smallest height (metres) of the sole in the middle of the swing. Origin: the toes of walking people pass
 about 1 to 2 cm above the floor (Winter 1991)."""
@@ -75,7 +75,7 @@ _SOFT_CLEARANCE_M = 0.004
 """Width (metres) of the smooth limit of the sole's height. Evidence: none."""
 _LANDING_SHARE = 0.65
 """Speed of the foot shortly before heel strike, as a share of the speed of the body. Evidence: none."""
-_LIFT_DEG = {"hip": 15.0, "knee": 32.0}
+_LIFT_DEG = {"hip": 12.0, "knee": 27.0}
 """Flexion (degrees) of the leg in the middle of a short step, in addition to the curves. Evidence: none."""
 
 
@@ -83,8 +83,7 @@ _LIFT_DEG = {"hip": 15.0, "knee": 32.0}
 class _Foot:
     """One foot: its shape and its N stances, as arrays. `Footprints` explains the fields.
 
-    `corrections` holds for each of the N−1 swings the differences between the footprints and the curves:
-    place and speed at the start, then at the end, as (N−1,4,3).
+    `rise_power` (N,) is the power of the angle of the foot over time while the heel rises.
     """
 
     side: str
@@ -276,7 +275,7 @@ class StanceWalk:
         opposite = phase + 0.5
         listing = ratio * pelvis_list_deg(phase)  # Left side up.
         rotation = 4.2 * ratio * np.cos(2 * np.pi * (phase - 0.04))  # Left side to the front.
-        tilt = 1.0 * ratio * np.cos(4 * np.pi * (phase - 0.02)) + 0.0 * size
+        tilt = 1.0 * ratio * np.cos(4 * np.pi * (phase - 0.02))
         # In the zero pose the left side is on +x and the face towards −y: the left side moves to the front by
         # a negative rotation about z, and up by a negative rotation about y.
         lean = self.walker.lean_deg * (0.4 + 0.6 * size) + 1.2 * ratio * np.cos(4 * np.pi * (phase - 0.1))
@@ -298,7 +297,7 @@ class StanceWalk:
         arms = []
         for cycle in (opposite, phase):  # Each arm swings with the opposite leg.
             forth = np.cos(2 * np.pi * (cycle - 0.03))
-            arms += [swing * (forth - 0.15), 14.0 + 0.0 * swing + 0.45 * swing * (forth + 0.6)]
+            arms += [swing * (forth - 0.15), 14.0 + 0.45 * swing * (forth + 0.6)]
         self._swings = CubicSpline(t_s, np.column_stack(arms))
         weights = self._weights(t_s)
         sway = self._sway(t_s, body, weights)
@@ -460,10 +459,7 @@ class StanceWalk:
         return np.asarray(hips + Rotation.from_euler("Z", yaw[:, None], degrees=True).apply(leg))
 
     def _find_corrections(self, foot: _Foot) -> FloatArray:
-        """Return the corrections (N−1,4,3) of the swings of a foot: place and speed, at start and end.
-
-        Swings outside the splines have no correction.
-        """
+        """Return the corrections (N−1,4,3) of the swings of a foot: place and speed, at start and end."""
         count = len(foot.strike_s) - 1
         index = np.arange(count)
         step = 1e-3
