@@ -14,6 +14,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.frame_matches import FrameMatcher
 from bodycap_batch.model.frozen_frames import find_frozen_frames, picture_change_px
 from bodycap_batch.model.optical_flow import (
     GreyImage,
@@ -96,6 +97,7 @@ class _KeyframeTracker:
             unknown.
         largest_shift_px: Largest median displacement of the corners since a keyframe, px of the reduced
             image.
+        last_step: Positions (M,2) of the corners before and after the last step, px of the reduced image.
     """
 
     camera: Camera
@@ -110,6 +112,7 @@ class _KeyframeTracker:
     change_px: float = float("nan")
     shift_px: float = float("nan")
     largest_shift_px: float = 0.0
+    last_step: tuple[Pixels, Pixels] | None = None
 
     def restart(self, image: GreyImage) -> None:
         """Remove all tracks, and detect the corners of a new keyframe."""
@@ -126,6 +129,7 @@ class _KeyframeTracker:
         flow = track_points(before, image, self.px, window_px=_WINDOW_PX)
         self.change_px = picture_change_px(before, image)
         self.shift_px = _median_distance(self.px[flow.ok], flow.px[flow.ok])
+        self.last_step = self.px[flow.ok], flow.px[flow.ok]
         self.px, self.start_rays = flow.px[flow.ok], self.start_rays[flow.ok]
         self.start_px = self.start_px[flow.ok]
         since_keyframe = _median_distance(self.start_px, self.px)
@@ -229,6 +233,7 @@ def select_keyframes(
     selected: list[int] = []
     novelty = [0.0]
     tracker = _KeyframeTracker(camera.camera, _coarse_mask(camera))
+    matcher = _frame_matcher(camera, tracker.mask)
     recent: deque[_Candidate] = deque(maxlen=options.window)
     see, keep = (_ignore, _ignore) if keeper is None else (keeper.add_frame, keeper.add_keyframe)
     is_damaged = np.ones(count, dtype=bool)
@@ -243,8 +248,12 @@ def select_keyframes(
             selected.append(index)
             keep(shot)
             tracker.restart(image)
+            if matcher is not None:
+                matcher.add(index, image)
         else:
             tracker.step(image)
+            if matcher is not None:
+                matcher.add(index, image, tracker.last_step)
             change_px[index], shift_px[index] = tracker.change_px, tracker.shift_px
             recent.append(_Candidate(index, image, sharp[index], tracker.survival(), shot))
             gap_s = times_s[index] - times_s[selected[-1]]
@@ -282,7 +291,15 @@ def select_keyframes(
         damaged=np.flatnonzero(is_damaged),
         frozen=frozen,
         motion_px=tracker.motion_px(),
+        matches=None if matcher is None else matcher.matches(),
     )
+
+
+def _frame_matcher(camera: CaptureCamera, mask: BoolArray | None) -> FrameMatcher | None:
+    """Return the matcher of adjacent frames; None if the camera is known to have a global shutter."""
+    if camera.rolling_shutter_known and not camera.rolling_shutter_s:
+        return None
+    return FrameMatcher(camera.name, camera.camera.width_px, mask)
 
 
 def _without_frozen(

@@ -20,7 +20,9 @@ from bodycap_batch.mapping.inputs import (
     make_mapping_context,
 )
 from bodycap_batch.mapping.intrinsics.intrinsics_check import find_misfit_intrinsics
+from bodycap_batch.mapping.intrinsics.readout_time import map_with_readouts
 from bodycap_batch.mapping.intrinsics.recalibration import recalibrate_if_misfit
+from bodycap_batch.mapping.intrinsics.shutters import known_readouts, turning_shutters
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     CameraKeyframes,
@@ -129,8 +131,12 @@ def build_map_once(
     workspace.mkdir(parents=True, exist_ok=True)
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         ids = {item.camera: add_camera(database, capture.camera(item.camera)) for item in selections}
+    readouts = known_readouts(capture)
+    shutters = turning_shutters(capture, selections, readouts)
     keyframes = [
-        CameraKeyframes(capture.camera(item.camera), ids[item.camera], np.asarray(item.frames))
+        CameraKeyframes(
+            capture.camera(item.camera), ids[item.camera], np.asarray(item.frames), shutters.get(item.camera)
+        )
         for item in selections
     ]
     add_keyframes(workspace, keyframes, options, context)
@@ -160,6 +166,8 @@ def build_map_once(
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
     log = MapDiagnostics(misfit_factors=misfits, details=log).to_log()
     result = make_result(models, workspace, log)
+    corrected = {name: readouts[name] for name in shutters}
+    result = replace(result, maps=tuple(map_with_readouts(item, corrected) for item in result.maps))
     reach_log = check_distances(result.maps[0], common_times_ns(capture), reach).to_log() if reach else None
     ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
     refused = refused or add_flip_hint(check_consistency(max(ratios), reach_log), flips)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,9 @@ from bodycap_batch.mapping.inputs import (
     intrinsics_of,
     make_mapping_context,
 )
+from bodycap_batch.mapping.intrinsics.readout_time import map_with_readouts
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
+from bodycap_batch.mapping.intrinsics.shutters import readouts_of_maps, turning_shutters
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     CameraKeyframes,
@@ -33,7 +35,7 @@ from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.model_files import read_model, registered_ids, write_models
 from bodycap_batch.mapping.results import finalise_models, make_result
 from bodycap_batch.mapping.validation.repair import remove_misregistered
-from bodycap_batch.model.scene import MapResult
+from bodycap_batch.model.scene import KeyframeSelection, MapResult
 
 
 def extend_map(
@@ -42,6 +44,7 @@ def extend_map(
     extra_frames: Mapping[str, IntArray],
     options: MapOptions,
     context: StageContext,
+    selections: Sequence[KeyframeSelection] = (),
     *,
     skeletal_above: int = SKELETAL_ABOVE,
 ) -> MapResult:
@@ -58,6 +61,8 @@ def extend_map(
             frame that is already a keyframe of the map is removed from the map and registered again.
         options: The stage's options.
         context: Work folder, threads, progress.
+        selections: The keyframes of the cameras with rolling shutters, with the matches between adjacent
+            frames. Without them, the new keyframes of these cameras are not corrected.
         skeletal_above: Maximum number of keyframes of a map that is not large (`MappingContext.is_large`).
 
     Returns:
@@ -72,11 +77,17 @@ def extend_map(
         existing = read_image_ids(database)
     ids = read_camera_ids(workspace)
     new = [ref for ref in _image_refs(extra_frames) if ref not in existing]
+    names = sorted({ref.camera for ref in new})
+    readouts = readouts_of_maps(previous.maps)
+    shutters = turning_shutters(capture, [item for item in selections if item.camera in names], readouts)
     keyframes = [
         CameraKeyframes(
-            capture.camera(name), ids[name], np.array(sorted(ref.frame for ref in new if ref.camera == name))
+            capture.camera(name),
+            ids[name],
+            np.array(sorted(ref.frame for ref in new if ref.camera == name)),
+            shutters.get(name),
         )
-        for name in sorted({ref.camera for ref in new})
+        for name in names
     ]
     add_keyframes(workspace, keyframes, options, context)
     generator = PairGenerator(workspace, new, common_times_ns(capture), options, context)
@@ -90,9 +101,9 @@ def extend_map(
         kept = registered_ids(model) - again
         inside = registered_ids(model) & again
         extended = re_register_images(model, inside, mapping, len(existing) + len(new))
-        model, names = remove_misregistered(extended, mapping)
+        model, cut = remove_misregistered(extended, mapping)
         models.append(model)
-        removed += names
+        removed += cut
         resected.append(registered_ids(model) - kept if mapping.is_large(len(kept)) else None)
     transient = finalise_models(models, mapping, capture, resected)
     write_models(workspace, models)
@@ -109,7 +120,8 @@ def extend_map(
         extensions=(*diagnostics.extensions, entry),
         details={**diagnostics.details, "keyframes": len(existing) + len(new)},
     )
-    return make_result(models, workspace, diagnostics.to_log())
+    result = make_result(models, workspace, diagnostics.to_log())
+    return replace(result, maps=tuple(map_with_readouts(item, readouts) for item in result.maps))
 
 
 def _image_refs(frames: Mapping[str, IntArray]) -> list[ImageRef]:

@@ -16,7 +16,7 @@ from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust, sub_model
 from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
 from bodycap_batch.mapping.reconstruction.reprojection import image_residuals_px
-from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
+from bodycap_batch.model.rotation_path import PosePath
 from bodycap_batch.model.scene import Map, Trajectory
 
 if TYPE_CHECKING:
@@ -85,14 +85,16 @@ class _Keypoints:
         camera: Name of the keyframe's camera.
         feature: (N,) indices of the features that observe a point of the model.
         px: (N,2) detected positions of these features, px.
-        velocity: (N,2) velocities of these features in the image, px/s.
+        frame: (N,) frame index of the keyframe, repeated.
+        points: (N,3) points that these features observe, in map units.
     """
 
     image_id: int
     camera: str
     feature: IntArray
     px: FloatArray
-    velocity: FloatArray
+    frame: IntArray
+    points: FloatArray
 
 
 class RollingShutterModel:
@@ -105,6 +107,8 @@ class RollingShutterModel:
         trajectories: Trajectories in the model's gauge, by camera name. A camera without a trajectory was
             registered against another model; its keypoints are not moved.
         cameras: The capture's cameras by name.
+        detected_px: Detected positions (N,2) of all keypoints of each image whose keypoints are at other
+            positions in the model, by image id.
     """
 
     def __init__(
@@ -112,8 +116,13 @@ class RollingShutterModel:
         model: pycolmap.Reconstruction,
         trajectories: Mapping[str, Trajectory],
         cameras: Mapping[str, CaptureCamera],
+        detected_px: Mapping[int, FloatArray] | None = None,
     ) -> None:
         self._model = model
+        self._detected_px = detected_px or {}
+        self._paths = {
+            name: PosePath.create(path.gauge_from_cam, path.times_ns) for name, path in trajectories.items()
+        }
         self._trajectories = trajectories
         self._cameras = cameras
         self._intrinsics = {
@@ -122,9 +131,7 @@ class RollingShutterModel:
             )
             for image_id in model.reg_image_ids()
         }
-        self._keypoints = [
-            self._keypoints_of(image_id, trajectories) for image_id in sorted(model.reg_image_ids())
-        ]
+        self._keypoints = [self._keypoints_of(image_id) for image_id in sorted(model.reg_image_ids())]
 
     def corrected(self, readout_s: Mapping[str, float]) -> pycolmap.Reconstruction:
         """Return a copy of the model in which all keypoints are at their corrected positions.
@@ -147,12 +154,19 @@ class RollingShutterModel:
                 is missing here, or that has a readout time of 0, are moved to their detected positions.
         """
         for item in self._keypoints:
-            px = px_at_mid_row(
-                self._intrinsics[item.camera], item.px, item.velocity, readout_s.get(item.camera, 0.0)
-            )
+            px = self._px_at_mid_row(item, readout_s.get(item.camera, 0.0))
             points = model.image(item.image_id).points2D
             for feature, xy in zip(item.feature.tolist(), px, strict=True):
                 points[feature].xy = xy
+
+    def _px_at_mid_row(self, item: _Keypoints, readout_s: float) -> FloatArray:
+        """Return the positions (N,2) of keypoints at the instant of the middle row, for a readout time."""
+        path = self._paths.get(item.camera)
+        if path is None or not readout_s:
+            return item.px
+        return path.px_at_mid_row(
+            self._intrinsics[item.camera], item.frame, item.points, item.px, readout_s
+        )
 
     def most_dynamic_subset(self) -> RollingShutterModel:
         """Return a smaller model: for each camera, only the successive keyframes with the largest motion."""
@@ -161,7 +175,10 @@ class RollingShutterModel:
             keyframes = [item for item in self._keypoints if item.camera == name]
             keyframes.sort(key=lambda item: ImageRef.parse(self._model.image(item.image_id).name).frame)
             speed = [
-                float(np.median(np.abs(item.velocity))) if len(item.velocity) else 0.0 for item in keyframes
+                float(np.median(np.abs(self._px_at_mid_row(item, _TRIAL_STEP_S) - item.px)))
+                if len(item.px)
+                else 0.0
+                for item in keyframes
             ]
             total = np.concatenate([[0.0], np.cumsum(speed)])
             size = min(_TRIAL_KEYFRAMES, len(keyframes))
@@ -169,7 +186,9 @@ class RollingShutterModel:
             kept |= {item.image_id for item in keyframes[start : start + size]}
         part = sub_model(self._model, kept)
         sideways = [name for name, camera in self._intrinsics.items() if camera.sideways]
-        return RollingShutterModel(part, self._trajectories, self._cameras).with_sideways(sideways)
+        return RollingShutterModel(
+            part, self._trajectories, self._cameras, self._detected_px
+        ).with_sideways(sideways)
 
     def with_sideways(self, sideways: Collection[str]) -> RollingShutterModel:
         """Return a copy with changed row directions.
@@ -209,7 +228,7 @@ class RollingShutterModel:
         names = [name for name in self._intrinsics if name in self._trajectories]
         unknown = [name for name in names if not self._cameras[name].rolling_shutter_known]
         out = {
-            name: _stated_readout(self._cameras[name].rolling_shutter_s)
+            name: stated_readout(self._cameras[name].rolling_shutter_s)
             for name in names
             if name not in unknown
         }
@@ -250,29 +269,26 @@ class RollingShutterModel:
         for name in self._intrinsics:
             camera = self._cameras[name]
             if camera.rolling_shutter_known:
-                out[name] = _stated_readout(camera.rolling_shutter_s)
+                out[name] = stated_readout(camera.rolling_shutter_s)
             else:
                 out[name] = Readout(0.0, 0.0, f"not determined: {reason}", 0.0)
         return out
 
-    def _keypoints_of(self, image_id: int, trajectories: Mapping[str, Trajectory]) -> _Keypoints:
-        """Return the observations of one image, with the features' velocities."""
+    def _keypoints_of(self, image_id: int) -> _Keypoints:
+        """Return the observations of one image, with their points."""
         image = self._model.image(image_id)
         ref = ImageRef.parse(image.name)
         feature = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
-        px = np.array([image.points2D[index].xy for index in feature.tolist()]).reshape(-1, 2)
-        x_in_map = self._points(image, feature)
-        path = trajectories.get(ref.camera)
-        if path is None:  # The camera was registered against another model: its motion is unknown here.
-            return _Keypoints(image_id, ref.camera, feature, px, np.zeros_like(px))
-        velocity = image_velocity(
-            self._intrinsics[ref.camera],
-            path.gauge_from_cam,
-            path.times_ns,
+        detected = self._detected_px.get(image_id)
+        used = np.array([image.points2D[index].xy for index in feature.tolist()]).reshape(-1, 2)
+        return _Keypoints(
+            image_id,
+            ref.camera,
+            feature,
+            used if detected is None else detected[feature],
             np.full(len(feature), ref.frame, dtype=np.int64),
-            x_in_map,
+            self._points(image, feature),
         )
-        return _Keypoints(image_id, ref.camera, feature, px, velocity)
 
     def _points(self, image: Any, feature: IntArray) -> FloatArray:
         """Return the positions (N,3), in map units, of the points that some features of an image observe."""
@@ -398,6 +414,6 @@ def map_with_readouts(scene: Map, readouts: Mapping[str, Readout]) -> Map:
     )
 
 
-def _stated_readout(readout_s: float) -> Readout:
+def stated_readout(readout_s: float) -> Readout:
     """Return the readout time of a camera whose readout time is given in the job."""
     return Readout(readout_s, 0.0, "stated", readout_s)

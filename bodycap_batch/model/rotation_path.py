@@ -1,0 +1,302 @@
+"""The rotation of a camera over time, and the correction of rolling shutters by it.
+
+A camera with a rolling shutter exposes each row of an image at another instant. If the orientation of the
+camera is known as a function of time, each observed pixel can be moved to the place where it would be if the
+whole image were exposed together with its middle row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import so3_exp, so3_log
+from bodycap_batch.model.optical_flow import unit_directions
+
+_MAX_GAP_FRAMES = 3.0
+"""Maximum time between two adjacent frames of one segment of the path, in median frame intervals. Over a
+longer time, the rotation between the frames is not smooth enough. Evidence:
+docs/decisions/registration.md (velocities over a hole of one second)."""
+
+
+@dataclass(frozen=True, slots=True)
+class RotationPath:
+    """The orientation of a camera over time: orientation and angular rate of each frame, and a cubic between.
+
+    Where the rotation between two adjacent frames is unknown, a new segment begins. Orientations of different
+    segments cannot be compared.
+
+    Attributes:
+        times_ns: (N,) frame times, nanoseconds.
+        rotation: (N,3,3) orientation of each frame: segment_from_cam.
+        segment: (N,) number of the segment of each frame, not decreasing.
+        rate: (N,3) angular velocity at the time of each frame, in the camera frame, rad/s.
+    """
+
+    times_ns: IntArray
+    rotation: FloatArray
+    segment: IntArray
+    rate: FloatArray
+
+    @staticmethod
+    def from_steps(
+        times_ns: IntArray, step: FloatArray, known: BoolArray, rate: FloatArray | None = None
+    ) -> RotationPath:
+        """Return the path with given rotations between adjacent frames.
+
+        Args:
+            times_ns: (N,) frame times, nanoseconds.
+            step: (N-1,3,3) rotation later_from_earlier of each frame and the next frame.
+            known: (N-1,) True if the rotation is known.
+            rate: (N,3) angular velocity of each frame, in the camera frame, rad/s. None: the velocity of the
+                smoothest path through the orientations; zero for a frame that is alone in its segment.
+        """
+        segment = np.concatenate([[0], np.cumsum(~(known & near_in_time(times_ns)))])[: len(times_ns)]
+        rotation = np.tile(np.eye(3), (len(times_ns), 1, 1))
+        for later in np.flatnonzero(np.diff(segment) == 0) + 1:
+            rotation[later] = rotation[later - 1] @ step[later - 1].T
+        if rate is None:
+            rate = _spline_rates(times_ns, rotation, segment)
+        return RotationPath(times_ns, rotation, segment, rate)
+
+    def steps(self) -> tuple[FloatArray, BoolArray]:
+        """Return the rotations (N-1,3,3) between adjacent frames, and a mask (N-1,) of the known ones."""
+        step = np.swapaxes(self.rotation[1:], 1, 2) @ self.rotation[:-1]
+        return step, np.asarray(np.diff(self.segment) == 0)
+
+    def with_poses(self, map_from_cam: FloatArray) -> RotationPath:
+        """Return the path in which poses replace the rotations between those adjacent frames that have poses.
+
+        Args:
+            map_from_cam: (N,4,4) poses of the frames; NaN for a frame without a pose.
+        """
+        step, known = self.steps()
+        has_pose = np.isfinite(map_from_cam).all(axis=(1, 2))
+        both = has_pose[1:] & has_pose[:-1]
+        if not both.any():
+            return self
+        rotation = map_from_cam[:, :3, :3]
+        step[both] = np.swapaxes(rotation[1:], 1, 2)[both] @ rotation[:-1][both]
+        posed = RotationPath.from_steps(self.times_ns, step, known | both)
+        # Without a neighbour with a pose on each side, poses do not tell the rate better than the matches.
+        beside = np.concatenate([[False], both]) & np.concatenate([both, [False]])
+        return replace(posed, rate=np.where(beside[:, None], posed.rate, self._rate_or(posed.rate)))
+
+    def _rate_or(self, other: FloatArray) -> FloatArray:
+        """Return the rates (N,3); for frames that are alone in their segments, the rates `other`."""
+        size = np.bincount(self.segment)[self.segment]
+        return np.where((size > 1)[:, None], self.rate, other)
+
+    def frame_from_instant(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
+        """Return the rotations (M,3,3) from the camera at some instants to the camera at the frame times.
+
+        Between two frames of a segment, the rotation vector is a cubic polynomial of time. Outside a segment,
+        the angular velocity is constant.
+
+        Args:
+            frame: (M,) frame index of each instant.
+            delay_s: (M,) seconds from the time of the frame to the instant.
+        """
+        other = np.clip(frame + np.where(delay_s < 0.0, -1, 1), 0, len(self.times_ns) - 1)
+        inside = (other != frame) & (self.segment[other] == self.segment[frame])
+        rate, turn = self.rate[frame], self.rate[frame] * delay_s[:, None]
+        f, g = frame[inside], other[inside]
+        pair, position = np.unique(np.stack([f, g], axis=1), axis=0, return_inverse=True)
+        position = position.ravel()
+        from_other = np.swapaxes(self.rotation[pair[:, 0]], 1, 2) @ self.rotation[pair[:, 1]]
+        end = so3_log(from_other)
+        end_rate = _rotvec_rate(end, self.rate[pair[:, 1]])[position]
+        span = ((self.times_ns[g] - self.times_ns[f]) * 1e-9)[:, None]
+        u = delay_s[inside, None] / span
+        # The cubic Hermite polynomial that starts at 0.
+        turn[inside] = (
+            u * (1.0 - u) ** 2 * span * rate[inside]
+            + u**2 * (3.0 - 2.0 * u) * end[position]
+            + u**2 * (u - 1.0) * span * end_rate
+        )
+        return np.asarray(so3_exp(turn)).reshape(-1, 3, 3)
+
+
+def _spline_rates(times_ns: IntArray, rotation: FloatArray, segment: IntArray) -> FloatArray:
+    """Return the angular velocities (N,3) of the smoothest paths through the orientations of segments."""
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    rate = np.zeros((len(times_ns), 3))
+    bounds = np.flatnonzero(np.diff(segment, prepend=-1, append=-1))
+    for first, stop in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
+        if stop - first > 1:
+            seconds = (times_ns[first:stop] - times_ns[first]) * 1e-9
+            spline = RotationSpline(seconds, Rotation.from_matrix(rotation[first:stop]))
+            rate[first:stop] = spline(seconds, 1)
+    return rate
+
+
+def _rotvec_rate(rotvec_rad: FloatArray, rate: FloatArray) -> FloatArray:
+    """Return the time derivatives (M,3) of rotation vectors (M,3), for angular velocities (M,3) of the body.
+
+    Source: Bortz, "A new mathematical formulation for strapdown inertial navigation", 1971.
+    """
+    angle = np.linalg.norm(rotvec_rad, axis=1)[:, None]
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    factor = np.where(small, 1.0 / 12.0, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
+    cross = np.cross(rotvec_rad, rate)
+    return np.asarray(rate + 0.5 * cross + factor * np.cross(rotvec_rad, cross))
+
+
+def near_in_time(times_ns: IntArray) -> BoolArray:
+    """Return a mask (N-1,): True if a frame and the next frame are near in time."""
+    interval_ns = np.diff(times_ns)
+    if len(interval_ns) == 0:
+        return np.zeros(0, dtype=bool)
+    return np.asarray(interval_ns <= _MAX_GAP_FRAMES * np.median(interval_ns))
+
+
+def row_delay_s(camera: Camera, px: FloatArray, readout_s: float) -> FloatArray:
+    """Return the exposure time (M,) of each pixel minus the frame time, seconds.
+
+    Args:
+        camera: The camera model. If the rows of the sensor are the columns of the image, it says so.
+        px: (M,2) pixels.
+        readout_s: Readout time, seconds.
+    """
+    position = px[:, 0] / camera.width_px if camera.sideways else px[:, 1] / camera.height_px
+    return np.asarray((position - 0.5) * readout_s, dtype=np.float64)
+
+
+def rotate_to_mid_row(
+    camera: Camera, path: RotationPath, frame: IntArray, px: FloatArray, readout_s: float
+) -> FloatArray:
+    """Return where pixels would be at the instant of the middle row if the camera only rotated.
+
+    Args:
+        camera: The camera model.
+        path: The rotation of the camera.
+        frame: (M,) frame index of each pixel.
+        px: (M,2) observed pixels.
+        readout_s: Readout time, seconds.
+
+    Returns:
+        The moved pixels (M,2). A pixel is not moved if the camera model has no ray for it, or if its ray is
+        behind the camera at the other instant.
+
+    Source: Forssén, Ringaby, "Rectifying rolling shutter video from hand-held devices", CVPR 2010.
+    """
+    rays = unit_directions(camera.unproject(px))
+    turned = np.einsum(
+        "mij,mj->mi", path.frame_from_instant(frame, row_delay_s(camera, px, readout_s)), rays
+    )
+    return _projected_or(camera, turned, px)
+
+
+@dataclass(frozen=True, slots=True)
+class TurningShutter:
+    """The rolling shutter of a camera whose rotation is known, but whose position is not.
+
+    Attributes:
+        camera: The camera model.
+        path: The rotation of the camera.
+        readout_s: Readout time, seconds.
+    """
+
+    camera: Camera
+    path: RotationPath
+    readout_s: float
+
+    def px_at_mid_row(self, frame: IntArray, px: FloatArray) -> FloatArray:
+        """Return where pixels (M,2) in frames (M,) would be at the instant of the middle row."""
+        return rotate_to_mid_row(self.camera, self.path, frame, px, self.readout_s)
+
+
+@dataclass(frozen=True, slots=True)
+class PosePath:
+    """The poses of a camera over time: a spline of its orientation, and a parabola of its position.
+
+    The parabola of a frame passes through the positions of the frame and of both neighbouring frames. If one
+    of them has no pose, it is a straight line. If none has a pose, the position is constant.
+
+    Attributes:
+        map_from_cam: (N,4,4) poses of the frames; NaN for a frame without a pose.
+        rotation: The orientation over time.
+        velocity: (N,3) velocity of the camera at each frame time, map units per second.
+        acceleration: (N,3) acceleration of the camera at each frame time, map units per second squared.
+    """
+
+    map_from_cam: FloatArray
+    rotation: RotationPath
+    velocity: FloatArray
+    acceleration: FloatArray
+
+    @staticmethod
+    def create(
+        map_from_cam: FloatArray, times_ns: IntArray, rotation: RotationPath | None = None
+    ) -> PosePath:
+        """Return the path through poses.
+
+        Args:
+            map_from_cam: (N,4,4) poses of the frames; NaN for a frame without a pose.
+            times_ns: (N,) frame times, nanoseconds.
+            rotation: The rotation between frames without poses; None if it is unknown.
+        """
+        count = len(times_ns)
+        if rotation is None:
+            unknown = np.zeros(max(0, count - 1), dtype=bool)
+            rotation = RotationPath.from_steps(times_ns, np.tile(np.eye(3), (len(unknown), 1, 1)), unknown)
+        velocity, acceleration = np.zeros((count, 3)), np.zeros((count, 3))
+        if count > 1:
+            interval_s = np.diff(times_ns) * 1e-9
+            slope = np.diff(map_from_cam[:, :3, 3], axis=0) / interval_s[:, None]
+            slope[~near_in_time(times_ns)] = np.nan
+            nothing = np.full((1, 3), np.nan)
+            before, after = np.concatenate([nothing, slope]), np.concatenate([slope, nothing])
+            span = np.concatenate([interval_s[:1], 0.5 * (interval_s[1:] + interval_s[:-1]), interval_s[-1:]])
+            bend = np.nan_to_num((after - before) / span[:, None])
+            # The slope between two frames is the velocity in the middle of their interval.
+            from_before = before + 0.5 * np.concatenate([[0.0], interval_s])[:, None] * bend
+            velocity = np.where(np.isfinite(before), from_before, np.where(np.isfinite(after), after, 0.0))
+            acceleration = bend
+        return PosePath(map_from_cam, rotation.with_poses(map_from_cam), velocity, acceleration)
+
+    def px_at_mid_row(
+        self, camera: Camera, frame: IntArray, points: FloatArray, px: FloatArray, readout_s: float
+    ) -> FloatArray:
+        """Return where observed pixels would be at the instant of the middle row.
+
+        Args:
+            camera: The camera model.
+            frame: (M,) frame index of each observation.
+            points: (M,3) observed map point of each observation, in the map frame.
+            px: (M,2) observed pixels.
+            readout_s: Readout time, seconds.
+
+        Returns:
+            The moved pixels (M,2). In a frame without a pose, and for a point behind the camera, only the
+            rotation is corrected.
+        """
+        delay_s = row_delay_s(camera, px, readout_s)
+        frame_from_instant = self.rotation.frame_from_instant(frame, delay_s)
+        rays = camera.unproject(px)
+        rays = np.column_stack([rays, np.ones(len(rays))])
+        out = _projected_or(camera, np.einsum("mij,mj->mi", frame_from_instant, rays), px)
+        pose = self.map_from_cam[frame]
+        has_pose = np.isfinite(pose).all(axis=(1, 2))
+        pose, frame_of, delay = pose[has_pose], frame[has_pose], delay_s[has_pose, None]
+        shift = self.velocity[frame_of] * delay + 0.5 * self.acceleration[frame_of] * delay**2
+        cam_from_map = np.swapaxes(pose[:, :3, :3], 1, 2)
+        from_instant = frame_from_instant[has_pose]
+        shift_in_cam = np.einsum("mij,mj->mi", cam_from_map, shift)
+        x_in_cam = np.einsum("mij,mj->mi", cam_from_map, points[has_pose] - pose[:, :3, 3])
+        depth = np.einsum("mi,mi->m", from_instant[:, :, 2], x_in_cam - shift_in_cam)
+        moved = np.einsum("mij,mj->mi", from_instant, rays[has_pose] * depth[:, None]) + shift_in_cam
+        rows = np.flatnonzero(has_pose)[depth > 0.0]
+        out[rows] = _projected_or(camera, moved[depth > 0.0], out[rows])
+        return out
+
+
+def _projected_or(camera: Camera, x_in_cam: FloatArray, px: FloatArray) -> FloatArray:
+    """Return the projections (M,2) of points, or the pixel in `px` (M,2) for a point without a projection."""
+    projected = camera.project(x_in_cam)
+    return np.where(np.isfinite(projected).all(axis=1)[:, None], projected, px)
