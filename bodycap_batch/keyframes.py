@@ -97,7 +97,6 @@ class _KeyframeTracker:
             unknown.
         largest_shift_px: Largest median displacement of the corners since a keyframe, px of the reduced
             image.
-        last_step: Positions (M,2) of the corners before and after the last step, px of the reduced image.
     """
 
     camera: Camera
@@ -112,7 +111,6 @@ class _KeyframeTracker:
     change_px: float = float("nan")
     shift_px: float = float("nan")
     largest_shift_px: float = 0.0
-    last_step: tuple[Pixels, Pixels] | None = None
 
     def restart(self, image: GreyImage) -> None:
         """Remove all tracks, and detect the corners of a new keyframe."""
@@ -123,13 +121,17 @@ class _KeyframeTracker:
         self.started = len(self.px)
         self.start_px = self.px
 
-    def step(self, image: GreyImage) -> None:
-        """Track the corners into the next frame."""
+    def step(self, image: GreyImage) -> tuple[Pixels, Pixels]:
+        """Track the corners into the next frame.
+
+        Returns:
+            Positions (M,2) of the tracked corners before and after this step, px of the reduced image.
+        """
         before = image if self.image is None else self.image
         flow = track_points(before, image, self.px, window_px=_WINDOW_PX)
         self.change_px = picture_change_px(before, image)
         self.shift_px = _median_distance(self.px[flow.ok], flow.px[flow.ok])
-        self.last_step = self.px[flow.ok], flow.px[flow.ok]
+        tracked = self.px[flow.ok], flow.px[flow.ok]
         self.px, self.start_rays = flow.px[flow.ok], self.start_rays[flow.ok]
         self.start_px = self.start_px[flow.ok]
         since_keyframe = _median_distance(self.start_px, self.px)
@@ -141,6 +143,7 @@ class _KeyframeTracker:
             self.round_trips.append(flow.round_trip_px[flow.ok] * self._full_scale(image))
             self.kept_samples += int(flow.ok.sum())
         self.image = image
+        return tracked
 
     def _full_scale(self, image: GreyImage) -> float:
         """Return the ratio of the full image's width to the reduced image's width."""
@@ -244,16 +247,12 @@ def select_keyframes(
         sharp[index] = sharpness(shot.grey)
         image = make_coarse_image(shot.grey)
         see(shot)
+        matcher.add(index, image, tracker.step(image) if selected else None)
         if not selected:
             selected.append(index)
             keep(shot)
             tracker.restart(image)
-            if matcher is not None:
-                matcher.add(index, image)
         else:
-            tracker.step(image)
-            if matcher is not None:
-                matcher.add(index, image, tracker.last_step)
             change_px[index], shift_px[index] = tracker.change_px, tracker.shift_px
             recent.append(_Candidate(index, image, sharp[index], tracker.survival(), shot))
             gap_s = times_s[index] - times_s[selected[-1]]
@@ -291,15 +290,14 @@ def select_keyframes(
         damaged=np.flatnonzero(is_damaged),
         frozen=frozen,
         motion_px=tracker.motion_px(),
-        matches=None if matcher is None else matcher.matches(),
+        matches=matcher.matches(),
     )
 
 
-def _frame_matcher(camera: CaptureCamera, mask: BoolArray | None) -> FrameMatcher | None:
-    """Return the matcher of adjacent frames; None if the camera is known to have a global shutter."""
-    if camera.rolling_shutter_known and not camera.rolling_shutter_s:
-        return None
-    return FrameMatcher(camera.name, camera.camera.width_px, mask)
+def _frame_matcher(camera: CaptureCamera, mask: BoolArray | None) -> FrameMatcher:
+    """Return the matcher of adjacent frames. It does nothing for a camera with a stated global shutter."""
+    is_rolling = bool(camera.rolling_shutter_s) or not camera.rolling_shutter_known
+    return FrameMatcher(camera.name, camera.camera.width_px, mask, enabled=is_rolling)
 
 
 def _without_frozen(

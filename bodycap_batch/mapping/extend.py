@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from bodycap_batch.mapping.inputs import (
 )
 from bodycap_batch.mapping.intrinsics.readout_time import map_with_readouts
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
-from bodycap_batch.mapping.intrinsics.shutters import readouts_of_maps, turning_shutters
+from bodycap_batch.mapping.intrinsics.shutters import read_shutters, readouts_of_maps
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     CameraKeyframes,
@@ -35,7 +35,7 @@ from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.model_files import read_model, registered_ids, write_models
 from bodycap_batch.mapping.results import finalise_models, make_result
 from bodycap_batch.mapping.validation.repair import remove_misregistered
-from bodycap_batch.model.scene import KeyframeSelection, MapResult
+from bodycap_batch.model.scene import MapResult
 
 
 def extend_map(
@@ -44,7 +44,6 @@ def extend_map(
     extra_frames: Mapping[str, IntArray],
     options: MapOptions,
     context: StageContext,
-    selections: Sequence[KeyframeSelection] = (),
     *,
     skeletal_above: int = SKELETAL_ABOVE,
 ) -> MapResult:
@@ -61,8 +60,6 @@ def extend_map(
             frame that is already a keyframe of the map is removed from the map and registered again.
         options: The stage's options.
         context: Work folder, threads, progress.
-        selections: The keyframes of the cameras with rolling shutters, with the matches between adjacent
-            frames. Without them, the new keyframes of these cameras are not corrected.
         skeletal_above: Maximum number of keyframes of a map that is not large (`MappingContext.is_large`).
 
     Returns:
@@ -79,7 +76,7 @@ def extend_map(
     new = [ref for ref in _image_refs(extra_frames) if ref not in existing]
     names = sorted({ref.camera for ref in new})
     readouts = readouts_of_maps(previous.maps)
-    shutters = turning_shutters(capture, [item for item in selections if item.camera in names], readouts)
+    shutters = read_shutters(workspace, names)
     keyframes = [
         CameraKeyframes(
             capture.camera(name),

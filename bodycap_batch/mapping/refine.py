@@ -80,7 +80,7 @@ def refine_map(
             if (px := read_detected_px(workspace, image_id)) is not None
         }
         rolling = RollingShutterModel(model, paths, cameras, detected)
-        rolling, readouts = estimate_readouts(rolling, cameras, settings, calibrated_ids)
+        rolling, readouts = estimate_readouts(rolling, cameras, settings, calibrated_ids, scene_map)
         readout_s = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         if readout_s:
             model = rolling.corrected(readout_s)

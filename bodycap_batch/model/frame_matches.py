@@ -79,6 +79,7 @@ class FrameMatcher:
         width_px: Width of the full image.
         mask: (H,W) True for each pixel of the reduced image that shows the room; None: every pixel shows the
             room.
+        enabled: False to match nothing.
 
     Source: Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
     """
@@ -86,6 +87,7 @@ class FrameMatcher:
     camera: str
     width_px: int
     mask: BoolArray | None = None
+    enabled: bool = True
     _image: GreyImage | None = None
     _index: int = -1
     _features: tuple[Pixels, _Descriptors] | None = None
@@ -103,6 +105,8 @@ class FrameMatcher:
             tracked: Positions (N,2) in the frame before and in this frame, px of the reduced image, of
                 points that were tracked anyway. If they are enough, no other points are tracked.
         """
+        if not self.enabled:
+            return
         before, features, adjacent = self._image, self._features, index == self._index + 1
         self._image, self._index, self._features = image, index, None
         if before is None or not adjacent:
@@ -121,8 +125,10 @@ class FrameMatcher:
         self._first.append(first * scale)
         self._second.append(second * scale)
 
-    def matches(self) -> FrameMatches:
-        """Return the matches of all frames that were added."""
+    def matches(self) -> FrameMatches | None:
+        """Return the matches of all frames that were added; None if the matcher is not enabled."""
+        if not self.enabled:
+            return None
         none = np.zeros((0, 2), np.float32)
         return FrameMatches(
             camera=self.camera,

@@ -21,6 +21,9 @@ _SAMPLES = 64
 is right, 64 samples contain a sample of two right matches with a probability of 99.9 %."""
 _SEED = 0
 """Seed of the random samples."""
+_MIN_SAMPLE_SINE = 0.02
+"""Minimum sine of the angle between the two directions of a random sample: about one degree. Nearer
+directions determine no rotation."""
 _NOISE_PX = 2.0
 """Expected deviation of a match from a pure rotation, px of an image with a long side of 640 px. It is mostly
 the parallax between two frames. Evidence: none."""
@@ -41,14 +44,14 @@ _WEIGHT_ROUNDS = 4
 _RATE_ROUNDS = 4
 """Number of rounds in which the angular velocities are estimated with the rotations. Evidence: none."""
 _SPLINE_ROUNDS = 4
-"""Maximum number of rounds: in each round, the rays are corrected with the spline of the round before, and all
-rotations are estimated again. Evidence: none."""
+"""Maximum number of rounds. In each round, the rays are corrected with the spline of the round before, and
+all rotations are estimated again. Evidence: none."""
 _INDEPENDENT_RATIO = 0.25
 """Ratio of the number of independent deviations of a pair to the number of its matches. The deviations are
 mostly parallax, which is similar for neighbouring points. Evidence: none."""
 _RATE_SIGMA_RATIO = 0.05
-"""Expected error of an angular velocity from the spline, as a ratio of the change of the mean angular velocity
-from the interval before the frame to the interval after it. Evidence: none."""
+"""Expected error of an angular velocity from the spline, as a ratio of the change of the mean angular
+velocity from the interval before the frame to the interval after it. Evidence: none."""
 _MIN_RATE_SIGMA = 0.1
 """Minimum expected error of an angular velocity from the spline, rad/s. Evidence: none."""
 _END_RATE_SIGMA_RATIO = 0.5
@@ -113,9 +116,18 @@ class MatchedRays:
         frame = np.repeat(np.arange(pairs), count)
         out = []
         for rays, delay, offset in ((self.first, self.first_delay, 0), (self.second, self.second_delay, 1)):
-            turn = path.frame_from_instant(frame + offset, delay.ravel() * readout_s)
-            out.append(np.einsum("mij,mj->mi", turn, rays.reshape(-1, 3)).reshape(pairs, count, 3))
+            turn = path.rotvec_to_instant(frame + offset, delay.ravel() * readout_s)
+            out.append(_turned(turn, rays.reshape(-1, 3)).reshape(pairs, count, 3))
         return out[0], out[1]
+
+
+def _turned(rotvec_rad: FloatArray, vector: FloatArray) -> FloatArray:
+    """Return vectors (M,3) turned by rotation vectors (M,3), by Rodrigues' formula."""
+    angle = np.sqrt(np.einsum("mi,mi->m", rotvec_rad, rotvec_rad))[:, None]
+    sine = np.sinc(angle / np.pi)
+    cosine = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    cross = np.cross(rotvec_rad, vector)
+    return np.asarray(vector + sine * cross + cosine * np.cross(rotvec_rad, cross))
 
 
 def _spread_rows(bounds: IntArray) -> tuple[IntArray, IntArray, IntArray]:
@@ -158,7 +170,12 @@ def fit_rotation_path(
 
 
 def fit_to_rays(
-    rays: MatchedRays, times_ns: IntArray, readout_s: float, start: RotationPath | None = None
+    rays: MatchedRays,
+    times_ns: IntArray,
+    readout_s: float,
+    start: RotationPath | None = None,
+    *,
+    with_rates: bool = True,
 ) -> RotationPath:
     """Estimate the rotation of a camera over time from rays; see `fit_rotation_path`.
 
@@ -167,6 +184,7 @@ def fit_to_rays(
         times_ns: (N,) frame times, nanoseconds.
         readout_s: Readout time, seconds.
         start: The path for a similar readout time. None: it is unknown.
+        with_rates: True to estimate the angular velocities of frames from their matches, too.
     """
     if start is None:
         step, known = _first_rotations(rays)
@@ -177,12 +195,12 @@ def fit_to_rays(
         before, _ = path.steps()
         first, second = rays.at_mid_row(path, readout_s)
         step, inlier = _refine_rotations(before, first, second, rays)
-        known = _is_known(inlier, rays.used)
+        known = _is_known(inlier, rays)
         path = RotationPath.from_steps(times_ns, step, known)
         change = np.linalg.norm((step - before)[known], axis=(1, 2))
         if readout_s == 0.0 or change.max(initial=0.0) < _CONVERGED_RAD:
             break
-    for _ in range(_RATE_ROUNDS if readout_s else 0):
+    for _ in range(_RATE_ROUNDS if readout_s and with_rates else 0):
         path = _with_rates(path, rays, readout_s)
     return path
 
@@ -196,12 +214,12 @@ def _with_rates(path: RotationPath, rays: MatchedRays, readout_s: float) -> Rota
     """
     step, known = path.steps()
     first, second = rays.at_mid_row(path, readout_s)
-    turned = np.einsum("pij,pkj->pki", step, first)
+    turned = first @ np.swapaxes(step, 1, 2)
     deviation = second - turned
     size = np.linalg.norm(deviation, axis=2)
     weight = _weights(size, rays)
     inlier = rays.used & (size < _INLIER_SCALE * rays.noise_rad)
-    weight *= _INDEPENDENT_RATIO * (_is_known(inlier, rays.used) | known)[:, None]
+    weight *= _INDEPENDENT_RATIO * (_is_known(inlier, rays) | known)[:, None]
     leverage = [
         _rate_leverage(path, offset, delay * readout_s)[:, :, None, None]
         for offset, delay in ((0, rays.first_delay), (1, rays.second_delay))
@@ -252,7 +270,9 @@ def _rate_sigma(path: RotationPath) -> FloatArray:
     nothing = np.full((1, 3), np.nan)
     bend = np.linalg.norm(np.concatenate([mean, nothing]) - np.concatenate([nothing, mean]), axis=1)
     end = _END_RATE_SIGMA + _END_RATE_SIGMA_RATIO * np.linalg.norm(path.rate, axis=1)
-    return np.where(np.isfinite(bend), _MIN_RATE_SIGMA + _RATE_SIGMA_RATIO * np.nan_to_num(bend), end)
+    return np.asarray(
+        np.where(np.isfinite(bend), _MIN_RATE_SIGMA + _RATE_SIGMA_RATIO * np.nan_to_num(bend), end)
+    )
 
 
 def _solve_chain(
@@ -290,10 +310,18 @@ def _skew(vector: FloatArray) -> FloatArray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _is_known(inlier: BoolArray, used: BoolArray) -> BoolArray:
-    """Return a mask (P,) of the pairs with enough inliers, from masks (P,K) of inliers and of matches."""
+def _is_known(inlier: BoolArray, rays: MatchedRays) -> BoolArray:
+    """Return a mask (P,) of the pairs with enough inliers in different directions.
+
+    Args:
+        inlier: (P,K) True for each inlier.
+        rays: The matches.
+    """
     count = inlier.sum(axis=1)
-    return np.asarray((count >= _MIN_INLIERS) & (count >= _MIN_INLIER_RATIO * used.sum(axis=1)))
+    enough = (count >= _MIN_INLIERS) & (count >= _MIN_INLIER_RATIO * rays.used.sum(axis=1))
+    directions = rays.first * inlier[:, :, None]
+    scatter = np.swapaxes(directions, 1, 2) @ directions / np.maximum(count, 1)[:, None, None]
+    return np.asarray(enough & (np.linalg.eigvalsh(scatter)[:, 1] > _MIN_SAMPLE_SINE**2))
 
 
 def _first_rotations(rays: MatchedRays) -> tuple[FloatArray, BoolArray]:
@@ -313,25 +341,33 @@ def _first_rotations(rays: MatchedRays) -> tuple[FloatArray, BoolArray]:
             continue
         i = (drawn[0] * count[rows, None]).astype(np.int64)
         j = (i + 1 + (drawn[1] * (count[rows, None] - 1)).astype(np.int64)) % count[rows, None]
-        first, second = (
+        (first, first_sine), (second, second_sine) = (
             _frames_of(np.take_along_axis(each, i[:, :, None], 1), np.take_along_axis(each, j[:, :, None], 1))
             for each in (rays.first[rows], rays.second[rows])
         )
         samples = second @ np.swapaxes(first, 2, 3)
-        error = np.linalg.norm(
-            np.einsum("psij,pkj->pski", samples, rays.first[rows]) - rays.second[rows][:, None], axis=3
-        )
+        turned = rays.first[rows][:, None] @ np.swapaxes(samples, 2, 3)
+        error = np.linalg.norm(turned - rays.second[rows][:, None], axis=3)
         cost = np.minimum(error / (_SAMPLE_SCALE * rays.noise_rad), 1.0)
-        best = (cost * rays.used[rows][:, None]).sum(axis=2).argmin(axis=1)
-        rotation[rows] = samples[np.arange(len(rows)), best]
+        cost = (cost * rays.used[rows][:, None]).sum(axis=2)
+        cost[np.minimum(first_sine, second_sine) < _MIN_SAMPLE_SINE] = np.inf
+        best = cost.argmin(axis=1)
+        is_found = np.isfinite(cost.min(axis=1))
+        rotation[rows[is_found]] = samples[np.flatnonzero(is_found), best[is_found]]
+        enough[rows[~is_found]] = False
     return rotation, enough
 
 
-def _frames_of(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return orthonormal frames (...,3,3) whose first axes are `first` (...,3), and that contain `second`."""
+def _frames_of(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return orthonormal frames (...,3,3) with the first axes `first` (...,3) that contain `second`.
+
+    The sines (...) of the angles between both directions are returned, too. Without an angle, there is no
+    frame.
+    """
     normal = np.cross(first, second)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
-    return np.stack([first, normal, np.cross(first, normal)], axis=-1)
+    sine = np.linalg.norm(normal, axis=-1)
+    normal /= np.maximum(sine, 1e-12)[..., None]
+    return np.stack([first, normal, np.cross(first, normal)], axis=-1), sine
 
 
 def _refine_rotations(
@@ -348,14 +384,14 @@ def _refine_rotations(
     Returns:
         The rotations second_from_first (P,3,3), and a mask (P,K) of the inliers.
 
-    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976, with Cauchy weights
-        whose scale is the median residual.
+    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976, with Cauchy
+        weights whose scale is the median residual.
     """
     for _ in range(_WEIGHT_ROUNDS):
-        error = np.linalg.norm(np.einsum("pij,pkj->pki", rotation, first) - second, axis=2)
+        error = np.linalg.norm(first @ np.swapaxes(rotation, 1, 2) - second, axis=2)
         weight = _weights(error, rays)
-        rotation = _nearest_rotations(np.einsum("pki,pkj,pk->pij", second, first, weight))
-    error = np.linalg.norm(np.einsum("pij,pkj->pki", rotation, first) - second, axis=2)
+        rotation = _nearest_rotations(np.swapaxes(second * weight[:, :, None], 1, 2) @ first)
+    error = np.linalg.norm(first @ np.swapaxes(rotation, 1, 2) - second, axis=2)
     return rotation, np.asarray(rays.used & (error < _INLIER_SCALE * rays.noise_rad))
 
 

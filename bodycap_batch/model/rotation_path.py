@@ -74,7 +74,7 @@ class RotationPath:
             map_from_cam: (N,4,4) poses of the frames; NaN for a frame without a pose.
         """
         step, known = self.steps()
-        has_pose = np.isfinite(map_from_cam).all(axis=(1, 2))
+        has_pose = np.asarray(np.isfinite(map_from_cam).all(axis=(1, 2)))
         both = has_pose[1:] & has_pose[:-1]
         if not both.any():
             return self
@@ -93,22 +93,30 @@ class RotationPath:
     def frame_from_instant(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
         """Return the rotations (M,3,3) from the camera at some instants to the camera at the frame times.
 
-        Between two frames of a segment, the rotation vector is a cubic polynomial of time. Outside a segment,
-        the angular velocity is constant.
-
         Args:
             frame: (M,) frame index of each instant.
             delay_s: (M,) seconds from the time of the frame to the instant.
         """
+        return so3_exp(self.rotvec_to_instant(frame, delay_s)).reshape(-1, 3, 3)
+
+    def rotvec_to_instant(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
+        """Return the rotation vectors (M,3) of `frame_from_instant`, rad.
+
+        Between two frames of a segment, the rotation vector is a cubic polynomial of time. Outside a segment,
+        the angular velocity is constant.
+        """
         other = np.clip(frame + np.where(delay_s < 0.0, -1, 1), 0, len(self.times_ns) - 1)
         inside = (other != frame) & (self.segment[other] == self.segment[frame])
-        rate, turn = self.rate[frame], self.rate[frame] * delay_s[:, None]
+        rate = self.rate[frame]
+        turn = np.asarray(rate * delay_s[:, None])
         f, g = frame[inside], other[inside]
-        pair, position = np.unique(np.stack([f, g], axis=1), axis=0, return_inverse=True)
-        position = position.ravel()
-        from_other = np.swapaxes(self.rotation[pair[:, 0]], 1, 2) @ self.rotation[pair[:, 1]]
-        end = so3_log(from_other)
-        end_rate = _rotvec_rate(end, self.rate[pair[:, 1]])[position]
+        # Many instants share the interval between two frames. An interval that begins with the earlier frame
+        # has an even number, else an odd number.
+        interval, position = np.unique(2 * np.minimum(f, g) + (g < f), return_inverse=True)
+        backward = interval % 2
+        start, stop = interval // 2 + backward, interval // 2 + 1 - backward
+        end = so3_log(np.swapaxes(self.rotation[start], 1, 2) @ self.rotation[stop])
+        end_rate = _rotvec_rate(end, self.rate[stop])[position]
         span = ((self.times_ns[g] - self.times_ns[f]) * 1e-9)[:, None]
         u = delay_s[inside, None] / span
         # The cubic Hermite polynomial that starts at 0.
@@ -117,7 +125,7 @@ class RotationPath:
             + u**2 * (3.0 - 2.0 * u) * end[position]
             + u**2 * (u - 1.0) * span * end_rate
         )
-        return np.asarray(so3_exp(turn)).reshape(-1, 3, 3)
+        return turn
 
 
 def _spline_rates(times_ns: IntArray, rotation: FloatArray, segment: IntArray) -> FloatArray:
@@ -186,9 +194,7 @@ def rotate_to_mid_row(
     Source: Forssén, Ringaby, "Rectifying rolling shutter video from hand-held devices", CVPR 2010.
     """
     rays = unit_directions(camera.unproject(px))
-    turned = np.einsum(
-        "mij,mj->mi", path.frame_from_instant(frame, row_delay_s(camera, px, readout_s)), rays
-    )
+    turned = np.einsum("mij,mj->mi", path.frame_from_instant(frame, row_delay_s(camera, px, readout_s)), rays)
     return _projected_or(camera, turned, px)
 
 
@@ -277,26 +283,37 @@ class PosePath:
             rotation is corrected.
         """
         delay_s = row_delay_s(camera, px, readout_s)
-        frame_from_instant = self.rotation.frame_from_instant(frame, delay_s)
+        from_instant = self.rotation.frame_from_instant(frame, delay_s)
+        shift = self._shift_in_cam(frame, delay_s)
+        pose = self.map_from_cam[frame]
+        x_in_cam = np.einsum("mji,mj->mi", pose[:, :3, :3], points - pose[:, :3, 3])
+        depth = np.einsum("mi,mi->m", from_instant[:, :, 2], x_in_cam - shift)
+        return self._moved(camera, from_instant, shift, depth, px)
+
+    def _shift_in_cam(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
+        """Return how far (M,3) the camera moves from frame times to instants, in its frame of the frame time.
+
+        The result is NaN for a frame without a pose.
+        """
+        delay = delay_s[:, None]
+        shift = self.velocity[frame] * delay + 0.5 * self.acceleration[frame] * delay**2
+        return np.asarray(np.einsum("mji,mj->mi", self.map_from_cam[frame][:, :3, :3], shift))
+
+    @staticmethod
+    def _moved(
+        camera: Camera, from_instant: FloatArray, shift: FloatArray, depth: FloatArray, px: FloatArray
+    ) -> FloatArray:
+        """Return pixels (M,2) after the rotation, and after the shift where shift and depth are known."""
         rays = camera.unproject(px)
         rays = np.column_stack([rays, np.ones(len(rays))])
-        out = _projected_or(camera, np.einsum("mij,mj->mi", frame_from_instant, rays), px)
-        pose = self.map_from_cam[frame]
-        has_pose = np.isfinite(pose).all(axis=(1, 2))
-        pose, frame_of, delay = pose[has_pose], frame[has_pose], delay_s[has_pose, None]
-        shift = self.velocity[frame_of] * delay + 0.5 * self.acceleration[frame_of] * delay**2
-        cam_from_map = np.swapaxes(pose[:, :3, :3], 1, 2)
-        from_instant = frame_from_instant[has_pose]
-        shift_in_cam = np.einsum("mij,mj->mi", cam_from_map, shift)
-        x_in_cam = np.einsum("mij,mj->mi", cam_from_map, points[has_pose] - pose[:, :3, 3])
-        depth = np.einsum("mi,mi->m", from_instant[:, :, 2], x_in_cam - shift_in_cam)
-        moved = np.einsum("mij,mj->mi", from_instant, rays[has_pose] * depth[:, None]) + shift_in_cam
-        rows = np.flatnonzero(has_pose)[depth > 0.0]
-        out[rows] = _projected_or(camera, moved[depth > 0.0], out[rows])
-        return out
+        has_depth = np.isfinite(depth) & (depth > 0.0) & np.isfinite(shift).all(axis=1)
+        scaled = rays * np.where(has_depth, depth, 1.0)[:, None]
+        moved = np.einsum("mij,mj->mi", from_instant, scaled) + np.where(has_depth[:, None], shift, 0.0)
+        return _projected_or(camera, moved, px)
 
 
 def _projected_or(camera: Camera, x_in_cam: FloatArray, px: FloatArray) -> FloatArray:
     """Return the projections (M,2) of points, or the pixel in `px` (M,2) for a point without a projection."""
     projected = camera.project(x_in_cam)
-    return np.where(np.isfinite(projected).all(axis=1)[:, None], projected, px)
+    is_seen = np.asarray(np.isfinite(projected).all(axis=1))
+    return np.where(is_seen[:, None], projected, px)

@@ -171,9 +171,7 @@ def _track_without_misplaced(
     return remaining, tracks, scene_map.keyframe_frame[misplaced]
 
 
-def _rotation_of(
-    camera: CaptureCamera, scene_map: Map, selection: KeyframeSelection
-) -> RotationPath | None:
+def _rotation_of(camera: CaptureCamera, scene_map: Map, selection: KeyframeSelection) -> RotationPath | None:
     """Return the rotation of a camera with a rolling shutter over time, from matches of adjacent frames.
 
     The result is None for a camera with a global shutter, and if there are no matches.

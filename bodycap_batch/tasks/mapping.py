@@ -110,8 +110,7 @@ def run_extend(task: ExtendTask, context: StageContext, files: Path) -> None:
     extra = {name: np.asarray(frames, dtype=np.int64) for name, frames in task.extra.items()}
     previous = load_map(task.map.path)
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
-    selections = [load_keyframes(artefact.path) for artefact in task.keyframes.values()]
-    _save_map(extend_map(capture, previous, extra, task.options, context, selections), files)
+    _save_map(extend_map(capture, previous, extra, task.options, context), files)
 
 
 def run_refine(task: RefineTask, context: StageContext, files: Path) -> None:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _TRIAL_STEP_S = 0.01
 """First step and maximum step (seconds) in the search for the readout time. Evidence: none."""
+_NEXT_STEP_S = 0.003
+"""First step (seconds) if the search starts from an estimate. Evidence: none."""
 _TRIAL_ITERATIONS = 40
 """Maximum number of iterations of a trial adjustment. Evidence: none."""
 _TRIAL_KEYFRAMES = 24
@@ -164,9 +166,7 @@ class RollingShutterModel:
         path = self._paths.get(item.camera)
         if path is None or not readout_s:
             return item.px
-        return path.px_at_mid_row(
-            self._intrinsics[item.camera], item.frame, item.points, item.px, readout_s
-        )
+        return path.px_at_mid_row(self._intrinsics[item.camera], item.frame, item.points, item.px, readout_s)
 
     def most_dynamic_subset(self) -> RollingShutterModel:
         """Return a smaller model: for each camera, only the successive keyframes with the largest motion."""
@@ -186,9 +186,9 @@ class RollingShutterModel:
             kept |= {item.image_id for item in keyframes[start : start + size]}
         part = sub_model(self._model, kept)
         sideways = [name for name, camera in self._intrinsics.items() if camera.sideways]
-        return RollingShutterModel(
-            part, self._trajectories, self._cameras, self._detected_px
-        ).with_sideways(sideways)
+        return RollingShutterModel(part, self._trajectories, self._cameras, self._detected_px).with_sideways(
+            sideways
+        )
 
     def with_sideways(self, sideways: Collection[str]) -> RollingShutterModel:
         """Return a copy with changed row directions.
@@ -204,7 +204,10 @@ class RollingShutterModel:
         return out
 
     def estimate(
-        self, settings: pycolmap.IncrementalPipelineOptions, calibrated_ids: Sequence[int]
+        self,
+        settings: pycolmap.IncrementalPipelineOptions,
+        calibrated_ids: Sequence[int],
+        start_s: Mapping[str, float] | None = None,
     ) -> dict[str, Readout]:
         """Estimate the readout time of each camera, from adjustments of the map with a few trial values.
 
@@ -214,6 +217,8 @@ class RollingShutterModel:
         Args:
             settings: The mapper's options.
             calibrated_ids: Database ids of the calibrated cameras.
+            start_s: Readout times (seconds) for which the poses were estimated, by camera name. The search
+                starts from them; from 0 for any other camera.
 
         Returns:
             Readout time of each camera with a trajectory, by camera name. Readout times that are given in the
@@ -235,11 +240,13 @@ class RollingShutterModel:
         if not unknown:
             return out
         frame_s = {name: float(np.median(np.diff(self._cameras[name].times_ns))) * 1e-9 for name in unknown}
-        readout_s = {name: readout.seconds for name, readout in out.items()} | dict.fromkeys(unknown, 0.0)
+        readout_s = {name: readout.seconds for name, readout in out.items()} | {
+            name: (start_s or {}).get(name, 0.0) for name in unknown
+        }
         model = self.corrected(readout_s)
         bundle_adjust(model, settings, calibrated_ids, _TRIAL_ITERATIONS)
         before = self._residuals(model)
-        step_s = dict.fromkeys(unknown, _TRIAL_STEP_S)
+        step_s = {name: _NEXT_STEP_S if readout_s[name] else _TRIAL_STEP_S for name in unknown}
         for _ in range(_MAX_TRIALS):
             readout_s = readout_s | {name: readout_s[name] + step_s[name] for name in unknown}
             self.move_keypoints(model, readout_s)
@@ -366,6 +373,7 @@ def estimate_readouts(
     cameras: Mapping[str, CaptureCamera],
     settings: pycolmap.IncrementalPipelineOptions,
     calibrated_ids: Sequence[int],
+    corrected: Map | None = None,
 ) -> tuple[RollingShutterModel, dict[str, Readout]]:
     """Estimate the readout time of each camera, and whether the sensor's rows are columns of the image.
 
@@ -377,19 +385,26 @@ def estimate_readouts(
         cameras: The capture's cameras by name.
         settings: The mapper's options.
         calibrated_ids: Database ids of the calibrated cameras.
+        corrected: The map whose readout times and row directions were estimated before; None if there is
+            none. The search starts from them.
 
     Returns:
         The model with the row directions that fit best; the readout times by camera name.
     """
     stated = {name for name, camera in cameras.items() if camera.camera.sideways}
+    start_s = {} if corrected is None else dict(corrected.readout_s)
+    if corrected is not None:
+        stated |= {name for name, camera in corrected.cameras.items() if camera.sideways}
     rolling = rolling.with_sideways(stated)
     try:
         part = rolling.most_dynamic_subset()
-        readouts = part.estimate(settings, calibrated_ids)
+        readouts = part.estimate(settings, calibrated_ids, start_s)
         turned = {
             name
             for name in readouts
-            if cameras[name].may_be_sideways and not cameras[name].rolling_shutter_known
+            if cameras[name].may_be_sideways
+            and not cameras[name].rolling_shutter_known
+            and name not in start_s
         }
         sideways = part.with_sideways(stated | turned).estimate(settings, calibrated_ids) if turned else {}
     except EstimationError as error:

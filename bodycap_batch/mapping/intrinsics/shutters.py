@@ -1,15 +1,21 @@
-"""Correct the keypoints of new keyframes for rolling shutters before the map exists."""
+"""Correct the keypoints of keyframes for rolling shutters before the map is built from them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from bodycap_batch.capture import Capture
+from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
 from bodycap_batch.mapping.intrinsics.readout_time import Readout, stated_readout
 from bodycap_batch.model.rotation_fit import fit_rotation_path
 from bodycap_batch.model.rotation_path import TurningShutter
 from bodycap_batch.model.scene import KeyframeSelection, Map
+
+_FOLDER = "shutters"
+"""Name of the folder with the shutters, in the workspace folder. Each camera with a rolling shutter has a
+file."""
 
 
 def known_readouts(capture: Capture) -> dict[str, Readout]:
@@ -42,7 +48,7 @@ def turning_shutters(
         readouts: The readout times by camera name.
 
     Returns:
-        The shutters by camera name. Cameras without matches or without a readout time have no entry.
+        The shutters by camera name. Cameras without matches or without a readout time have none.
     """
     out = {}
     for selection in selections:
@@ -54,3 +60,24 @@ def turning_shutters(
         path = fit_rotation_path(selection.matches, lens, camera.times_ns, readout.seconds)
         out[selection.camera] = TurningShutter(lens, path, readout.seconds)
     return out
+
+
+def write_shutters(workspace: Path, shutters: Mapping[str, TurningShutter]) -> None:
+    """Store shutters in a workspace. New keyframes are corrected with them when the map is extended."""
+    folder = workspace / _FOLDER
+    for name, shutter in sorted(shutters.items()):
+        folder.mkdir(exist_ok=True)
+        write_dataclass(shutter, folder, name)
+
+
+def read_shutters(workspace: Path, names: Iterable[str]) -> dict[str, TurningShutter]:
+    """Read the shutters of some cameras from a workspace, by camera name.
+
+    Cameras without a stored shutter have no entry.
+    """
+    folder = workspace / _FOLDER
+    return {
+        name: read_dataclass(TurningShutter, folder, name)
+        for name in names
+        if (folder / f"{name}.json").exists()
+    }
