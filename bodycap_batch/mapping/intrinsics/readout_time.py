@@ -46,6 +46,14 @@ global. Evidence: none."""
 _MIN_SIGMAS = 5.0
 """Minimum ratio of an estimated readout time to its standard deviation. With a smaller ratio, the estimate is
 not significant and the shutter is treated as global. Evidence: none."""
+_MAX_DIFFERENCE_S = 0.003
+"""Maximum difference of the readout times from residuals and from matches, seconds. With a larger difference,
+the residuals are not used. Evidence: none."""
+_BLOCKS = 8
+"""Number of blocks of successive keyframes from which a standard deviation is estimated. Evidence: none."""
+_FLOOR_SIGMA_S = 0.0001
+"""Standard deviation that is added to each estimate, seconds, because the path between frames is a spline.
+Evidence: none."""
 _LOSS_PX = 1.0
 """Width (px) of the robust weight function of a residual. Evidence: none."""
 _MAX_RESIDUAL_PX = 8.0
@@ -71,6 +79,21 @@ class Readout:
     source: str
     best_s: float
     sideways: bool = False
+
+    def with_other_estimate(self, other_s: float) -> Readout:
+        """Return the readout time with a standard deviation that covers the difference to another estimate.
+
+        The residuals of a map hold only the points that agree with the map. If they contradict the matches
+        between adjacent frames, the matches are right.
+
+        Args:
+            other_s: Readout time (seconds) from matches between adjacent frames.
+        """
+        difference_s = abs(self.best_s - other_s)
+        if difference_s > _MAX_DIFFERENCE_S:
+            return replace(self, seconds=other_s, sigma_s=difference_s, source="estimated", best_s=other_s)
+        sigma_s = float(np.hypot(self.sigma_s, 0.5 * difference_s))
+        return replace(self, seconds=self.best_s, sigma_s=sigma_s, source="estimated")
 
     @property
     def significance(self) -> float:
@@ -261,6 +284,9 @@ class RollingShutterModel:
             if max(map(abs, step_s.values())) < _CONVERGED_S:
                 break
             before = after
+        for name in start_s or {}:
+            if name in unknown:
+                out[name] = out[name].with_other_estimate((start_s or {})[name])
         return out
 
     def undetermined(self, reason: str) -> dict[str, Readout]:
@@ -326,12 +352,14 @@ class _ResidualSlope:
         correlation: Weighted sum of the products of each residual and its derivative, px²/s. The derivative
             is taken with respect to the readout time.
         information: Weighted sum of the squared derivatives, px²/s².
-        variance: Weighted variance of the residuals at the readout time with the smallest residuals, px².
+        sigma_s: Standard deviation of the readout time, seconds. It is estimated by leaving out blocks of
+            successive keyframes one after another (jackknife), because the residuals of a keyframe have
+            common errors.
     """
 
     correlation: float
     information: float
-    variance: float
+    sigma_s: float
 
     @staticmethod
     def of(before: FloatArray, after: FloatArray, step_s: float) -> _ResidualSlope:
@@ -349,9 +377,19 @@ class _ResidualSlope:
         weight = np.where(small, 1.0 / (1.0 + (after / _LOSS_PX) ** 2), 0.0)
         information = float((weight * change * change).sum())
         correlation = float((weight * change * after).sum())
-        best = after - change * (correlation / information if information else 0.0)
-        variance = float((weight * best**2).sum() / max(weight.sum(), 1.0))
-        return _ResidualSlope(correlation, information, variance)
+        if information <= 0.0:
+            return _ResidualSlope(correlation, information, float("inf"))
+        products = (
+            np.array_split(weight * change * after, _BLOCKS),
+            np.array_split(weight * change**2, _BLOCKS),
+        )
+        other_correlation, other_information = (
+            total - np.array([block.sum() for block in blocks])
+            for total, blocks in zip((correlation, information), products, strict=True)
+        )
+        without = other_correlation / np.maximum(other_information, 1e-12 * information)
+        variance = (_BLOCKS - 1) / _BLOCKS * ((without - without.mean()) ** 2).sum()
+        return _ResidualSlope(correlation, information, float(np.hypot(np.sqrt(variance), _FLOOR_SIGMA_S)))
 
     def readout(self, at_s: float, frame_s: float) -> Readout:
         """Return the readout time with the smallest residuals, or 0 if that time is not significant.
@@ -363,9 +401,8 @@ class _ResidualSlope:
         if self.information <= 0.0:
             return Readout(0.0, float("inf"), "none found", at_s)
         best_s = at_s - self.correlation / self.information
-        sigma_s = float(np.sqrt(self.variance / self.information))
-        found = max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s) < abs(best_s) < _MAX_READOUT_FRAMES * frame_s
-        return Readout(best_s if found else 0.0, sigma_s, "estimated" if found else "none found", best_s)
+        found = max(_MIN_READOUT_S, _MIN_SIGMAS * self.sigma_s) < abs(best_s) < _MAX_READOUT_FRAMES * frame_s
+        return Readout(best_s if found else 0.0, self.sigma_s, "estimated" if found else "none found", best_s)
 
 
 def estimate_readouts(
