@@ -54,10 +54,10 @@ _RATE_SIGMA_RATIO = 0.05
 velocity from the interval before the frame to the interval after it. Evidence: none."""
 _MIN_RATE_SIGMA = 0.1
 """Minimum expected error of an angular velocity from the spline, rad/s. Evidence: none."""
-_END_RATE_SIGMA_RATIO = 0.5
+_END_RATE_SIGMA_RATIO = 0.3
 """Expected error of an angular velocity at the end of a segment, as a ratio of this velocity. Evidence:
 none."""
-_END_RATE_SIGMA = 5.0
+_END_RATE_SIGMA = 2.0
 """Expected error of an angular velocity at the end of a segment, rad/s, added to the ratio. An arm reaches
 20 rad/s. Evidence: none."""
 _CONVERGED_RAD = 1e-4

@@ -201,8 +201,12 @@ def _groups_of_equal_cameras(capture: Capture, names: Sequence[str]) -> list[lis
 
 
 def _agree(single: Sequence[_Estimate], joint: _Estimate) -> bool:
-    """Return whether the readout times of single cameras agree with the common readout time."""
-    return all(abs(each.seconds - joint.seconds) <= _MIN_SIGMAS * each.sigma_s for each in single)
+    """Return whether the readout times of single cameras agree with the common readout time.
+
+    Cameras whose data determine no readout time are not asked.
+    """
+    determined = [each for each in single if each.sigma_s <= _MAX_SIGMA_S]
+    return all(abs(each.seconds - joint.seconds) <= _MIN_SIGMAS * each.sigma_s for each in determined)
 
 
 def _estimate(profiles: Sequence[_Profile]) -> _Estimate:
