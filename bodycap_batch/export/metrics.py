@@ -98,7 +98,8 @@ def observation_errors(scene: Map, trajectories: Sequence[Trajectory]) -> FloatA
         if camera in paths and camera in scene.readout_s:
             path, frame = paths[camera], np.full(len(observations), scene.keyframe_frame[keyframe])
             poses = PosePath.create(path.gauge_from_cam, path.times_ns)
-            px = poses.px_at_mid_row(intrinsics, frame, points, px, scene.readout_s[camera])
+            seen = intrinsics, frame, points, px, scene.readout_s[camera]
+            px = poses.with_fitted_rates(*seen).px_at_mid_row(*seen)
         projected = intrinsics.project(transform_points(invert(scene.map_from_cam[keyframe]), points))
         out[observations] = np.linalg.norm(projected - px, axis=1)
     return out

@@ -221,7 +221,9 @@ def _with_rates(path: RotationPath, rays: MatchedRays, readout_s: float) -> Rota
     inlier = rays.used & (size < _INLIER_SCALE * rays.noise_rad)
     weight *= _INDEPENDENT_RATIO * (_is_known(inlier, rays) | known)[:, None]
     leverage = [
-        _rate_leverage(path, offset, delay * readout_s)[:, :, None, None]
+        path.rate_leverage_s(
+            np.broadcast_to(np.arange(len(delay))[:, None] + offset, delay.shape), delay * readout_s
+        )[:, :, None, None]
         for offset, delay in ((0, rays.first_delay), (1, rays.second_delay))
     ]
     jacobian = np.concatenate(
@@ -245,21 +247,6 @@ def _with_rates(path: RotationPath, rays: MatchedRays, readout_s: float) -> Rota
     pair_change = np.concatenate([change[:-1], change[1:]], axis=1)
     turn = -(turn + np.einsum("pij,pj->pi", to_turn, pair_change))
     return RotationPath.from_steps(path.times_ns, so3_exp(turn) @ step, known, path.rate + change)
-
-
-def _rate_leverage(path: RotationPath, offset: int, delay_s: FloatArray) -> FloatArray:
-    """Return how much the angular velocity of a frame turns its rays, seconds.
-
-    Args:
-        path: The rotation of the camera.
-        offset: 0 for the first frame of each pair, 1 for the second.
-        delay_s: (P,K) time of each ray minus the time of its frame.
-    """
-    frame = np.arange(len(delay_s))[:, None] + offset
-    other = np.clip(frame + np.where(delay_s < 0.0, -1, 1), 0, len(path.times_ns) - 1)
-    inside = (other != frame) & (path.segment[other] == path.segment[frame])
-    span = np.where(inside, (path.times_ns[other] - path.times_ns[frame]) * 1e-9, np.inf)
-    return np.asarray(delay_s * (1.0 - delay_s / span) ** 2)
 
 
 def _rate_sigma(path: RotationPath) -> FloatArray:

@@ -14,8 +14,25 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import so3_exp, so3_log
-from bodycap_batch.model.optical_flow import unit_directions
+from bodycap_batch.model.optical_flow import pixel_scale, unit_directions
 
+_RATE_SIGMA = 2.0
+"""Largest expected error of an angular velocity from the spline, rad/s, along each axis. Evidence: none."""
+_MIN_RATE_SIGMA = 0.01
+"""Smallest expected error of an angular velocity from the spline, rad/s. Evidence: none."""
+_RATE_FITS = 3
+"""Number of times that the weights and the prior of the angular velocities are computed again. Evidence:
+none."""
+_RATE_NOISE_PX = 0.7
+"""Standard deviation of an observation, px of an image with a long side of 640 px. Evidence: none."""
+_MAX_RATE_RESIDUAL_PX = 12.0
+"""Maximum residual of an observation that is used for an angular velocity, px of an image with a long side of
+640 px. Evidence: none."""
+_MIN_RATE_POINTS = 15
+"""Minimum number of observations of a frame for its angular velocity. Origin: 30 measured coordinates for 9
+unknowns. Evidence: none."""
+_RATE_BATCH_FRAMES = 64
+"""Number of frames whose equations are made together. It bounds the memory."""
 _NOISE_FROM_QUARTILE = 1.57
 """Ratio of the root mean square length of a normally distributed vector in three dimensions to the first
 quartile of its length: sqrt(3 / 1.213). The first quartile of the squared length is 1.213 variances."""
@@ -101,6 +118,20 @@ class RotationPath:
             delay_s: (M,) seconds from the time of the frame to the instant.
         """
         return so3_exp(self.rotvec_to_instant(frame, delay_s)).reshape(-1, 3, 3)
+
+    def rate_leverage_s(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
+        """Return how much the angular velocity of frames turns the camera until some instants, seconds.
+
+        It is less than the delay, because the orientations of the neighbouring frames stay as they are.
+
+        Args:
+            frame: Frame index of each instant, of any shape.
+            delay_s: Seconds from the time of the frame to the instant, of the same shape.
+        """
+        other = np.clip(frame + np.where(delay_s < 0.0, -1, 1), 0, len(self.times_ns) - 1)
+        inside = (other != frame) & (self.segment[other] == self.segment[frame])
+        span_s = np.where(inside, (self.times_ns[other] - self.times_ns[frame]) * 1e-9, np.inf)
+        return np.asarray(delay_s * (1.0 - delay_s / span_s) ** 2)
 
     def rotvec_to_instant(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
         """Return the rotation vectors (M,3) of `frame_from_instant`, rad.
@@ -347,6 +378,50 @@ class PosePath:
         depth = np.einsum("mi,mi->m", from_instant[:, :, 2], x_in_cam - shift)
         return self._moved(camera, from_instant, shift, depth, px)
 
+    def with_fitted_rates(
+        self, camera: Camera, frame: IntArray, points: FloatArray, px: FloatArray, readout_s: float
+    ) -> PosePath:
+        """Return the path with angular velocities that fit the observations of each frame.
+
+        A hand shakes faster than its video can tell from frame to frame. But the rows of a frame are exposed
+        one after another, so the observations of a frame tell its angular velocity. A correction of the
+        velocity is fitted together with a correction of the pose, and only the velocity is used. The usual
+        size of the corrections of a camera is the prior of each of them.
+
+        Args:
+            camera: The camera model.
+            frame: (M,) frame index of each observation, in any order.
+            points: (M,3) observed map point of each observation, in the map frame.
+            px: (M,2) observed pixels.
+            readout_s: Readout time, seconds. It must be known: velocities explain a wrong one.
+
+        Source: Albl, Kukelova, Pajdla, "R6P - Rolling shutter absolute camera pose", CVPR 2015, for the model
+            of a frame with an angular velocity.
+        """
+        moved = camera.unproject(self.px_at_mid_row(camera, frame, points, px, readout_s))
+        pose = self.map_from_cam[frame]
+        x_in_cam = np.einsum("mji,mj->mi", pose[:, :3, :3], points - pose[:, :3, 3])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            expected = x_in_cam[:, :2] / x_in_cam[:, 2:]
+        residual = moved - expected
+        limit = _MAX_RATE_RESIDUAL_PX * pixel_scale(camera.width_px, camera.height_px) / camera.focal_px
+        with np.errstate(invalid="ignore"):
+            used = (x_in_cam[:, 2] > 0.0) & (np.linalg.norm(residual, axis=1) < limit)
+        rows = np.flatnonzero(used)
+        rows = rows[np.argsort(frame[rows], kind="stable")]
+        delay_s = row_delay_s(camera, px[rows], readout_s)
+        leverage_s = self.rotation.rate_leverage_s(frame[rows], delay_s)
+        turn = _turn_jacobian(moved[rows])
+        move = np.zeros((len(rows), 2, 3))
+        move[:, 0, 0] = move[:, 1, 1] = 1.0
+        move[:, :, 2] = -moved[rows]
+        # A translation is measured in units of the depth of the points: the parts have similar sizes then.
+        move *= (np.median(x_in_cam[rows, 2]) if len(rows) else 1.0) / x_in_cam[rows, 2][:, None, None]
+        jacobian = np.concatenate([turn, move, leverage_s[:, None, None] * turn], axis=2)
+        noise = _RATE_NOISE_PX * pixel_scale(camera.width_px, camera.height_px) / camera.focal_px
+        change = _fit_frames(frame[rows], residual[rows], jacobian, noise, len(self.map_from_cam))
+        return replace(self, rotation=replace(self.rotation, rate=self.rotation.rate + change))
+
     def _shift_in_cam(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
         """Return how far (M,3) the camera moves from frame times to instants, in its frame of the frame time.
 
@@ -367,6 +442,61 @@ class PosePath:
         scaled = rays * np.where(has_depth, depth, 1.0)[:, None]
         moved = np.einsum("mij,mj->mi", from_instant, scaled) + np.where(has_depth[:, None], shift, 0.0)
         return _projected_or(camera, moved, px)
+
+
+def _turn_jacobian(ray: FloatArray) -> FloatArray:
+    """Return the derivatives (M,2,3) of image points (M,2) at depth 1 for a turn of their rays."""
+    x, y = ray[:, 0], ray[:, 1]
+    one = np.ones(len(ray))
+    return np.stack(
+        [np.stack([-x * y, one + x * x, -y], axis=1), np.stack([-one - y * y, x * y, x], axis=1)], axis=1
+    )
+
+
+def _fit_frames(
+    frame: IntArray, residual: FloatArray, jacobian: FloatArray, noise: float, count: int
+) -> FloatArray:
+    """Fit corrections of poses and angular velocities to residuals, frame by frame, robustly.
+
+    Args:
+        frame: (M,) frame index of each residual, not decreasing.
+        residual: (M,2) residuals.
+        jacobian: (M,2,9) derivatives of the residuals with respect to turn, shift and angular velocity.
+        noise: Standard deviation of a residual.
+        count: Number of frames.
+
+    Returns:
+        The corrections (count,3) of the angular velocities, rad/s; 0 for a frame with too few residuals.
+    """
+    out = np.zeros((count, 3))
+    frames, starts, sizes = np.unique(frame, return_index=True, return_counts=True)
+    enough = sizes >= _MIN_RATE_POINTS
+    if not enough.any():
+        return out
+    sigma = _RATE_SIGMA
+    solution: FloatArray = np.zeros((len(frames), 9))
+    position = np.repeat(np.arange(len(frames)), sizes)
+    for _ in range(_RATE_FITS):
+        left = residual + np.einsum("mij,mj->mi", jacobian, solution[position])
+        weight = 1.0 / (noise**2 + np.einsum("mi,mi->m", left, left))
+        normal = np.empty((len(frames), 9, 9))
+        right = np.empty((len(frames), 9))
+        for start in range(0, len(frames), _RATE_BATCH_FRAMES):
+            part = slice(start, start + _RATE_BATCH_FRAMES)
+            first, stop = int(starts[part][0]), int(starts[part][-1] + sizes[part][-1])
+            inner = starts[part] - first
+            weighted = jacobian[first:stop] * weight[first:stop, None, None]
+            normal[part] = np.add.reduceat(np.swapaxes(weighted, 1, 2) @ jacobian[first:stop], inner, axis=0)
+            right[part] = np.add.reduceat(
+                np.einsum("mia,mi->ma", weighted, residual[first:stop]), inner, axis=0
+            )
+        prior = np.concatenate([np.full(6, 1e-6 / noise**2), np.full(3, 1.0 / sigma**2)])
+        normal[:, np.arange(9), np.arange(9)] += prior
+        solution = np.asarray(-np.linalg.solve(normal, right[:, :, None])[:, :, 0], dtype=np.float64)
+        size = np.linalg.norm(solution[enough, 6:], axis=1)
+        sigma = float(np.clip(np.median(size), _MIN_RATE_SIGMA, _RATE_SIGMA))
+    out[frames[enough]] = solution[enough, 6:]
+    return out
 
 
 def _projected_or(camera: Camera, x_in_cam: FloatArray, px: FloatArray) -> FloatArray:

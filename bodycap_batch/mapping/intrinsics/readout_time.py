@@ -170,6 +170,26 @@ class RollingShutterModel:
         self.move_keypoints(out, readout_s)
         return out
 
+    def with_fitted_rates(self, readout_s: Mapping[str, float]) -> RollingShutterModel:
+        """Return a copy in which the angular velocities of the keyframes fit their observations.
+
+        Args:
+            readout_s: Readout time (seconds) of each camera, by camera name.
+        """
+        out = copy.copy(self)
+        out._paths = dict(self._paths)
+        for name, path in self._paths.items():
+            own = [item for item in self._keypoints if item.camera == name]
+            if own and readout_s.get(name):
+                frame, points, px = (
+                    np.concatenate([getattr(item, part) for item in own])
+                    for part in ("frame", "points", "px")
+                )
+                out._paths[name] = path.with_fitted_rates(
+                    self._intrinsics[name], frame, points, px, readout_s[name]
+                )
+        return out
+
     def move_keypoints(self, model: pycolmap.Reconstruction, readout_s: Mapping[str, float]) -> None:
         """Move the keypoints in a copy of the model to their positions at the instant of the middle row.
 

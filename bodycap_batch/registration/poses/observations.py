@@ -256,7 +256,8 @@ class FrameBlock:
                 rows = self.member == number
                 own_poses, points = path @ invert(member.cam_from_rig), scene_map.points[self.point[rows]]
                 poses = PosePath.create(own_poses, times_ns, member.rotation)
-                out[rows] = poses.px_at_mid_row(lens, self.frame[rows], points, out[rows], readout_s)
+                seen = lens, self.frame[rows], points, out[rows], readout_s
+                out[rows] = poses.with_fitted_rates(*seen).px_at_mid_row(*seen)
         return out
 
     def count_by_frame(self, selected: BoolArray) -> IntArray:

@@ -149,7 +149,8 @@ def _mid_row_px(scene_map: Map, paths: Mapping[str, Trajectory]) -> FloatArray:
         frame = scene_map.keyframe_frame[scene_map.obs_keyframe[is_own]]
         lens, points = scene_map.cameras[name], scene_map.points[scene_map.obs_point[is_own]]
         poses = PosePath.create(path.gauge_from_cam, path.times_ns)
-        out[is_own] = poses.px_at_mid_row(lens, frame, points, out[is_own], readout_s)
+        seen = lens, frame, points, out[is_own], readout_s
+        out[is_own] = poses.with_fitted_rates(*seen).px_at_mid_row(*seen)
     return out
 
 

@@ -49,7 +49,7 @@ def film(rotation_at: Any, readout_s: float, seed: int = 1) -> FrameMatches:
             rays = np.einsum("mji,mj->mi", rotation_at(frame * FRAME_S + delay), points)
             at = LENS.project(rays)
             delay = (np.nan_to_num(np.clip(at[:, 1] / 480.0, 0, 1), nan=0.5) - 0.5) * readout_s
-        inside = ((at > 0) & (at < (640, 480))).all(axis=1)
+        inside = np.asarray(((at > 0) & (at < (640, 480))).all(axis=1))
         px.append(np.where(inside[:, None], at + rng.normal(0, NOISE_PX, at.shape), np.nan))
     frames, first, second = [], [], []
     for frame in range(FRAMES - 1):

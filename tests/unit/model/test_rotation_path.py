@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
@@ -20,25 +21,27 @@ FRAME_S = 1 / 30
 READOUT_S = 0.02
 TIMES_NS = np.round(np.arange(FRAMES) * FRAME_S * 1e9).astype(np.int64)
 NOISE_PX = 0.2
+SHAKE_RAD = 0.02
 
 
-def poses_at(time_s: FloatArray, sway_m: float = 0.0) -> FloatArray:
-    """A hand thrown about, up to 15° a frame: map_from_cam (N,4,4)."""
-    phase = 2 * np.pi * np.atleast_1d(time_s)
+def poses_at(time_s: npt.ArrayLike, sway_m: float = 0.0, shake_rad: float = 0.0) -> FloatArray:
+    """A hand thrown about, up to 15° a frame, that may shake 11 times a second: map_from_cam (N,4,4)."""
+    phase = 2 * np.pi * np.atleast_1d(np.asarray(time_s, dtype=np.float64))
     turn = [0.5 * np.sin(1.1 * phase), 0.9 * np.sin(1.3 * phase + 1.0), 0.4 * np.cos(0.9 * phase)]
     centre = sway_m * np.stack([np.sin(1.2 * phase), np.cos(phase), np.sin(0.8 * phase)], axis=1)
-    return make_transform(so3_exp(np.stack(turn, axis=1)), centre)
+    shake = shake_rad * np.stack([np.sin(11 * phase), np.sin(13 * phase + 2.0), 0 * phase], axis=1)
+    return make_transform(so3_exp(np.stack(turn, axis=1)) @ so3_exp(shake), centre)
 
 
-def seen(frame: int, points: FloatArray, sway_m: float = 0.0) -> FloatArray:
+def seen(frame: int, points: FloatArray, sway_m: float = 0.0, shake_rad: float = 0.0) -> FloatArray:
     """Pixels (N,2) of points, each where it is when its own row is exposed; NaN outside the image."""
     delay = np.zeros(len(points))
     px = np.full((len(points), 2), np.nan)
     for _ in range(12):
-        cam_from_map = invert(poses_at(frame * FRAME_S + delay, sway_m))
+        cam_from_map = invert(poses_at(frame * FRAME_S + delay, sway_m, shake_rad))
         px = LENS.project(np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points) + cam_from_map[:, :3, 3])
         delay = (np.nan_to_num(np.clip(px[:, 1] / 480.0, 0, 1), nan=0.5) - 0.5) * READOUT_S
-    inside = ((px > 0) & (px < (640, 480))).all(axis=1)
+    inside = np.asarray(((px > 0) & (px < (640, 480))).all(axis=1))
     return np.where(inside[:, None], px, np.nan)
 
 
@@ -184,3 +187,59 @@ def test_columns_are_exposed_one_after_another_in_a_sideways_image() -> None:
     sideways = rotate_to_mid_row(replace(LENS, sideways=True), path, np.ones(2, np.int64), px, READOUT_S)
     assert np.linalg.norm(upright - px, axis=1) == pytest.approx([9.8, 0.0], abs=1.0)
     assert np.linalg.norm(sideways - px, axis=1) == pytest.approx([0.0, 15.5], abs=1.5)
+
+
+def test_the_rows_of_a_frame_tell_a_shake_that_its_neighbours_do_not() -> None:
+    rng = np.random.default_rng(2)
+    points = directions(1500, seed=4) * rng.uniform(1.5, 4.0, (1500, 1))
+    poses = poses_at(np.arange(FRAMES) * FRAME_S, 0.4, SHAKE_RAD)
+    noise = so3_exp(rng.normal(0.0, 0.0008, (FRAMES, 3)))  # 0.3 px
+    measured = poses @ make_transform(noise, np.zeros(3))
+    frames, seen_px, true_px, observed = [], [], [], []
+    for frame in range(FRAMES):
+        px = seen(frame, points, 0.4, SHAKE_RAD)
+        rows = np.flatnonzero(np.isfinite(px).all(axis=1))
+        cam_from_map = invert(poses[frame])
+        frames.append(np.full(len(rows), frame))
+        observed.append(points[rows])
+        seen_px.append(px[rows])
+        true_px.append(LENS.project(points[rows] @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]))
+    at, point, px = np.concatenate(frames), np.concatenate(observed), np.concatenate(seen_px)
+    noisy_px = px + rng.normal(0.0, 0.4, px.shape)
+    noisy_px[::20] += 40.0
+    spline = PosePath.create(measured, TIMES_NS)
+    fitted = spline.with_fitted_rates(LENS, at, point, noisy_px, READOUT_S)
+    error = [
+        np.linalg.norm(path.px_at_mid_row(LENS, at, point, px, READOUT_S) - np.concatenate(true_px), axis=1)
+        for path in (spline, fitted)
+    ]
+    # 0.02 rad · 2π · 11 Hz · 10 ms · 400 px are 5 px at an edge. Some 150 observations of 0.4 px tell the
+    # velocity to 0.1 px there; its change inside the frame remains.
+    assert np.percentile(error[0], 90) > 3.0
+    assert np.percentile(error[1], 90) < 1.0
+
+
+def test_smooth_motion_is_not_disturbed_by_fitted_rates() -> None:
+    rng = np.random.default_rng(2)
+    points = directions(800, seed=4) * rng.uniform(1.5, 4.0, (800, 1))
+    poses = poses_at(np.arange(FRAMES) * FRAME_S, 0.4)
+    px = [seen(frame, points, 0.4) for frame in range(FRAMES)]
+    rows = [np.flatnonzero(np.isfinite(each).all(axis=1)) for each in px]
+    frame = np.concatenate([np.full(len(each), number) for number, each in enumerate(rows)])
+    point = np.concatenate([points[each] for each in rows])
+    noisy_px = np.concatenate([each[at] for each, at in zip(px, rows, strict=True)])
+    noisy_px += rng.normal(0.0, 0.4, noisy_px.shape)
+    path = PosePath.create(poses, TIMES_NS)
+    change = (
+        path.with_fitted_rates(LENS, frame, point, noisy_px, READOUT_S).rotation.rate - path.rotation.rate
+    )
+    # 0.05 rad/s · 10 ms · 400 px: 0.2 px at an edge.
+    assert np.median(np.linalg.norm(change, axis=1)[2:-2]) < 0.05
+
+
+def test_a_frame_with_few_observations_keeps_its_rate() -> None:
+    poses = poses_at(np.arange(FRAMES) * FRAME_S, 0.4)
+    path = PosePath.create(poses, TIMES_NS)
+    points = np.tile([[0.0, 0.0, 3.0]], (5, 1))
+    found = path.with_fitted_rates(LENS, np.full(5, 7), points, np.full((5, 2), 200.0), READOUT_S)
+    assert np.array_equal(found.rotation.rate, path.rotation.rate)
