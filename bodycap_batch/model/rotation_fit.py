@@ -11,7 +11,8 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.frame_matches import FrameMatches
 from bodycap_batch.model.geometry import so3_exp, so3_log
 from bodycap_batch.model.optical_flow import pixel_scale, unit_directions
-from bodycap_batch.model.rotation_path import RotationPath, row_delay_s
+from bodycap_batch.model.rolling_shutter import row_delay
+from bodycap_batch.model.rotation_path import RotationPath
 
 _MATCHES = 64
 """Maximum number of matches of a pair of frames that are used. More matches do not improve a rotation of
@@ -105,7 +106,7 @@ class MatchedRays:
         for each, each_px in zip(rays, px, strict=True):
             padded, delay = np.zeros((*shape, 3)), np.zeros(shape)
             padded[pair, slot] = each[rows[chosen]]
-            delay[pair, slot] = row_delay_s(camera, each_px[rows[chosen]], 1.0)
+            delay[pair, slot] = row_delay(camera, each_px[rows[chosen]])
             out.append((padded, delay))
         noise_px = _NOISE_PX * pixel_scale(camera.width_px, camera.height_px)
         return MatchedRays(out[0][0], out[1][0], out[0][1], out[1][1], used, noise_px / camera.focal_px)

@@ -15,6 +15,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import so3_exp, so3_log
 from bodycap_batch.model.optical_flow import pixel_scale, unit_directions
+from bodycap_batch.model.rolling_shutter import row_delay
 
 _RATE_SIGMA = 2.0
 """Largest expected error of an angular velocity from the spline, rad/s, along each axis. Evidence: none."""
@@ -241,18 +242,6 @@ def near_in_time(times_ns: IntArray) -> BoolArray:
     return np.asarray(interval_ns <= _MAX_GAP_FRAMES * np.median(interval_ns))
 
 
-def row_delay_s(camera: Camera, px: FloatArray, readout_s: float) -> FloatArray:
-    """Return the exposure time (M,) of each pixel minus the frame time, seconds.
-
-    Args:
-        camera: The camera model. If the rows of the sensor are the columns of the image, it says so.
-        px: (M,2) pixels.
-        readout_s: Readout time, seconds.
-    """
-    position = px[:, 0] / camera.width_px if camera.sideways else px[:, 1] / camera.height_px
-    return np.asarray((position - 0.5) * readout_s, dtype=np.float64)
-
-
 def rotate_to_mid_row(
     camera: Camera, path: RotationPath, frame: IntArray, px: FloatArray, readout_s: float
 ) -> FloatArray:
@@ -272,7 +261,7 @@ def rotate_to_mid_row(
     Source: Forssén, Ringaby, "Rectifying rolling shutter video from hand-held devices", CVPR 2010.
     """
     rays = unit_directions(camera.unproject(px))
-    turned = np.einsum("mij,mj->mi", path.frame_from_instant(frame, row_delay_s(camera, px, readout_s)), rays)
+    turned = np.einsum("mij,mj->mi", path.frame_from_instant(frame, row_delay(camera, px) * readout_s), rays)
     return _projected_or(camera, turned, px)
 
 
@@ -370,7 +359,7 @@ class PosePath:
             The moved pixels (M,2). In a frame without a pose, and for a point behind the camera, only the
             rotation is corrected.
         """
-        delay_s = row_delay_s(camera, px, readout_s)
+        delay_s = row_delay(camera, px) * readout_s
         from_instant = self.rotation.frame_from_instant(frame, delay_s)
         shift = self._shift_in_cam(frame, delay_s)
         pose = self.map_from_cam[frame]
@@ -409,7 +398,7 @@ class PosePath:
             used = (x_in_cam[:, 2] > 0.0) & (np.linalg.norm(residual, axis=1) < limit)
         rows = np.flatnonzero(used)
         rows = rows[np.argsort(frame[rows], kind="stable")]
-        delay_s = row_delay_s(camera, px[rows], readout_s)
+        delay_s = row_delay(camera, px[rows]) * readout_s
         leverage_s = self.rotation.rate_leverage_s(frame[rows], delay_s)
         turn = _turn_jacobian(moved[rows])
         move = np.zeros((len(rows), 2, 3))
