@@ -12,6 +12,8 @@ from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.relative_pose import RelativePose
+from bodycap_batch.model.rotation_fit import fit_rotation_path
+from bodycap_batch.model.rotation_path import RotationPath, rotate_to_mid_row
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration
 from bodycap_batch.registration.poses.keyframe_requests import request_keyframes
 from bodycap_batch.registration.poses.misplaced_keyframes import (
@@ -71,11 +73,14 @@ def register_frames(
     points_by_keyframe = select_keyframe_points(scene_map, camera.name)
     tracks = track_all(camera, points_by_keyframe, TrackCache.from_registration(previous), context)
     context.progress(0, 0, "misplaced keyframes")
-    scene_map, tracks, misplaced = _track_without_misplaced(camera, scene_map, tracks, criteria, context)
+    rotation = _rotation_of(camera, scene_map, selection)
+    scene_map, tracks, misplaced = _track_without_misplaced(
+        camera, scene_map, tracks, criteria, context, rotation
+    )
     if selection.frozen.any():
         tracks = tracks.select(~selection.frozen[tracks.frame])
     context.progress(0, 0, "poses")
-    poses = solve_camera(camera, scene_map, tracks, criteria, context.threads)
+    poses = solve_camera(camera, scene_map, tracks, criteria, context.threads, rotation)
     trajectory = smooth_if_final(build_trajectory(camera, scene_map.gauge, poses, selection))
     already_requested = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes
     requested = request_keyframes(trajectory.localised | selection.frozen, selection.sharpness, offered)
@@ -140,21 +145,41 @@ def _track_without_misplaced(
     tracks: Tracks,
     criteria: AcceptanceCriteria,
     context: StageContext,
+    rotation: RotationPath | None,
 ) -> tuple[Map, Tracks, IntArray]:
     """Remove misregistered keyframes, and track the frames around them from the remaining keyframes.
+
+    If the rotation of a camera with a rolling shutter is known, the tracks are compared with the map at the
+    instants of the middle rows.
 
     Returns:
         The map without the misregistered keyframes, the tracks, and the frame indices of the removed
         keyframes.
     """
     nothing = np.zeros(0, np.int64)
-    misplaced = find_misplaced_keyframes(camera.name, scene_map, tracks, criteria)
+    compared = tracks
+    if rotation is not None:
+        lens, readout_s = scene_map.cameras[camera.name], scene_map.readout_s[camera.name]
+        px = rotate_to_mid_row(lens, rotation, tracks.frame, tracks.px.astype(np.float64), readout_s)
+        compared = replace(tracks, px=px.astype(np.float32))
+    misplaced = find_misplaced_keyframes(camera.name, scene_map, compared, criteria)
     if len(misplaced) == 0:
         return scene_map, tracks, nothing
     cache = TrackCache(tracks, sorted(select_keyframe_points(scene_map, camera.name)))
     remaining = map_without_keyframes(scene_map, misplaced)
     tracks = track_all(camera, select_keyframe_points(remaining, camera.name), cache, context)
     return remaining, tracks, scene_map.keyframe_frame[misplaced]
+
+
+def _rotation_of(camera: CaptureCamera, scene_map: Map, selection: KeyframeSelection) -> RotationPath | None:
+    """Return the rotation of a camera with a rolling shutter over time, from matches of adjacent frames.
+
+    The result is None for a camera with a global shutter, and if there are no matches.
+    """
+    readout_s = scene_map.readout_s.get(camera.name, 0.0)
+    if not readout_s or selection.matches is None:
+        return None
+    return fit_rotation_path(selection.matches, scene_map.cameras[camera.name], camera.times_ns, readout_s)
 
 
 def _offered_keyframes(selection: KeyframeSelection, previous: Registration | None) -> IntArray:
