@@ -71,6 +71,9 @@ _SCATTER_FLOOR_S = 0.0003
 _SLOW_S = 0.0003
 """Standard deviation, seconds, of the change of the way of sound from the start to the end of a recording.
 Evidence: docs/decisions/clocks.md."""
+_FINE_UP_TO_S = 60.0
+"""Maximum duration of the shorter sound, seconds, with which many short windows are examined, too. Longer
+sound has enough windows of the usual duration. Evidence: docs/decisions/clocks.md."""
 _CURVE_S = 0.03
 """Lag, seconds, before and after the peak, in the curve for the picture."""
 
@@ -213,7 +216,7 @@ def _measure(first: SoundTrack, second: SoundTrack, limits: tuple[float, float] 
                     examined.append(_examine(first, second, *searched[-1], _FEW_WINDOWS))
         if examined:
             outcome = _decide(first, second, examined)
-        if examined and not outcome.accepted:
+        if examined and not outcome.accepted and first.end_s - first.start_s <= _FINE_UP_TO_S:
             # The second examination counts as twice the number of lags.
             finer = [
                 _examine(first, second, start_s, peak, 2 * lags, _MAX_WINDOWS)

@@ -95,9 +95,7 @@ class Flow:
         self.runner.expect_frames(int(summary["frames"]), int(summary.get("large_frames", 0)))
         self.runner.report_notes(artefact, "check")
         if len(self._capture.cameras) > 1:
-            self._sound = self.runner.start(
-                make_task(SOUND, SoundTask(capture=capture_ref(self._capture, self._cameras)))
-            )
+            self._sound = self._start_sound()
         if self._capture.start_s is not None or self._capture.end_s is not None:
             self._apply_sound_offsets()
 
@@ -315,6 +313,15 @@ class Flow:
         digests = self._settings.store.digests
         task = report_task(self._job, results, self._cameras, digests, failure)
         return self.runner.run(make_task(REPORT, task))
+
+    def _start_sound(self) -> Future[Artefact]:
+        """Compare the sound of the cameras, beside the keyframes if there are threads for both."""
+        task = make_task(SOUND, SoundTask(capture=capture_ref(self._capture, self._cameras)))
+        if self._threads > 1:
+            return self.runner.start(task)
+        done = Future[Artefact]()
+        done.set_result(self.runner.run(task))
+        return done
 
     def _apply_sound_offsets(self) -> None:
         """Select the frames between start_s and end_s with the clocks that the sound determines.

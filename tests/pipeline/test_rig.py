@@ -26,7 +26,7 @@ def _run(folder: Path, rig: str) -> tuple[list[dict[str, str]], dict[str, Any], 
     """Frames, metrics and score of a job without a body."""
     cameras = [{"name": name, "video": f"{name}.mp4"} for name in ("torso", "torso_2")]
     job = {
-        "capture": {"cameras": cameras, "calibration": "calib.json", "rig": rig},
+        "capture": {"cameras": cameras, "calibration": "calib.json", "clocks": "common", "rig": rig},
         "skeleton": "none",
         "export": {"preview": False},
     }

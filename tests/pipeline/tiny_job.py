@@ -115,7 +115,8 @@ class Place:
 
     def manifests(self) -> list[Path]:
         """Of all artefacts but the rendered capture, which came from outside."""
-        return sorted(self.store.glob("artefacts/[!s]*/*/manifest.json"))
+        found = self.store.glob("artefacts/*/*/manifest.json")
+        return sorted(path for path in found if path.parts[-3] != "synth")
 
     def leftovers(self) -> list[str]:
         """What only a crash leaves behind."""

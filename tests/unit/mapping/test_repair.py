@@ -226,7 +226,7 @@ def test_a_further_model_without_points_is_dropped(
     empty = copy.deepcopy(model)
     for point in list(empty.point3D_ids()):
         empty.delete_point3D(point)
-    monkeypatch.setattr(results, "common_times_ns", lambda _: {"cam": np.arange(99) * 10**9})
+    monkeypatch.setattr(results, "frame_times_ns", lambda _: {"cam": np.arange(99) * 10**9})
     models = [copy.deepcopy(model), empty]
     finalise_models(models, mapping, cast(Capture, None), [None, None])
     assert [item.num_reg_images() for item in models] == [_KEYFRAMES]
