@@ -185,11 +185,12 @@ def fit_to_rays(
         times_ns: (N,) frame times, nanoseconds.
         readout_s: Readout time, seconds.
         start: The path for a similar readout time. None: it is unknown.
-        with_rates: True to estimate the angular velocities of frames from their matches, too.
+        with_rates: True to estimate the angular velocities of frames from their matches, too. False: they are
+            those of the smoothest path through the orientations, without a bias towards small velocities.
     """
     if start is None:
         step, known = _first_rotations(rays)
-        path = RotationPath.from_steps(times_ns, step, known)
+        path = RotationPath.from_steps(times_ns, step, known, shrunk=with_rates)
     else:
         path = start
     for _ in range(_SPLINE_ROUNDS):
@@ -197,7 +198,7 @@ def fit_to_rays(
         first, second = rays.at_mid_row(path, readout_s)
         step, inlier = _refine_rotations(before, first, second, rays)
         known = _is_known(inlier, rays)
-        path = RotationPath.from_steps(times_ns, step, known)
+        path = RotationPath.from_steps(times_ns, step, known, shrunk=with_rates)
         change = np.linalg.norm((step - before)[known], axis=(1, 2))
         if readout_s == 0.0 or change.max(initial=0.0) < _CONVERGED_RAD:
             break

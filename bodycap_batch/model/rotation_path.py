@@ -37,6 +37,10 @@ _RATE_BATCH_FRAMES = 64
 _NOISE_FROM_QUARTILE = 1.57
 """Ratio of the root mean square length of a normally distributed vector in three dimensions to the first
 quartile of its length: sqrt(3 / 1.213). The first quartile of the squared length is 1.213 variances."""
+_ROW_ROUNDS = 4
+"""Number of times that the row in which a point is exposed is computed again. Origin: a camera that turns by
+50 degrees a frame moves a point by the height of a picture in one frame interval; with a readout of half an
+interval, each round at least halves the error."""
 _MAX_GAP_FRAMES = 3.0
 """Maximum time between two adjacent frames of one segment of the path, in median frame intervals. Over a
 longer time, the rotation between the frames is not smooth enough. Evidence:
@@ -64,7 +68,12 @@ class RotationPath:
 
     @staticmethod
     def from_steps(
-        times_ns: IntArray, step: FloatArray, known: BoolArray, rate: FloatArray | None = None
+        times_ns: IntArray,
+        step: FloatArray,
+        known: BoolArray,
+        rate: FloatArray | None = None,
+        *,
+        shrunk: bool = True,
     ) -> RotationPath:
         """Return the path with given rotations between adjacent frames.
 
@@ -74,6 +83,8 @@ class RotationPath:
             known: (N-1,) True if the rotation is known.
             rate: (N,3) angular velocity of each frame, in the camera frame, rad/s. None: the velocity of the
                 smoothest path through the orientations; zero for a frame that is alone in its segment.
+            shrunk: True to shrink the velocity of the smoothest path towards a mean velocity where it differs
+                by noise. That is more exact for each frame, but the velocities are too small on average.
         """
         segment = np.concatenate([[0], np.cumsum(~(known & near_in_time(times_ns)))])[: len(times_ns)]
         rotation = np.tile(np.eye(3), (len(times_ns), 1, 1))
@@ -81,6 +92,8 @@ class RotationPath:
             rotation[later] = rotation[later - 1] @ step[later - 1].T
         if rate is None:
             rate = _spline_rates(times_ns, rotation, segment)
+            if shrunk:
+                rate = _without_noise(rate, _mean_rates(times_ns, rotation, segment))
         return RotationPath(times_ns, rotation, segment, rate)
 
     def steps(self) -> tuple[FloatArray, BoolArray]:
@@ -110,6 +123,17 @@ class RotationPath:
         """Return the rates (N,3); for frames that are alone in their segments, the rates `other`."""
         size = np.bincount(self.segment)[self.segment]
         return np.where((size > 1)[:, None], self.rate, other)
+
+    def is_known(self, frame: int) -> bool:
+        """Return True if the rotation between a frame and a frame beside it is known."""
+        near = self.segment[max(0, frame - 1) : frame + 2] == self.segment[frame]
+        return bool(near.sum() > 1)
+
+    def turn(self, earlier: int, later: int) -> FloatArray | None:
+        """Return the rotation (3,3) later_from_earlier between two frames; None if it is unknown."""
+        if self.segment[earlier] != self.segment[later]:
+            return None
+        return np.asarray(self.rotation[later].T @ self.rotation[earlier])
 
     def frame_from_instant(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
         """Return the rotations (M,3,3) from the camera at some instants to the camera at the frame times.
@@ -178,7 +202,7 @@ def _spline_rates(times_ns: IntArray, rotation: FloatArray, segment: IntArray) -
             # The spline has no acceleration at its ends. The velocity is extrapolated from two steps instead.
             for end, inwards in ((first, 1), (stop - 1, -1)):
                 rate[end] = _end_rate(times_ns, rotation, np.arange(3) * inwards + end)
-    return _without_noise(rate, _mean_rates(times_ns, rotation, segment))
+    return rate
 
 
 def _end_rate(times_ns: IntArray, rotation: FloatArray, frames: IntArray) -> FloatArray:
@@ -282,6 +306,19 @@ class TurningShutter:
     def px_at_mid_row(self, frame: IntArray, px: FloatArray) -> FloatArray:
         """Return where pixels (M,2) in frames (M,) would be at the instant of the middle row."""
         return rotate_to_mid_row(self.camera, self.path, frame, px, self.readout_s)
+
+    def px_in_picture(self, frame: IntArray, px: FloatArray) -> FloatArray:
+        """Return where points are seen in frames (M,), for their pixels (M,2) at the middle row's instant.
+
+        The instant at which a point is exposed depends on where it is seen, so this is repeated.
+        """
+        rays = unit_directions(self.camera.unproject(px))
+        seen = px
+        for _ in range(_ROW_ROUNDS):
+            delay_s = row_delay(self.camera, seen) * self.readout_s
+            turned = np.einsum("mji,mj->mi", self.path.frame_from_instant(frame, delay_s), rays)
+            seen = _projected_or(self.camera, turned, px)
+        return seen
 
 
 @dataclass(frozen=True, slots=True)

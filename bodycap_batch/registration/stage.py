@@ -12,8 +12,7 @@ from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.relative_pose import RelativePose
-from bodycap_batch.model.rotation_fit import fit_rotation_path
-from bodycap_batch.model.rotation_path import RotationPath, rotate_to_mid_row
+from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration
 from bodycap_batch.registration.poses.keyframe_requests import request_keyframes
 from bodycap_batch.registration.poses.misplaced_keyframes import (
@@ -33,6 +32,7 @@ from bodycap_batch.registration.poses.trajectory import (
     solve_camera,
     solve_rig,
 )
+from bodycap_batch.registration.poses.turning_tracks import rotation_from_matches, turn_tracks
 from bodycap_batch.registration.recovery.path_smoothing import smooth_if_final
 from bodycap_batch.registration.tracking.frame_ranges import TrackCache, track_all
 from bodycap_batch.registration.tracking.klt import Tracks, select_keyframe_points
@@ -73,7 +73,7 @@ def register_frames(
     points_by_keyframe = select_keyframe_points(scene_map, camera.name)
     tracks = track_all(camera, points_by_keyframe, TrackCache.from_registration(previous), context)
     context.progress(0, 0, "misplaced keyframes")
-    rotation = _rotation_of(camera, scene_map, selection)
+    rotation = rotation_from_matches(camera, scene_map, selection)
     scene_map, tracks, misplaced = _track_without_misplaced(
         camera, scene_map, tracks, criteria, context, rotation
     )
@@ -131,7 +131,8 @@ def register_in_rig(
         return own.registration, relative_poses
     criteria = acceptance_criteria(own.camera, selection, options)
     for member in members:
-        misplaced = find_misplaced_keyframes(member.camera.name, scene_map, member.tracks, criteria)
+        turned = turn_tracks(member.camera.name, scene_map, member.tracks, member.rotation)
+        misplaced = find_misplaced_keyframes(member.camera.name, scene_map, turned, criteria)
         scene_map = map_without_keyframes(scene_map, misplaced)
     start = initial_rig_poses(own, others, members)
     poses = solve_rig(members, scene_map, start, criteria, threads)
@@ -157,29 +158,14 @@ def _track_without_misplaced(
         keyframes.
     """
     nothing = np.zeros(0, np.int64)
-    compared = tracks
-    if rotation is not None:
-        lens, readout_s = scene_map.cameras[camera.name], scene_map.readout_s[camera.name]
-        px = rotate_to_mid_row(lens, rotation, tracks.frame, tracks.px.astype(np.float64), readout_s)
-        compared = replace(tracks, px=px.astype(np.float32))
-    misplaced = find_misplaced_keyframes(camera.name, scene_map, compared, criteria)
+    turned = turn_tracks(camera.name, scene_map, tracks, rotation)
+    misplaced = find_misplaced_keyframes(camera.name, scene_map, turned, criteria)
     if len(misplaced) == 0:
         return scene_map, tracks, nothing
     cache = TrackCache(tracks, sorted(select_keyframe_points(scene_map, camera.name)))
     remaining = map_without_keyframes(scene_map, misplaced)
     tracks = track_all(camera, select_keyframe_points(remaining, camera.name), cache, context)
     return remaining, tracks, scene_map.keyframe_frame[misplaced]
-
-
-def _rotation_of(camera: CaptureCamera, scene_map: Map, selection: KeyframeSelection) -> RotationPath | None:
-    """Return the rotation of a camera with a rolling shutter over time, from matches of adjacent frames.
-
-    The result is None for a camera with a global shutter, and if there are no matches.
-    """
-    readout_s = scene_map.readout_s.get(camera.name, 0.0)
-    if not readout_s or selection.matches is None:
-        return None
-    return fit_rotation_path(selection.matches, scene_map.cameras[camera.name], camera.times_ns, readout_s)
 
 
 def _offered_keyframes(selection: KeyframeSelection, previous: Registration | None) -> IntArray:

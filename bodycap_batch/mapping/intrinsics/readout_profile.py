@@ -55,6 +55,9 @@ much better than none. Evidence: none."""
 _FLOOR_SIGMA_S = 0.0002
 """Standard deviation that is added to each estimate, seconds, because the model has no translation. Evidence:
 none."""
+_MODEL_SIGMA_RATIO = 0.04
+"""Standard deviation that is added to each estimate, as a ratio of the readout time. A hand shakes faster
+than the spline through the orientations of the frames follows. Evidence: docs/decisions/mapping.md."""
 
 
 @dataclass(slots=True)
@@ -227,7 +230,7 @@ def _estimate(profiles: Sequence[_Profile]) -> _Estimate:
     grid = [centre - step_s, centre, centre + step_s]
     costs = [np.stack([item.pair_costs(value) for value in grid]) for item in profiles]
     sigma_s = _standard_deviation(costs, [item.speeds() for item in profiles], step_s)
-    return _Estimate(best, sigma_s, cost(centre))
+    return _Estimate(best, float(np.hypot(sigma_s, _MODEL_SIGMA_RATIO * best)), cost(centre))
 
 
 def _bracketed_minimum(cost: Callable[[float], float], limit_s: float) -> float:

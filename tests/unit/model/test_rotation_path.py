@@ -13,7 +13,7 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.frame_matches import FrameMatches
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp, so3_log
 from bodycap_batch.model.rotation_fit import fit_rotation_path
-from bodycap_batch.model.rotation_path import PosePath, RotationPath, rotate_to_mid_row
+from bodycap_batch.model.rotation_path import PosePath, RotationPath, TurningShutter, rotate_to_mid_row
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
 FRAMES = 40
@@ -243,3 +243,25 @@ def test_a_frame_with_few_observations_keeps_its_rate() -> None:
     points = np.tile([[0.0, 0.0, 3.0]], (5, 1))
     found = path.with_fitted_rates(LENS, np.full(5, 7), points, np.full((5, 2), 200.0), READOUT_S)
     assert np.array_equal(found.rotation.rate, path.rotation.rate)
+
+
+def test_a_turned_pixel_is_found_again_in_the_picture() -> None:
+    points = 100.0 * directions(1500)
+    path = fit_rotation_path(matches_of(points), LENS, TIMES_NS, READOUT_S)
+    shutter = TurningShutter(LENS, path, READOUT_S)
+    frame = np.repeat(np.arange(FRAMES), 40)
+    px = np.random.default_rng(6).uniform((40, 40), (600, 440), (len(frame), 2))
+    back = shutter.px_in_picture(frame, shutter.px_at_mid_row(frame, px))
+    # A turn of 15 degrees a frame moves edge rows by 30 px. After four rounds the row is known to a tenth.
+    assert np.abs(back - px).max() < 0.2
+
+
+def test_the_turn_between_two_frames_is_known_only_within_a_segment() -> None:
+    path = fit_rotation_path(matches_of(100.0 * directions(1500), lost=19), LENS, TIMES_NS, READOUT_S)
+    turn = path.turn(4, 5)
+    assert turn is not None
+    true = poses_at(np.array([4, 5]) * FRAME_S)[:, :3, :3]
+    assert np.linalg.norm(so3_log(turn @ true[0].T @ true[1])) < 0.01
+    assert path.turn(19, 20) is None
+    assert path.is_known(19)
+    assert path.is_known(20)
