@@ -101,11 +101,12 @@ class RotationPath:
         step = np.swapaxes(self.rotation[1:], 1, 2) @ self.rotation[:-1]
         return step, np.asarray(np.diff(self.segment) == 0)
 
-    def with_poses(self, map_from_cam: FloatArray) -> RotationPath:
+    def with_poses(self, map_from_cam: FloatArray, *, shrunk: bool = True) -> RotationPath:
         """Return the path in which poses replace the rotations between those adjacent frames that have poses.
 
         Args:
             map_from_cam: (N,4,4) poses of the frames; NaN for a frame without a pose.
+            shrunk: The same as for `from_steps`.
         """
         step, known = self.steps()
         has_pose = np.asarray(np.isfinite(map_from_cam).all(axis=(1, 2)))
@@ -114,7 +115,7 @@ class RotationPath:
             return self
         rotation = map_from_cam[:, :3, :3]
         step[both] = np.swapaxes(rotation[1:], 1, 2)[both] @ rotation[:-1][both]
-        posed = RotationPath.from_steps(self.times_ns, step, known | both)
+        posed = RotationPath.from_steps(self.times_ns, step, known | both, shrunk=shrunk)
         # Without a neighbour with a pose on each side, poses do not tell the rate better than the matches.
         beside = np.concatenate([[False], both]) & np.concatenate([both, [False]])
         return replace(posed, rate=np.where(beside[:, None], posed.rate, self._rate_or(posed.rate)))
@@ -342,7 +343,11 @@ class PosePath:
 
     @staticmethod
     def create(
-        map_from_cam: FloatArray, times_ns: IntArray, rotation: RotationPath | None = None
+        map_from_cam: FloatArray,
+        times_ns: IntArray,
+        rotation: RotationPath | None = None,
+        *,
+        shrunk: bool = True,
     ) -> PosePath:
         """Return the path through poses.
 
@@ -350,6 +355,7 @@ class PosePath:
             map_from_cam: (N,4,4) poses of the frames; NaN for a frame without a pose.
             times_ns: (N,) frame times, nanoseconds.
             rotation: The rotation between frames without poses; None if it is unknown.
+            shrunk: The same as for `RotationPath.from_steps`.
         """
         count = len(times_ns)
         if rotation is None:
@@ -378,7 +384,9 @@ class PosePath:
             )
             acceleration = np.where(inner, bend, np.where(np.isfinite(after), ahead, behind))
             acceleration[~np.isfinite(after) & ~np.isfinite(before)] = 0.0
-        return PosePath(map_from_cam, rotation.with_poses(map_from_cam), velocity, acceleration)
+        return PosePath(
+            map_from_cam, rotation.with_poses(map_from_cam, shrunk=shrunk), velocity, acceleration
+        )
 
     def px_at_mid_row(
         self, camera: Camera, frame: IntArray, points: FloatArray, px: FloatArray, readout_s: float

@@ -44,20 +44,27 @@ _BLOCK_FRAMES = 15
 standard deviation is estimated. Evidence: none."""
 _MIN_BLOCKS = 4
 """Minimum number of blocks for a standard deviation. Evidence: none."""
-_MIN_READOUT_S = 0.002
-"""Minimum readout time (seconds) of a rolling shutter. A shutter with a smaller estimate is treated as
-global."""
+_MIN_READOUT_S = 0.001
+"""Minimum estimated readout time (seconds) of a rolling shutter. A shorter one moves no pixel by much.
+Evidence: none."""
+_MAX_GLOBAL_S = 0.002
+"""A shutter is treated as global if its readout time is shorter than this value (seconds) with 95 %
+probability. Evidence: none."""
 _MIN_SIGMAS = 3.0
-"""Minimum ratio of a readout time to its standard deviation. Evidence: none."""
-_MAX_SIGMA_S = 0.003
-"""Maximum standard deviation of a determined readout time, seconds. A correction with a larger error is not
-much better than none. Evidence: none."""
+"""Minimum ratio of a readout time to its standard deviation. Origin: the correction then removes at least two
+thirds of the displacements."""
+_MAX_SIGMA_S = 0.004
+"""Maximum standard deviation of a determined readout time, seconds. Evidence: none."""
 _FLOOR_SIGMA_S = 0.0002
 """Standard deviation that is added to each estimate, seconds, because the model has no translation. Evidence:
 none."""
-_MODEL_SIGMA_RATIO = 0.04
+_MODEL_SIGMA_RATIO = 0.025
 """Standard deviation that is added to each estimate, as a ratio of the readout time. A hand shakes faster
 than the spline through the orientations of the frames follows. Evidence: docs/decisions/mapping.md."""
+_PARALLAX_COST_RATIO = 0.0016
+"""Change of the cost, as a ratio of the least cost, at one standard deviation of the readout time. What
+remains of the deviations is mostly parallax, and a small part of it looks like a rolling shutter. Evidence:
+docs/decisions/mapping.md."""
 
 
 @dataclass(slots=True)
@@ -230,7 +237,8 @@ def _estimate(profiles: Sequence[_Profile]) -> _Estimate:
     grid = [centre - step_s, centre, centre + step_s]
     costs = [np.stack([item.pair_costs(value) for value in grid]) for item in profiles]
     sigma_s = _standard_deviation(costs, [item.speeds() for item in profiles], step_s)
-    return _Estimate(best, float(np.hypot(sigma_s, _MODEL_SIGMA_RATIO * best)), cost(centre))
+    sigma_s = float(np.hypot(sigma_s, _MODEL_SIGMA_RATIO * best)) if abs(best) <= limit_s else float("inf")
+    return _Estimate(best, sigma_s, cost(centre))
 
 
 def _bracketed_minimum(cost: Callable[[float], float], limit_s: float) -> float:
@@ -261,6 +269,7 @@ def _parabola_minimum(costs: FloatArray) -> float:
 def _standard_deviation(costs: Sequence[FloatArray], speeds: Sequence[FloatArray], step_s: float) -> float:
     """Return the standard deviation of a readout time, seconds; infinity if it is not determined.
 
+    It has a part from the scatter of the data, and a part from the parallax, which the model does not have.
     Blocks of successive frames are left out one after another (jackknife). The slower and the faster half of
     the pairs must agree, too: otherwise their difference is the standard deviation.
 
@@ -269,6 +278,9 @@ def _standard_deviation(costs: Sequence[FloatArray], speeds: Sequence[FloatArray
         speeds: (P,) speed of the picture in each pair of frames of each camera.
         step_s: The step, seconds.
     """
+    from scipy.stats import norm
+    from scipy.stats import t as student_t
+
     total = np.sum([each.sum(axis=1) for each in costs], axis=0)
     blocks = [
         each[:, start : start + _BLOCK_FRAMES].sum(axis=1)
@@ -278,7 +290,10 @@ def _standard_deviation(costs: Sequence[FloatArray], speeds: Sequence[FloatArray
     if len(blocks) < _MIN_BLOCKS or total[0] - 2.0 * total[1] + total[2] <= 0.0:
         return float("inf")
     without = np.array([_newton_step(total - block) for block in blocks])
-    variance = (len(blocks) - 1) / len(blocks) * ((without - without.mean()) ** 2).sum()
+    # Few blocks often have similar estimates by chance.
+    few = student_t.ppf(0.975, len(blocks) - 1) / norm.ppf(0.975)
+    variance = few**2 * (len(blocks) - 1) / len(blocks) * ((without - without.mean()) ** 2).sum()
+    variance += 2.0 * _PARALLAX_COST_RATIO * total[1] / (total[0] - 2.0 * total[1] + total[2])
     every, speed = np.concatenate(list(costs), axis=1), np.concatenate(list(speeds))
     fast: BoolArray = np.asarray(speed > np.median(speed))
     halves = [_half(every[:, part]) for part in (fast, ~fast)]
@@ -307,9 +322,8 @@ def _half(costs: FloatArray) -> tuple[float, float]:
 def _readout(estimate: _Estimate, *, sideways: bool) -> Readout:
     """Return the readout time, or 0 with the reason why it is not used."""
     best_s, sigma_s = estimate.seconds, estimate.sigma_s
-    if abs(best_s) < _MIN_READOUT_S:
+    if sigma_s <= _MAX_SIGMA_S and abs(best_s) >= max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s):
+        return Readout(best_s, sigma_s, "estimated", best_s, sideways)
+    if abs(best_s) + 2.0 * sigma_s < _MAX_GLOBAL_S:
         return Readout(0.0, sigma_s, "none found", best_s)
-    if sigma_s > _MAX_SIGMA_S or abs(best_s) < _MIN_SIGMAS * sigma_s:
-        reason = "not determined: the camera turns too evenly, or too little"
-        return Readout(0.0, sigma_s, reason, best_s)
-    return Readout(best_s, sigma_s, "estimated", best_s, sideways)
+    return Readout(0.0, sigma_s, "not determined: the camera turns too evenly, or too little", best_s)

@@ -49,6 +49,13 @@ not significant and the shutter is treated as global. Evidence: none."""
 _MAX_DIFFERENCE_S = 0.003
 """Maximum difference of the readout times from residuals and from matches, seconds. With a larger difference,
 the residuals are not used. Evidence: none."""
+_MODEL_SIGMA_RATIO = 0.025
+"""Standard deviation that is added to each estimate that starts from matches, as a ratio of the readout time.
+A hand shakes faster than the spline through the poses of the frames follows. Evidence:
+docs/decisions/mapping.md."""
+_MAX_POOLED_SIGMAS = 3.0
+"""Maximum deviation of the readout time of a camera from the mean of equal cameras, in its standard
+deviations. With a larger deviation, the cameras do not share the mean. Evidence: none."""
 _BLOCKS = 8
 """Number of blocks of successive keyframes from which a standard deviation is estimated. Evidence: none."""
 _FLOOR_SIGMA_S = 0.0001
@@ -80,6 +87,27 @@ class Readout:
     best_s: float
     sideways: bool = False
 
+    def pooled(self, others: Sequence[Readout]) -> Readout:
+        """Return the readout time with the common best value of equal cameras, if all of them agree with it.
+
+        Args:
+            others: The readout times of all equal cameras, this one included.
+
+        Source: Birge, "The calculation of errors by the method of least squares", 1932, for the standard
+            deviation of a mean of values that scatter more than their standard deviations.
+        """
+        value = np.array([item.best_s for item in others])
+        sigma = np.hypot([item.sigma_s for item in others], _MODEL_SIGMA_RATIO * np.abs(value))
+        if len(others) < 2 or not np.isfinite(sigma).all() or not sigma.all():
+            return self
+        weight = 1.0 / sigma**2
+        mean = float((weight * value).sum() / weight.sum())
+        deviation = (value - mean) / sigma
+        if np.abs(deviation).max() > _MAX_POOLED_SIGMAS:
+            return self
+        scatter = max(1.0, float((deviation**2).sum()) / (len(others) - 1))
+        return replace(self, best_s=mean, sigma_s=float(np.sqrt(scatter / weight.sum())))
+
     def with_other_estimate(self, other_s: float) -> Readout:
         """Return the readout time with a standard deviation that covers the difference to another estimate.
 
@@ -92,7 +120,8 @@ class Readout:
         difference_s = abs(self.best_s - other_s)
         if difference_s > _MAX_DIFFERENCE_S:
             return replace(self, seconds=other_s, sigma_s=difference_s, source="estimated", best_s=other_s)
-        sigma_s = float(np.hypot(self.sigma_s, 0.5 * difference_s))
+        model_s = _MODEL_SIGMA_RATIO * abs(self.best_s)
+        sigma_s = float(np.sqrt(self.sigma_s**2 + (0.5 * difference_s) ** 2 + model_s**2))
         return replace(self, seconds=self.best_s, sigma_s=sigma_s, source="estimated")
 
     @property
@@ -146,7 +175,8 @@ class RollingShutterModel:
         self._model = model
         self._detected_px = detected_px or {}
         self._paths = {
-            name: PosePath.create(path.gauge_from_cam, path.times_ns) for name, path in trajectories.items()
+            name: PosePath.create(path.gauge_from_cam, path.times_ns, shrunk=False)
+            for name, path in trajectories.items()
         }
         self._trajectories = trajectories
         self._cameras = cameras
@@ -178,7 +208,8 @@ class RollingShutterModel:
         """
         out = copy.copy(self)
         out._paths = dict(self._paths)
-        for name, path in self._paths.items():
+        for name, trajectory in self._trajectories.items():
+            path = PosePath.create(trajectory.gauge_from_cam, trajectory.times_ns)
             own = [item for item in self._keypoints if item.camera == name]
             if own and readout_s.get(name):
                 frame, points, px = (
@@ -304,9 +335,13 @@ class RollingShutterModel:
             if max(map(abs, step_s.values())) < _CONVERGED_S:
                 break
             before = after
-        for name in start_s or {}:
-            if name in unknown:
-                out[name] = out[name].with_other_estimate((start_s or {})[name])
+        start_s = {name: value for name, value in (start_s or {}).items() if name in unknown}
+        # Equal cameras start from the same value, which was estimated from the matches of all of them.
+        equal = {
+            name: [out[other] for other in start_s if start_s[other] == start_s[name]] for name in start_s
+        }
+        for name, value in start_s.items():
+            out[name] = out[name].pooled(equal[name]).with_other_estimate(value)
         return out
 
     def undetermined(self, reason: str) -> dict[str, Readout]:

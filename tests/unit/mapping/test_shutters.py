@@ -215,3 +215,27 @@ def test_a_matcher_that_is_not_enabled_finds_nothing() -> None:
     matcher.add(0, make_coarse_image(_picture(0)))
     matcher.add(1, make_coarse_image(_picture(1)))
     assert matcher.matches() is None
+
+
+def _estimate(best_s: float, sigma_s: float) -> Readout:
+    return Readout(best_s, sigma_s, "estimated", best_s)
+
+
+def test_equal_cameras_that_agree_share_the_mean_of_their_readouts() -> None:
+    equal = [_estimate(0.0247, 0.0002), _estimate(0.0257, 0.0006), _estimate(0.0245, 0.0001)]
+    shared = [item.pooled(equal) for item in equal]
+    assert len({item.best_s for item in shared}) == 1
+    assert shared[0].best_s == pytest.approx(0.0249, abs=0.0002)
+    # The residuals scatter less than the spline between poses is wrong: 2.5 % for each of three cameras.
+    assert shared[0].sigma_s > 0.0003
+
+
+def test_equal_cameras_that_contradict_each_other_keep_their_readouts() -> None:
+    equal = [_estimate(0.010, 0.0002), _estimate(0.020, 0.0002)]
+    assert [item.pooled(equal).best_s for item in equal] == [0.010, 0.020]
+    assert equal[0].pooled(equal[:1]) == equal[0]
+
+
+def test_a_readout_from_residuals_has_the_uncertainty_of_the_model() -> None:
+    found = _estimate(0.024, 0.0001).with_other_estimate(0.024)
+    assert 0.0005 < found.sigma_s < 0.0008

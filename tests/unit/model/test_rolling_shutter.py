@@ -362,6 +362,11 @@ def test_a_rolling_shutter_shows_in_the_residuals(readout_s: float, shows: bool,
     assert not shows or 0.001 < apparent_s < 0.021
 
 
+def test_no_observations_tell_no_readout() -> None:
+    none = np.zeros((0, 2))
+    assert estimate_residual_readout(LENS, np.zeros(0, np.int64), none, none, none) == (0.0, float("inf"))
+
+
 @pytest.mark.parametrize(
     ("film", "either_way", "shows"),
     [
