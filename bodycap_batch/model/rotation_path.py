@@ -37,6 +37,9 @@ _RATE_BATCH_FRAMES = 64
 _NOISE_FROM_QUARTILE = 1.57
 """Ratio of the root mean square length of a normally distributed vector in three dimensions to the first
 quartile of its length: sqrt(3 / 1.213). The first quartile of the squared length is 1.213 variances."""
+_EXTRAPOLATION_RATIO = 0.5
+"""Expected error of an extrapolated angular velocity, as a ratio of the largest velocity around the frame.
+Evidence: docs/decisions/registration.md."""
 _ROW_ROUNDS = 4
 """Number of times that the row in which a point is exposed is computed again. Origin: a camera that turns by
 50 degrees a frame moves a point by the height of a picture in one frame interval; with a readout of half an
@@ -129,6 +132,19 @@ class RotationPath:
         """Return True if the rotation between a frame and a frame beside it is known."""
         near = self.segment[max(0, frame - 1) : frame + 2] == self.segment[frame]
         return bool(near.sum() > 1)
+
+    def row_uncertainty(self, frame: int, readout_s: float) -> float:
+        """Return the expected error (radians) of the turn from the middle row of a frame to its other rows.
+
+        It is the root mean square over the rows. It is 0 if the rotations to both adjacent frames are known.
+        Otherwise the angular velocity is extrapolated, and its error is a part of the velocities around the
+        frame.
+        """
+        around = slice(max(0, frame - 1), frame + 2)
+        if len(self.times_ns[around]) == 3 and (self.segment[around] == self.segment[frame]).all():
+            return 0.0
+        rate = float(np.linalg.norm(self.rate[around], axis=1).max())
+        return float(_EXTRAPOLATION_RATIO * rate * abs(readout_s) / np.sqrt(12.0))
 
     def turn(self, earlier: int, later: int) -> FloatArray | None:
         """Return the rotation (3,3) later_from_earlier between two frames; None if it is unknown."""
@@ -307,6 +323,10 @@ class TurningShutter:
     def px_at_mid_row(self, frame: IntArray, px: FloatArray) -> FloatArray:
         """Return where pixels (M,2) in frames (M,) would be at the instant of the middle row."""
         return rotate_to_mid_row(self.camera, self.path, frame, px, self.readout_s)
+
+    def uncertainty(self, frame: int) -> float:
+        """Return the expected error of the turn from the middle row of a frame to its other rows, radians."""
+        return self.path.row_uncertainty(frame, self.readout_s)
 
     def px_in_picture(self, frame: IntArray, px: FloatArray) -> FloatArray:
         """Return where points are seen in frames (M,), for their pixels (M,2) at the middle row's instant.

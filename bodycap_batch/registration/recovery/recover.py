@@ -279,7 +279,8 @@ def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> d
     """Search an interval and return the accepted poses with smoothed centres, by frame.
 
     A pose is accepted if it has enough support, if its centre is near the smoothed centre, and if the sigma
-    of the centre is small.
+    of the centre is small. If the angular velocity of a camera with a rolling shutter is extrapolated in the
+    frame, its error adds to the covariance.
     """
     estimates = propagation.run()
     if not estimates:
@@ -289,6 +290,9 @@ def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> d
     accepted = {}
     for frame, estimate in estimates.items():
         pose, covariance = estimate.conditioned_on_centre(smoothed.positions[frame])
+        shutter = propagation.localiser.shutter
+        unsure = 0.0 if shutter is None else shutter.uncertainty(frame)
+        covariance = covariance + np.diag(np.repeat([unsure, unsure * estimate.depth], 3) ** 2)
         sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
         if (
             estimate.has_support(criteria.min_inliers, _MIN_INLIER_WEIGHT_RATIO)

@@ -265,3 +265,14 @@ def test_the_turn_between_two_frames_is_known_only_within_a_segment() -> None:
     assert path.turn(19, 20) is None
     assert path.is_known(19)
     assert path.is_known(20)
+
+
+def test_an_extrapolated_velocity_is_uncertain_where_the_camera_turns_fast() -> None:
+    points = 100.0 * directions(4000)
+    path = fit_rotation_path(matches_of(points, lost=19), LENS, TIMES_NS, READOUT_S)
+    shutter = TurningShutter(LENS, path, READOUT_S)
+    assert shutter.uncertainty(10) == 0.0
+    # Half of some 5 rad/s over the root mean square of the delays, 0.29 readout times.
+    for frame in (19, 20):
+        assert 0.005 < shutter.uncertainty(frame) < 0.04
+    assert replace(shutter, path=replace(path, rate=0.0 * path.rate)).uncertainty(19) == 0.0
