@@ -91,21 +91,21 @@ class Readout:
         """Return the readout time with the common best value of equal cameras, if all of them agree with it.
 
         Args:
-            others: The readout times of all equal cameras, this one included.
+            others: The readout times of the equal cameras whose residuals agree with their matches.
 
         Source: Birge, "The calculation of errors by the method of least squares", 1932, for the standard
             deviation of a mean of values that scatter more than their standard deviations.
         """
         value = np.array([item.best_s for item in others])
         sigma = np.hypot([item.sigma_s for item in others], _MODEL_SIGMA_RATIO * np.abs(value))
-        if len(others) < 2 or not np.isfinite(sigma).all() or not sigma.all():
+        if len(others) == 0 or not np.isfinite(sigma).all() or not sigma.all():
             return self
         weight = 1.0 / sigma**2
         mean = float((weight * value).sum() / weight.sum())
         deviation = (value - mean) / sigma
         if np.abs(deviation).max() > _MAX_POOLED_SIGMAS:
             return self
-        scatter = max(1.0, float((deviation**2).sum()) / (len(others) - 1))
+        scatter = max(1.0, float((deviation**2).sum()) / max(1, len(others) - 1))
         return replace(self, best_s=mean, sigma_s=float(np.sqrt(scatter / weight.sum())))
 
     def with_other_estimate(self, other_s: float) -> Readout:
@@ -337,11 +337,12 @@ class RollingShutterModel:
             before = after
         start_s = {name: value for name, value in (start_s or {}).items() if name in unknown}
         # Equal cameras start from the same value, which was estimated from the matches of all of them.
-        equal = {
-            name: [out[other] for other in start_s if start_s[other] == start_s[name]] for name in start_s
-        }
+        equal: dict[float, list[Readout]] = {value: [] for value in start_s.values()}
         for name, value in start_s.items():
-            out[name] = out[name].pooled(equal[name]).with_other_estimate(value)
+            if abs(out[name].best_s - value) <= _MAX_DIFFERENCE_S:
+                equal[value].append(out[name])
+        for name, value in start_s.items():
+            out[name] = out[name].pooled(equal[value]).with_other_estimate(value)
         return out
 
     def undetermined(self, reason: str) -> dict[str, Readout]:

@@ -233,7 +233,13 @@ def test_equal_cameras_that_agree_share_the_mean_of_their_readouts() -> None:
 def test_equal_cameras_that_contradict_each_other_keep_their_readouts() -> None:
     equal = [_estimate(0.010, 0.0002), _estimate(0.020, 0.0002)]
     assert [item.pooled(equal).best_s for item in equal] == [0.010, 0.020]
-    assert equal[0].pooled(equal[:1]) == equal[0]
+    assert equal[0].pooled([]) == equal[0]
+
+
+def test_a_camera_whose_residuals_tell_nothing_takes_the_readout_of_equal_cameras() -> None:
+    lost = _estimate(0.029, 0.001).pooled([_estimate(0.0171, 0.0003), _estimate(0.0167, 0.0003)])
+    assert lost.best_s == pytest.approx(0.0169, abs=1e-5)
+    assert lost.sigma_s < 0.001
 
 
 def test_a_readout_from_residuals_has_the_uncertainty_of_the_model() -> None:
