@@ -83,7 +83,7 @@ def refine_map(
         rolling, readouts = estimate_readouts(rolling, cameras, settings, calibrated_ids, scene_map)
         readout_s = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         if readout_s:
-            model = rolling.with_fitted_rates(readout_s).corrected(readout_s)
+            model = rolling.with_exact_rates(readout_s, scene_map.readout_s.keys()).corrected(readout_s)
             if mapping.is_large(model.num_reg_images()):
                 adjust_in_two_steps(model, settings, calibrated_ids)
             else:

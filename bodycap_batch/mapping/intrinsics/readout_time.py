@@ -50,9 +50,8 @@ _MAX_DIFFERENCE_S = 0.003
 """Maximum difference of the readout times from residuals and from matches, seconds. With a larger difference,
 the residuals are not used. Evidence: none."""
 _MODEL_SIGMA_RATIO = 0.025
-"""Standard deviation that is added to each estimate that starts from matches, as a ratio of the readout time.
-A hand shakes faster than the spline through the poses of the frames follows. Evidence:
-docs/decisions/mapping.md."""
+"""Standard deviation that is added to each estimate, as a ratio of the readout time. A hand shakes faster
+than the spline through the poses of the frames follows. Evidence: docs/decisions/mapping.md."""
 _MAX_POOLED_SIGMAS = 3.0
 """Maximum deviation of the readout time of a camera from the mean of equal cameras, in its standard
 deviations. With a larger deviation, the cameras do not share the mean. Evidence: none."""
@@ -97,7 +96,7 @@ class Readout:
             deviation of a mean of values that scatter more than their standard deviations.
         """
         value = np.array([item.best_s for item in others])
-        sigma = np.hypot([item.sigma_s for item in others], _MODEL_SIGMA_RATIO * np.abs(value))
+        sigma = np.array([item.sigma_s for item in others])
         if len(others) == 0 or not np.isfinite(sigma).all() or not sigma.all():
             return self
         weight = 1.0 / sigma**2
@@ -106,7 +105,8 @@ class Readout:
         if np.abs(deviation).max() > _MAX_POOLED_SIGMAS:
             return self
         scatter = max(1.0, float((deviation**2).sum()) / max(1, len(others) - 1))
-        return replace(self, best_s=mean, sigma_s=float(np.sqrt(scatter / weight.sum())))
+        sigma_s = float(np.hypot(np.sqrt(scatter / weight.sum()), _MODEL_SIGMA_RATIO * mean))
+        return replace(self, best_s=mean, sigma_s=sigma_s)
 
     def with_other_estimate(self, other_s: float) -> Readout:
         """Return the readout time with a standard deviation that covers the difference to another estimate.
@@ -120,8 +120,7 @@ class Readout:
         difference_s = abs(self.best_s - other_s)
         if difference_s > _MAX_DIFFERENCE_S:
             return replace(self, seconds=other_s, sigma_s=difference_s, source="estimated", best_s=other_s)
-        model_s = _MODEL_SIGMA_RATIO * abs(self.best_s)
-        sigma_s = float(np.sqrt(self.sigma_s**2 + (0.5 * difference_s) ** 2 + model_s**2))
+        sigma_s = float(np.hypot(self.sigma_s, 0.5 * difference_s))
         return replace(self, seconds=self.best_s, sigma_s=sigma_s, source="estimated")
 
     @property
@@ -200,18 +199,26 @@ class RollingShutterModel:
         self.move_keypoints(out, readout_s)
         return out
 
-    def with_fitted_rates(self, readout_s: Mapping[str, float]) -> RollingShutterModel:
-        """Return a copy in which the angular velocities of the keyframes fit their observations.
+    def with_exact_rates(
+        self, readout_s: Mapping[str, float], corrected: Collection[str]
+    ) -> RollingShutterModel:
+        """Return a copy with the most exact angular velocities, for a correction with known readout times.
+
+        If the model was built from corrected keypoints, the angular velocities of the keyframes are fitted to
+        their observations. In a model of uncorrected keypoints, poses and points have absorbed a part of the
+        displacements. Velocities that fit them would leave this part as it is.
 
         Args:
             readout_s: Readout time (seconds) of each camera, by camera name.
+            corrected: Names of the cameras whose keypoints were corrected before the model was built.
         """
         out = copy.copy(self)
         out._paths = dict(self._paths)
         for name, trajectory in self._trajectories.items():
             path = PosePath.create(trajectory.gauge_from_cam, trajectory.times_ns)
             own = [item for item in self._keypoints if item.camera == name]
-            if own and readout_s.get(name):
+            out._paths[name] = path
+            if own and readout_s.get(name) and name in corrected:
                 frame, points, px = (
                     np.concatenate([getattr(item, part) for item in own])
                     for part in ("frame", "points", "px")
@@ -458,7 +465,8 @@ class _ResidualSlope:
             return Readout(0.0, float("inf"), "none found", at_s)
         best_s = at_s - self.correlation / self.information
         found = max(_MIN_READOUT_S, _MIN_SIGMAS * self.sigma_s) < abs(best_s) < _MAX_READOUT_FRAMES * frame_s
-        return Readout(best_s if found else 0.0, self.sigma_s, "estimated" if found else "none found", best_s)
+        sigma_s = float(np.hypot(self.sigma_s, _MODEL_SIGMA_RATIO * best_s))
+        return Readout(best_s if found else 0.0, sigma_s, "estimated" if found else "none found", best_s)
 
 
 def estimate_readouts(

@@ -222,12 +222,12 @@ def _estimate(best_s: float, sigma_s: float) -> Readout:
 
 
 def test_equal_cameras_that_agree_share_the_mean_of_their_readouts() -> None:
-    equal = [_estimate(0.0247, 0.0002), _estimate(0.0257, 0.0006), _estimate(0.0245, 0.0001)]
+    equal = [_estimate(0.0247, 0.0007), _estimate(0.0257, 0.0009), _estimate(0.0245, 0.0006)]
     shared = [item.pooled(equal) for item in equal]
     assert len({item.best_s for item in shared}) == 1
     assert shared[0].best_s == pytest.approx(0.0249, abs=0.0002)
-    # The residuals scatter less than the spline between poses is wrong: 2.5 % for each of three cameras.
-    assert shared[0].sigma_s > 0.0003
+    # The errors of the spline between poses are common to all cameras: 2.5 %.
+    assert shared[0].sigma_s > 0.0006
 
 
 def test_equal_cameras_that_contradict_each_other_keep_their_readouts() -> None:
@@ -242,6 +242,6 @@ def test_a_camera_whose_residuals_tell_nothing_takes_the_readout_of_equal_camera
     assert lost.sigma_s < 0.001
 
 
-def test_a_readout_from_residuals_has_the_uncertainty_of_the_model() -> None:
-    found = _estimate(0.024, 0.0001).with_other_estimate(0.024)
-    assert 0.0005 < found.sigma_s < 0.0008
+def test_a_readout_that_contradicts_the_matches_has_the_difference_as_sigma() -> None:
+    found = _estimate(0.024, 0.0001).with_other_estimate(0.022)
+    assert (found.seconds, found.sigma_s) == (0.024, pytest.approx(0.001, abs=1e-5))
