@@ -14,6 +14,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.frame_matches import FrameMatcher
 from bodycap_batch.model.frozen_frames import find_frozen_frames, picture_change_px
 from bodycap_batch.model.optical_flow import (
     GreyImage,
@@ -120,12 +121,17 @@ class _KeyframeTracker:
         self.started = len(self.px)
         self.start_px = self.px
 
-    def step(self, image: GreyImage) -> None:
-        """Track the corners into the next frame."""
+    def step(self, image: GreyImage) -> tuple[Pixels, Pixels]:
+        """Track the corners into the next frame.
+
+        Returns:
+            Positions (M,2) of the tracked corners before and after this step, px of the reduced image.
+        """
         before = image if self.image is None else self.image
         flow = track_points(before, image, self.px, window_px=_WINDOW_PX)
         self.change_px = picture_change_px(before, image)
         self.shift_px = _median_distance(self.px[flow.ok], flow.px[flow.ok])
+        tracked = self.px[flow.ok], flow.px[flow.ok]
         self.px, self.start_rays = flow.px[flow.ok], self.start_rays[flow.ok]
         self.start_px = self.start_px[flow.ok]
         since_keyframe = _median_distance(self.start_px, self.px)
@@ -137,6 +143,7 @@ class _KeyframeTracker:
             self.round_trips.append(flow.round_trip_px[flow.ok] * self._full_scale(image))
             self.kept_samples += int(flow.ok.sum())
         self.image = image
+        return tracked
 
     def _full_scale(self, image: GreyImage) -> float:
         """Return the ratio of the full image's width to the reduced image's width."""
@@ -229,6 +236,7 @@ def select_keyframes(
     selected: list[int] = []
     novelty = [0.0]
     tracker = _KeyframeTracker(camera.camera, _coarse_mask(camera))
+    matcher = _frame_matcher(camera, tracker.mask)
     recent: deque[_Candidate] = deque(maxlen=options.window)
     see, keep = (_ignore, _ignore) if keeper is None else (keeper.add_frame, keeper.add_keyframe)
     is_damaged = np.ones(count, dtype=bool)
@@ -239,12 +247,12 @@ def select_keyframes(
         sharp[index] = sharpness(shot.grey)
         image = make_coarse_image(shot.grey)
         see(shot)
+        matcher.add(index, image, tracker.step(image) if selected else None)
         if not selected:
             selected.append(index)
             keep(shot)
             tracker.restart(image)
         else:
-            tracker.step(image)
             change_px[index], shift_px[index] = tracker.change_px, tracker.shift_px
             recent.append(_Candidate(index, image, sharp[index], tracker.survival(), shot))
             gap_s = times_s[index] - times_s[selected[-1]]
@@ -282,7 +290,14 @@ def select_keyframes(
         damaged=np.flatnonzero(is_damaged),
         frozen=frozen,
         motion_px=tracker.motion_px(),
+        matches=matcher.matches(),
     )
+
+
+def _frame_matcher(camera: CaptureCamera, mask: BoolArray | None) -> FrameMatcher:
+    """Return the matcher of adjacent frames. It does nothing for a camera with a stated global shutter."""
+    is_rolling = bool(camera.rolling_shutter_s) or not camera.rolling_shutter_known
+    return FrameMatcher(camera.name, camera.camera.width_px, mask, enabled=is_rolling)
 
 
 def _without_frozen(

@@ -22,7 +22,7 @@ from bodycap_batch.export.target_frames import (
 )
 from bodycap_batch.model.geometry import invert, rotation_angle_rad, transform_points
 from bodycap_batch.model.relative_pose import RelativePose
-from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
+from bodycap_batch.model.rotation_path import PosePath
 from bodycap_batch.model.scene import Map, Trajectory
 from bodycap_batch.model.skeleton import Motion
 
@@ -119,8 +119,9 @@ def observation_errors(scene: Map, trajectories: Sequence[Trajectory]) -> FloatA
         intrinsics, px = scene.cameras[camera], scene.obs_px[observations]
         if camera in paths and camera in scene.readout_s:
             path, frame = paths[camera], np.full(len(observations), scene.keyframe_frame[keyframe])
-            velocity = image_velocity(intrinsics, path.gauge_from_cam, path.times_ns, frame, points)
-            px = px_at_mid_row(intrinsics, px, velocity, scene.readout_s[camera])
+            poses = PosePath.create(path.gauge_from_cam, path.times_ns)
+            seen = intrinsics, frame, points, px, scene.readout_s[camera]
+            px = poses.with_fitted_rates(*seen).px_at_mid_row(*seen)
         projected = intrinsics.project(transform_points(invert(scene.map_from_cam[keyframe]), points))
         out[observations] = np.linalg.norm(projected - px, axis=1)
     return out

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,10 @@ from bodycap_batch.mapping.inputs import (
     make_mapping_context,
 )
 from bodycap_batch.mapping.intrinsics.intrinsics_check import find_misfit_intrinsics
+from bodycap_batch.mapping.intrinsics.readout_profile import estimate_from_matches
+from bodycap_batch.mapping.intrinsics.readout_time import map_with_readouts
 from bodycap_batch.mapping.intrinsics.recalibration import recalibrate_if_misfit
+from bodycap_batch.mapping.intrinsics.shutters import known_readouts, turning_shutters, write_shutters
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     CameraKeyframes,
@@ -124,8 +127,16 @@ def build_map_once(
     workspace.mkdir(parents=True, exist_ok=True)
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         ids = {item.camera: add_camera(database, capture.camera(item.camera)) for item in selections}
+    readouts = {**known_readouts(capture), **estimate_from_matches(capture, selections)}
+    shutters = turning_shutters(capture, selections, readouts)
+    write_shutters(workspace, shutters)
     keyframes = [
-        CameraKeyframes(capture.camera(item.camera), ids[item.camera], np.asarray(item.frames))
+        CameraKeyframes(
+            capture.camera(item.camera),
+            ids[item.camera],
+            np.asarray(item.frames),
+            shutters.get(item.camera),
+        )
         for item in selections
     ]
     add_keyframes(workspace, keyframes, options, context)
@@ -156,8 +167,12 @@ def build_map_once(
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
     removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
+    if readouts:
+        log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
     log = MapDiagnostics(misfit_factors=misfits, misplaced=misplaced, details=log).to_log()
     result = make_result(models, workspace, log)
+    corrected = {name: readouts[name] for name in shutters}
+    result = replace(result, maps=tuple(map_with_readouts(item, corrected) for item in result.maps))
     ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
     refused = refused or add_flip_hint(check_consistency(max(ratios)), flips)
     return result, refused

@@ -18,7 +18,9 @@ from bodycap_batch.mapping.inputs import (
     intrinsics_of,
     make_mapping_context,
 )
+from bodycap_batch.mapping.intrinsics.readout_time import map_with_readouts
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
+from bodycap_batch.mapping.intrinsics.shutters import read_shutters, readouts_of_maps
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     CameraKeyframes,
@@ -72,11 +74,17 @@ def extend_map(
         existing = read_image_ids(database)
     ids = read_camera_ids(workspace)
     new = [ref for ref in _image_refs(extra_frames) if ref not in existing]
+    names = sorted({ref.camera for ref in new})
+    readouts = readouts_of_maps(previous.maps)
+    shutters = read_shutters(workspace, names)
     keyframes = [
         CameraKeyframes(
-            capture.camera(name), ids[name], np.array(sorted(ref.frame for ref in new if ref.camera == name))
+            capture.camera(name),
+            ids[name],
+            np.array(sorted(ref.frame for ref in new if ref.camera == name)),
+            shutters.get(name),
         )
-        for name in sorted({ref.camera for ref in new})
+        for name in names
     ]
     add_keyframes(workspace, keyframes, options, context)
     generator = PairGenerator(workspace, new, frame_times_ns(capture), options, context)
@@ -90,9 +98,9 @@ def extend_map(
         kept = registered_ids(model) - again
         inside = registered_ids(model) & again
         extended = re_register_images(model, inside, mapping, len(existing) + len(new))
-        model, names = remove_misregistered(extended, mapping)
+        model, cut = remove_misregistered(extended, mapping)
         models.append(model)
-        removed += names
+        removed += cut
         resected.append(registered_ids(model) - kept if mapping.is_large(len(kept)) else None)
     transient = finalise_models(models, mapping, capture, resected)
     for number, model in enumerate(models):
@@ -116,7 +124,8 @@ def extend_map(
         extensions=(*diagnostics.extensions, entry),
         details={**diagnostics.details, "keyframes": len(existing) + len(new)},
     )
-    return make_result(models, workspace, diagnostics.to_log())
+    result = make_result(models, workspace, diagnostics.to_log())
+    return replace(result, maps=tuple(map_with_readouts(item, readouts) for item in result.maps))
 
 
 def _image_refs(frames: Mapping[str, IntArray]) -> list[ImageRef]:

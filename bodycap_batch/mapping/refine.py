@@ -16,7 +16,7 @@ from bodycap_batch.mapping.intrinsics.readout_time import (
     map_with_readouts,
 )
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
-from bodycap_batch.mapping.matching.database import read_camera_ids
+from bodycap_batch.mapping.matching.database import read_camera_ids, read_detected_px
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
 from bodycap_batch.mapping.reconstruction.model_files import read_model, write_models
@@ -74,11 +74,16 @@ def refine_map(
         context.progress(number, len(previous.maps), "maps refined")
         model = read_model(workspace, number)
         paths = {path.camera: path for path in trajectories if path.gauge == scene_map.gauge}
-        rolling = RollingShutterModel(model, paths, cameras)
-        rolling, readouts = estimate_readouts(rolling, cameras, settings, calibrated_ids)
+        detected = {
+            image_id: px
+            for image_id in model.reg_image_ids()
+            if (px := read_detected_px(workspace, image_id)) is not None
+        }
+        rolling = RollingShutterModel(model, paths, cameras, detected)
+        rolling, readouts = estimate_readouts(rolling, cameras, settings, calibrated_ids, scene_map)
         readout_s = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         if readout_s:
-            model = rolling.corrected(readout_s)
+            model = rolling.with_exact_rates(readout_s, scene_map.readout_s.keys()).corrected(readout_s)
             if mapping.is_large(model.num_reg_images()):
                 adjust_in_two_steps(model, settings, calibrated_ids)
             else:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -229,9 +230,9 @@ def estimate_residual_readout(
     frame, px, residual_px, velocity_px_s = frame[keep], px[keep], residual_px[keep], velocity_px_s[keep]
     signal = velocity_px_s * row_delay(camera, px)[:, None]
     x = (px - (0.5 * camera.width_px, 0.5 * camera.height_px)) / camera.width_px
-    starts = np.flatnonzero(np.diff(frame, prepend=-1))
+    bounds = np.flatnonzero(np.diff(frame, prepend=-1, append=-1))
     signals, residuals = [np.zeros(0)], [np.zeros(0)]
-    for start, stop in zip(starts, [*starts[1:], len(frame)], strict=True):
+    for start, stop in pairwise(bounds.tolist()):
         if stop - start >= _MIN_POINTS:
             basis, _ = np.linalg.qr(_camera_motion_basis(x[start:stop]))
             for collected, values in ((signals, signal), (residuals, residual_px)):

@@ -16,6 +16,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.frame_matches import FrameMatches
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 
 _FEATURE_STRIDE = 1 << 24
@@ -87,6 +88,7 @@ class KeyframeSelection:
             moves. An empty array means that no frame is frozen.
         motion_px: Largest median displacement of corners since a keyframe, pixels of an image with a long
             side of 640 px. It is infinity if it is unknown.
+        matches: Matches between adjacent frames; None if the camera is known to have a global shutter.
     """
 
     camera: str
@@ -97,6 +99,7 @@ class KeyframeSelection:
     damaged: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     frozen: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     motion_px: float = float("inf")
+    matches: FrameMatches | None = None
 
     def __post_init__(self) -> None:
         set_array(self, "frames", (None,), np.int64)

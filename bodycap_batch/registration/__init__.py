@@ -2,6 +2,7 @@
 
 from bodycap_batch.registration.poses.contradicted import withdraw_contradicted_poses
 from bodycap_batch.registration.poses.rig_members import RegisteredCamera
+from bodycap_batch.registration.poses.turning_tracks import with_rotation
 from bodycap_batch.registration.recovery.recover import RecoveryInputs, recover_lost_frames
 from bodycap_batch.registration.stage import register_frames, register_in_rig
 
@@ -11,5 +12,6 @@ __all__ = [
     "recover_lost_frames",
     "register_frames",
     "register_in_rig",
+    "with_rotation",
     "withdraw_contradicted_poses",
 ]

@@ -12,6 +12,7 @@ from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.relative_pose import RelativePose
+from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration
 from bodycap_batch.registration.poses.keyframe_requests import request_keyframes
 from bodycap_batch.registration.poses.misplaced_keyframes import (
@@ -31,6 +32,7 @@ from bodycap_batch.registration.poses.trajectory import (
     solve_camera,
     solve_rig,
 )
+from bodycap_batch.registration.poses.turning_tracks import rotation_from_matches, turn_tracks
 from bodycap_batch.registration.recovery.path_smoothing import smooth_if_final
 from bodycap_batch.registration.tracking.frame_ranges import TrackCache, track_all
 from bodycap_batch.registration.tracking.klt import Tracks, select_keyframe_points
@@ -71,11 +73,14 @@ def register_frames(
     points_by_keyframe = select_keyframe_points(scene_map, camera.name)
     tracks = track_all(camera, points_by_keyframe, TrackCache.from_registration(previous), context)
     context.progress(0, 0, "misplaced keyframes")
-    scene_map, tracks, misplaced = _track_without_misplaced(camera, scene_map, tracks, criteria, context)
+    rotation = rotation_from_matches(camera, scene_map, selection)
+    scene_map, tracks, misplaced = _track_without_misplaced(
+        camera, scene_map, tracks, criteria, context, rotation
+    )
     if selection.frozen.any():
         tracks = tracks.select(~selection.frozen[tracks.frame])
     context.progress(0, 0, "poses")
-    poses = solve_camera(camera, scene_map, tracks, criteria, context.threads)
+    poses = solve_camera(camera, scene_map, tracks, criteria, context.threads, rotation)
     trajectory = smooth_if_final(build_trajectory(camera, scene_map.gauge, poses, selection))
     already_requested = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes
     requested = request_keyframes(trajectory.localised | selection.frozen, selection.sharpness, offered)
@@ -126,7 +131,8 @@ def register_in_rig(
         return own.registration, relative_poses
     criteria = acceptance_criteria(own.camera, selection, options)
     for member in members:
-        misplaced = find_misplaced_keyframes(member.camera.name, scene_map, member.tracks, criteria)
+        turned = turn_tracks(member.camera.name, scene_map, member.tracks, member.rotation)
+        misplaced = find_misplaced_keyframes(member.camera.name, scene_map, turned, criteria)
         scene_map = map_without_keyframes(scene_map, misplaced)
     start = initial_rig_poses(own, others, members)
     poses = solve_rig(members, scene_map, start, criteria, threads)
@@ -140,15 +146,20 @@ def _track_without_misplaced(
     tracks: Tracks,
     criteria: AcceptanceCriteria,
     context: StageContext,
+    rotation: RotationPath | None,
 ) -> tuple[Map, Tracks, IntArray]:
     """Remove misregistered keyframes, and track the frames around them from the remaining keyframes.
+
+    If the rotation of a camera with a rolling shutter is known, the tracks are compared with the map at the
+    instants of the middle rows.
 
     Returns:
         The map without the misregistered keyframes, the tracks, and the frame indices of the removed
         keyframes.
     """
     nothing = np.zeros(0, np.int64)
-    misplaced = find_misplaced_keyframes(camera.name, scene_map, tracks, criteria)
+    turned = turn_tracks(camera.name, scene_map, tracks, rotation)
+    misplaced = find_misplaced_keyframes(camera.name, scene_map, turned, criteria)
     if len(misplaced) == 0:
         return scene_map, tracks, nothing
     cache = TrackCache(tracks, sorted(select_keyframe_points(scene_map, camera.name)))

@@ -23,8 +23,8 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
     from bodycap_batch.model.relative_pose import RigPoses
     from bodycap_batch.registration import (
         RecoveryInputs,
-        RegisteredCamera,
         recover_lost_frames,
+        with_rotation,
         withdraw_contradicted_poses,
     )
 
@@ -33,15 +33,16 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
     paths = paths_of(task.registrations.values())
     scene = load_map(task.map.path)
     in_rig = (paths[0] / f"{RIG_POSES}.json").exists()
+    selections = {name: load_keyframes(item.path) for name, item in task.keyframes.items()}
     inputs = RecoveryInputs(
         capture=capture,
         # A generator loads one registration at a time: the tracks of a long video need much memory.
         registrations=(
-            RegisteredCamera(camera=camera, registration=load_registration(path))
+            with_rotation(camera, load_registration(path), scene.maps, selections[camera.name])
             for camera, path in zip(capture.cameras, paths, strict=True)
         ),
         maps=scene.maps,
-        selection=load_keyframes(task.keyframes[task.cameras[0]].path),
+        selection=selections[task.cameras[0]],
         in_rig=in_rig,
     )
     registration = recover_lost_frames(load_registration(paths[0]), inputs, task.options, context)

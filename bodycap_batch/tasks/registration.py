@@ -59,6 +59,8 @@ def run_registration(task: RegistrationTask, context: StageContext, files: Path)
     rolling = (
         bool(camera.rolling_shutter_s)
         if known
+        else True
+        if any(camera.name in scene.readout_s for scene in maps)
         else has_visible_rolling_shutter(found, maps, allow_sideways=camera.may_be_sideways)
     )
     save_registration(found, camera, files, rolling=rolling)

@@ -22,21 +22,24 @@ def run_rig(task: CameraGroupTask, context: StageContext, files: Path) -> None:
     from bodycap_batch.model.camera_clock import ClockRelation
     from bodycap_batch.model.relative_pose import RigPoses, not_rigid_note
     from bodycap_batch.registration import (
-        RegisteredCamera,
         register_in_rig,
+        with_rotation,
         withdraw_contradicted_poses,
     )
 
     context.check_cancelled()
+    scene = load_map(task.map.path)
+    selections = {name: load_keyframes(item.path) for name, item in task.keyframes.items()}
     own, *others = (
-        RegisteredCamera(
-            camera=replace(camera, clock=ClockRelation(offset_s=task.offsets_s[camera.name])),
-            registration=load_registration(task.registrations[camera.name].path),
+        with_rotation(
+            replace(camera, clock=ClockRelation(offset_s=task.offsets_s[camera.name])),
+            load_registration(task.registrations[camera.name].path),
+            scene.maps,
+            selections[camera.name],
         )
         for camera in load_capture(task.capture, task.keyframes, threads=context.threads).cameras
     )
-    selection = load_keyframes(task.keyframes[own.camera.name].path)
-    scene = load_map(task.map.path)
+    selection = selections[own.camera.name]
     found, relative = register_in_rig(own, others, scene.maps, selection, task.options, context.threads)
     misplaced = scene.diagnostics.misplaced.get(own.camera.name, ())
     found = withdraw_contradicted_poses(found, scene.maps, misplaced)

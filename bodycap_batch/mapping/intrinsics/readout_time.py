@@ -16,7 +16,7 @@ from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust, sub_model
 from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
 from bodycap_batch.mapping.reconstruction.reprojection import image_residuals_px
-from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
+from bodycap_batch.model.rotation_path import PosePath
 from bodycap_batch.model.scene import Map, Trajectory
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _TRIAL_STEP_S = 0.01
 """First step and maximum step (seconds) in the search for the readout time. Evidence: none."""
+_NEXT_STEP_S = 0.003
+"""First step (seconds) if the search starts from an estimate. Evidence: none."""
 _TRIAL_ITERATIONS = 40
 """Maximum number of iterations of a trial adjustment. Evidence: none."""
 _TRIAL_KEYFRAMES = 24
@@ -44,6 +46,20 @@ global. Evidence: none."""
 _MIN_SIGMAS = 5.0
 """Minimum ratio of an estimated readout time to its standard deviation. With a smaller ratio, the estimate is
 not significant and the shutter is treated as global. Evidence: none."""
+_MAX_DIFFERENCE_S = 0.003
+"""Maximum difference of the readout times from residuals and from matches, seconds. With a larger difference,
+the residuals are not used. Evidence: none."""
+_MODEL_SIGMA_RATIO = 0.025
+"""Standard deviation that is added to each estimate, as a ratio of the readout time. A hand shakes faster
+than the spline through the poses of the frames follows. Evidence: docs/decisions/mapping.md."""
+_MAX_POOLED_SIGMAS = 3.0
+"""Maximum deviation of the readout time of a camera from the mean of equal cameras, in its standard
+deviations. With a larger deviation, the cameras do not share the mean. Evidence: none."""
+_BLOCKS = 8
+"""Number of blocks of successive keyframes from which a standard deviation is estimated. Evidence: none."""
+_FLOOR_SIGMA_S = 0.0001
+"""Standard deviation that is added to each estimate, seconds, because the path between frames is a spline.
+Evidence: none."""
 _LOSS_PX = 1.0
 """Width (px) of the robust weight function of a residual. Evidence: none."""
 _MAX_RESIDUAL_PX = 8.0
@@ -70,6 +86,43 @@ class Readout:
     best_s: float
     sideways: bool = False
 
+    def pooled(self, others: Sequence[Readout]) -> Readout:
+        """Return the readout time with the common best value of equal cameras, if all of them agree with it.
+
+        Args:
+            others: The readout times of the equal cameras whose residuals agree with their matches.
+
+        Source: Birge, "The calculation of errors by the method of least squares", 1932, for the standard
+            deviation of a mean of values that scatter more than their standard deviations.
+        """
+        value = np.array([item.best_s for item in others])
+        sigma = np.array([item.sigma_s for item in others])
+        if len(others) == 0 or not np.isfinite(sigma).all() or not sigma.all():
+            return self
+        weight = 1.0 / sigma**2
+        mean = float((weight * value).sum() / weight.sum())
+        deviation = (value - mean) / sigma
+        if np.abs(deviation).max() > _MAX_POOLED_SIGMAS:
+            return self
+        scatter = max(1.0, float((deviation**2).sum()) / max(1, len(others) - 1))
+        sigma_s = float(np.hypot(np.sqrt(scatter / weight.sum()), _MODEL_SIGMA_RATIO * mean))
+        return replace(self, best_s=mean, sigma_s=sigma_s)
+
+    def with_other_estimate(self, other_s: float) -> Readout:
+        """Return the readout time with a standard deviation that covers the difference to another estimate.
+
+        The residuals of a map hold only the points that agree with the map. If they contradict the matches
+        between adjacent frames, the matches are right.
+
+        Args:
+            other_s: Readout time (seconds) from matches between adjacent frames.
+        """
+        difference_s = abs(self.best_s - other_s)
+        if difference_s > _MAX_DIFFERENCE_S:
+            return replace(self, seconds=other_s, sigma_s=difference_s, source="estimated", best_s=other_s)
+        sigma_s = float(np.hypot(self.sigma_s, 0.5 * difference_s))
+        return replace(self, seconds=self.best_s, sigma_s=sigma_s, source="estimated")
+
     @property
     def significance(self) -> float:
         """Ratio of the readout time to its standard deviation; 0 if no readout time was found."""
@@ -85,14 +138,16 @@ class _Keypoints:
         camera: Name of the keyframe's camera.
         feature: (N,) indices of the features that observe a point of the model.
         px: (N,2) detected positions of these features, px.
-        velocity: (N,2) velocities of these features in the image, px/s.
+        frame: (N,) frame index of the keyframe, repeated.
+        points: (N,3) points that these features observe, in map units.
     """
 
     image_id: int
     camera: str
     feature: IntArray
     px: FloatArray
-    velocity: FloatArray
+    frame: IntArray
+    points: FloatArray
 
 
 class RollingShutterModel:
@@ -105,6 +160,8 @@ class RollingShutterModel:
         trajectories: Trajectories in the model's gauge, by camera name. A camera without a trajectory was
             registered against another model; its keypoints are not moved.
         cameras: The capture's cameras by name.
+        detected_px: Detected positions (N,2) of all keypoints of each image whose keypoints are at other
+            positions in the model, by image id.
     """
 
     def __init__(
@@ -112,8 +169,14 @@ class RollingShutterModel:
         model: pycolmap.Reconstruction,
         trajectories: Mapping[str, Trajectory],
         cameras: Mapping[str, CaptureCamera],
+        detected_px: Mapping[int, FloatArray] | None = None,
     ) -> None:
         self._model = model
+        self._detected_px = detected_px or {}
+        self._paths = {
+            name: PosePath.create(path.gauge_from_cam, path.times_ns, shrunk=False)
+            for name, path in trajectories.items()
+        }
         self._trajectories = trajectories
         self._cameras = cameras
         self._intrinsics = {
@@ -122,9 +185,7 @@ class RollingShutterModel:
             )
             for image_id in model.reg_image_ids()
         }
-        self._keypoints = [
-            self._keypoints_of(image_id, trajectories) for image_id in sorted(model.reg_image_ids())
-        ]
+        self._keypoints = [self._keypoints_of(image_id) for image_id in sorted(model.reg_image_ids())]
 
     def corrected(self, readout_s: Mapping[str, float]) -> pycolmap.Reconstruction:
         """Return a copy of the model in which all keypoints are at their corrected positions.
@@ -138,6 +199,35 @@ class RollingShutterModel:
         self.move_keypoints(out, readout_s)
         return out
 
+    def with_exact_rates(
+        self, readout_s: Mapping[str, float], corrected: Collection[str]
+    ) -> RollingShutterModel:
+        """Return a copy with the most exact angular velocities, for a correction with known readout times.
+
+        If the model was built from corrected keypoints, the angular velocities of the keyframes are fitted to
+        their observations. In a model of uncorrected keypoints, poses and points have absorbed a part of the
+        displacements. Velocities that fit them would leave this part as it is.
+
+        Args:
+            readout_s: Readout time (seconds) of each camera, by camera name.
+            corrected: Names of the cameras whose keypoints were corrected before the model was built.
+        """
+        out = copy.copy(self)
+        out._paths = dict(self._paths)
+        for name, trajectory in self._trajectories.items():
+            path = PosePath.create(trajectory.gauge_from_cam, trajectory.times_ns)
+            own = [item for item in self._keypoints if item.camera == name]
+            out._paths[name] = path
+            if own and readout_s.get(name) and name in corrected:
+                frame, points, px = (
+                    np.concatenate([getattr(item, part) for item in own])
+                    for part in ("frame", "points", "px")
+                )
+                out._paths[name] = path.with_fitted_rates(
+                    self._intrinsics[name], frame, points, px, readout_s[name]
+                )
+        return out
+
     def move_keypoints(self, model: pycolmap.Reconstruction, readout_s: Mapping[str, float]) -> None:
         """Move the keypoints in a copy of the model to their positions at the instant of the middle row.
 
@@ -147,12 +237,17 @@ class RollingShutterModel:
                 is missing here, or that has a readout time of 0, are moved to their detected positions.
         """
         for item in self._keypoints:
-            px = px_at_mid_row(
-                self._intrinsics[item.camera], item.px, item.velocity, readout_s.get(item.camera, 0.0)
-            )
+            px = self._px_at_mid_row(item, readout_s.get(item.camera, 0.0))
             points = model.image(item.image_id).points2D
             for feature, xy in zip(item.feature.tolist(), px, strict=True):
                 points[feature].xy = xy
+
+    def _px_at_mid_row(self, item: _Keypoints, readout_s: float) -> FloatArray:
+        """Return the positions (N,2) of keypoints at the instant of the middle row, for a readout time."""
+        path = self._paths.get(item.camera)
+        if path is None or not readout_s:
+            return item.px
+        return path.px_at_mid_row(self._intrinsics[item.camera], item.frame, item.points, item.px, readout_s)
 
     def most_dynamic_subset(self) -> RollingShutterModel:
         """Return a smaller model: for each camera, only the successive keyframes with the largest motion."""
@@ -161,7 +256,10 @@ class RollingShutterModel:
             keyframes = [item for item in self._keypoints if item.camera == name]
             keyframes.sort(key=lambda item: ImageRef.parse(self._model.image(item.image_id).name).frame)
             speed = [
-                float(np.median(np.abs(item.velocity))) if len(item.velocity) else 0.0 for item in keyframes
+                float(np.median(np.abs(self._px_at_mid_row(item, _TRIAL_STEP_S) - item.px)))
+                if len(item.px)
+                else 0.0
+                for item in keyframes
             ]
             total = np.concatenate([[0.0], np.cumsum(speed)])
             size = min(_TRIAL_KEYFRAMES, len(keyframes))
@@ -169,7 +267,9 @@ class RollingShutterModel:
             kept |= {item.image_id for item in keyframes[start : start + size]}
         part = sub_model(self._model, kept)
         sideways = [name for name, camera in self._intrinsics.items() if camera.sideways]
-        return RollingShutterModel(part, self._trajectories, self._cameras).with_sideways(sideways)
+        return RollingShutterModel(part, self._trajectories, self._cameras, self._detected_px).with_sideways(
+            sideways
+        )
 
     def with_sideways(self, sideways: Collection[str]) -> RollingShutterModel:
         """Return a copy with changed row directions.
@@ -185,7 +285,10 @@ class RollingShutterModel:
         return out
 
     def estimate(
-        self, settings: pycolmap.IncrementalPipelineOptions, calibrated_ids: Sequence[int]
+        self,
+        settings: pycolmap.IncrementalPipelineOptions,
+        calibrated_ids: Sequence[int],
+        start_s: Mapping[str, float] | None = None,
     ) -> dict[str, Readout]:
         """Estimate the readout time of each camera, from adjustments of the map with a few trial values.
 
@@ -195,6 +298,8 @@ class RollingShutterModel:
         Args:
             settings: The mapper's options.
             calibrated_ids: Database ids of the calibrated cameras.
+            start_s: Readout times (seconds) for which the poses were estimated, by camera name. The search
+                starts from them; from 0 for any other camera.
 
         Returns:
             Readout time of each camera with a trajectory, by camera name. Readout times that are given in the
@@ -209,18 +314,20 @@ class RollingShutterModel:
         names = [name for name in self._intrinsics if name in self._trajectories]
         unknown = [name for name in names if not self._cameras[name].rolling_shutter_known]
         out = {
-            name: _stated_readout(self._cameras[name].rolling_shutter_s)
+            name: stated_readout(self._cameras[name].rolling_shutter_s)
             for name in names
             if name not in unknown
         }
         if not unknown:
             return out
         frame_s = {name: float(np.median(np.diff(self._cameras[name].times_ns))) * 1e-9 for name in unknown}
-        readout_s = {name: readout.seconds for name, readout in out.items()} | dict.fromkeys(unknown, 0.0)
+        readout_s = {name: readout.seconds for name, readout in out.items()} | {
+            name: (start_s or {}).get(name, 0.0) for name in unknown
+        }
         model = self.corrected(readout_s)
         bundle_adjust(model, settings, calibrated_ids, _TRIAL_ITERATIONS)
         before = self._residuals(model)
-        step_s = dict.fromkeys(unknown, _TRIAL_STEP_S)
+        step_s = {name: _NEXT_STEP_S if readout_s[name] else _TRIAL_STEP_S for name in unknown}
         for _ in range(_MAX_TRIALS):
             readout_s = readout_s | {name: readout_s[name] + step_s[name] for name in unknown}
             self.move_keypoints(model, readout_s)
@@ -235,6 +342,14 @@ class RollingShutterModel:
             if max(map(abs, step_s.values())) < _CONVERGED_S:
                 break
             before = after
+        start_s = {name: value for name, value in (start_s or {}).items() if name in unknown}
+        # Equal cameras start from the same value, which was estimated from the matches of all of them.
+        equal: dict[float, list[Readout]] = {value: [] for value in start_s.values()}
+        for name, value in start_s.items():
+            if abs(out[name].best_s - value) <= _MAX_DIFFERENCE_S:
+                equal[value].append(out[name])
+        for name, value in start_s.items():
+            out[name] = out[name].pooled(equal[value]).with_other_estimate(value)
         return out
 
     def undetermined(self, reason: str) -> dict[str, Readout]:
@@ -250,29 +365,26 @@ class RollingShutterModel:
         for name in self._intrinsics:
             camera = self._cameras[name]
             if camera.rolling_shutter_known:
-                out[name] = _stated_readout(camera.rolling_shutter_s)
+                out[name] = stated_readout(camera.rolling_shutter_s)
             else:
                 out[name] = Readout(0.0, 0.0, f"not determined: {reason}", 0.0)
         return out
 
-    def _keypoints_of(self, image_id: int, trajectories: Mapping[str, Trajectory]) -> _Keypoints:
-        """Return the observations of one image, with the features' velocities."""
+    def _keypoints_of(self, image_id: int) -> _Keypoints:
+        """Return the observations of one image, with their points."""
         image = self._model.image(image_id)
         ref = ImageRef.parse(image.name)
         feature = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
-        px = np.array([image.points2D[index].xy for index in feature.tolist()]).reshape(-1, 2)
-        x_in_map = self._points(image, feature)
-        path = trajectories.get(ref.camera)
-        if path is None:  # The camera was registered against another model: its motion is unknown here.
-            return _Keypoints(image_id, ref.camera, feature, px, np.zeros_like(px))
-        velocity = image_velocity(
-            self._intrinsics[ref.camera],
-            path.gauge_from_cam,
-            path.times_ns,
+        detected = self._detected_px.get(image_id)
+        used = np.array([image.points2D[index].xy for index in feature.tolist()]).reshape(-1, 2)
+        return _Keypoints(
+            image_id,
+            ref.camera,
+            feature,
+            used if detected is None else detected[feature],
             np.full(len(feature), ref.frame, dtype=np.int64),
-            x_in_map,
+            self._points(image, feature),
         )
-        return _Keypoints(image_id, ref.camera, feature, px, velocity)
 
     def _points(self, image: Any, feature: IntArray) -> FloatArray:
         """Return the positions (N,3), in map units, of the points that some features of an image observe."""
@@ -303,12 +415,14 @@ class _ResidualSlope:
         correlation: Weighted sum of the products of each residual and its derivative, px²/s. The derivative
             is taken with respect to the readout time.
         information: Weighted sum of the squared derivatives, px²/s².
-        variance: Weighted variance of the residuals at the readout time with the smallest residuals, px².
+        sigma_s: Standard deviation of the readout time, seconds. It is estimated by leaving out blocks of
+            successive keyframes one after another (jackknife), because the residuals of a keyframe have
+            common errors.
     """
 
     correlation: float
     information: float
-    variance: float
+    sigma_s: float
 
     @staticmethod
     def of(before: FloatArray, after: FloatArray, step_s: float) -> _ResidualSlope:
@@ -326,9 +440,19 @@ class _ResidualSlope:
         weight = np.where(small, 1.0 / (1.0 + (after / _LOSS_PX) ** 2), 0.0)
         information = float((weight * change * change).sum())
         correlation = float((weight * change * after).sum())
-        best = after - change * (correlation / information if information else 0.0)
-        variance = float((weight * best**2).sum() / max(weight.sum(), 1.0))
-        return _ResidualSlope(correlation, information, variance)
+        if information <= 0.0:
+            return _ResidualSlope(correlation, information, float("inf"))
+        products = (
+            np.array_split(weight * change * after, _BLOCKS),
+            np.array_split(weight * change**2, _BLOCKS),
+        )
+        other_correlation, other_information = (
+            total - np.array([block.sum() for block in blocks])
+            for total, blocks in zip((correlation, information), products, strict=True)
+        )
+        without = other_correlation / np.maximum(other_information, 1e-12 * information)
+        variance = (_BLOCKS - 1) / _BLOCKS * ((without - without.mean()) ** 2).sum()
+        return _ResidualSlope(correlation, information, float(np.hypot(np.sqrt(variance), _FLOOR_SIGMA_S)))
 
     def readout(self, at_s: float, frame_s: float) -> Readout:
         """Return the readout time with the smallest residuals, or 0 if that time is not significant.
@@ -340,8 +464,8 @@ class _ResidualSlope:
         if self.information <= 0.0:
             return Readout(0.0, float("inf"), "none found", at_s)
         best_s = at_s - self.correlation / self.information
-        sigma_s = float(np.sqrt(self.variance / self.information))
-        found = max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s) < abs(best_s) < _MAX_READOUT_FRAMES * frame_s
+        found = max(_MIN_READOUT_S, _MIN_SIGMAS * self.sigma_s) < abs(best_s) < _MAX_READOUT_FRAMES * frame_s
+        sigma_s = float(np.hypot(self.sigma_s, _MODEL_SIGMA_RATIO * best_s))
         return Readout(best_s if found else 0.0, sigma_s, "estimated" if found else "none found", best_s)
 
 
@@ -350,6 +474,7 @@ def estimate_readouts(
     cameras: Mapping[str, CaptureCamera],
     settings: pycolmap.IncrementalPipelineOptions,
     calibrated_ids: Sequence[int],
+    corrected: Map | None = None,
 ) -> tuple[RollingShutterModel, dict[str, Readout]]:
     """Estimate the readout time of each camera, and whether the sensor's rows are columns of the image.
 
@@ -361,19 +486,26 @@ def estimate_readouts(
         cameras: The capture's cameras by name.
         settings: The mapper's options.
         calibrated_ids: Database ids of the calibrated cameras.
+        corrected: The map whose readout times and row directions were estimated before; None if there is
+            none. The search starts from them.
 
     Returns:
         The model with the row directions that fit best; the readout times by camera name.
     """
     stated = {name for name, camera in cameras.items() if camera.camera.sideways}
+    start_s = {} if corrected is None else dict(corrected.readout_s)
+    if corrected is not None:
+        stated |= {name for name, camera in corrected.cameras.items() if camera.sideways}
     rolling = rolling.with_sideways(stated)
     try:
         part = rolling.most_dynamic_subset()
-        readouts = part.estimate(settings, calibrated_ids)
+        readouts = part.estimate(settings, calibrated_ids, start_s)
         turned = {
             name
             for name in readouts
-            if cameras[name].may_be_sideways and not cameras[name].rolling_shutter_known
+            if cameras[name].may_be_sideways
+            and not cameras[name].rolling_shutter_known
+            and name not in start_s
         }
         sideways = part.with_sideways(stated | turned).estimate(settings, calibrated_ids) if turned else {}
     except EstimationError as error:
@@ -398,6 +530,6 @@ def map_with_readouts(scene: Map, readouts: Mapping[str, Readout]) -> Map:
     )
 
 
-def _stated_readout(readout_s: float) -> Readout:
+def stated_readout(readout_s: float) -> Readout:
     """Return the readout time of a camera whose readout time is given in the job."""
     return Readout(readout_s, 0.0, "stated", readout_s)

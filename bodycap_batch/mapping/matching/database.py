@@ -15,9 +15,10 @@ import numpy.typing as npt
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
-from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.matching.sift import extract_features
+from bodycap_batch.model.rotation_path import TurningShutter
 
 if TYPE_CHECKING:
     import pycolmap
@@ -26,6 +27,9 @@ DATABASE_NAME = "database.db"
 """File name of the database in the workspace folder."""
 _COLOURS_FOLDER = "colours"
 """Name of the folder with the colours of the keypoints, in the workspace folder. Each image has one file."""
+_DETECTED_FOLDER = "detected"
+"""Name of the folder with the detected positions of the keypoints, in the workspace folder. Each image whose
+keypoints were moved to the instant of the middle row has one file."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -59,11 +63,13 @@ class CameraKeyframes:
         camera: The camera.
         camera_id: Database id of the camera. The camera's rig has the same id.
         frames: (K,) frame indices, increasing.
+        shutter: Moves the keypoints to the instant of the middle row; None for a global shutter.
     """
 
     camera: CaptureCamera
     camera_id: int
     frames: IntArray
+    shutter: TurningShutter | None = None
 
 
 def read_image_ids(database: pycolmap.Database) -> dict[ImageRef, int]:
@@ -144,13 +150,43 @@ def add_keyframes(
         for item in keyframes:
             for index, features in extract_features(item.camera, item.frames, options.features, context):
                 image_id = write_image(database, ImageRef(item.camera.name, index), item.camera_id)
-                database.write_keypoints(image_id, features.keypoints)
+                keypoints = features.keypoints
+                if item.shutter is not None:
+                    _save_detected(workspace, image_id, keypoints[:, :2])
+                    keypoints = _at_mid_row(keypoints, index, item.shutter)
+                database.write_keypoints(image_id, keypoints)
                 descriptors = pycolmap.FeatureDescriptors(sift, features.descriptors)
                 database.write_descriptors(image_id, descriptors)
                 np.save(colours / f"{image_id}.npy", features.rgb)
                 done += 1
                 context.progress(done, total, "features")
     context.progress(0, 0, "choosing pairs")
+
+
+def _at_mid_row(
+    keypoints: npt.NDArray[np.float32], frame: int, shutter: TurningShutter
+) -> npt.NDArray[np.float32]:
+    """Return keypoints (N,4) of a frame, moved to the instant of the middle row."""
+    moved = keypoints.copy()
+    px = keypoints[:, :2].astype(np.float64)
+    moved[:, :2] = shutter.px_at_mid_row(np.full(len(px), frame, np.int64), px)
+    return moved
+
+
+def _save_detected(workspace: Path, image_id: int, px: npt.NDArray[np.float32]) -> None:
+    """Store the detected positions (N,2) of the keypoints of an image."""
+    folder = workspace / _DETECTED_FOLDER
+    folder.mkdir(exist_ok=True)
+    np.save(folder / f"{image_id}.npy", px)
+
+
+def read_detected_px(workspace: Path, image_id: int) -> FloatArray | None:
+    """Return the detected positions (N,2) of the keypoints of an image, px.
+
+    The result is None if the keypoints of the image were not moved.
+    """
+    path = workspace / _DETECTED_FOLDER / f"{image_id}.npy"
+    return np.asarray(np.load(path), dtype=np.float64) if path.exists() else None
 
 
 def rewrite_without_cameras(workspace: Path, cameras: Collection[str]) -> None:
@@ -164,7 +200,7 @@ def rewrite_without_cameras(workspace: Path, cameras: Collection[str]) -> None:
     """
     import pycolmap
 
-    colours = workspace / _COLOURS_FOLDER
+    folders = [workspace / name for name in (_COLOURS_FOLDER, _DETECTED_FOLDER)]
     before = (workspace / DATABASE_NAME).rename(workspace / f"whole_{DATABASE_NAME}")
     with (
         pycolmap.Database.open(str(before)) as source,
@@ -178,16 +214,18 @@ def rewrite_without_cameras(workspace: Path, cameras: Collection[str]) -> None:
         kept = {int(model.camera_id): model for model in models if model.camera_id not in removed}
         new_ids = {number: _write_camera(database, model) for number, model in kept.items()}
         for number, ref in images:
-            colour_file = colours / f"{number}.npy"
+            files = [folder / f"{number}.npy" for folder in folders if (folder / f"{number}.npy").exists()]
             if ref.camera in cameras:
-                colour_file.unlink()
+                for file in files:
+                    file.unlink()
                 continue
             image_id = write_image(database, ref, new_ids[camera_of[number]])
             database.write_keypoints(image_id, source.read_keypoints(number))
             database.write_descriptors(image_id, source.read_descriptors(number))
             # A new id is never larger than the old id of the same image. So this rename never overwrites the
             # file of another image: the files with smaller old ids were already renamed or removed.
-            colour_file.rename(colours / f"{image_id}.npy")
+            for file in files:
+                file.rename(file.with_name(f"{image_id}.npy"))
     before.unlink()
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.mapping.matching.database import ImageRef, read_keypoint_colours
+from bodycap_batch.mapping.matching.database import ImageRef, read_detected_px, read_keypoint_colours
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform
 from bodycap_batch.model.scene import Map
@@ -43,7 +43,9 @@ def map_from_reconstruction(model: pycolmap.Reconstruction, workspace: Path) -> 
         keyframe_rows.append(np.full(len(rows), row))
         point_rows.append(rows)
         features.append(feature)
-        pixels.append(np.array([point.xy for point in observations]).reshape(-1, 2))
+        detected = read_detected_px(workspace, image_id)
+        used = np.array([point.xy for point in observations]).reshape(-1, 2)
+        pixels.append(used if detected is None else detected[feature])
         np.add.at(colour_sum, rows, colours[feature])
     obs_point = _concatenate(point_rows)
     counts = np.bincount(obs_point, minlength=len(point_ids))

@@ -11,7 +11,7 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert
-from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
+from bodycap_batch.model.rotation_path import PosePath, RotationPath
 from bodycap_batch.model.scene import Map
 from bodycap_batch.registration.poses.batched_pnp import Observations, make_observations, projection_jacobian
 from bodycap_batch.registration.poses.static_points import static_points
@@ -53,12 +53,15 @@ class RigMember:
         cam_from_rig: (4,4) pose of the camera in the rig. The estimated poses of frames are poses of the rig.
         rig_frame: (N,) index of the rig's frame at the instant of each frame of this camera; -1 if the rig
             has no frame at this instant.
+        rotation: The rotation of the camera from matches between adjacent frames; None if it is unknown.
+            It is used where poses are missing.
     """
 
     camera: CaptureCamera
     tracks: Tracks
     cam_from_rig: FloatArray
     rig_frame: IntArray
+    rotation: RotationPath | None = None
 
 
 @dataclass(slots=True)
@@ -242,7 +245,8 @@ class FrameBlock:
         """Return the pixels (M,2) moved to the instant of the middle row.
 
         Args:
-            path: (F,4,4) poses map_from_rig of all frames; NaN for a frame without a pose.
+            path: (F,4,4) poses map_from_rig of all frames; NaN for a frame without a pose. Without poses,
+                only the rotation between adjacent frames is corrected, if it is known.
         """
         out = self.px.copy()
         scene_map, times_ns = self.rig.scene_map, self.rig.members[0].camera.times_ns
@@ -251,8 +255,9 @@ class FrameBlock:
             if readout_s:
                 rows = self.member == number
                 own_poses, points = path @ invert(member.cam_from_rig), scene_map.points[self.point[rows]]
-                velocity = image_velocity(lens, own_poses, times_ns, self.frame[rows], points)
-                out[rows] = px_at_mid_row(lens, out[rows], velocity, readout_s)
+                poses = PosePath.create(own_poses, times_ns, member.rotation)
+                seen = lens, self.frame[rows], points, out[rows], readout_s
+                out[rows] = poses.with_fitted_rates(*seen).px_at_mid_row(*seen)
         return out
 
     def count_by_frame(self, selected: BoolArray) -> IntArray:

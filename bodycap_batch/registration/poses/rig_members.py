@@ -11,6 +11,7 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.relative_pose import RelativePose, estimate_relative_pose, match_instants
+from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import Registration
 from bodycap_batch.registration.poses.observations import RigMember
 from bodycap_batch.registration.tracking.klt import Tracks
@@ -23,10 +24,13 @@ class RegisteredCamera:
     Attributes:
         camera: The camera.
         registration: The registration of this camera.
+        rotation: The rotation of a camera with a rolling shutter from matches between adjacent frames; None
+            if it is unknown.
     """
 
     camera: CaptureCamera
     registration: Registration
+    rotation: RotationPath | None = None
 
     @property
     def tracks(self) -> Tracks:
@@ -72,7 +76,13 @@ def rig_members(
     """
     count = len(own.camera.times_ns)
     out = [
-        RigMember(camera=own.camera, tracks=own.tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
+        RigMember(
+            camera=own.camera,
+            tracks=own.tracks,
+            cam_from_rig=np.eye(4),
+            rig_frame=np.arange(count),
+            rotation=own.rotation,
+        )
     ]
     for other, pose in zip(others, relative, strict=True):
         if not pose.is_rigid:
@@ -85,6 +95,7 @@ def rig_members(
                 tracks=other.tracks,
                 cam_from_rig=invert(first_from_second) if own_first else first_from_second,
                 rig_frame=match_instants(own.camera.common_times_ns(), other.camera.common_times_ns()),
+                rotation=other.rotation,
             )
         )
     return out

@@ -12,6 +12,7 @@ from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.geometry import interpolate_pose, invert
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
+from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Trajectory
 from bodycap_batch.registration.poses.batched_pnp import find_inliers
 from bodycap_batch.registration.poses.observations import PointReliability, RigMember, RigObservations
@@ -66,14 +67,26 @@ def acceptance_criteria(
 
 
 def solve_camera(
-    camera: CaptureCamera, scene_map: Map, tracks: Tracks, criteria: AcceptanceCriteria, threads: int = 1
+    camera: CaptureCamera,
+    scene_map: Map,
+    tracks: Tracks,
+    criteria: AcceptanceCriteria,
+    threads: int = 1,
+    rotation: RotationPath | None = None,
 ) -> list[FramePose]:
     """Estimate the pose of every frame of a camera from the observed map points; see `solve_rig`.
 
-    The solution starts from poses that are interpolated between the keyframes.
+    The solution starts from poses that are interpolated between the keyframes. `rotation` is the rotation of
+    a camera with a rolling shutter from matches between adjacent frames; None if it is unknown.
     """
     count = len(camera.times_ns)
-    member = RigMember(camera=camera, tracks=tracks, cam_from_rig=np.eye(4), rig_frame=np.arange(count))
+    member = RigMember(
+        camera=camera,
+        tracks=tracks,
+        cam_from_rig=np.eye(4),
+        rig_frame=np.arange(count),
+        rotation=rotation,
+    )
     rows = scene_map.keyframes_of(camera.name)
     start = _interpolated_keyframe_poses(scene_map.keyframe_frame[rows], scene_map.map_from_cam[rows], count)
     return solve_rig([member], scene_map, start, criteria, threads)
@@ -106,7 +119,8 @@ def solve_rig(
         too few inliers.
     """
     rig = RigObservations.create(members, scene_map)
-    solution = _solve(rig, start, criteria, threads)
+    unknown = np.full_like(start, np.nan) if rig.rolling else None
+    solution = _solve(rig, start, criteria, threads, path=unknown)
     for _ in range(_REPEATS_ROLLING if rig.rolling else _REPEATS):
         poses = pose_array(solution.poses)
         start = np.where(np.isfinite(poses), invert(poses), start)

@@ -10,6 +10,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
+from bodycap_batch.model.rotation_path import TurningShutter
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.registration.poses.batched_pnp import Observations, make_observations, refine_poses
 from bodycap_batch.registration.poses.observations import point_weights
@@ -148,10 +149,12 @@ class SearchFrame:
     """A frame to be searched.
 
     Attributes:
+        index: Frame index.
         pyramid: Image pyramid of the frame.
         keyframe_row: Row index of the frame among the map's keyframes, or -1 if the frame is not a keyframe.
     """
 
+    index: int
     pyramid: Pyramid
     keyframe_row: int
 
@@ -179,6 +182,8 @@ class GuidedLocaliser:
         criteria: The conditions that a pose must meet.
         exposure_ratio: Exposure time as a fraction of the frame interval.
         readout_ratio: Readout time as a fraction of the frame interval.
+        shutter: The rolling shutter with the rotation of the camera from matches between adjacent frames.
+            None: the rotation is unknown, or the shutter is global.
         is_unmasked: Function from pixels (N,2) to a mask (N,) of the pixels that the camera's mask does not
             cover.
     """
@@ -188,6 +193,7 @@ class GuidedLocaliser:
     criteria: AcceptanceCriteria
     exposure_ratio: float
     readout_ratio: float = 0.0
+    shutter: TurningShutter | None = None
     is_unmasked: Callable[[FloatArray], BoolArray]
 
     def localise(
@@ -241,11 +247,13 @@ class GuidedLocaliser:
         """Return the expected view of a frame."""
         return PredictedView(
             lens=self.lens,
+            frame=search_frame.index,
             pyramid=search_frame.pyramid,
             cam_from_map=pose,
             neighbour_pose=neighbour.pose,
             exposure_ratio=self.exposure_ratio,
             readout_ratio=neighbour.direction * self.readout_ratio,
+            shutter=self.shutter,
             keyframe_row=search_frame.keyframe_row,
         )
 

@@ -13,6 +13,7 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, transform_points
 from bodycap_batch.model.optical_flow import GreyImage, pixel_scale
 from bodycap_batch.model.rolling_shutter import px_at_mid_row
+from bodycap_batch.model.rotation_path import TurningShutter
 from bodycap_batch.model.scene import Map
 from bodycap_batch.registration.tracking.klt import grid_sample
 
@@ -109,23 +110,70 @@ class PredictedView:
 
     Attributes:
         lens: The camera model.
+        frame: Frame index.
         pyramid: Image pyramid of the frame.
         cam_from_map: (4,4) expected pose of the frame.
         neighbour_pose: (4,4) pose cam_from_map of the frame before, or of the frame after.
         exposure_ratio: Exposure time as a fraction of the frame interval.
         readout_ratio: Readout time as a fraction of the frame interval; 0 if the map was not adjusted for a
             rolling shutter. It is negative if `neighbour_pose` is the pose of the frame after.
+        shutter: The rolling shutter with the rotation of the camera from matches between adjacent frames.
+            None: it is unknown, and the image motion is used.
         keyframe_row: Row index of this frame among the map's keyframes, or -1. Patches of this keyframe are
             not used, because they would match even if its pose in the map is wrong.
     """
 
     lens: Camera
+    frame: int
     pyramid: Pyramid
     cam_from_map: FloatArray
     neighbour_pose: FloatArray
     exposure_ratio: float
     readout_ratio: float = 0.0
+    shutter: TurningShutter | None = None
     keyframe_row: int = -1
+
+    def px_in_picture(self, points: FloatArray, px: FloatArray) -> FloatArray:
+        """Return where points (N,3) are seen in the picture, from their pixels (N,2) at the frame time.
+
+        The shift of a point depends on the row in which it is exposed. Without a rotation from matches, the
+        row at the instant of the middle row is used instead: a point moves little during the readout.
+        """
+        if not self._turns:
+            return px_at_mid_row(self.lens, px, image_motion(self, points, px), -self.readout_ratio)
+        assert self.shutter is not None
+        shifted = px_at_mid_row(self.lens, px, self._shift_motion(points, px), -self.readout_ratio)
+        return self.shutter.px_in_picture(np.full(len(px), self.frame), shifted)
+
+    def px_at_mid_row(self, points: FloatArray, expected_px: FloatArray, px: FloatArray) -> FloatArray:
+        """Return where observed pixels (N,2) would be at the instant of the middle row.
+
+        Args:
+            points: (N,3) observed points in the map.
+            expected_px: (N,2) their expected pixels at the instant of the middle row.
+            px: (N,2) observed pixels; NaN for points that were not found.
+        """
+        if not self._turns:
+            motion = image_motion(self, points, expected_px)
+            return px_at_mid_row(self.lens, px, motion, self.readout_ratio)
+        assert self.shutter is not None
+        out = px - px_at_mid_row(self.lens, px, self._shift_motion(points, expected_px), self.readout_ratio)
+        seen = np.isfinite(px).all(axis=1)
+        turned = px.copy()
+        turned[seen] = self.shutter.px_at_mid_row(np.full(int(seen.sum()), self.frame), px[seen])
+        return np.asarray(turned - out)
+
+    @property
+    def _turns(self) -> bool:
+        """True if the rotation of the camera in this frame is known from matches."""
+        return self.shutter is not None and self.shutter.path.is_known(self.frame)
+
+    def _shift_motion(self, points: FloatArray, px: FloatArray) -> FloatArray:
+        """Return the motion (N,2) of points since the neighbouring frame, without the rotation."""
+        shift = invert(self.neighbour_pose)[:3, 3]
+        rotation = self.cam_from_map[:3, :3]
+        before = (points - shift) @ rotation.T
+        return np.asarray(np.nan_to_num(px - self.lens.project(before)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,12 +292,9 @@ def match_patches(
         return PatchMatches(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
     warp = _patch_warps(scene, lens, view.cam_from_map, rows, px)
     step = view.pyramid.step_px[level.pyramid_level]
-    motion = _image_motion(view, points, px)
+    motion = image_motion(view, points, px)
     images, is_inside = _render_patches(patches, rows, warp, _motion_blur(view, motion), level, step)
-    # The shift to the point's real pixel depends on the image row at which the point is exposed. This row is
-    # unknown. The row at the instant of the middle row is used instead: a point moves little during the
-    # readout, so the two rows are nearly equal.
-    expected_px = px_at_mid_row(lens, px, motion, -view.readout_ratio)
+    expected_px = view.px_in_picture(points, px)
     found_px, score = np.full((len(rows), 2), np.nan), np.zeros(len(rows))
     target = view.pyramid.levels[level.pyramid_level].astype(np.float32)
     for number in np.flatnonzero(is_inside).tolist():
@@ -258,7 +303,7 @@ def match_patches(
             found_px[number] = (np.array(match[:2]) + 0.5) * step
             score[number] = match[2]
     accepted = (score > level.min_score) & np.isfinite(found_px).all(axis=1)
-    mid_row_px = px_at_mid_row(lens, found_px, motion, view.readout_ratio)
+    mid_row_px = view.px_at_mid_row(points, px, found_px)
     return PatchMatches(
         scene.obs_point[rows[accepted]], found_px[accepted], mid_row_px[accepted], score[accepted]
     )
@@ -294,7 +339,7 @@ def _patch_warps(
     )
 
 
-def _image_motion(view: PredictedView, points: FloatArray, px: FloatArray) -> FloatArray:
+def image_motion(view: PredictedView, points: FloatArray, px: FloatArray) -> FloatArray:
     """Return the motion (N,2) of points in the image since the neighbouring frame, in pixels.
 
     Args:

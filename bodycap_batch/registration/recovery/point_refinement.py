@@ -10,7 +10,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.optical_flow import pixel_scale
-from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
+from bodycap_batch.model.rotation_path import PosePath
 from bodycap_batch.model.scene import FrameStatus, Map, Trajectory
 from bodycap_batch.registration.poses.batched_pnp import Observations, linearise, make_observations
 from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
@@ -148,8 +148,9 @@ def _mid_row_px(scene_map: Map, paths: Mapping[str, Trajectory]) -> FloatArray:
         is_own = np.isin(scene_map.obs_keyframe, scene_map.keyframes_of(name))
         frame = scene_map.keyframe_frame[scene_map.obs_keyframe[is_own]]
         lens, points = scene_map.cameras[name], scene_map.points[scene_map.obs_point[is_own]]
-        velocity = image_velocity(lens, path.gauge_from_cam, path.times_ns, frame, points)
-        out[is_own] = px_at_mid_row(lens, out[is_own], velocity, readout_s)
+        poses = PosePath.create(path.gauge_from_cam, path.times_ns)
+        seen = lens, frame, points, out[is_own], readout_s
+        out[is_own] = poses.with_fitted_rates(*seen).px_at_mid_row(*seen)
     return out
 
 

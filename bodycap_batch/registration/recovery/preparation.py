@@ -21,6 +21,7 @@ from bodycap_batch.registration.poses.trajectory import (
     build_trajectory,
     solve_camera,
 )
+from bodycap_batch.registration.poses.turning_tracks import turn_tracks
 from bodycap_batch.registration.recovery.motion_prior import MotionStatistics, times_in_intervals
 from bodycap_batch.registration.recovery.point_refinement import refine_points, remove_weak_boundary_poses
 
@@ -44,7 +45,9 @@ def remove_misplaced_keyframes(
     for camera in cameras:
         if camera.registration.trajectory.gauge == scene_map.gauge:
             criteria = acceptance_criteria(camera.camera, selection, options)
-            misplaced.append(find_misplaced_keyframes(camera.camera.name, scene_map, camera.tracks, criteria))
+            name = camera.camera.name
+            turned = turn_tracks(name, scene_map, camera.tracks, camera.rotation)
+            misplaced.append(find_misplaced_keyframes(name, scene_map, turned, criteria))
     return map_without_keyframes(scene_map, np.concatenate([np.zeros(0, np.int64), *misplaced]))
 
 
@@ -81,7 +84,7 @@ def prepare_recovery(
         return scene_map, own.registration
     refined_map = refine_points(scene_map, paths)
     criteria = acceptance_criteria(own.camera, selection, options)
-    poses = solve_camera(own.camera, refined_map, own.tracks, criteria, threads)
+    poses = solve_camera(own.camera, refined_map, own.tracks, criteria, threads, own.rotation)
     path = build_trajectory(own.camera, scene_map.gauge, poses, selection)
     path = remove_weak_boundary_poses(path, options.min_inliers)
     if motion_statistics(path) is None:

@@ -87,7 +87,7 @@ class LostInterval:
 
     def search_frame(self, frame: int) -> SearchFrame:
         """Return a frame with its image pyramid, ready to be searched."""
-        return SearchFrame(self.pyramids[frame], self.keyframe_rows.get(frame, -1))
+        return SearchFrame(frame, self.pyramids[frame], self.keyframe_rows.get(frame, -1))
 
 
 @dataclass(slots=True)
@@ -255,12 +255,16 @@ class Propagation:
     def _candidate_rotations(self, state: _PropagationState, frame: int) -> list[FloatArray]:
         """Return possible rotations cam_from_map (3,3) of the next frame, the most likely first.
 
-        The first candidate follows from the image motion, if this motion is known. The last candidate assumes
-        a constant angular velocity.
+        The first candidate follows from matches between adjacent frames or from the image motion, if one of
+        them is known. The last candidate assumes a constant angular velocity.
         """
         rotation, lens = state.pose[:3, :3], self.localiser.lens
         previous_pyramid, pyramid = self.interval.pyramids.get(state.frame), self.interval.pyramids[frame]
         constant_rotation = [state.rotation_step @ rotation]
+        shutter = self.localiser.shutter
+        matched = None if shutter is None else shutter.path.turn(state.frame, frame)
+        if matched is not None:
+            return [matched @ rotation, *constant_rotation]
         if previous_pyramid is None:
             return constant_rotation
         first, second = make_coarse_image(previous_pyramid.levels[0]), make_coarse_image(pyramid.levels[0])

@@ -12,11 +12,13 @@ from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.geometry import invert
+from bodycap_batch.model.rotation_path import RotationPath, TurningShutter
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
 from bodycap_batch.registration.poses.pose_outliers import ISOLATED_INLIER_FACTOR, isolated_poses
 from bodycap_batch.registration.poses.rig_members import RegisteredCamera
+from bodycap_batch.registration.poses.turning_tracks import with_rotation
 from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser, PoseEstimate
 from bodycap_batch.registration.recovery.motion_prior import (
     MAX_DISAGREEMENT,
@@ -99,13 +101,13 @@ def recover_lost_frames(
             trajectories.append(camera.registration.trajectory)
             yield camera
 
+    own = with_rotation(inputs.capture.cameras[0], registration, [own_map], inputs.selection)
     scene_map = remove_misplaced_keyframes(own_map, cameras(), inputs.selection, options)
     if not inputs.in_rig:
-        own = RegisteredCamera(camera=inputs.capture.cameras[0], registration=registration)
         scene_map, registration = prepare_recovery(
             own, trajectories[1:], scene_map, inputs.selection, options, context.threads
         )
-    return find_lost_poses(registration, scene_map, inputs.capture, options, context)
+    return find_lost_poses(registration, scene_map, inputs.capture, options, context, own.rotation)
 
 
 def find_lost_poses(
@@ -114,6 +116,7 @@ def find_lost_poses(
     capture: Capture,
     options: RegistrationOptions,
     context: StageContext,
+    rotation: RotationPath | None = None,
 ) -> Registration:
     """Search the lost frames of a camera, and accept the poses that are well supported.
 
@@ -133,6 +136,8 @@ def find_lost_poses(
         capture: All cameras.
         options: Minimum number of inliers and maximum relative sigma of a pose.
         context: Progress and cancellation.
+        rotation: The rotation of a camera with a rolling shutter from matches between adjacent frames; None
+            if it is unknown.
 
     Returns:
         The registration with more poses and a smoothed trajectory. It contains no observations of the
@@ -144,7 +149,7 @@ def find_lost_poses(
     if statistics is None:
         return registration
     times = times_in_intervals(path.times_ns)
-    localiser = _make_localiser(scene_map, capture, path, options, context)
+    localiser = _make_localiser(scene_map, capture, path, options, context, rotation)
     interval_search = _IntervalSearch(
         camera=camera,
         scene_map=scene_map,
@@ -177,6 +182,7 @@ def _make_localiser(
     path: Trajectory,
     options: RegistrationOptions,
     context: StageContext,
+    rotation: RotationPath | None,
 ) -> GuidedLocaliser:
     """Return a localiser with the keyframes of all cameras and the camera's exposure time."""
     camera = capture.camera(path.camera)
@@ -184,12 +190,14 @@ def _make_localiser(
         max_error_px=1.0, min_inliers=options.min_inliers, max_sigma_depth=options.max_sigma_depth
     )
     interval_s = float(np.median(np.diff(path.times_ns))) * 1e-9
+    lens, readout_s = scene_map.cameras[camera.name], scene_map.readout_s.get(camera.name, 0.0)
     localiser = GuidedLocaliser(
-        lens=scene_map.cameras[camera.name],
+        lens=lens,
         patches=read_keyframe_patches(scene_map, capture, camera, context),
         criteria=criteria,
         exposure_ratio=0.0,
-        readout_ratio=scene_map.readout_s.get(camera.name, 0.0) / interval_s,
+        readout_ratio=readout_s / interval_s,
+        shutter=None if rotation is None else TurningShutter(lens, rotation, readout_s),
         is_unmasked=camera.is_unmasked,
     )
     return replace(localiser, exposure_ratio=estimate_exposure(camera, localiser, path))
@@ -271,7 +279,8 @@ def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> d
     """Search an interval and return the accepted poses with smoothed centres, by frame.
 
     A pose is accepted if it has enough support, if its centre is near the smoothed centre, and if the sigma
-    of the centre is small.
+    of the centre is small. If the angular velocity of a camera with a rolling shutter is extrapolated in the
+    frame, its error adds to the covariance.
     """
     estimates = propagation.run()
     if not estimates:
@@ -281,6 +290,9 @@ def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> d
     accepted = {}
     for frame, estimate in estimates.items():
         pose, covariance = estimate.conditioned_on_centre(smoothed.positions[frame])
+        shutter = propagation.localiser.shutter
+        unsure = 0.0 if shutter is None else shutter.uncertainty(frame)
+        covariance = covariance + np.diag(np.repeat([unsure, unsure * estimate.depth], 3) ** 2)
         sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
         if (
             estimate.has_support(criteria.min_inliers, _MIN_INLIER_WEIGHT_RATIO)

@@ -131,11 +131,13 @@ def estimate_exposure(camera: CaptureCamera, localiser: GuidedLocaliser, path: T
         pose, neighbour_pose = (invert(path.gauge_from_cam[index]) for index in (frame, frame - 1))
         view = PredictedView(
             lens=localiser.lens,
+            frame=frame,
             pyramid=Pyramid.build(grey),
             cam_from_map=pose,
             neighbour_pose=neighbour_pose,
             exposure_ratio=0.0,
             readout_ratio=localiser.readout_ratio,
+            shutter=localiser.shutter,
         )
         rows = select_patches(localiser.patches, view)
         for number, ratio in enumerate(_EXPOSURE_CANDIDATES):

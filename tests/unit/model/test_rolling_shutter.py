@@ -209,6 +209,16 @@ def test_a_stated_readout_keeps_its_way_where_none_could_be_looked_for(
     assert (reported.seconds, reported.source) == (0.0, "not determined: no convergence")
 
 
+def test_velocities_are_not_fitted_to_a_map_that_has_absorbed_the_displacements() -> None:
+    # Pixels, poses and points agree without a correction, as they do in a map of uncorrected keypoints.
+    film = Film(0.0)
+    rolling, readout_s = rolling_model(film), {"head": 0.02}
+    moved = misfit_px(rolling.with_exact_rates(readout_s, ()).corrected(readout_s), film)
+    fitted = misfit_px(rolling.with_exact_rates(readout_s, {"head"}).corrected(readout_s), film)
+    assert moved == pytest.approx(misfit_px(rolling.corrected(readout_s), film), rel=0.1)
+    assert fitted < 0.8 * moved
+
+
 def test_a_sensor_that_was_not_turned_is_read_along_rows_alone() -> None:
     film = Film(0.02, sideways=True)
     _, reported = readouts_of(film, camera_of(film))
@@ -360,6 +370,11 @@ def test_a_rolling_shutter_shows_in_the_residuals(readout_s: float, shows: bool,
     )
     assert (abs(apparent_s) > 8 * sigma_s) is shows
     assert not shows or 0.001 < apparent_s < 0.021
+
+
+def test_no_observations_tell_no_readout() -> None:
+    none = np.zeros((0, 2))
+    assert estimate_residual_readout(LENS, np.zeros(0, np.int64), none, none, none) == (0.0, float("inf"))
 
 
 @pytest.mark.parametrize(
