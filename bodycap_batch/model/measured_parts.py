@@ -27,11 +27,12 @@ _MIN_SPAN_S = 0.1
 
 
 class PartState(StrEnum):
-    """How much of a part of the body the cameras measured at one tick."""
+    """How much of a part of the body the cameras measured."""
 
     MEASURED = "measured"
     PARTLY = "partly measured"
     UNMEASURED = "not measured"
+    FILLED = "filled with a plausible motion"
 
 
 _STATES = (PartState.UNMEASURED, PartState.PARTLY, PartState.MEASURED)

@@ -221,3 +221,8 @@ class MergeResult(SolvedBody):
         if self.joint_covariance_m2 is None:
             return np.full(self.observed.shape, np.nan)
         return np.asarray(np.sqrt(np.trace(self.joint_covariance_m2, axis1=2, axis2=3) / 3.0))
+
+
+def filled_joints(merge: MergeResult) -> BoolArray:
+    """Return which joints (J,) the stage `fill` posed; none before this stage."""
+    return np.zeros(len(merge.solved), dtype=bool) if merge.fill is None else merge.fill.filled

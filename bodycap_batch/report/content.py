@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.model.measured_parts import PartState, part_states
+from bodycap_batch.model.measured_parts import BODY_PARTS, PartState, part_states
+from bodycap_batch.model.merge_data import MergeResult, filled_joints
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
-from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.report.drawn_scene import DrawnScene, common_times_s
 from bodycap_batch.report.figures.before_after import draw_before_and_after, find_unoptimised_bones
 from bodycap_batch.report.figures.camera_landmark_matrix import draw_camera_landmark_matrix
@@ -64,7 +64,7 @@ def page_content(
     verdict = judge(inputs.metrics, inputs.failure)
     return {
         "name": inputs.name,
-        "person": None if inputs.merge is None else _person(inputs.merge.motion),
+        "person": None if inputs.merge is None else _person(inputs.merge),
         "curves": _motion_curves(inputs, budget),
         "files": describe_files(inputs.files),
         "verdict": verdict,
@@ -92,17 +92,33 @@ def page_content(
     }
 
 
-def _person(motion: Motion) -> dict[str, Any]:
-    """Return the pictogram, and for each part of the body the shares of ticks in each state."""
-    states = part_states(motion)
+def _person(merge: MergeResult) -> dict[str, Any]:
+    """Return the pictogram, the shares of ticks in each state of each part, and how the rest is posed."""
+    motion = merge.motion
+    filled = filled_joints(merge)
     parts = []
-    for name, values in states.items():
+    for name, values in part_states(motion).items():
         measured, partly = float((values == 2).mean()), float((values == 1).mean())
         state = PartState.MEASURED if measured >= _WHOLE_SHARE else PartState.PARTLY
-        state = PartState.UNMEASURED if measured + partly <= 1.0 - _WHOLE_SHARE else state
+        if measured + partly <= 1.0 - _WHOLE_SHARE:
+            is_filled = filled[[role in BODY_PARTS[name] for role in motion.skeleton.roles]].all()
+            state = PartState.FILLED if is_filled else PartState.UNMEASURED
         parts.append({"name": name, "measured": measured, "partly": partly, "state": state})
-    unmeasured = [part["name"] for part in parts if part["state"] == PartState.UNMEASURED]
-    return {"pictogram": draw_pictogram(motion), "parts": parts, "unmeasured": unmeasured}
+    return {
+        "pictogram": draw_pictogram(motion, filled),
+        "parts": parts,
+        "filled": [part["name"] for part in parts if part["state"] == PartState.FILLED],
+        "unmeasured": [part["name"] for part in parts if part["state"] == PartState.UNMEASURED],
+        "sure_steps": _share_of_sure_steps(merge),
+    }
+
+
+def _share_of_sure_steps(merge: MergeResult) -> float | None:
+    """Return the share of ticks at which the motion determines the filled steps; None without filled legs."""
+    fill = merge.fill
+    if fill is None or not fill.standing.any():
+        return None
+    return float(fill.is_sure.mean())
 
 
 def _motion_curves(inputs: ReportInputs, budget: PageBudget) -> str:

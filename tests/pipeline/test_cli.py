@@ -105,7 +105,7 @@ def test_the_second_run_has_nothing_to_do(bench: Bench) -> None:
     bench.run("run", "my walk")
     code, out, _ = bench.run("run", "my walk")
     assert code == 0
-    assert "nothing to do, because all 12 stages were already done" in out
+    assert "nothing to do, because all 13 stages were already done" in out
 
 
 def test_results_elsewhere_have_their_store_beside_them(bench: Bench) -> None:

@@ -1,10 +1,10 @@
-"""Draw the person as a pictogram: which bones the cameras measured, partly measured or did not measure."""
+"""Draw the person as a pictogram: which bones were measured, partly measured, filled or neither."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.model.bone_axes import bone_ends_m, has_floor_root
 from bodycap_batch.model.skeleton import Motion, rest_pose
 from bodycap_batch.model.skeleton_presets import split_side
@@ -31,11 +31,12 @@ _MIN_BONE_STATURE = 0.03
 """Shortest bone that is drawn, as a share of the drawn height. Evidence: none."""
 
 
-def draw_pictogram(motion: Motion) -> str:
+def draw_pictogram(motion: Motion, filled: BoolArray) -> str:
     """Draw the skeleton at rest, seen from the front, with lowered arms.
 
     Args:
         motion: The motion.
+        filled: (J,) True for joints that were filled with a plausible motion.
 
     Returns:
         The drawing as SVG.
@@ -56,7 +57,7 @@ def draw_pictogram(motion: Motion) -> str:
         if (joint == 0 and has_floor_root(skeleton)) or not role:
             continue
         (x1, y1), (x2, y2) = on_page(flat_at[joint]), on_page(flat_ends[joint])
-        kind = _kind(float(share[joint]))
+        kind = _kind(float(share[joint]), bool(filled[joint]))
         if role == "Head":
             parts.append(
                 element(
@@ -99,7 +100,9 @@ def _lowered(roles: tuple[str, ...], at: FloatArray, ends: FloatArray) -> tuple[
     return at, ends
 
 
-def _kind(share: float) -> str:
+def _kind(share: float, is_filled: bool) -> str:
     if share >= _WHOLE:
         return "measured"
-    return "unknown" if share <= _PART else "partly"
+    if share > _PART:
+        return "partly"
+    return "filled" if is_filled else "unknown"

@@ -20,11 +20,13 @@ def test_the_pictogram_shows_each_state() -> None:
     roles = motion.skeleton.roles
     observed[:, roles.index("LeftArm")] = True
     observed[:10, roles.index("RightArm")] = True
-    drawing = draw_pictogram(replace(motion, observed=observed))
-    kinds = re.findall(r'class="(measured|partly|unknown)"', drawing)
+    filled = np.array([role.endswith("Leg") for role in roles])
+    drawing = draw_pictogram(replace(motion, observed=observed), filled)
+    kinds = re.findall(r'class="(measured|partly|filled|unknown)"', drawing)
     assert kinds.count("measured") == 1
     assert kinds.count("partly") == 1
-    assert kinds.count("unknown") > 10
+    assert kinds.count("filled") == 4
+    assert kinds.count("unknown") > 6
     # Seen from the front, the left arm is on the right.
     (x1,) = re.findall(r'class="measured" x1="([\d.]+)"', drawing)
     assert float(x1) > 84

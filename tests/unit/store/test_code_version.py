@@ -113,6 +113,7 @@ HASHED = {
     **dict.fromkeys(("registration", "rig", "recover"), CAMERAS | {"registration"}),
     # Merging reads marker boards from the images, and explains a failure by mirrored cameras.
     "merge": BODY | {"merging", "calibration", "mapping"},
+    "fill": BODY | {"fill"},
     "export": BODY | {"export"},
     "report": BODY | {"report", "overlay"},
     "preview": BODY | {"preview", "overlay"},
