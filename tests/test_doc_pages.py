@@ -73,7 +73,7 @@ def test_the_option_blocks_in_the_reference_show_the_defaults(tmp_path: Path) ->
         assert getattr(job, stage) == getattr(plain, stage)
 
 
-SETTINGS = sorted(set(re.findall(r"`((?:export|merge|map): \{[^`…]*\})`", TEXT)))
+SETTINGS = sorted(set(re.findall(r"`((?:export|merge|map|telemetry): \{[^`…]*\})`", TEXT)))
 
 
 @pytest.mark.parametrize("setting", SETTINGS)

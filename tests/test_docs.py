@@ -21,6 +21,8 @@ import generate  # noqa: E402 - the generator of the reference lies beside its p
 
 METRICS = REPOSITORY / "bodycap_batch" / "export" / "metrics.py"
 RUN = REPOSITORY / "bodycap_batch" / "pipeline" / "run.py"
+TELEMETRY = REPOSITORY / "bodycap_batch" / "model" / "inertial_camera.py"
+FILL = REPOSITORY / "bodycap_batch" / "export" / "fill_report.py"
 
 
 def fields_without_description(model: type[BaseModel]) -> Iterator[str]:
@@ -71,6 +73,17 @@ def last_parts(name: str) -> set[str]:
 
 def test_every_key_of_the_metrics_has_a_description() -> None:
     assert keys_in(METRICS) - last_parts("metrics.json") == set()
+
+
+def test_every_key_of_the_inertial_sensors_has_a_description() -> None:
+    described = {
+        key.split(".")[-1] for key in generate.descriptions()["metrics.json"] if "telemetry.*" in key
+    }
+    assert keys_in(TELEMETRY) == described
+
+
+def test_every_key_of_the_filled_joints_has_a_description() -> None:
+    assert keys_in(FILL) == last_parts("fill.json")
 
 
 def test_every_key_of_the_record_of_a_run_has_a_description() -> None:

@@ -164,7 +164,7 @@ def results() -> str:
     for name in ("frames.csv", "joints.csv"):
         rows = [(f"`{column}`", known[name][column]) for column in columns()[name]]
         parts.append(f"\n## `{name}`\n\n{_table(('column', 'meaning'), rows)}")
-    for name in ("metrics.json", "status.json", "run.json"):
+    for name in ("metrics.json", "fill.json", "status.json", "run.json"):
         rows = [(f"`{key}`", text) for key, text in known[name].items()]
         parts.append(f"\n## `{name}`\n\n{_table(('key', 'meaning'), rows)}")
     parts.append("\n## `merge` in `metrics.json`\n")
