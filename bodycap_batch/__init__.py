@@ -3,4 +3,4 @@
 # zlib must be loaded before pycolmap: the other order aborts on the first compression.
 import zlib  # noqa: F401
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
