@@ -38,8 +38,16 @@ def find_job(path: Path) -> JobPlace:
     """Return the job and the results that a path means.
 
     A folder of results holds ``run.json`` and ``job.yaml``, itself or in its subfolder ``partial``. The
-    folder of a job in a watched folder (``done/NAME``) means its results.
+    folder of a job in a watched folder (``done/NAME``) means its results. A path that cannot be read is taken
+    for a job; loading it tells why it cannot be read.
     """
+    try:
+        return _place_of(path)
+    except OSError:
+        return JobPlace(file=path)
+
+
+def _place_of(path: Path) -> JobPlace:
     if (path / _STATUS_FILE).is_file() and (path / _RESULT).is_dir():
         path = path / _RESULT
     if _is_run(path):
