@@ -260,6 +260,7 @@ def test_waiting_for_gc_is_reported_once(bench: SpoolFixture) -> None:
     assert [line.partition(": the job continues")[0] for line in lines] == ["walk: started", "walk: stopped"]
 
 
+@pytest.mark.slow
 def test_a_watcher_with_once_leaves_no_job_behind(bench: SpoolFixture) -> None:
     for name in ("one", "two"):  # left by a watcher with two job slots
         bench.drop(name)

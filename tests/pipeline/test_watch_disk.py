@@ -59,6 +59,7 @@ def failing(times: int, function: Callable[..., Any], number: int = errno.EIO) -
     return fail
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["entries_in", "visible_entries", "ignored_paths_in"])
 def test_the_watcher_waits_for_a_folder_that_cannot_be_read(
     bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch, name: str
@@ -265,6 +266,7 @@ def test_a_job_waits_for_missing_videos_without_a_limit(
     assert bench.status("walk")["state"] == "cancelled"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("impatient")
 def test_a_repeated_disk_failure_is_reported_once(
     bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch

@@ -22,6 +22,8 @@ from bodycap_batch.model.scene import KeyframeSelection, MapResult
 from tests.rooms import stroll
 from tests.stages.conftest import DARK, FRAMES, context
 
+pytestmark = pytest.mark.slow
+
 _EVERY = [frame for frame in range(0, FRAMES, 2) if frame not in DARK]
 
 
