@@ -127,11 +127,3 @@ class Site:
 
     def results(self, out: str = "out") -> dict[str, bytes]:
         return results_of(self.folder / out)
-
-
-def gone(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return True
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"

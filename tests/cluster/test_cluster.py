@@ -16,8 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.cluster.site import NAMES, REAL, Site, gone, wait_for
+from tests.cluster.site import NAMES, REAL, Site, wait_for
 from tests.pipeline.tiny_job import JOB
+from tests.processes import gone
 
 pytestmark = pytest.mark.cluster
 

@@ -11,7 +11,7 @@ import pytest
 
 from bodycap_batch.cli import main
 from tests.pipeline.test_cli import Bench as Command
-from tests.pipeline.test_cli import gone
+from tests.processes import gone
 from tests.results import results_of
 
 NAMES = ("monday", "tuesday")

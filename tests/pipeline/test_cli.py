@@ -21,6 +21,7 @@ import bodycap_batch
 from bodycap_batch.cli import main
 from tests.pipeline.fake_bodycap import run_here
 from tests.pipeline.fake_stages import ORDERS
+from tests.processes import gone
 from tests.results import results_of
 
 ROOT = Path(__file__).parents[2]
@@ -79,14 +80,6 @@ def test_a_video_that_is_not_used_is_a_note_of_the_run_and_of_the_batch(bench: B
     job = yaml.safe_load((bench.folder / "out" / "my_walk" / "job.yaml").read_text())
     assert [camera["name"] for camera in job["capture"]["cameras"]] == ["torso", "left_palm"]
     assert job["capture"]["cameras_only"] is True
-
-
-def gone(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return True
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
 
 
 def test_a_folder_runs_without_a_job_and_the_last_line_names_the_results(bench: Bench) -> None:

@@ -29,8 +29,8 @@ from bodycap_batch.watch.job_status import JobStatusFile
 from bodycap_batch.watch.ownership import read_owner
 from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir
 from tests.pipeline.spools import SpoolFixture, wait_for
-from tests.pipeline.test_cli import gone
 from tests.pipeline.test_watch_disk import running
+from tests.processes import gone
 from tests.videos import textured_frame, write_video
 
 

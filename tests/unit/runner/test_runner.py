@@ -31,6 +31,7 @@ from bodycap_batch.runner import Children, NotStored, Rules, Runner, Task
 from bodycap_batch.runner.child_main import DiskFailures
 from bodycap_batch.runner.child_pool import CHILDREN_LOG
 from bodycap_batch.store.artefacts import ArtefactKey, Store
+from tests.processes import gone
 
 ROOT = Path(__file__).parents[3]
 FAKE = (sys.executable, str(ROOT / "tests" / "pipeline" / "fake_child.py"))
@@ -78,14 +79,6 @@ def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
     while not condition():
         assert time.monotonic() < end, "it never happened"
         time.sleep(0.02)
-
-
-def alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
 
 
 def test_the_task_file_of_another_run_does_no_harm(bench: Bench) -> None:
@@ -137,9 +130,9 @@ def test_a_child_does_one_task_after_another_and_ends_with_its_runner(bench: Ben
     with pytest.raises(EstimationError):
         bench.runner.run(a_task("refuse"))
     assert pid_of(bench, "work", 3) == first
-    assert alive(first)
+    assert not gone(first)
     bench.runner.close()
-    assert not alive(first)
+    assert gone(first)
     assert not (bench.logs / "children.log").exists(), "it had nothing to say"
 
 
@@ -148,7 +141,7 @@ def test_a_child_that_failed_unexpectedly_is_not_used_again(bench: Bench, stage:
     first = pid_of(bench, "work", 1)
     with pytest.raises(BodycapError):
         bench.runner.run(a_task(stage))
-    assert not alive(first)
+    assert gone(first)
     assert pid_of(bench, "work", 2) != first
 
 
@@ -161,7 +154,7 @@ def test_idle_children_that_died_are_replaced_silently(bench: Bench) -> None:
     assert first in waiting
     for pid in waiting:
         os.kill(pid, signal.SIGKILL)
-        wait_for(lambda pid=pid: not alive(pid))  # type: ignore[misc]
+        wait_for(lambda pid=pid: gone(pid))  # type: ignore[misc]
     assert pid_of(bench, "work", 2) not in waiting
     assert set(bench.kinds()) == {"started", "progress", "finished"}
 
@@ -177,7 +170,7 @@ def test_a_child_ends_with_its_task_if_the_listener_fails(bench: Bench) -> None:
     runner = Runner(bench.store, bench.children, logs=bench.logs, listener=tell, rules=rules)
     with pytest.raises(OSError, match="pipe"):
         runner.run(a_task("work", 2))
-    assert not alive(first)
+    assert gone(first)
     assert pid_of(bench, "work", 3) != first
 
 
@@ -267,7 +260,7 @@ def test_cancelling_stops_the_child_and_cleans_up(bench: Bench, tmp_path: Path, 
     thread.join(20)
     pid, work = started.read_text().split(" ", 1)
     assert len(failures) == 1
-    assert not alive(int(pid))
+    assert gone(int(pid))
     assert not Path(work).exists()
     assert bench.kinds()[-1] == "stopped"
 
@@ -306,10 +299,10 @@ def test_children_do_not_outlive_a_killed_parent(tmp_path: Path) -> None:
     parent = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
     wait_for(lambda: started.exists() and " " in started.read_text())
     child = int(started.read_text().split()[0])
-    assert alive(child)
+    assert not gone(child)
     parent.kill()
     parent.wait()
-    wait_for(lambda: not alive(child))
+    wait_for(lambda: gone(child))
 
 
 def test_nothing_is_committed_for_a_job_of_another_process(bench: Bench) -> None:
