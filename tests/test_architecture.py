@@ -22,7 +22,7 @@ LAYERS = (
     {"inertial"},
     {
         "keyframes", "mapping", "registration", "merging", "export", "report", "preview", "evaluate",
-        "synthetic", "check", "calibration", "clocks", "fill",
+        "synthetic", "check", "calibration", "clocks", "camera_places", "fill",
     },
     {"tasks"},
     {"pipeline"},

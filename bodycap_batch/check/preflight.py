@@ -277,7 +277,7 @@ def _body_notes(job: Job) -> list[str]:
         return []
     roles = {camera.role for camera in job.capture.cameras}
     notes = []
-    if not roles & set(TRUNK_ROLES):
+    if not roles & set(TRUNK_ROLES) and not job.capture.unplaced():
         notes.append(
             "no camera is on the trunk or the head, so the position of the body is only inferred from the "
             "limbs"

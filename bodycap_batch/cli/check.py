@@ -15,6 +15,7 @@ from bodycap_batch.cli.shared_options import (
     HeightOption,
     JobArgument,
     OutOption,
+    PlacesOption,
     SkeletonOption,
     make_overrides,
 )
@@ -28,6 +29,7 @@ def check(  # noqa: PLR0913, PLR0917 - the flags a user types
     skeleton: SkeletonOption = None,
     height: HeightOption = None,
     camera: CamerasOption = None,
+    places: PlacesOption = None,
     activity: ActivityOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
 ) -> None:
@@ -44,7 +46,7 @@ def check(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.clocks import describe_clocks
     from bodycap_batch.telemetry import telemetry_notes
 
-    report = check_path(find_job(job).file, make_overrides(out, skeleton, height, camera, activity))
+    report = check_path(find_job(job).file, make_overrides(out, skeleton, height, camera, activity, places))
     if report.ready and report.job is not None:
         capture = report.job.capture
         notes = (*report.notes, *describe_clocks(capture), *telemetry_notes(capture))

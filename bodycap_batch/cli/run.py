@@ -19,6 +19,7 @@ from bodycap_batch.cli.shared_options import (
     JobArgument,
     MemoryOption,
     OutOption,
+    PlacesOption,
     SkeletonOption,
     StoreOption,
     ThreadsOption,
@@ -44,6 +45,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     skeleton: SkeletonOption = None,
     height: HeightOption = None,
     camera: CamerasOption = None,
+    places: PlacesOption = None,
     activity: ActivityOption = None,
     threads: ThreadsOption = None,
     store: StoreOption = None,
@@ -127,7 +129,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         job_file = place.file if place.results else job_file_in(job) if job.is_dir() else None
         if job_file is not None:
             display(Event(kind="note", stage="", what=f"the settings are taken from {job_file}"))
-        overrides = make_overrides(out or place.results, skeleton, height, camera, activity)
+        overrides = make_overrides(out or place.results, skeleton, height, camera, activity, places)
         loaded = load_job_with_origins(place.file, overrides, prepare=prepare)
         if height is not None:
             shown = describe_height(loaded.job.height_m or 0.0)

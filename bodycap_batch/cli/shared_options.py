@@ -69,6 +69,15 @@ CamerasOption = Annotated[
         "repeat this option.",
     ),
 ]
+PlacesOption = Annotated[
+    str | None,
+    typer.Option(
+        "--places",
+        metavar="PLACE,PLACE,PLACE",
+        help="Find from the motion which camera was where: torso,left_palm,right_palm. For videos whose "
+        "names do not contain a place.",
+    ),
+]
 ActivityOption = Annotated[
     str | None,
     typer.Option(metavar="walk|generic", help="What the subject does (default: generic; walk: only walks)."),
@@ -99,6 +108,7 @@ def make_overrides(
     height: str | None = None,
     cameras: list[str] | None = None,
     activity: str | None = None,
+    places: str | None = None,
 ) -> Overrides:
     """Return the values of the command line that replace values of the job.
 
@@ -114,6 +124,7 @@ def make_overrides(
         height_m=None if height is None else height_from_text(height),
         mounts=_mounts(cameras or []),
         activity=activity,
+        places=tuple(word.strip() for word in (places or "").split(",") if word.strip()),
     )
 
 

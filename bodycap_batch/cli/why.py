@@ -19,6 +19,7 @@ from bodycap_batch.cli.shared_options import (
     JobArgument,
     JsonOption,
     OutOption,
+    PlacesOption,
     SkeletonOption,
     StoreOption,
     make_overrides,
@@ -35,6 +36,7 @@ def why(  # noqa: PLR0913, PLR0917 - the flags a user types
     skeleton: SkeletonOption = None,
     height: HeightOption = None,
     camera: CamerasOption = None,
+    places: PlacesOption = None,
     activity: ActivityOption = None,
     store: StoreOption = None,
     as_json: JsonOption = False,
@@ -53,7 +55,9 @@ def why(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.store.artefacts import Store
 
     place = find_job(job)
-    resolved = load_job(place.file, make_overrides(out or place.results, skeleton, height, camera, activity))
+    resolved = load_job(
+        place.file, make_overrides(out or place.results, skeleton, height, camera, activity, places)
+    )
     out_dir = results_folder(resolved)
     settings = Settings(
         store=Store(store or find_store(out_dir)),

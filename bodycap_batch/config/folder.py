@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
+from bodycap_batch.config.mounts import MOTION_PLACES, MOUNT_NAMES, mount_of
 from bodycap_batch.core.errors import CaptureError, JobError
 
 VIDEO_SUFFIXES = frozenset(
@@ -311,7 +311,15 @@ def _refuse_unknown_mounts(named: list[tuple[str, Path]], is_known: Callable[[st
             "name does not contain a place",
             path=folder,
             hint="rename each video, or the folder of its chapters, after its place (for example torso.mp4); "
-            f"or give the place of each video, for example --camera {first}=torso; or run "
-            f"`bodycap init {shlex.quote(folder.name)}`, which writes a job.yaml with a blank per place. "
-            f"The places are {', '.join(MOUNT_NAMES)}",
+            f"or give the place of each video, for example --camera {first}=torso; "
+            f"{_motion_hint(named)}or run `bodycap init {shlex.quote(folder.name)}`, which writes a job.yaml "
+            f"with a blank per place. The places are {', '.join(MOUNT_NAMES)}",
         )
+
+
+def _motion_hint(named: Sequence[tuple[str, Path]]) -> str:
+    """Return the advice to let the run find the places, for three cameras that can be at `MOTION_PLACES`."""
+    stated = [found[0] for name, _ in named if (found := mount_of(name)) is not None]
+    if len(named) != len(MOTION_PLACES) or not set(stated) <= set(MOTION_PLACES):
+        return ""
+    return f"if you do not know which is which, let the run find it: --places {','.join(MOTION_PLACES)}; "

@@ -71,6 +71,7 @@ class Overrides:
         height_m: Height of the subject, metres.
         mounts: Place on the body of each named camera, by the name of the camera or of its video.
         activity: What the subject does.
+        places: The places where the cameras were, in any order, if it is unknown which camera was where.
     """
 
     out: Path | None = None
@@ -78,6 +79,7 @@ class Overrides:
     height_m: float | None = None
     mounts: Mapping[str, str] = field(default_factory=dict)
     activity: str | None = None
+    places: tuple[str, ...] = ()
 
 
 def load_job(
@@ -135,7 +137,8 @@ def load_job_with_origins(
         full = _job_source(full, policy)
         source = _read_source(full, limits or Limits())
         overrides = overrides or Overrides()
-        stated = _stated_job(full, source, Places(overrides.mounts), alone=alone)
+        places = Places(overrides.mounts, overrides.places)
+        stated = _stated_job(full, source, places, alone=alone)
         return _resolved_job(stated, overrides, prepare, policy, is_draft=is_draft)
     except PermissionError as error:
         kind = JobError if error.filename == str(full) else CaptureError
@@ -267,6 +270,7 @@ def _stated_without_places(
     stated_data = _top_mapping(source)
     data = stated_data if alone else _with_folder_capture(stated_data, full.parent, places)
     job = _validated(data, full, source)
+    places = replace(places, worn=places.worn or job.capture.places)
     if data is not stated_data:
         stated = _without_cameras(job.capture)
         return _StatedJob(path=full, source=source, job=job, stated=stated, uses_folder=True)
@@ -458,7 +462,9 @@ def _with_folder_capture(data: dict[str, Any], folder: Path, places: Places) -> 
         videos_in(folder)
     except CaptureError:  # no videos here: the validation reports the missing cameras
         return data
-    return {**data, "capture": {**folder_capture(folder, places.is_known), **capture}}
+    are_found = bool(capture.get("places"))
+    found = folder_capture(folder, lambda name: are_found or places.is_known(name))
+    return {**data, "capture": {**found, **capture}}
 
 
 def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> Job:
@@ -498,6 +504,8 @@ def _with_overrides(job: Job, overrides: Overrides) -> Job:
         update["height_m"] = height_from_text(overrides.height_m)
     if overrides.activity is not None:
         update["activity"] = _known_activity(overrides.activity)
+    if overrides.places:
+        update["capture"] = job.capture.model_copy(update={"places": overrides.places})
     return job.model_copy(update=update)
 
 

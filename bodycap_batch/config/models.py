@@ -127,6 +127,11 @@ class CameraConfig(_Block):
         None,
         description="place of the camera on the body; default: the place that the camera's name contains",
     )
+    mount_source: Literal["motion"] | None = Field(
+        None,
+        description="motion: a run found the place `mount` from the motion of the cameras; a run writes this "
+        "into the job.yaml of its results",
+    )
     segment: str | None = Field(
         None, description="bone on which the camera is mounted, if no mount name describes its place"
     )
@@ -223,6 +228,13 @@ class CaptureConfig(_Block):
         None,
         description="calibration of every camera that has no calibration of its own",
     )
+    places: tuple[str, ...] = Field(
+        (),
+        max_length=64,
+        description="the places on the body where the cameras were, in any order, if it is unknown which "
+        "camera was where: [torso, left_palm, right_palm]; the run finds the place of each camera from the "
+        "motion, or says that the motion does not show it",
+    )
     rig: Literal["free", "synced"] = Field(
         "free",
         description="synced: the cameras on one segment are fixed rigidly to each other, and one hardware "
@@ -257,6 +269,10 @@ class CaptureConfig(_Block):
                 if camera.role == role:
                     return camera
         return self.cameras[0]
+
+    def unplaced(self) -> tuple[CameraConfig, ...]:
+        """Return the cameras whose place the run finds from the motion."""
+        return tuple(camera for camera in self.cameras if self.places and camera.role is None)
 
     def segments(self) -> list[list[CameraConfig]]:
         """Return the cameras of each body segment on which two or more cameras are mounted."""

@@ -54,6 +54,10 @@ ROLES = tuple(dict.fromkeys(role for _, role in _MOUNT_BY_SPELLING.values()))
 MOUNT_NAMES = tuple(dict.fromkeys(mount for mount, _ in _MOUNT_BY_SPELLING.values()))
 """The preferred name of each place on the body where a camera can be mounted, for messages and help texts."""
 
+MOTION_PLACES = ("torso", "left_palm", "right_palm")
+"""The places that a run can find from the motion of the cameras. It needs one camera at each. Evidence:
+docs/decisions/places.md."""
+
 TRUNK_ROLES = ("Hips", "Spine", "Spine1", "Neck", "Head")
 """Roles of the bones of the trunk and the head."""
 

@@ -26,11 +26,12 @@ Source = Literal[
     "video metadata",
     "camera name",
     "lens profile",
+    "motion",
     "default",
 ]
 """Kind of place that a setting comes from. "folder" means a video that the job file does not list, in the
 capture's folder; "sidecar file" means a file of timestamps beside the video; "lens profile" means the table
-of lenses, with the camera model that the video's metadata name."""
+of lenses, with the camera model that the video's metadata name; "motion" means the motion of the cameras."""
 
 _NOT_NAMED = "not a video, and no setting names it"
 

@@ -17,17 +17,19 @@ class Places:
 
     Attributes:
         by_name: The place of each named camera.
+        worn: The places of all cameras, if the run finds from the motion which camera was where; else empty.
     """
 
     by_name: Mapping[str, str] = field(default_factory=dict)
+    worn: tuple[str, ...] = ()
 
     def place_of(self, name: str) -> str | None:
         """Return the place that is given for a camera or a video; None if none is given."""
         return next((place for given, place in self.by_name.items() if _is_same(given, name)), None)
 
     def is_known(self, name: str) -> bool:
-        """Return True if the place of a video is given, or if its name contains the place."""
-        return self.place_of(name) is not None or mount_of(name) is not None
+        """Return True if the place of a video is given or found later, or if its name contains the place."""
+        return bool(self.worn) or self.place_of(name) is not None or mount_of(name) is not None
 
     def mounted(self, camera: CameraConfig) -> CameraConfig:
         """Return a camera with the place that is given for it, or unchanged.
@@ -44,7 +46,7 @@ class Places:
                 field="--camera",
                 hint=f"use one of {', '.join(MOUNT_NAMES)}",
             )
-        return camera.model_copy(update={"mount": place, "segment": None})
+        return camera.model_copy(update={"mount": place, "mount_source": None, "segment": None})
 
     def require_used(self, cameras: Sequence[CameraConfig]) -> None:
         """Check that each name belongs to a camera. Raises `JobError`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,7 +109,7 @@ def resolved_camera(index: int, capture: CaptureConfig, stated: CaptureConfig, b
         if camera.offset_s is not None
         else _offset_origin(camera, entry, file, capture, is_stated=is_stated),
         clock_drift=_drift_origin(camera, capture),
-        mount=_mount_origin(config),
+        mount=_mount_origin(config, capture.places),
         mount_pose=Origin(source="default", value="typical of the place")
         if camera.joint_from_cam is None
         else Origin(source="job file", value="measured"),
@@ -179,9 +180,13 @@ def _drift_origin(camera: CameraConfig, capture: CaptureConfig) -> Origin:
     return Origin(source="default", value="0 ppm" if is_reference else "auto")
 
 
-def _mount_origin(config: CameraConfig) -> Origin:
+def _mount_origin(config: CameraConfig, places: Sequence[str]) -> Origin:
+    if config.mount_source is not None:
+        return Origin(source=config.mount_source, value=str(config.mount))
     if config.segment is not None or config.mount is not None:
         return Origin(source="job file", value=str(config.segment or config.mount))
+    if config.role is None and places:
+        return Origin(source="motion", value=f"found by the run: one of {', '.join(places)}")
     if config.role is None:
         return Origin(source="default", value="unknown")
     return Origin(source="camera name", value=config.role)

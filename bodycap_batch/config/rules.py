@@ -21,7 +21,7 @@ from bodycap_batch.config.models import (
     Job,
     MountPose,
 )
-from bodycap_batch.config.mounts import MOUNT_NAMES, ROLES
+from bodycap_batch.config.mounts import MOTION_PLACES, MOUNT_NAMES, ROLES, mount_of
 from bodycap_batch.config.options import MARKER_COUNTS
 from bodycap_batch.model.skeleton_presets import split_side
 
@@ -48,7 +48,7 @@ def problems_in(job: Job) -> list[Problem]:
     for index, camera in enumerate(job.capture.cameras):
         for found in (*_camera_names(job, index), *_mount(job, camera), *_pose(camera), *_paths(camera)):
             problems.append(found._replace(location=("capture", "cameras", index, *found.location)))
-    rules = (_job_names, _skeleton, _size, _times, _named_frames, _rig, _board)
+    rules = (_job_names, _skeleton, _size, _times, _named_frames, _places, _rig, _board)
     return [*problems, *(found for rule in rules for found in rule(job))]
 
 
@@ -96,7 +96,7 @@ def _mount(job: Job, camera: CameraConfig) -> Iterator[Problem]:
         yield Problem(("mount",), message, f"use one of {', '.join(MOUNT_NAMES)}")
     elif camera.segment is None and camera.mount is not None and camera.role is None:
         yield Problem(("mount",), f"there is no mount {camera.mount!r}", _nearest(camera.mount, MOUNT_NAMES))
-    elif camera.role is None and skeleton_of(job) != NO_SKELETON:
+    elif camera.role is None and skeleton_of(job) != NO_SKELETON and not job.capture.places:
         near = [*difflib.get_close_matches(camera.name, MOUNT_NAMES, n=1), "torso"][0]
         yield Problem(
             (),
@@ -211,6 +211,39 @@ def _times(job: Job) -> Iterator[Problem]:
             ("capture", "end_s"),
             f"end_s {end:g} is not after start_s {start:g}",
             "exchange start_s and end_s, or correct one of these times",
+        )
+
+
+def _places(job: Job) -> Iterator[Problem]:
+    """Yield a problem if the run cannot find the places of the cameras from the motion."""
+    capture = job.capture
+    unplaced = capture.unplaced()
+    where = ("capture", "places")
+    for place in capture.places:
+        if mount_of(place) is None:
+            yield Problem(where, f"there is no place {place!r} on the body", _nearest(place, MOUNT_NAMES))
+            return
+    if not unplaced or skeleton_of(job) == NO_SKELETON:
+        return
+    mounts = [mount_of(camera.mount or camera.name) for camera in capture.cameras]
+    stated = [found[0] for found in mounts if found is not None]
+    given = [found[0] for place in capture.places if (found := mount_of(place)) is not None]
+    every = [*stated, *(place for place in given if place not in stated)]
+    if sorted(every) != sorted(MOTION_PLACES) or len(capture.cameras) != len(MOTION_PLACES):
+        yield Problem(
+            where,
+            "the program can find from the motion only which of three cameras was on "
+            f"{', '.join(MOTION_PLACES[:-1])} and {MOTION_PLACES[-1]}; this job has {len(capture.cameras)} "
+            f"cameras, on {', '.join(every)}",
+            "give the place of each camera, for example --camera "
+            f"{unplaced[0].name}={MOTION_PLACES[0]}, or `mount: {MOTION_PLACES[0]}` in the job file",
+        )
+    if capture.start_s is not None or capture.end_s is not None:
+        yield Problem(
+            where,
+            "start_s and end_s are times on the clock of the torso's camera, and it is not known which "
+            "camera that is",
+            "leave out start_s and end_s, or give the place of each camera",
         )
 
 

@@ -11,7 +11,8 @@ from typing import Any
 
 from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_POSED
 from bodycap_batch.config.models import CameraConfig, Job
-from bodycap_batch.core.errors import BodycapError, CaptureError, JobError
+from bodycap_batch.config.mounts import MOTION_PLACES, mount_of
+from bodycap_batch.core.errors import BodycapError, CaptureError, EstimationError, JobError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.pipeline.inputs import (
@@ -45,6 +46,7 @@ from bodycap_batch.tasks.inputs import BodyInput, stated_clocks
 from bodycap_batch.tasks.keyframes import KEYFRAMES, KeyframesTask
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE, ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import MERGE, BoardFootage, MergeTask
+from bodycap_batch.tasks.places import PLACES, PlacesTask
 from bodycap_batch.tasks.preview import PREVIEW
 from bodycap_batch.tasks.recover import RECOVER
 from bodycap_batch.tasks.registration import REGISTRATION, RegistrationTask
@@ -250,6 +252,34 @@ class Flow:
         self.runner.report_notes(artefact, "clocks")
         return artefact
 
+    def find_places(self, scene_map: Artefact, registrations: ByCamera) -> Job:
+        """Find the places of the cameras whose place is unknown, and return the job with all places.
+
+        If every place is known, or the job asks for no skeleton, the job is returned unchanged.
+
+        Raises:
+            EstimationError: The motion does not show which camera was where.
+        """
+        unplaced = self._job.capture.unplaced()
+        if not unplaced or not has_body(self._job):
+            return self._job
+        clocks = self.clocks(scene_map, registrations)
+        stated = [(camera.name, mount_of(camera.mount or camera.name)) for camera in self._capture.cameras]
+        task = PlacesTask(
+            stated={name: found[0] for name, found in stated if found is not None},
+            clocks=artefact_ref(clocks),
+            registrations=refs_by_camera(registrations),
+        )
+        artefact = self.runner.run(make_task(PLACES, task))
+        self.runner.report_notes(artefact, "places")
+        summary = read_summary(artefact.path)
+        if not summary["places"]:
+            raise _unknown_places([camera.name for camera in unplaced], summary["reason"])
+        self._job = with_places(self._job, summary["places"])
+        self._capture = self._job.capture
+        del self._body  # It was made for the cameras whose place was known.
+        return self._job
+
     def use_sensors(self, registrations: ByCamera) -> ByCamera:
         """Use the inertial sensors of the cameras that have telemetry, and report notes to the user.
 
@@ -453,6 +483,29 @@ class Flow:
             registrations=refs_by_camera({name: registrations[name] for name in names}),
             offsets_s={},
         )
+
+
+def with_places(job: Job, places: Mapping[str, str]) -> Job:
+    """Return a job in which the cameras without a place have the places that were found, by camera name."""
+    unplaced = job.capture.unplaced()
+    cameras = tuple(
+        camera.model_copy(update={"mount": places[camera.name], "mount_source": "motion"})
+        if camera in unplaced
+        else camera
+        for camera in job.capture.cameras
+    )
+    capture = job.capture.model_copy(update={"cameras": cameras, "places": ()})
+    return job.model_copy(update={"capture": capture})
+
+
+def _unknown_places(cameras: Sequence[str], reason: str) -> EstimationError:
+    stated = " ".join(f"--camera {name}=PLACE" for name in cameras)
+    return EstimationError(
+        f"the motion does not show which camera was at which place: {reason}",
+        field="capture.places",
+        hint=f"look at the videos, and give the places: {stated} (one of {', '.join(MOTION_PLACES)}); the "
+        "stages that are finished are not computed again",
+    )
 
 
 def _posed_frames(registrations: ByCamera) -> int:

@@ -18,7 +18,7 @@ _FILE_FIELDS = ("video", "timestamps", "mask")
 _CLOCK_FIELDS = ("offset_s", "drift_ppm")
 """Fields that describe a camera's clock. The frames of a camera depend on them only if start_s or end_s
 selects frames; a new offset then changes the selected frames."""
-_MOUNT_FIELDS = ("mount", "segment", "joint_from_cam", "sigma_deg", "sigma_m")
+_MOUNT_FIELDS = ("mount", "mount_source", "segment", "joint_from_cam", "sigma_deg", "sigma_m")
 """Fields that describe a camera's mount on the body. Only the skeleton depends on them, so they are not part
 of a camera's digest."""
 
@@ -146,11 +146,13 @@ def samples_input(camera: CameraConfig, digests: FileDigests) -> FileRef | None:
 def body_input(job: Job, digests: FileDigests) -> BodyInput:
     """Return the body of a job as input of a task: skeleton, stature, activity and mounts.
 
+    Cameras whose place the run finds later have no mount.
+
     Raises:
         JobError: A camera's place on the body is unknown, or the skeleton file cannot be read.
         StoreError: The disk fails.
     """
-    path = skeleton_file(job)
+    path, unplaced = skeleton_file(job), job.capture.unplaced()
     return BodyInput(
         skeleton=None if path else job.skeleton,
         skeleton_file=None if path is None else FileRef(path=path, digest=_skeleton_digest(path, digests)),
@@ -158,7 +160,7 @@ def body_input(job: Job, digests: FileDigests) -> BodyInput:
         tpose_frame=job.tpose_frame if path else None,
         height_m=job.height_m,
         activity=job.activity,
-        mounts=tuple(_mount_input(camera) for camera in job.capture.cameras),
+        mounts=tuple(_mount_input(camera) for camera in job.capture.cameras if camera not in unplaced),
     )
 
 

@@ -83,7 +83,7 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
         stopped_by = _run_until(job, flow, results, out_dir, settings)
         summary = _summary(flow, results, out_dir)
         if runs_to_end and results.exported is not None:
-            folder = _publish_results(job, flow, results, out_dir, settings)
+            folder = _publish_results(results.job or job, flow, results, out_dir, settings)
             if stopped_by is not None:
                 _add_hint(stopped_by, f"see {folder} for the other results")
             if results.failure is None:
@@ -116,6 +116,7 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     results.map, found = flow.refine_map(scene_map, found, keyframes)
     found = flow.solve_rigs(results.map, found, keyframes)
     results.registrations = flow.recover(results.map, found, keyframes)
+    results.job = job = flow.find_places(results.map, results.registrations)
     results.clocks = flow.clocks(results.map, results.registrations)
     results.registrations = flow.use_sensors(results.registrations)
     yield "registration"
@@ -153,7 +154,7 @@ def _run_until(
             if stage == settings.until:
                 break
             if stage == "report" and results.preview is not None and not results.preview.done():
-                settings.results_ready(_publish_results(job, flow, results, out_dir, settings))
+                settings.results_ready(_publish_results(results.job or job, flow, results, out_dir, settings))
     except BodycapError as error:
         # Finished results are published even if their report could not be written.
         reportable = results.exported is not None or _is_about_data(error)

@@ -32,6 +32,7 @@ class StageResults:
         keyframes: The artefact of each camera's keyframes, by camera name.
         map: The artefact of the map.
         registrations: The registration of each camera, by camera name.
+        job: The job with the places that were found from the motion; None before they are looked for.
         clocks: The artefact of the clocks of all cameras.
         merged: The artefact of the skeleton's motion.
         filled: The artefact of the motion with the joints that no camera measured.
@@ -47,6 +48,7 @@ class StageResults:
     keyframes: Mapping[str, Artefact] = field(default_factory=dict)
     map: Artefact | None = None
     registrations: Mapping[str, Artefact] = field(default_factory=dict)
+    job: Job | None = None
     clocks: Artefact | None = None
     merged: Artefact | None = None
     filled: Artefact | None = None
@@ -90,6 +92,11 @@ def report_task(
         merge=optional_ref(results.filled),
         export=optional_ref(results.exported),
         body=body_input(job, digests) if with_body else None,
+        places_from_motion={
+            camera.name: str(camera.mount)
+            for camera in job.capture.cameras
+            if camera.mount_source == "motion"
+        },
     )
 
 

@@ -23,7 +23,7 @@ _INPUTS = {
     "capture": "the video, the calibration, start_s or end_s of {}",
     "cameras": "the video, the calibration, start_s or end_s of {}",
     "clocks": "the clock of {}",
-    "stated": "the clock of {}",
+    "stated": "the clock or the place of {}",
     "keyframes": "the keyframes of {}",
     "registrations": "the poses of {}",
     "body": "the body: {}",
@@ -36,6 +36,7 @@ _WHOLE_INPUTS = {
     "common": "capture.clocks",
     "merge": "the motion",
     "previous": "the result of the previous round",
+    "places_from_motion": "the places found from the motion",
     "reach": "the distances between the cameras",
 }
 """Description of an input as a whole, by the name of the input's field. Every other input is described by the

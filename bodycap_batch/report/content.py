@@ -78,6 +78,7 @@ def page_content(
         else [],
         "tables": make_tables(inputs),
         "scene": scene,
+        "places": {name: place.replace("_", " ") for name, place in inputs.places_from_motion.items()},
         "has_viewer": scene.has_content,
         "has_body": inputs.merge is not None,
         "cameras": _cameras(inputs, losses, colours, budget),

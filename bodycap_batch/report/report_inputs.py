@@ -33,6 +33,7 @@ class ReportInputs:
             None if no error stopped the job.
         max_gap_s: Maximum time (seconds) between two measurements that the body's motion bridges
             (``merge.max_gap_s``).
+        places_from_motion: Place of each camera whose place the run found from the motion, by camera name.
         files: Paths of the result files, relative to the folder of the page.
     """
 
@@ -49,6 +50,7 @@ class ReportInputs:
     capture: Capture | None = None
     failure: Mapping[str, Any] | None = None
     max_gap_s: float = 1.0
+    places_from_motion: Mapping[str, str] = field(default_factory=dict)
     files: tuple[str, ...] = ()
 
     def registration(self, camera: str) -> Registration | None:

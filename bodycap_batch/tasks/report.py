@@ -41,6 +41,7 @@ class ReportTask:
         merge: The skeleton's motion; None if there is no motion.
         export: The result files; None if the export did not finish.
         body: The body; None if there is no motion.
+        places_from_motion: Place of each camera whose place the run found from the motion, by camera name.
     """
 
     name: str
@@ -54,6 +55,7 @@ class ReportTask:
     merge: ArtefactRef | None
     export: ArtefactRef | None
     body: BodyInput | None
+    places_from_motion: Mapping[str, str]
 
 
 def run_report(task: ReportTask, context: StageContext, files: Path) -> None:
@@ -97,6 +99,7 @@ def load_inputs(task: ReportTask, threads: int = 0) -> ReportInputs:
         capture=_open_capture(task, clocks, threads),
         failure=task.failure,
         max_gap_s=task.max_gap_s,
+        places_from_motion=task.places_from_motion,
         files=() if task.export is None else _result_files(task.export),
     )
 

@@ -13,6 +13,7 @@ from bodycap_batch.tasks.inertial import INERTIAL
 from bodycap_batch.tasks.keyframes import KEYFRAMES
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE
 from bodycap_batch.tasks.merge import MERGE
+from bodycap_batch.tasks.places import PLACES
 from bodycap_batch.tasks.preview import PREVIEW
 from bodycap_batch.tasks.recover import RECOVER
 from bodycap_batch.tasks.registration import REGISTRATION
@@ -36,6 +37,7 @@ STAGES: Mapping[str, Stage[Any]] = {
         RECOVER,
         SOUND,
         CLOCKS,
+        PLACES,
         INERTIAL,
         MERGE,
         FILL,

@@ -161,12 +161,11 @@ def _checksum(text: str | bytes) -> str:
     return hashlib.sha256(text.encode() if isinstance(text, str) else text).hexdigest()
 
 
-def make_result_paths_relative(job_dir: JobDir, job: Job) -> None:
+def make_result_paths_relative(job_dir: JobDir) -> None:
     """Make the paths in the `job.yaml` of the results relative, because the job's folder will be moved.
 
     Args:
         job_dir: The job's folder.
-        job: The job that was run.
 
     Raises:
         StoreError: The disk is full or fails.
@@ -174,6 +173,7 @@ def make_result_paths_relative(job_dir: JobDir, job: Job) -> None:
     for file in (job_dir.result / "job.yaml", job_dir.result / "partial" / "job.yaml"):
         if file.is_file():
             change = partial(_relative_to_file, job_dir=job_dir.path, file=file)
+            job = Job.model_validate(yaml.safe_load(file.read_text(encoding="utf-8")))
             write_results_file(file.parent, file.name, yaml_from_job(with_changed_paths(job, change)))
 
 

@@ -118,6 +118,12 @@ def registered(options: Json, arguments: Json, files: Path) -> None:
     (files / "summary.json").write_text(json.dumps(values))
 
 
+def placed(options: Json, arguments: Json, files: Path) -> None:
+    found = orders().get("places", {})
+    values = {"notes": [], "places": found, "reason": "" if found else "the arms do not move"}
+    (files / "summary.json").write_text(json.dumps(values))
+
+
 def exported(options: Json, arguments: Json, files: Path) -> None:
     results = files / "results"
     (results / "trajectories").mkdir(parents=True)
@@ -154,6 +160,7 @@ EXTRA = {
     "inertial": with_sensor,
     "registration": registered,
     "export": exported,
+    "places": placed,
     "report": reported,
     "preview": previewed,
     "synth": rendered,
@@ -169,6 +176,7 @@ NAMES = (
     "recover",
     "sound",
     "clocks",
+    "places",
     "inertial",
     "merge",
     "fill",

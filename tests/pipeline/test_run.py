@@ -500,3 +500,43 @@ def test_events_report_every_stage(bench: Bench) -> None:
     finished = sorted(event.label for event in bench.events if event.kind == "finished")
     assert finished == ALL
     assert "note: a note" in [event.what for event in bench.events if event.kind == "note"]
+
+
+FOUND = {"a": "left_palm", "b": "torso", "c": "right_palm"}
+
+
+def unplaced_job(bench: Bench) -> Job:
+    for name in "abc":
+        (bench.folder / f"{name}.mp4").write_text(f"frames of {name}")
+    cameras = [{"name": name, "video": [str(bench.folder / f"{name}.mp4")]} for name in "abc"]
+    capture = {"cameras": cameras, "places": list(FOUND.values())}
+    return Job.model_validate({"capture": capture, "name": "walk", "skeleton": "auto"})
+
+
+def test_places_found_from_the_motion_are_used_and_written_into_the_job_file(bench: Bench) -> None:
+    bench.order(places=FOUND)
+    job = unplaced_job(bench)
+    run_job(job, out_dir=bench.out, settings=bench.settings())
+    written = yaml.safe_load((bench.out / "job.yaml").read_text())["capture"]["cameras"]
+    assert {each["name"]: (each["mount"], each["mount_source"]) for each in written} == {
+        name: (place, "motion") for name, place in FOUND.items()
+    }
+    again = Job.model_validate(yaml.safe_load((bench.out / "job.yaml").read_text()))
+    summary = run_job(again, out_dir=bench.out, settings=bench.settings())
+    computed = {stage.stage for stage in summary.stages if not stage.reused}
+    assert computed <= {"check"}, "a job with the found places gives the same results"
+
+
+def test_places_that_the_motion_does_not_show_are_asked_for(bench: Bench) -> None:
+    job = unplaced_job(bench)
+    with pytest.raises(EstimationError, match="the arms do not move") as caught:
+        run_job(job, out_dir=bench.out, settings=bench.settings())
+    assert "--camera a=PLACE --camera b=PLACE" in str(caught.value.hint)
+    assert (bench.out / "partial" / "report.html").is_file()
+    cameras = [each.model_copy(update={"mount": FOUND[each.name]}) for each in job.capture.cameras]
+    capture = job.capture.model_copy(update={"cameras": tuple(cameras), "places": ()})
+    summary = run_job(
+        job.model_copy(update={"capture": capture}), out_dir=bench.out, settings=bench.settings()
+    )
+    reused = {stage.stage for stage in summary.stages if stage.reused}
+    assert {"keyframes", "map", "registration"} <= reused

@@ -10,7 +10,7 @@ import yaml
 
 from bodycap_batch.config.body_height import height_from_text
 from bodycap_batch.config.folder import JOB_FILES, VIDEO_SUFFIXES, camera_block, grouped_recordings
-from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
+from bodycap_batch.config.mounts import MOTION_PLACES, MOUNT_NAMES, mount_of
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.store.artefacts import disk_errors
 
@@ -26,12 +26,16 @@ def questions_about(names: Sequence[str]) -> dict[str, Any]:
 
     Returns:
         A dictionary of JSON values: ``unknown``, the recordings whose names do not contain a place on the
-        body, each with its name and its video files; ``places``, the possible places; ``has_job``, True if a
-        job file answers all questions.
+        body, each with its name and its video files; ``places``, the possible places; ``found_places``, the
+        places that the run can find from the motion instead, or an empty list; ``has_job``, True if a job
+        file answers all questions.
     """
     recordings = _recordings(names)
     unknown = [name for name in recordings if mount_of(name) is None] if len(recordings) > 1 else []
+    stated = {found[0] for name in recordings if (found := mount_of(name)) is not None}
+    can_find = bool(unknown) and len(recordings) == len(MOTION_PLACES) and stated <= set(MOTION_PLACES)
     return {
+        "found_places": list(MOTION_PLACES) if can_find else [],
         "unknown": [{"name": name, "files": recordings[name]} for name in unknown],
         "places": list(MOUNT_NAMES),
         "has_job": any(name in JOB_FILES for name in names),
@@ -56,14 +60,16 @@ def write_answers(folder: Path, answers: Mapping[str, Any]) -> None:
 
     Args:
         folder: The folder of videos.
-        answers: ``height``, a text, which may be empty; ``places``, the place of each recording by its name.
+        answers: ``height``, a text, which may be empty; ``places``, the place of each recording by its name;
+            ``find_places``, True if the run shall find the places from the motion.
 
     Raises:
         JobError: An answer cannot be understood, or the user has put a job file into the folder.
         StoreError: The file cannot be written.
     """
     height, places = str(answers.get("height") or "").strip(), answers.get("places") or {}
-    if not height and not places:
+    find_places = bool(answers.get("find_places"))
+    if not height and not places and not find_places:
         return
     if not is_answered_by_page(folder):
         raise JobError(
@@ -72,7 +78,12 @@ def write_answers(folder: Path, answers: Mapping[str, Any]) -> None:
             hint="correct the job file",
         )
     document: dict[str, Any] = {"height_m": height_from_text(height)} if height else {}
-    if places:
+    if find_places:
+        recordings = _recordings(files_below(folder))
+        unknown = {name: files for name, files in recordings.items() if mount_of(name) is None}
+        cameras = [{"name": _camera_name(name), "video": files} for name, files in unknown.items()]
+        document["capture"] = {"cameras": cameras, "places": list(MOTION_PLACES)}
+    elif places:
         document["capture"] = {"cameras": _cameras(_recordings(files_below(folder)), places)}
     text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
     with disk_errors(folder):
@@ -92,9 +103,12 @@ def _cameras(recordings: Mapping[str, Sequence[str]], places: object) -> list[di
                 field="mount",
                 hint=f"choose one of {', '.join(MOUNT_NAMES)}",
             )
-        camera = str(camera_block(name, Path(name))["name"])
-        cameras.append({"name": camera, "video": list(recordings[name]), "mount": str(place)})
+        cameras.append({"name": _camera_name(name), "video": list(recordings[name]), "mount": str(place)})
     return cameras
+
+
+def _camera_name(recording: str) -> str:
+    return str(camera_block(recording, Path(recording))["name"])
 
 
 def _recordings(names: Sequence[str]) -> dict[str, list[str]]:

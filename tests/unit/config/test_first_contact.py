@@ -149,3 +149,51 @@ def test_all_problems_of_a_job_are_reported_at_once(tmp_path: Path) -> None:
         load_job(tmp_path / "walk.yaml")
     for part in ("no mount 'tail'", "no skeleton 'uper'", "gone.mp4", "away.mp4"):
         assert part in caught.value.message
+
+
+THREE = "torso,left_palm,right_palm"
+
+
+def test_the_run_may_find_which_camera_was_where(tmp_path: Path) -> None:
+    folder(tmp_path, "gopro1.mp4", "gopro2.mp4", "left_palm.mp4")
+    with pytest.raises(JobError) as caught:
+        load_job(tmp_path)
+    assert f"--places {THREE}" in str(caught.value.hint)
+    loaded = load_job_with_origins(tmp_path, Overrides(places=tuple(THREE.split(","))))
+    assert [camera.name for camera in loaded.job.capture.unplaced()] == ["gopro1", "gopro2"]
+    assert "found by the run" in loaded.origins["gopro1"].mount.text()
+    (tmp_path / "job.yaml").write_text("capture: {places: [left_palm, torso, right_hand]}\n")
+    assert len(load_job(tmp_path).capture.unplaced()) == 2
+
+
+@pytest.mark.parametrize(
+    ("names", "places", "message"),
+    [
+        (("a.mp4", "b.mp4", "c.mp4"), ("head", "left_palm", "right_palm"), "can find from the motion only"),
+        (("a.mp4", "b.mp4", "c.mp4"), ("left_palm", "right_palm"), "can find from the motion only"),
+        (
+            ("a.mp4", "b.mp4", "head.mp4"),
+            ("torso", "left_palm", "right_palm"),
+            "can find from the motion only",
+        ),
+        (("a.mp4", "b.mp4", "c.mp4"), ("torso", "left_plam", "right_palm"), "no place 'left_plam'"),
+    ],
+)
+def test_places_that_no_run_can_find_are_refused(
+    tmp_path: Path, names: tuple[str, ...], places: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(JobError, match=message):
+        load_job(folder(tmp_path, *names), Overrides(places=places))
+
+
+def test_a_given_place_replaces_one_that_was_found(tmp_path: Path) -> None:
+    folder(tmp_path, "a.mp4", "b.mp4", "c.mp4")
+    cameras = [
+        f"{{name: {name}, video: {name}.mp4, mount: {place}, mount_source: motion}}"
+        for name, place in zip("abc", THREE.split(","), strict=True)
+    ]
+    (tmp_path / "job.yaml").write_text(f"capture: {{cameras: [{', '.join(cameras)}]}}\n")
+    loaded = load_job_with_origins(tmp_path)
+    assert loaded.origins["a"].mount.text() == "torso (from the motion)"
+    cameras_now = load_job(tmp_path, Overrides(mounts={"a": "head"})).capture.cameras
+    assert [camera.mount_source for camera in cameras_now] == [None, "motion", "motion"]

@@ -32,6 +32,7 @@ from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, FileRef, MountInp
 from bodycap_batch.tasks.keyframes import KeyframesTask
 from bodycap_batch.tasks.mapping import ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import BoardFootage, MergeTask
+from bodycap_batch.tasks.places import PlacesTask
 from bodycap_batch.tasks.preview import PreviewTask
 from bodycap_batch.tasks.registration import RegistrationTask
 from bodycap_batch.tasks.report import ReportTask
@@ -129,6 +130,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             registrations=stored,
             reach=(CameraDistance(first="head", second="torso", least_m=0.1, most_m=0.9),),
         ),
+        "places": PlacesTask(stated={"a": "torso"}, clocks=scene_map, registrations=stored),
         "merge": MergeTask(
             options=MergeOptions(known_distance=("torso:1", "head:2", 1.5)),
             map=scene_map,
@@ -157,6 +159,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             merge=None,
             export=scene_map,
             body=body,
+            places_from_motion={"gopro1": "torso"},
         ),
         "preview": PreviewTask(**together, clocks=scene_map, merge=scene_map, failure=None),
     }

@@ -48,6 +48,17 @@ def test_the_answers_become_a_job_file(tmp_path: Path) -> None:
     assert load_job(root).height_m == 1.8
 
 
+def test_the_run_can_find_the_places_of_three_cameras(tmp_path: Path) -> None:
+    names = ("GX010120.MP4", "GX010121.MP4", "torso.mp4")
+    assert questions_about(names)["found_places"] == ["torso", "left_palm", "right_palm"]
+    assert questions_about(["head.mp4", *names[:2]])["found_places"] == []
+    assert questions_about(["torso.mp4", "left_palm.mp4", "right_palm.mp4"])["found_places"] == []
+    root = folder(tmp_path, *names)
+    write_answers(root, {"height": "", "places": {}, "find_places": True})
+    job = load_job(root)
+    assert [camera.name for camera in job.capture.unplaced()] == ["GX-0120", "GX-0121"]
+
+
 def test_no_answer_writes_no_file(tmp_path: Path) -> None:
     write_answers(folder(tmp_path, *NAMES), {"height": " ", "places": {}})
     assert "job.yaml" not in files_below(tmp_path)

@@ -222,6 +222,17 @@ function questionForm(asks, sourceOf, startText, start) {
     form.append(row);
     return select;
   });
+  const find = element("input");
+  find.type = "checkbox";
+  if (asks.found_places.length) {
+    const label = element("label", "find");
+    const names = asks.found_places.map((place) => place.replaceAll("_", " "));
+    label.append(find, ` I do not know which is which. The cameras were on ${names.slice(0, -1).join(", ")} and ${names.at(-1)}: find out from the motion.`);
+    find.addEventListener("change", () => {
+      for (const select of selects) select.disabled = find.checked;
+    });
+    form.append(label);
+  }
   const error = element("p", "cause");
   const submit = element("button", "", startText);
   submit.type = "submit";
@@ -230,9 +241,9 @@ function questionForm(asks, sourceOf, startText, start) {
     event.preventDefault();
     submit.disabled = true;
     error.textContent = "";
-    const places = Object.fromEntries(selects.map((select) => [select.name, select.value]));
+    const places = find.checked ? {} : Object.fromEntries(selects.map((select) => [select.name, select.value]));
     try {
-      await start({ height: height.value, places });
+      await start({ height: height.value, places, find_places: find.checked });
     } catch (failure) {
       error.textContent = failure.message;
     }
