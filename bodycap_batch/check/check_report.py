@@ -10,6 +10,7 @@ from typing import Any
 from bodycap_batch.capture.kept import should_keep_all
 from bodycap_batch.check.overview import unused_lines
 from bodycap_batch.config.models import NO_SKELETON, Job
+from bodycap_batch.config.mounts import place_of_role
 from bodycap_batch.config.origins import CameraOrigins, UnusedFile
 from bodycap_batch.core.errors import BodycapError
 
@@ -76,6 +77,7 @@ class CameraSummary:
         files = ", ".join(self.files[:_MAX_SHOWN_FILES])
         if len(self.files) > _MAX_SHOWN_FILES:
             files += f" … ({len(self.files)} chapters)"
+        place = "place not known yet" if self.role is None else place_of_role(self.role)
         width, height = self.size_px
         size = f"{width}×{height}"
         if self.work_size_px != self.size_px:
@@ -86,7 +88,7 @@ class CameraSummary:
             f"{self.end_s - self.start_s:.1f} s, {self.start_s:.2f} to {self.end_s:.2f} s on the common clock"
         )
         return [
-            f"{self.name}: {files} -> {self.role or 'no bone'}",
+            f"{self.name}: {files} -> {place}",
             f"  {size}, {rate}, {self.frames} frames{used}, {span}",
             f"  {self.lens}",
             *(f"  {line}" for line in ([] if self.origins is None else self.origins.lines())),

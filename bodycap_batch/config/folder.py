@@ -117,8 +117,8 @@ def videos_in(folder: Path) -> list[Path]:
         raise CaptureError(
             f"the folder contains no video{_content_instead(entries)}",
             path=folder,
-            hint="put the videos into the folder, and name each video after its place on the body, for "
-            "example torso.mp4, left_palm.mp4, right_palm.mp4",
+            hint=f"{_first_step(entries)}put the videos into the folder, and name each video after its place "
+            "on the body, for example torso.mp4, left_palm.mp4, right_palm.mp4",
         )
     return videos
 
@@ -132,6 +132,12 @@ def _content_instead(entries: Sequence[Path]) -> str:
     ]
     found += [f"the folder {name} with folders of videos" for name in deeper[:1]]
     return f"; it contains {' and '.join(found)}" if found else ""
+
+
+def _first_step(entries: Sequence[Path]) -> str:
+    """Return the advice to unpack an archive in a folder, as the start of a hint; "" without an archive."""
+    has_archive = any(path.suffix.lower() in ARCHIVE_SUFFIXES for path in entries)
+    return "unpack the archive; " if has_archive else ""
 
 
 def _folders_in(folder: Path) -> list[Path]:
@@ -285,7 +291,7 @@ def _refuse_nested_videos(videos: Sequence[Path]) -> None:
         raise JobError(
             f"the videos are in the subfolder {videos[0].name}",
             path=videos[0].parent,
-            hint=f"give the subfolder: {videos[0]}",
+            hint=f"give the subfolder: {shlex.quote(str(videos[0]))}",
         )
 
 

@@ -35,7 +35,7 @@ from bodycap_batch.config.models import (
     CaptureConfig,
     Job,
 )
-from bodycap_batch.config.mounts import TRUNK_ROLES, mount_of
+from bodycap_batch.config.mounts import TRUNK_ROLES, mount_of, place_of_role
 from bodycap_batch.config.origins import LoadedJob
 from bodycap_batch.config.places import Places
 from bodycap_batch.config.resolved_camera import ResolvedCamera, resolved_camera, with_found_calibrations
@@ -404,7 +404,7 @@ def _no_body(job: Job, resolved: Job) -> str:
         return ""
     cameras = job.capture.cameras
     names = ", ".join(camera.name for camera in cameras)
-    places = " and ".join(sorted({camera.role or "an unknown place" for camera in cameras}))
+    places = " and ".join(sorted({_place_of(camera) for camera in cameras}))
     roles = {camera.role for camera in cameras}
     if None in roles:
         add = "name each video after its place on the body, for example torso.mp4, and add left_palm.mp4"
@@ -416,6 +416,10 @@ def _no_body(job: Job, resolved: Job) -> str:
         "no body is computed: a body takes two cameras or more on different bones, and this job has only "
         f"{names} (on {places}); {add}"
     )
+
+
+def _place_of(camera: CameraConfig) -> str:
+    return "an unknown place" if camera.role is None else place_of_role(camera.role)
 
 
 def synthetic_folder(job: Job, base: Path) -> Path:

@@ -101,6 +101,11 @@ def mount_of(name: str) -> tuple[str, str] | None:
     return mount_of(kept) if kept and len(kept) < len(name) and kept != name.lower() else None
 
 
+def place_of_role(role: str) -> str:
+    """Return the preferred name of the place of a camera on the bone with a role; the role if it has none."""
+    return next((mount for mount, known in _MOUNT_BY_SPELLING.values() if known == role), role)
+
+
 def role_of_segment(segment: str) -> str | None:
     """Return the role for a value of ``segment:``, which is a role (``LeftHand``) or the name of a mount.
 

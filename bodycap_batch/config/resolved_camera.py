@@ -10,6 +10,7 @@ from typing import Any
 from bodycap_batch.config.calibration import Calibration, CalibrationEntry, read_calibration
 from bodycap_batch.config.folder import calibration_in, chapters_in, real_path, shown_name
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from bodycap_batch.config.mounts import place_of_role
 from bodycap_batch.config.origins import CameraOrigins, Origin, Source
 from bodycap_batch.core.errors import CaptureError
 
@@ -189,7 +190,7 @@ def _mount_origin(config: CameraConfig, places: Sequence[str]) -> Origin:
         return Origin(source="motion", value=f"found by the run: one of {', '.join(places)}")
     if config.role is None:
         return Origin(source="default", value="unknown")
-    return Origin(source="camera name", value=config.role)
+    return Origin(source="camera name", value=place_of_role(config.role))
 
 
 def _chapters(camera: CameraConfig, base: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:

@@ -233,22 +233,7 @@ class Flow:
 
     def clocks(self, scene_map: Artefact, registrations: ByCamera) -> Artefact:
         """Decide which clock each camera has, and report unknown and contradicted clocks to the user."""
-        distances = [] if self._body is None else camera_distances(self._body)
-        capture = self._job.capture
-        task = ClocksTask(
-            capture=capture_ref(capture, self._cameras),
-            stated=stated_clocks(capture),
-            common=capture.clocks,
-            rig=capture.rig,
-            sound=optional_ref(None if self._sound is None else self._sound.result()),
-            map=artefact_ref(scene_map),
-            registrations=refs_by_camera(registrations),
-            reach=tuple(
-                CameraDistance(first=first, second=second, least_m=least_m, most_m=most_m)
-                for first, second, least_m, most_m in distances
-            ),
-        )
-        artefact = self.runner.run(make_task(CLOCKS, task))
+        artefact = self._decide_clocks(scene_map, registrations)
         self.runner.report_notes(artefact, "clocks")
         return artefact
 
@@ -263,7 +248,7 @@ class Flow:
         unplaced = self._job.capture.unplaced()
         if not unplaced or not has_body(self._job):
             return self._job
-        clocks = self.clocks(scene_map, registrations)
+        clocks = self._decide_clocks(scene_map, registrations)
         stated = [(camera.name, mount_of(camera.mount or camera.name)) for camera in self._capture.cameras]
         task = PlacesTask(
             stated={name: found[0] for name, found in stated if found is not None},
@@ -379,6 +364,25 @@ class Flow:
         digests = self._settings.store.digests
         task = report_task(self._job, results, self._cameras, digests, failure)
         return self.runner.run(make_task(REPORT, task))
+
+    def _decide_clocks(self, scene_map: Artefact, registrations: ByCamera) -> Artefact:
+        """Decide which clock each camera has, and return the artefact of the clocks."""
+        distances = [] if self._body is None else camera_distances(self._body)
+        capture = self._job.capture
+        task = ClocksTask(
+            capture=capture_ref(capture, self._cameras),
+            stated=stated_clocks(capture),
+            common=capture.clocks,
+            rig=capture.rig,
+            sound=optional_ref(None if self._sound is None else self._sound.result()),
+            map=artefact_ref(scene_map),
+            registrations=refs_by_camera(registrations),
+            reach=tuple(
+                CameraDistance(first=first, second=second, least_m=least_m, most_m=most_m)
+                for first, second, least_m, most_m in distances
+            ),
+        )
+        return self.runner.run(make_task(CLOCKS, task))
 
     def _start_sound(self) -> Future[Artefact]:
         """Compare the sound of the cameras, beside the keyframes if there are threads for both."""

@@ -50,7 +50,7 @@ def test_a_good_capture(walk: Path, tmp_path: Path) -> None:
     assert not torso.variable_rate
     assert torso.notes == palm.notes == ()
     text = "\n".join(report.lines())
-    assert "torso: torso.mp4 -> Spine1" in text
+    assert "torso: torso.mp4 -> torso" in text
     assert "all cameras recorded at the same time for 2.5 s" in text
     assert json.loads(json.dumps(report.to_dict()))["ready"] is True
     assert not (tmp_path / "out").exists()
@@ -284,7 +284,7 @@ def test_the_check_says_where_settings_come_from_and_what_is_not_used(
         "  calibration: auto (from the job file), starting at 65° (from the video metadata)",
         "  timestamps: left_palm.timestamps.txt (from the sidecar file)",
         "  clock: offset 0.2 s (from the job file); drift 0 ppm (default)",
-        "  mount: Spine1 (from the camera name); pose on the bone: typical of the place (default)",
+        "  mount: torso (from the camera name); pose on the bone: typical of the place (default)",
         "  video: left_palm.mp4 (from the folder)",
         "not used (the name is not a known place on the body): board.mp4",
         "not used (not a video, and no setting names it): notes.txt",

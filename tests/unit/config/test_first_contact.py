@@ -197,3 +197,21 @@ def test_a_given_place_replaces_one_that_was_found(tmp_path: Path) -> None:
     assert loaded.origins["a"].mount.text() == "torso (from the motion)"
     cameras_now = load_job(tmp_path, Overrides(mounts={"a": "head"})).capture.cameras
     assert [camera.mount_source for camera in cameras_now] == [None, "motion", "motion"]
+
+
+def test_a_folder_with_an_archive_says_to_unpack_it(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError) as caught:
+        load_job(folder(tmp_path, "walk.zip"))
+    assert str(caught.value.hint).startswith("unpack the archive")
+
+
+def test_a_subfolder_with_a_space_is_quoted(tmp_path: Path) -> None:
+    folder(tmp_path, "day 1/torso.mp4", "day 1/left_palm.mp4")
+    with pytest.raises(JobError) as caught:
+        load_job(tmp_path)
+    assert f"'{tmp_path / 'day 1'}'" in str(caught.value.hint)
+
+
+def test_an_origin_names_the_place_and_not_the_bone(tmp_path: Path) -> None:
+    loaded = load_job_with_origins(folder(tmp_path, "chest.mp4", "left_hand.mp4"))
+    assert loaded.origins["left_hand"].mount.text() == "left_palm (from the camera name)"

@@ -319,7 +319,7 @@ def test_where_the_settings_of_a_camera_come_from(tmp_path: Path) -> None:
         "calibration: auto (default)",
         "timestamps: left_palm.timestamps.txt (from the sidecar file)",
         "clock: offset auto (default); drift auto (default)",
-        "mount: LeftHand (from the camera name); pose on the bone: typical of the place (default)",
+        "mount: left_palm (from the camera name); pose on the bone: typical of the place (default)",
     ]
 
 
@@ -339,9 +339,7 @@ def test_a_sidecar_beside_a_link_or_beside_its_target_is_used(tmp_path: Path) ->
 
 def test_a_job_that_computes_no_body_says_what_is_missing(tmp_path: Path) -> None:
     root = folder(tmp_path, "torso.mp4")
-    assert (
-        "this job has only torso (on Spine1); add a camera on a limb" in load_job_with_origins(root).no_body
-    )
+    assert "this job has only torso (on torso); add a camera on a limb" in load_job_with_origins(root).no_body
     assert load_job_with_origins(root).warnings_of_run() == ()
     (root / "job.yaml").write_text(f"height_m: 1.7\n{TORSO.replace('torso,', 'left_palm,')}")
     loaded = load_job_with_origins(root)
