@@ -29,6 +29,16 @@ _MIN_TIME_RATIO = 0.25
 
 A camera with a smaller fraction is considered after all cameras with a larger fraction. Evidence: none.
 """
+_CLOCK_HINT = (
+    "record sound, start all cameras and then clap once; or state `offset_s` of each camera; or, if one "
+    "signal started all cameras, state `capture: {clocks: common}`"
+)
+"""Advice if only unknown clocks make the cameras unusable."""
+_MAP_HINT = (
+    "let two cameras on the trunk, on the head or on one limb film the same places, so that both cameras are "
+    "in one map; film more texture, use more light, and start slowly; frames.csv lists why frames were lost"
+)
+"""Advice if no map holds enough cameras."""
 
 
 class MainMapCandidate(NamedTuple):
@@ -76,13 +86,12 @@ def align_usable_cameras(
     unused = {**excluded, **unused}
     usable = [each.camera for each in inputs.trajectories if each.camera not in unused]
     reasons = "; ".join(f"{camera!r}: {reason}" for camera, reason in sorted(unused.items()))
+    unknown = [camera for camera in unused if not inputs.clocks[camera].is_known]
     raise EstimationError(
         "no two cameras determine the size of the body: the usable cameras are "
         f"{', '.join(map(repr, usable)) or 'none'}"
         + (f"; the unusable cameras are {reasons}" if reasons else ""),
-        hint="let two cameras on the trunk, on the head or on one limb film the same places, so that both "
-        "cameras are in one map; film more texture, use more light, and start slowly; frames.csv lists "
-        "why frames were lost",
+        hint=_CLOCK_HINT if unknown and len(unknown) == len(unused) else _MAP_HINT,
     )
 
 

@@ -10,10 +10,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from bodycap_batch.watch.commands import JobRow, inbox_rows, job_row
 from bodycap_batch.watch.job_status import read_status
 from bodycap_batch.watch.spool import JobDir, Spool, visible_entries
-from bodycap_batch.watch.web.questions import files_below, is_answered_by_page, questions_about
+from bodycap_batch.watch.web.questions import (
+    earlier_answers,
+    files_below,
+    is_answered_by_page,
+    questions_about,
+)
 
 REPORT = "report.html"
 _MAX_AGE_S = 0.8
@@ -121,9 +128,12 @@ def _open_questions(row: JobRow, job: JobDir | None) -> dict[str, Any] | None:
     try:
         found = questions_about(files_below(job.input))
         is_open = bool(found["unknown"]) and is_answered_by_page(job.input)
-    except OSError:
+        earlier = earlier_answers(job.input) if is_open else {}
+    except (OSError, yaml.YAMLError):
         return None
-    return found if is_open else None
+    if earlier.get("find_places"):  # The motion did not show the places, and would not show them again.
+        found["found_places"] = []
+    return {**found, "height": earlier.get("height", "")} if is_open else None
 
 
 def _browser_entry(row: JobRow, job: JobDir | None) -> dict[str, Any]:

@@ -55,6 +55,21 @@ def is_answered_by_page(folder: Path) -> bool:
     return all(path.read_text(encoding="utf-8", errors="replace").startswith(_FIRST_LINE) for path in found)
 
 
+def earlier_answers(folder: Path) -> dict[str, Any]:
+    """Return what the page has written into the job file of a folder; empty without such a file.
+
+    Returns:
+        A dictionary of JSON values: ``height``, as text, and ``find_places``, True if a run was to find the
+        places from the motion.
+    """
+    path = folder / JOB_FILES[0]
+    if not path.is_file() or not is_answered_by_page(folder):
+        return {}
+    document = yaml.safe_load(path.read_text(encoding="utf-8", errors="replace")) or {}
+    capture = document.get("capture") or {}
+    return {"height": str(document.get("height_m") or ""), "find_places": bool(capture.get("places"))}
+
+
 def write_answers(folder: Path, answers: Mapping[str, Any]) -> None:
     """Write the answers of the user into the job file of a folder.
 

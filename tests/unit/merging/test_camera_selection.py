@@ -244,6 +244,20 @@ def test_hands_alone_do_not_determine_the_scale_and_the_error_names_what_is_miss
         align_usable_cameras(_lose(nobody, "torso", 6), lambda: None)
 
 
+def test_cameras_that_only_lack_a_clock_are_advised_to_clap(capture):
+    unknown = {
+        name: clock if name == "torso" else replace(clock, source="none")
+        for name, clock in capture.inputs.clocks.items()
+    }
+    with pytest.raises(EstimationError) as caught:
+        align_usable_cameras(replace(capture.inputs, clocks=unknown), lambda: None)
+    assert "clap once" in str(caught.value.hint)
+    lost = _lose(replace(capture.inputs, clocks=unknown), "torso", 6)
+    with pytest.raises(EstimationError) as caught:
+        align_usable_cameras(lost, lambda: None)
+    assert "film the same places" in str(caught.value.hint)
+
+
 def test_a_camera_on_a_limb_gives_no_vertical(capture):
     inputs = capture.inputs
     bones = kinematic_chain(inputs.skeleton, {mount.role for mount in inputs.mounts})

@@ -10,7 +10,7 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.watch.spool import JobDir
 from bodycap_batch.watch.web.job_list import list_result_files
-from bodycap_batch.watch.web.questions import files_below, questions_about, write_answers
+from bodycap_batch.watch.web.questions import earlier_answers, files_below, questions_about, write_answers
 
 NAMES = ("GX010120.MP4", "GX020120.MP4", "left_palm.mp4", "clips/a.mp4", "clips/b.mp4", "IMG_1.jpg")
 
@@ -57,6 +57,15 @@ def test_the_run_can_find_the_places_of_three_cameras(tmp_path: Path) -> None:
     write_answers(root, {"height": "", "places": {}, "find_places": True})
     job = load_job(root)
     assert [camera.name for camera in job.capture.unplaced()] == ["GX-0120", "GX-0121"]
+
+
+def test_the_page_remembers_its_answers(tmp_path: Path) -> None:
+    root = folder(tmp_path, "GX010120.MP4", "GX010121.MP4", "torso.mp4")
+    assert earlier_answers(root) == {}
+    write_answers(root, {"height": "175", "places": {}, "find_places": True})
+    assert earlier_answers(root) == {"height": "1.75", "find_places": True}
+    (root / "job.yaml").write_text("height_m: 1.8\n")
+    assert earlier_answers(root) == {}, "a job file of the user is no answer to the page"
 
 
 def test_no_answer_writes_no_file(tmp_path: Path) -> None:

@@ -204,7 +204,7 @@ function questionForm(asks, sourceOf, startText, start) {
   const form = element("form", "ask");
   const heightLabel = element("label", "", "Height of the person ");
   const height = element("input");
-  Object.assign(height, { type: "text", name: "height", placeholder: "1.75, 175 or 5'9\"", size: 14 });
+  Object.assign(height, { type: "text", name: "height", placeholder: "1.75, 175 or 5'9\"", size: 14, value: asks.height ?? "" });
   heightLabel.append(height, element("span", "since", " without it, sizes can be wrong by a tenth"));
   form.append(heightLabel);
   if (asks.unknown.length) form.append(element("p", "", "Where on the body was each of these cameras?"));
