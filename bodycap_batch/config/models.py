@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -333,3 +334,19 @@ class Job(_Block):
         "the measured joints, rest: they are held in the rest pose, none: they are left out of the files",
     )
     export: ExportOptions = ExportOptions()
+
+    def with_places(self, places: Mapping[str, str]) -> Job:
+        """Return the job in which each camera without a place has the place that was found from the motion.
+
+        Args:
+            places: The place of each of these cameras, by camera name.
+        """
+        unplaced = self.capture.unplaced()
+        cameras = tuple(
+            camera.model_copy(update={"mount": places[camera.name], "mount_source": "motion"})
+            if camera in unplaced
+            else camera
+            for camera in self.capture.cameras
+        )
+        capture = self.capture.model_copy(update={"cameras": cameras, "places": ()})
+        return self.model_copy(update={"capture": capture})

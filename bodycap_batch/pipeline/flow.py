@@ -260,7 +260,7 @@ class Flow:
         summary = read_summary(artefact.path)
         if not summary["places"]:
             raise _unknown_places([camera.name for camera in unplaced], summary["reason"])
-        self._job = with_places(self._job, summary["places"])
+        self._job = self._job.with_places(summary["places"])
         self._capture = self._job.capture
         del self._body  # It was made for the cameras whose place was known.
         return self._job
@@ -487,19 +487,6 @@ class Flow:
             registrations=refs_by_camera({name: registrations[name] for name in names}),
             offsets_s={},
         )
-
-
-def with_places(job: Job, places: Mapping[str, str]) -> Job:
-    """Return a job in which the cameras without a place have the places that were found, by camera name."""
-    unplaced = job.capture.unplaced()
-    cameras = tuple(
-        camera.model_copy(update={"mount": places[camera.name], "mount_source": "motion"})
-        if camera in unplaced
-        else camera
-        for camera in job.capture.cameras
-    )
-    capture = job.capture.model_copy(update={"cameras": cameras, "places": ()})
-    return job.model_copy(update={"capture": capture})
 
 
 def _unknown_places(cameras: Sequence[str], reason: str) -> EstimationError:

@@ -145,7 +145,7 @@ class JobWorker:
                 status.update(verdict=summary.verdict.to_dict())
         finally:
             if claim.ownership.is_held():
-                make_result_paths_relative(job_dir)
+                make_result_paths_relative(job_dir, job)
 
     def _is_cancelled(self, claim: Claim) -> bool:
         return self._stop.is_set() or claim.lost.is_set() or claim.job.cancel.exists()

@@ -11,11 +11,18 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 
+from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.watch.change_notifier import ChangeNotifier, is_on_network_disk
 from bodycap_batch.watch.claim import HeartbeatMonitor, create_claim, take_over_job
-from bodycap_batch.watch.dropped_job import JobPermissions, read_dropped_job, read_job
+from bodycap_batch.watch.dropped_job import (
+    JobPermissions,
+    make_result_paths_relative,
+    read_dropped_job,
+    read_job,
+)
 from bodycap_batch.watch.inbox_claim import claim_entry
 from bodycap_batch.watch.inbox_entries import (
     CompletionTracker,
@@ -353,3 +360,25 @@ def test_the_service_example_is_a_valid_unit(tmp_path: Path) -> None:
         ["systemd-analyze", "verify", str(unit)], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr.strip()) == (0, "")
+
+
+def test_the_job_file_of_the_results_keeps_places_found_from_the_motion(tmp_path: Path) -> None:
+    names = ("a", "b", "c")
+    found = dict(zip(names, ("left_palm", "torso", "right_palm"), strict=True))
+    here = tmp_path / "job"
+    cameras = [{"name": name, "video": [str(here / "input" / f"{name}.mp4")]} for name in names]
+    capture = {"cameras": cameras, "places": list(found.values())}
+    job = Job.model_validate({"capture": capture, "name": "walk", "skeleton": "auto"})
+    job_dir = JobDir(here)
+    job_dir.result.mkdir(parents=True)
+    written = job_dir.result / "job.yaml"
+    for document, mounts in (
+        (job.with_places(found).model_dump(mode="json", exclude_none=True), found),
+        (job.model_dump(mode="json", exclude_none=True), {}),
+        ("left by another program", {}),
+    ):
+        written.write_text(yaml.safe_dump(document))
+        make_result_paths_relative(job_dir, job)
+        read = yaml.safe_load(written.read_text())["capture"]["cameras"]
+        assert [camera["video"] for camera in read] == [[f"../input/{name}.mp4"] for name in names]
+        assert {each["name"]: each["mount"] for each in read if "mount" in each} == mounts
