@@ -39,9 +39,10 @@ _START_COST = 1.0
 
 _EVIDENCE_HZ = 10.0
 """Independent samples of evidence per second. Derivation: the signals have no frequencies above 4 Hz."""
-_RISE_SCALE = 1.2
+_RISE_SCALE = 2.4
 """Acceleration (m/s²) of the trunk that is one nat of evidence for both feet on the floor, and downward for
-one foot. Derivation: a rise and fall of ± 1.2 cm at 1.6 steps a second."""
+one foot. Derivation: a rise and fall of ± 2.4 cm at 1.6 steps a second. Evidence:
+docs/decisions/filling.md."""
 _SWAY_SCALE = 0.5
 """Acceleration (m/s²) of the hips to the left that is one nat of evidence that the right foot stands alone.
 Derivation: a sway of ± 1.6 cm at 0.8 strides a second, halved because the trunk's lean disturbs it."""
@@ -51,7 +52,7 @@ Derivation: a yaw of ± 4° at 0.8 strides a second."""
 _ARM_SCALE = 1.0
 """Velocity (m/s) of the left hand relative to the right hand, forward, that is one nat of evidence that the
 left foot stands alone. Derivation: an arm swing of ± 10 cm for each hand at 0.8 strides a second."""
-_LAG_S = 0.055
+_LAG_S = 0.03
 """Time (s) by which the signals of the trunk follow the contacts of the feet. Evidence:
 docs/decisions/filling.md."""
 _MAX_EVIDENCE = 1.5
@@ -63,10 +64,11 @@ _FLIGHT_SIGMA = 3.0
 _FLIGHT_MARGIN = 4.0
 """Evidence (nats) against a flight at a tick without vertical acceleration beyond this. Evidence: none."""
 
-_STILL_SPEED = 0.12
-"""Speed (m/s) below which a person is taken to stand rather than to step. Evidence: none."""
-_STEPPING_SPEED = 0.3
-"""Speed (m/s) above which a person must step. Evidence: none."""
+_STILL_SPEED = 0.06
+"""Speed (m/s) below which a person is taken to stand rather than to step. Evidence:
+docs/decisions/filling.md."""
+_STEPPING_SPEED = 0.24
+"""Speed (m/s) above which a person must step. Evidence: as `_STILL_SPEED`."""
 _TURN_RADIUS_M = 0.25
 """Radius (metres) by which the rate of a turn on the spot is converted to a speed. Evidence: none."""
 
@@ -77,6 +79,11 @@ _STEP_HZ_EXPONENT = 0.42
 """Exponent of speed in the number of steps per second. Source: as `_STEP_HZ_AT_1_3`."""
 _MIN_CADENCE_SPEED = 0.35
 """Minimum speed (m/s) for which the number of steps per second is computed. Evidence: none."""
+_ASIDE_SHARE = 0.4
+"""Share of the speed that is not forward, above which the steps are steps aside or back. Evidence: none."""
+_ASIDE_STEP_S = 0.65
+"""Maximum time (s) between two steps aside or back: they are shorter and quicker than slow steps forward.
+Evidence: none."""
 _DOUBLE_SHARE = 0.24
 """Share of a step during which both feet stand, at 1.3 m/s. Source: M. P. Murray, A. B. Drought, R. C. Kory,
 "Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964."""
@@ -105,7 +112,10 @@ _SURE_NATS = 1.0
 """Evidence (nats) for the side of a certain step. Evidence: none."""
 _MAX_CONTRADICTION_NATS = 1.5
 """Maximum evidence (nats) of one signal against the side of a certain step. Evidence: none."""
-_ORDINARY_DURATION = (0.5, 1.15)
+_SURE_SPEED = 0.15
+"""Minimum mean speed (m/s) of a certain step. Derivation: the first step from standing has half of the speed
+of a slow walk."""
+_ORDINARY_DURATION = (0.45, 1.15)
 """Minimum and maximum time on one foot of a certain step, as a ratio to the expected time between two steps.
 Derivation: the expected time on one foot is 0.6 to 0.9 of it; three sigmas of `_SINGLE_LOG_SIGMA` are
 wider."""
@@ -272,7 +282,10 @@ def _evidence(signals: TrunkSignals, coarse_fps: float) -> _Evidence:
 def _step_period_s(signals: TrunkSignals) -> FloatArray:
     """Return the expected time (T,) between two steps, seconds."""
     speed = np.maximum(signals.speed_m_per_s(), _MIN_CADENCE_SPEED)
-    return np.asarray(1.0 / (_STEP_HZ_AT_1_3 * (speed / 1.3) ** _STEP_HZ_EXPONENT))
+    period = 1.0 / (_STEP_HZ_AT_1_3 * (speed / 1.3) ** _STEP_HZ_EXPONENT)
+    forward = (signals.velocity_m_per_s[:, :2] * signals.forward()).sum(axis=1)
+    is_aside = forward < (1.0 - _ASIDE_SHARE) * speed
+    return np.asarray(np.where(is_aside, np.minimum(period, _ASIDE_STEP_S), period))
 
 
 def _own_rhythm(state: IntArray, rhythm: _Rhythm, fps: float) -> _Rhythm:
@@ -458,7 +471,7 @@ def _is_ordinary(signals: _StepSignals, start: int, end: int) -> bool:
     duration = (end - start) / signals.fps / (signals.period_s[own].mean())
     return bool(
         _ORDINARY_DURATION[0] <= duration <= _ORDINARY_DURATION[1]
-        and signals.speed[own].mean() >= _STEPPING_SPEED
+        and signals.speed[own].mean() >= _SURE_SPEED
         and np.abs(signals.sinking[own]).max() <= _MAX_SINKING_M
         and np.abs(signals.twist[own]).max() <= _MAX_TWIST
     )

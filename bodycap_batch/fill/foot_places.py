@@ -17,8 +17,11 @@ from bodycap_batch.fill.trunk_signals import TrunkSignals
 from bodycap_batch.model.fill_data import Footsteps
 
 _BEHIND_M = 0.01
-"""Distance (metres) of the ankle behind the middle of the hips at the middle of the time on this foot.
-Derivation: the pressure under a foot lies between heel and ball, in front of the ankle."""
+"""Distance (metres) of the ankle behind the middle of the hips when the hips pass the foot. Derivation: the
+pressure under a foot lies between heel and ball, in front of the ankle."""
+_EARLY_SHARE = 0.05
+"""Time by which the hips pass the foot before the middle of the time on this foot, as a share of the time
+between two steps. Evidence: docs/decisions/filling.md."""
 _WALKING_WIDTH = 0.115
 """Distance between the paths of the two ankles while walking, as a ratio to the length of the leg. Source:
 J. M. Donelan, R. Kram, A. D. Kuo, "Mechanical and metabolic determinants of the preferred step width in human
@@ -189,5 +192,6 @@ def _passing_hips(stance: _Stance, contacts: Contacts, signals: TrunkSignals) ->
     at = np.arange(first, max(end, first + 1))
     inside = np.clip(at, 0, last)
     beyond = ((at - inside) / signals.fps)[:, None]
-    path = signals.slow_hips_m[inside, :2] + beyond * signals.velocity_m_per_s[inside, :2]
+    early = _EARLY_SHARE * (contacts.single_s + contacts.double_s)[inside, None]
+    path = signals.slow_hips_m[inside, :2] + (beyond - early) * signals.velocity_m_per_s[inside, :2]
     return np.asarray(path.mean(axis=0)), float(signals.heading_rad[inside].mean())

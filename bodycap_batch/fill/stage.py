@@ -8,7 +8,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.fill.contacts import Contacts, find_contacts
+from bodycap_batch.fill.contacts import STAND, Contacts, find_contacts
 from bodycap_batch.fill.floor_height import FloorHeight, floor_below_legs, lifted_steps
 from bodycap_batch.fill.foot_paths import REACH_SHARE, foot_path, kept_steps, reachable_steps
 from bodycap_batch.fill.foot_places import place_feet
@@ -307,5 +307,5 @@ def _sure(steps: Footsteps, contacts: Contacts, known: BoolArray) -> BoolArray:
     out = contacts.is_sure & known
     for start, end, sure in zip(steps.start_tick, steps.end_tick, steps.is_sure, strict=True):
         if not sure:
-            out[start:end] = False
+            out[start:end] &= contacts.state[start:end] != STAND
     return out
