@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.fill.trunk_signals import TrunkSignals
+from bodycap_batch.fill.trunk_signals import TrunkSignals, oscillation_amplitude
 
 STAND, LEFT, RIGHT, LEFT_TO_RIGHT, RIGHT_TO_LEFT, FLIGHT_LEFT, FLIGHT_RIGHT, FLIGHT_BOTH = range(8)
 """The states. The names of the flights say which foot left the floor last."""
@@ -125,6 +125,11 @@ rise and fall of an ordinary walk. A person who bows or crouches is outside."""
 _MAX_TWIST = 1.2
 """Maximum rate (rad/s) of the trunk's yaw with the stride during a certain step. Derivation: three times
 `_TWIST_SCALE`, rounded up."""
+_RESTLESS_M_PER_S2 = 0.8
+"""Amplitude of the vertical acceleration of the trunk above which a person who does not move away may step in
+place. Derivation: a rise and fall of ± 0.7 cm at 1.7 steps a second; a walking person has ± 1 cm or more."""
+_RESTLESS_HZ = 0.5
+"""Cutoff frequency (Hz) of this amplitude. Derivation: less than a third of the frequency of steps."""
 _MIN_STEPS = 2
 """Minimum number of successive steps that can be certain. Evidence: none."""
 
@@ -195,6 +200,7 @@ class _StepSignals:
         speed: (T,) speed of the slow path, m/s.
         sinking: (T,) height of the slow path over its median, metres.
         twist: (T,) rate of the trunk's yaw without the slow heading, rad/s.
+        is_restless: (T,) True if the trunk rises and falls as with steps.
     """
 
     fps: float
@@ -202,6 +208,7 @@ class _StepSignals:
     speed: FloatArray
     sinking: FloatArray
     twist: FloatArray
+    is_restless: BoolArray
 
 
 def find_contacts(signals: TrunkSignals) -> Contacts:
@@ -226,6 +233,9 @@ def find_contacts(signals: TrunkSignals) -> Contacts:
         speed=signals.speed_m_per_s()[chosen],
         sinking=(height - np.median(height))[chosen],
         twist=signals.twist_rad_per_s[chosen],
+        is_restless=(
+            oscillation_amplitude(signals.rise_m_per_s2, _RESTLESS_HZ, signals.fps) > _RESTLESS_M_PER_S2
+        )[chosen],
     )
     sure = _sure_ticks(found, coarse, ordinary)
     nearest = np.minimum(np.round(np.arange(ticks) / stride).astype(np.int64), len(chosen) - 1)
@@ -415,9 +425,9 @@ def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> 
 
     A step is certain if it is one of two or more successive steps of an ordinary walk: evidence for its side
     without a strong contradiction, an ordinary duration, a trunk that neither sinks nor twists much. Standing
-    is always certain: nothing is claimed about it but that no foot moves.
+    is certain if the trunk does not rise and fall as with steps, as it does on a treadmill.
     """
-    out = np.ones(len(state), dtype=bool)
+    out = ~((state == STAND) & signals.is_restless)
     bounds = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state)]
     walks: list[list[tuple[int, int]]] = [[]]
     for start, end in itertools.pairwise(bounds):
@@ -444,7 +454,7 @@ def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> 
         for start, end in walk:
             nearest = np.argsort(np.abs(middles - 0.5 * (start + end)))[: 1 if (start, end) in singles else 2]
             out[start:end] = bool(len(nearest)) and bool(sure[nearest].all())
-    return out
+    return np.asarray(out)
 
 
 def _support(state: IntArray, evidence: _Evidence, start: int, end: int) -> FloatArray:

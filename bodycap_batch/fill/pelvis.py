@@ -29,6 +29,19 @@ _LIST_RAD = np.radians(3.5)
 """Amplitude of the pelvis's list with each stride, at 1.3 m/s. Source: as `_YAW_RAD`."""
 _FULL_SPEED = 1.3
 """Speed (m/s) for which these amplitudes hold. They are proportional to the speed."""
+_FOLLOWING_RAD = (float(np.radians(20.0)), float(np.radians(70.0)))
+"""Angles of the trunk against the vertical from which the pelvis starts to follow it, and follows it most.
+Evidence: none."""
+_BOWING_SHARE = 0.5
+"""Share of the angle of a bowed trunk that the pelvis has. Derivation: in a deep bow, hips and spine take
+about half of the angle each."""
+_LYING_HEIGHT = (0.5, 0.8)
+"""Heights of the trunk's joint over the floor, as shares of the length of the leg, below which a person with
+a level trunk lies, and above which the person bows. Derivation: on a bed the trunk is at 0.6 to 0.7, in a
+deep bow at 1."""
+_RECLINED_RAD = (float(np.radians(60.0)), float(np.radians(80.0)))
+"""Angles of the trunk against the vertical from which a person may lie, and is taken to lie. Evidence:
+none."""
 _MAX_TURN_RAD = np.radians(6.0)
 """Maximum angle by which the pelvis is turned about each axis so that a leg reaches its foot. Evidence:
 none."""
@@ -73,10 +86,48 @@ def stride_phase_rad(steps: Footsteps, ticks: int) -> FloatArray:
     return np.asarray(np.interp(np.arange(ticks), at, phase))
 
 
+def reclined_share(trunk: FloatArray, floor_m: float, leg_m: float) -> FloatArray:
+    """Return 0 for a standing or sitting person, 1 for a lying one, and a smooth change between (T,).
+
+    Args:
+        trunk: (T,4,4) poses of the trunk's joint in the world, metres.
+        floor_m: Height of the floor, metres.
+        leg_m: Length of a leg, metres.
+    """
+    low = 1.0 - _smooth_step((trunk[:, 2, 3] - floor_m) / leg_m, _LYING_HEIGHT)
+    return np.asarray(low * _smooth_step(_tilt_rad(trunk), _RECLINED_RAD))
+
+
+def following_pelvis(pelvis: FloatArray, trunk: FloatArray, reclined: FloatArray) -> FloatArray:
+    """Return the orientation (T,3,3) of a pelvis that follows a trunk which is bent far or lies.
+
+    Args:
+        pelvis: (T,3,3) orientation of the pelvis below an upright trunk.
+        trunk: (T,3,3) orientation of the trunk in the world.
+        reclined: (T,) 1 for a lying person.
+    """
+    zero = np.zeros(3)
+    share = _smooth_step(_tilt_rad(trunk), _FOLLOWING_RAD) * (
+        _BOWING_SHARE + (1.0 - _BOWING_SHARE) * reclined
+    )
+    return np.asarray(
+        interpolate_pose(make_transform(pelvis, zero), make_transform(trunk, zero), share)[:, :3, :3]
+    )
+
+
+def _tilt_rad(rotation: FloatArray) -> FloatArray:
+    return np.asarray(np.arccos(np.clip(rotation[:, 2, 2], -1.0, 1.0)))
+
+
+def _smooth_step(values: FloatArray, limits: tuple[float, float]) -> FloatArray:
+    x = np.clip((values - limits[0]) / (limits[1] - limits[0]), 0.0, 1.0)
+    return np.asarray(x * x * (3.0 - 2.0 * x))
+
+
 def pelvis_rotation(
     signals: TrunkSignals, contacts: Contacts, steps: Footsteps, has_gait: bool
 ) -> FloatArray:
-    """Return the orientation (T,3,3) of the pelvis in the world.
+    """Return the orientation (T,3,3) of the pelvis in the world below an upright trunk.
 
     Args:
         signals: The signals of the trunk.

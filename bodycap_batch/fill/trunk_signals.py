@@ -93,7 +93,7 @@ def trunk_signals(motion: Motion, trunk: int, hands: tuple[int | None, int | Non
         apart = poses[:, hands[0], :2, 3] - poses[:, hands[1], :2, 3]
         ahead = (apart * forward).sum(axis=1)
         arm = _rate(low_pass(ahead, _STRIDE_HZ, fps) - low_pass(ahead, _SLOW_HZ, fps), fps)
-        swing = _amplitude(arm, fps)
+        swing = oscillation_amplitude(arm, _SWING_HZ, fps)
     return TrunkSignals(
         fps=fps,
         hips_m=hips,
@@ -128,9 +128,9 @@ def low_pass(values: FloatArray, cutoff_hz: float, fps: float) -> FloatArray:
     return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=padding))
 
 
-def _amplitude(values: FloatArray, fps: float) -> FloatArray:
-    """Return the amplitude (T,) of an oscillation (T,), averaged over some periods."""
-    return np.asarray(np.sqrt(2.0 * np.maximum(low_pass(values**2, _SWING_HZ, fps), 0.0)))
+def oscillation_amplitude(values: FloatArray, cutoff_hz: float, fps: float) -> FloatArray:
+    """Return the amplitude (T,) of an oscillation (T,), averaged with a low-pass filter."""
+    return np.asarray(np.sqrt(2.0 * np.maximum(low_pass(values**2, cutoff_hz, fps), 0.0)))
 
 
 def _rate(values: FloatArray, fps: float) -> FloatArray:
