@@ -19,7 +19,7 @@ _MAX_SHIFT_S = 86_400.0
 def compare(
     first: Annotated[Path, typer.Argument(metavar="A", help="A results folder or a BVH file.")],
     second: Annotated[
-        Path, typer.Argument(metavar="B", help="A results folder or a BVH file, for example a true motion.")
+        Path, typer.Argument(metavar="B", help="A results folder, a BVH file, or a truth as joints.npz.")
     ],
     out: Annotated[Path, typer.Option("--out", metavar="FILE.html", help="The page to write.")] = Path(
         "comparison.html"
@@ -41,6 +41,7 @@ def compare(
     Examples:
       bodycap compare out/monday out/tuesday
       bodycap compare out/my_walk mocap.bvh --shift 0.4 --out walk.html
+      bodycap compare out/my_walk capture/gt/joints.npz
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.report.comparison import compare as compare_motions
     from bodycap_batch.report.comparison import write_comparison

@@ -299,7 +299,7 @@ class ExportOptions(Options):
         "full", description="joints in the files: the whole body, or only the solved joints"
     )
     filled_markers: bool = Field(
-        False, description="write joints that no camera measured to the TRC file; default: blank"
+        False, description="write joints that no camera measured to the TRC file; default: they are left out"
     )
     preview: bool = Field(
         True, description="write preview.mp4, which shows the body in the room next to the videos"

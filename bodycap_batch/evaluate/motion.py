@@ -14,29 +14,10 @@ from bodycap_batch.core.errors import JobError
 from bodycap_batch.evaluate.association import interpolate_truth
 from bodycap_batch.evaluate.trajectories import ErrorSummary
 from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.formats.joint_positions import read_joint_positions
 from bodycap_batch.formats.tum import TimedPoses
 from bodycap_batch.model.geometry import Similarity, align_points, nearest_rotation, rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion
-
-_ROLE_BY_TRUTH_NAME = {
-    "root": "Hips",
-    "torso": "Spine1",
-    "head": "Head",
-    **{
-        f"{side}_{joint}": side.title() + role
-        for side in ("left", "right")
-        for joint, role in {
-            "palm": "Hand",
-            "elbow": "ForeArm",
-            "shoulder": "Arm",
-            "hip": "UpLeg",
-            "knee": "Leg",
-            "ankle": "Foot",
-        }.items()
-    },
-}
-"""Anatomical role of each joint in the ground truth file ``gt/joints.npz``, by the joint's name in this
-file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,21 +138,13 @@ def _read_truth(path: Path) -> _JointPoses:
                 "the BVH file contains no frames", path=path, hint="give a BVH file that contains a motion"
             )
         return _joints_from_motion(motion)
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            names, seconds, world = (np.asarray(content[key]) for key in ("names", "t", "world"))
-    except (OSError, KeyError, ValueError) as error:
-        raise JobError(
-            f"the file cannot be read as a file of joint positions: {error}",
-            path=path,
-            hint="give a .npz file that contains the arrays names, t and world",
-        ) from error
-    kept = [index for index, name in enumerate(names.tolist()) if name in _ROLE_BY_TRUTH_NAME]
+    truth = read_joint_positions(path)
+    shape = (*truth.x_in_world_m.shape, 3)
     return _JointPoses(
-        times_ns=np.round(seconds * 1e9).astype(np.int64),
-        roles=tuple(_ROLE_BY_TRUTH_NAME[str(names[index])] for index in kept),
-        positions=world[:, kept].astype(np.float64),
-        rotations=np.broadcast_to(np.eye(3), (len(seconds), len(kept), 3, 3)),
+        times_ns=truth.times_ns,
+        roles=truth.roles,
+        positions=truth.x_in_world_m,
+        rotations=np.broadcast_to(np.eye(3), shape),
         oriented=False,
     )
 

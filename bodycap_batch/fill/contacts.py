@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.fill.trunk_signals import TrunkSignals
+from bodycap_batch.fill.trunk_signals import TrunkSignals, oscillation_amplitude
 
 STAND, LEFT, RIGHT, LEFT_TO_RIGHT, RIGHT_TO_LEFT, FLIGHT_LEFT, FLIGHT_RIGHT, FLIGHT_BOTH = range(8)
 """The states. The names of the flights say which foot left the floor last."""
@@ -39,9 +39,10 @@ _START_COST = 1.0
 
 _EVIDENCE_HZ = 10.0
 """Independent samples of evidence per second. Derivation: the signals have no frequencies above 4 Hz."""
-_RISE_SCALE = 1.2
+_RISE_SCALE = 2.4
 """Acceleration (m/s²) of the trunk that is one nat of evidence for both feet on the floor, and downward for
-one foot. Derivation: a rise and fall of ± 1.2 cm at 1.6 steps a second."""
+one foot. Derivation: a rise and fall of ± 2.4 cm at 1.6 steps a second. Evidence:
+docs/decisions/filling.md."""
 _SWAY_SCALE = 0.5
 """Acceleration (m/s²) of the hips to the left that is one nat of evidence that the right foot stands alone.
 Derivation: a sway of ± 1.6 cm at 0.8 strides a second, halved because the trunk's lean disturbs it."""
@@ -51,7 +52,7 @@ Derivation: a yaw of ± 4° at 0.8 strides a second."""
 _ARM_SCALE = 1.0
 """Velocity (m/s) of the left hand relative to the right hand, forward, that is one nat of evidence that the
 left foot stands alone. Derivation: an arm swing of ± 10 cm for each hand at 0.8 strides a second."""
-_LAG_S = 0.055
+_LAG_S = 0.03
 """Time (s) by which the signals of the trunk follow the contacts of the feet. Evidence:
 docs/decisions/filling.md."""
 _MAX_EVIDENCE = 1.5
@@ -63,10 +64,11 @@ _FLIGHT_SIGMA = 3.0
 _FLIGHT_MARGIN = 4.0
 """Evidence (nats) against a flight at a tick without vertical acceleration beyond this. Evidence: none."""
 
-_STILL_SPEED = 0.12
-"""Speed (m/s) below which a person is taken to stand rather than to step. Evidence: none."""
-_STEPPING_SPEED = 0.3
-"""Speed (m/s) above which a person must step. Evidence: none."""
+_STILL_SPEED = 0.06
+"""Speed (m/s) below which a person is taken to stand rather than to step. Evidence:
+docs/decisions/filling.md."""
+_STEPPING_SPEED = 0.24
+"""Speed (m/s) above which a person must step. Evidence: as `_STILL_SPEED`."""
 _TURN_RADIUS_M = 0.25
 """Radius (metres) by which the rate of a turn on the spot is converted to a speed. Evidence: none."""
 
@@ -77,6 +79,11 @@ _STEP_HZ_EXPONENT = 0.42
 """Exponent of speed in the number of steps per second. Source: as `_STEP_HZ_AT_1_3`."""
 _MIN_CADENCE_SPEED = 0.35
 """Minimum speed (m/s) for which the number of steps per second is computed. Evidence: none."""
+_ASIDE_SHARE = 0.4
+"""Share of the speed that is not forward, above which the steps are steps aside or back. Evidence: none."""
+_ASIDE_STEP_S = 0.65
+"""Maximum time (s) between two steps aside or back: they are shorter and quicker than slow steps forward.
+Evidence: none."""
 _DOUBLE_SHARE = 0.24
 """Share of a step during which both feet stand, at 1.3 m/s. Source: M. P. Murray, A. B. Drought, R. C. Kory,
 "Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964."""
@@ -105,7 +112,10 @@ _SURE_NATS = 1.0
 """Evidence (nats) for the side of a certain step. Evidence: none."""
 _MAX_CONTRADICTION_NATS = 1.5
 """Maximum evidence (nats) of one signal against the side of a certain step. Evidence: none."""
-_ORDINARY_DURATION = (0.5, 1.15)
+_SURE_SPEED = 0.15
+"""Minimum mean speed (m/s) of a certain step. Derivation: the first step from standing has half of the speed
+of a slow walk."""
+_ORDINARY_DURATION = (0.45, 1.15)
 """Minimum and maximum time on one foot of a certain step, as a ratio to the expected time between two steps.
 Derivation: the expected time on one foot is 0.6 to 0.9 of it; three sigmas of `_SINGLE_LOG_SIGMA` are
 wider."""
@@ -115,6 +125,11 @@ rise and fall of an ordinary walk. A person who bows or crouches is outside."""
 _MAX_TWIST = 1.2
 """Maximum rate (rad/s) of the trunk's yaw with the stride during a certain step. Derivation: three times
 `_TWIST_SCALE`, rounded up."""
+_RESTLESS_M_PER_S2 = 0.8
+"""Amplitude of the vertical acceleration of the trunk above which a person who does not move away may step in
+place. Derivation: a rise and fall of ± 0.7 cm at 1.7 steps a second; a walking person has ± 1 cm or more."""
+_RESTLESS_HZ = 0.5
+"""Cutoff frequency (Hz) of this amplitude. Derivation: less than a third of the frequency of steps."""
 _MIN_STEPS = 2
 """Minimum number of successive steps that can be certain. Evidence: none."""
 
@@ -185,6 +200,7 @@ class _StepSignals:
         speed: (T,) speed of the slow path, m/s.
         sinking: (T,) height of the slow path over its median, metres.
         twist: (T,) rate of the trunk's yaw without the slow heading, rad/s.
+        is_restless: (T,) True if the trunk rises and falls as with steps.
     """
 
     fps: float
@@ -192,6 +208,7 @@ class _StepSignals:
     speed: FloatArray
     sinking: FloatArray
     twist: FloatArray
+    is_restless: BoolArray
 
 
 def find_contacts(signals: TrunkSignals) -> Contacts:
@@ -216,6 +233,9 @@ def find_contacts(signals: TrunkSignals) -> Contacts:
         speed=signals.speed_m_per_s()[chosen],
         sinking=(height - np.median(height))[chosen],
         twist=signals.twist_rad_per_s[chosen],
+        is_restless=(
+            oscillation_amplitude(signals.rise_m_per_s2, _RESTLESS_HZ, signals.fps) > _RESTLESS_M_PER_S2
+        )[chosen],
     )
     sure = _sure_ticks(found, coarse, ordinary)
     nearest = np.minimum(np.round(np.arange(ticks) / stride).astype(np.int64), len(chosen) - 1)
@@ -272,7 +292,10 @@ def _evidence(signals: TrunkSignals, coarse_fps: float) -> _Evidence:
 def _step_period_s(signals: TrunkSignals) -> FloatArray:
     """Return the expected time (T,) between two steps, seconds."""
     speed = np.maximum(signals.speed_m_per_s(), _MIN_CADENCE_SPEED)
-    return np.asarray(1.0 / (_STEP_HZ_AT_1_3 * (speed / 1.3) ** _STEP_HZ_EXPONENT))
+    period = 1.0 / (_STEP_HZ_AT_1_3 * (speed / 1.3) ** _STEP_HZ_EXPONENT)
+    forward = (signals.velocity_m_per_s[:, :2] * signals.forward()).sum(axis=1)
+    is_aside = forward < (1.0 - _ASIDE_SHARE) * speed
+    return np.asarray(np.where(is_aside, np.minimum(period, _ASIDE_STEP_S), period))
 
 
 def _own_rhythm(state: IntArray, rhythm: _Rhythm, fps: float) -> _Rhythm:
@@ -402,9 +425,9 @@ def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> 
 
     A step is certain if it is one of two or more successive steps of an ordinary walk: evidence for its side
     without a strong contradiction, an ordinary duration, a trunk that neither sinks nor twists much. Standing
-    is always certain: nothing is claimed about it but that no foot moves.
+    is certain if the trunk does not rise and fall as with steps, as it does on a treadmill.
     """
-    out = np.ones(len(state), dtype=bool)
+    out = ~((state == STAND) & signals.is_restless)
     bounds = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state)]
     walks: list[list[tuple[int, int]]] = [[]]
     for start, end in itertools.pairwise(bounds):
@@ -431,7 +454,7 @@ def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> 
         for start, end in walk:
             nearest = np.argsort(np.abs(middles - 0.5 * (start + end)))[: 1 if (start, end) in singles else 2]
             out[start:end] = bool(len(nearest)) and bool(sure[nearest].all())
-    return out
+    return np.asarray(out)
 
 
 def _support(state: IntArray, evidence: _Evidence, start: int, end: int) -> FloatArray:
@@ -458,7 +481,7 @@ def _is_ordinary(signals: _StepSignals, start: int, end: int) -> bool:
     duration = (end - start) / signals.fps / (signals.period_s[own].mean())
     return bool(
         _ORDINARY_DURATION[0] <= duration <= _ORDINARY_DURATION[1]
-        and signals.speed[own].mean() >= _STEPPING_SPEED
+        and signals.speed[own].mean() >= _SURE_SPEED
         and np.abs(signals.sinking[own]).max() <= _MAX_SINKING_M
         and np.abs(signals.twist[own]).max() <= _MAX_TWIST
     )

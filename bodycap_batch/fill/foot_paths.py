@@ -46,6 +46,8 @@ longer distance, the heel is raised. Derivation: the limit at which the knee is 
 _CLEARANCE_POWER = 0.65
 """Exponent of time in the height of a swing: below 1, the foot is highest before the middle. Evidence:
 docs/decisions/filling.md."""
+_RISING_SHARE = 0.7
+"""Share of a swing during which the foot rises to a higher place or sinks to a lower one. Evidence: none."""
 _TOLERANCE_M = 0.06
 """Distance (metres) by which a place may be beyond the reach of the leg before it is moved. Derivation: the
 error of the height of hips and floor in the recordings of the benchmark `body`."""
@@ -310,7 +312,10 @@ def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg
     speed = (start[1] - start[0])[:2] * count
     travel = _quintic(phase, start[1, :2], speed, end[:2])
     # The drop is limited to what the foot has while it rolls over the ball.
-    floor = (first.place[2] + _smooth(phase) * (second.place[2] - first.place[2])) - leg.ankle_height_m
+    rise = second.place[2] - first.place[2]
+    # The foot rises before it moves ahead to a higher place, and sinks after it has moved over a lower place.
+    late = phase / _RISING_SHARE if rise > 0.0 else 1.0 - (1.0 - phase) / _RISING_SHARE
+    floor = first.place[2] + _smooth(late) * rise - leg.ankle_height_m
     path.pitch_rad[inside] = pitch
     path.toe_rad[inside] = toe
     path.heading_rad[inside] = first.heading + _smooth(phase) * (second.heading - first.heading)

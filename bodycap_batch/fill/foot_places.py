@@ -6,6 +6,7 @@ is linear in the state of the hips at the middle of the time on this foot.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +18,11 @@ from bodycap_batch.fill.trunk_signals import TrunkSignals
 from bodycap_batch.model.fill_data import Footsteps
 
 _BEHIND_M = 0.01
-"""Distance (metres) of the ankle behind the middle of the hips at the middle of the time on this foot.
-Derivation: the pressure under a foot lies between heel and ball, in front of the ankle."""
+"""Distance (metres) of the ankle behind the middle of the hips when the hips pass the foot. Derivation: the
+pressure under a foot lies between heel and ball, in front of the ankle."""
+_EARLY_SHARE = 0.05
+"""Time by which the hips pass the foot before the middle of the time on this foot, as a share of the time
+between two steps. Evidence: docs/decisions/filling.md."""
 _WALKING_WIDTH = 0.115
 """Distance between the paths of the two ankles while walking, as a ratio to the length of the leg. Source:
 J. M. Donelan, R. Kram, A. D. Kuo, "Mechanical and metabolic determinants of the preferred step width in human
@@ -37,6 +41,17 @@ Derivation: a walking person is above 0.95."""
 _CROUCHING_AHEAD = 0.45
 """Distance by which the feet are placed ahead of the hips, as a ratio to the distance by which the hips are
 lower than `_LOW_SHARE`. Derivation: the ankles of a person on a chair are some 15 cm ahead of the hips."""
+_STRAIGHT_SHARE = 0.985
+"""Distance between hip and ankle of a standing person, as a share of the length of the leg. Derivation: a
+knee that is bent by 15°, as in M. P. Murray and others, 1964."""
+_MIN_RAISED_M = 0.12
+"""Minimum height (metres) of a stair or another raised floor. Derivation: a stair has 15 to 20 cm; the error
+of the height of hips and floor is up to 10 cm in the recordings of the benchmark `body`."""
+_MIN_RAISED_S = 2.0
+"""Minimum time (s) on stairs or another raised floor. Derivation: a jump takes 0.7 s, and three stairs
+take 1 s."""
+_LEVEL_PERCENTILE = 10.0
+"""Percentile of these distances that belongs to the level floor. Evidence: none."""
 _MAX_SHIFT_M = 0.22
 """Distance (metres) that the hips may move over standing feet before a foot takes a step. Derivation: the
 length of a foot from the ankle to the ball, with a margin."""
@@ -73,7 +88,9 @@ def place_feet(
     places = [_place(each, contacts, signals, legs[each.side], floor_m) for each in stances]
     out = np.array([place for place, _ in places]).reshape(-1, 2)
     _keep_apart(out, stances, signals, 0.5 * (legs[0].length_m + legs[1].length_m))
-    heights = np.array([floor_m + legs[each.side].ankle_height_m for each in stances])
+    excess = np.array([_excess_m(each, contacts, signals, legs[each.side], floor_m) for each in stances])
+    ankles = np.array([legs[each.side].ankle_height_m for each in stances])
+    heights = floor_m + _raised_m(excess, stances, signals.fps) + ankles
     return Footsteps(
         side=np.array([each.side for each in stances], dtype=np.int64),
         start_tick=np.array([each.start for each in stances], dtype=np.int64),
@@ -166,6 +183,39 @@ def _place(
     return place, heading + outward * _TOE_OUT_RAD
 
 
+def _excess_m(
+    stance: _Stance, contacts: Contacts, signals: TrunkSignals, leg: LegGeometry, floor_m: float
+) -> float:
+    """Return how far (metres) above the floor a straight leg ends while its foot stands."""
+    ticks = np.arange(stance.start, stance.end)
+    state = contacts.state[stance.start : stance.end]
+    chosen = ticks[state == STAND]
+    if len(chosen) == 0:
+        chosen = ticks[state == (LEFT if stance.side == 0 else RIGHT)]
+    if len(chosen) == 0:
+        chosen = ticks
+    hips_m = float(np.median(signals.slow_hips_m[chosen, 2]))
+    return hips_m - floor_m - _STRAIGHT_SHARE * leg.length_m - leg.ankle_height_m
+
+
+def _raised_m(excess_m: FloatArray, stances: list[_Stance], fps: float) -> FloatArray:
+    """Return the heights (N,) of the stairs below N successive feet over the floor, metres; 0 for the floor.
+
+    A foot stands higher if its straight leg does not reach the floor, as those of its neighbours for some
+    time. In a jump they do not reach the floor for a short time.
+    """
+    out = np.zeros(len(excess_m))
+    if len(out) == 0:
+        return out
+    over = excess_m - np.clip(np.percentile(excess_m, _LEVEL_PERCENTILE), 0.0, _MIN_RAISED_M)
+    for is_raised, group in itertools.groupby(range(len(out)), key=lambda index: over[index] > _MIN_RAISED_M):
+        own = list(group)
+        seconds = (max(stances[index].end for index in own) - stances[own[0]].start) / fps
+        if is_raised and seconds >= _MIN_RAISED_S:
+            out[own] = over[own]
+    return out
+
+
 def _passing_hips(stance: _Stance, contacts: Contacts, signals: TrunkSignals) -> tuple[FloatArray, float]:
     """Return the mean position (2,) and heading of the hips while the foot stands alone.
 
@@ -189,5 +239,6 @@ def _passing_hips(stance: _Stance, contacts: Contacts, signals: TrunkSignals) ->
     at = np.arange(first, max(end, first + 1))
     inside = np.clip(at, 0, last)
     beyond = ((at - inside) / signals.fps)[:, None]
-    path = signals.slow_hips_m[inside, :2] + beyond * signals.velocity_m_per_s[inside, :2]
+    early = _EARLY_SHARE * (contacts.single_s + contacts.double_s)[inside, None]
+    path = signals.slow_hips_m[inside, :2] + (beyond - early) * signals.velocity_m_per_s[inside, :2]
     return np.asarray(path.mean(axis=0)), float(signals.heading_rad[inside].mean())

@@ -17,10 +17,31 @@ _YAW_RAD = np.radians(3.0)
 """Amplitude of the pelvis's yaw with each stride, at 1.3 m/s. Source: M. P. Murray, A. B. Drought, R. C.
 Kory, "Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964: ± 3 to 5°. The smaller
 value, because the turn that reaches the feet is added."""
+_YAW_PER_SWING = np.radians(4.0)
+"""Amplitude (radians) of this yaw for each m/s of the velocity of one hand relative to the other hand.
+Evidence: docs/decisions/filling.md."""
+_MAX_YAW_RAD = np.radians(12.0)
+"""Maximum amplitude of this yaw. Evidence: none."""
+_MIN_YAW_SHARE = 0.4
+"""Minimum amplitude of this yaw, as a share of `_YAW_RAD`, of a person whose arms do not swing. Evidence:
+none."""
 _LIST_RAD = np.radians(3.5)
 """Amplitude of the pelvis's list with each stride, at 1.3 m/s. Source: as `_YAW_RAD`."""
 _FULL_SPEED = 1.3
 """Speed (m/s) for which these amplitudes hold. They are proportional to the speed."""
+_FOLLOWING_RAD = (float(np.radians(20.0)), float(np.radians(70.0)))
+"""Angles of the trunk against the vertical from which the pelvis starts to follow it, and follows it most.
+Evidence: none."""
+_BOWING_SHARE = 0.5
+"""Share of the angle of a bowed trunk that the pelvis has. Derivation: in a deep bow, hips and spine take
+about half of the angle each."""
+_LYING_HEIGHT = (0.5, 0.8)
+"""Heights of the trunk's joint over the floor, as shares of the length of the leg, below which a person with
+a level trunk lies, and above which the person bows. Derivation: on a bed the trunk is at 0.6 to 0.7, in a
+deep bow at 1."""
+_RECLINED_RAD = (float(np.radians(60.0)), float(np.radians(80.0)))
+"""Angles of the trunk against the vertical from which a person may lie, and is taken to lie. Evidence:
+none."""
 _MAX_TURN_RAD = np.radians(6.0)
 """Maximum angle by which the pelvis is turned about each axis so that a leg reaches its foot. Evidence:
 none."""
@@ -65,10 +86,48 @@ def stride_phase_rad(steps: Footsteps, ticks: int) -> FloatArray:
     return np.asarray(np.interp(np.arange(ticks), at, phase))
 
 
+def reclined_share(trunk: FloatArray, floor_m: float, leg_m: float) -> FloatArray:
+    """Return 0 for a standing or sitting person, 1 for a lying one, and a smooth change between (T,).
+
+    Args:
+        trunk: (T,4,4) poses of the trunk's joint in the world, metres.
+        floor_m: Height of the floor, metres.
+        leg_m: Length of a leg, metres.
+    """
+    low = 1.0 - _smooth_step((trunk[:, 2, 3] - floor_m) / leg_m, _LYING_HEIGHT)
+    return np.asarray(low * _smooth_step(_tilt_rad(trunk), _RECLINED_RAD))
+
+
+def following_pelvis(pelvis: FloatArray, trunk: FloatArray, reclined: FloatArray) -> FloatArray:
+    """Return the orientation (T,3,3) of a pelvis that follows a trunk which is bent far or lies.
+
+    Args:
+        pelvis: (T,3,3) orientation of the pelvis below an upright trunk.
+        trunk: (T,3,3) orientation of the trunk in the world.
+        reclined: (T,) 1 for a lying person.
+    """
+    zero = np.zeros(3)
+    share = _smooth_step(_tilt_rad(trunk), _FOLLOWING_RAD) * (
+        _BOWING_SHARE + (1.0 - _BOWING_SHARE) * reclined
+    )
+    return np.asarray(
+        interpolate_pose(make_transform(pelvis, zero), make_transform(trunk, zero), share)[:, :3, :3]
+    )
+
+
+def _tilt_rad(rotation: FloatArray) -> FloatArray:
+    return np.asarray(np.arccos(np.clip(rotation[:, 2, 2], -1.0, 1.0)))
+
+
+def _smooth_step(values: FloatArray, limits: tuple[float, float]) -> FloatArray:
+    x = np.clip((values - limits[0]) / (limits[1] - limits[0]), 0.0, 1.0)
+    return np.asarray(x * x * (3.0 - 2.0 * x))
+
+
 def pelvis_rotation(
     signals: TrunkSignals, contacts: Contacts, steps: Footsteps, has_gait: bool
 ) -> FloatArray:
-    """Return the orientation (T,3,3) of the pelvis in the world.
+    """Return the orientation (T,3,3) of the pelvis in the world below an upright trunk.
 
     Args:
         signals: The signals of the trunk.
@@ -83,10 +142,23 @@ def pelvis_rotation(
         phase = stride_phase_rad(steps, ticks)
         walking = low_pass((contacts.state != STAND).astype(np.float64), _FADE_HZ, signals.fps)
         strength = np.clip(walking, 0.0, 1.0) * np.clip(signals.speed_m_per_s() / _FULL_SPEED, 0.0, 1.3)
-        yaw = yaw - _YAW_RAD * strength * np.cos(phase)
+        yaw = yaw - np.clip(walking, 0.0, 1.0) * _yaw_amplitude_rad(signals) * np.cos(phase)
         tilt = -_LIST_RAD * strength * np.sin(phase)
     turn = so3_exp(np.column_stack([zero, zero, yaw]))
     return np.asarray(turn @ so3_exp(np.column_stack([zero, tilt, zero])))
+
+
+def _yaw_amplitude_rad(signals: TrunkSignals) -> FloatArray:
+    """Return the amplitude (T,) of the pelvis's yaw with each stride, from the arm swing and the speed.
+
+    Arms and legs swing against each other so that the body as a whole does not yaw. A person with a wide arm
+    swing therefore turns the pelvis far.
+    """
+    usual = _YAW_RAD * np.clip(signals.speed_m_per_s() / _FULL_SPEED, 0.0, 1.3)
+    if signals.arm_swing_m_per_s is None:
+        return np.asarray(usual)
+    own = np.minimum(_YAW_PER_SWING * signals.arm_swing_m_per_s, _MAX_YAW_RAD)
+    return np.asarray(np.clip(own, _MIN_YAW_SHARE * usual, None))
 
 
 def reaching_pelvis(

@@ -8,14 +8,21 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.fill.contacts import Contacts, find_contacts
+from bodycap_batch.fill.contacts import STAND, Contacts, find_contacts
 from bodycap_batch.fill.floor_height import FloorHeight, floor_below_legs, lifted_steps
 from bodycap_batch.fill.foot_paths import REACH_SHARE, foot_path, kept_steps, reachable_steps
 from bodycap_batch.fill.foot_places import place_feet
 from bodycap_batch.fill.head import head_rotations
 from bodycap_batch.fill.leg_geometry import LegGeometry, leg_geometry
 from bodycap_batch.fill.leg_poses import pose_leg
-from bodycap_batch.fill.pelvis import bend_spine, pelvis_rotation, reaching_pelvis
+from bodycap_batch.fill.lying import lay_legs
+from bodycap_batch.fill.pelvis import (
+    bend_spine,
+    following_pelvis,
+    pelvis_rotation,
+    reaching_pelvis,
+    reclined_share,
+)
 from bodycap_batch.fill.trunk_signals import TrunkSignals, trunk_signals
 from bodycap_batch.model.fill_data import SIDES, FillMode, FillReport, FillResult, Footsteps
 from bodycap_batch.model.geometry import make_transform
@@ -74,14 +81,23 @@ def fill_motion(
         steps = place_feet(contacts, signals, legs, floor.height_m)
         steps, floor = lifted_steps(steps, floor, world, contacts, legs)
     context.progress(2, _PROGRESS_STEPS, "pelvis")
+    reclined = np.zeros(len(world))
+    if legs is not None and split_side(skeleton.roles[first])[0] == "":
+        reclined = reclined_share(world[:, first], floor.height_m, legs[0].length_m)
     if first != 0:
         pelvis = pelvis_rotation(signals, contacts, steps, legs is not None)
+        pelvis = following_pelvis(pelvis, world[:, first, :3, :3], reclined)
         if legs is not None:
             pelvis = _within_reach(skeleton, first, pelvis, world, (legs, steps, signals))
         bend_spine(skeleton, first, pelvis, world, filled)
     missed = np.ones_like(contacts.standing)
     if legs is not None:
         steps, missed = _fill_legs(skeleton, legs, steps, signals, world, filled)
+        if reclined.any():
+            missed |= (reclined > 0.0)[:, None]
+            steps = kept_steps(steps, missed)
+            for leg in legs:
+                lay_legs(skeleton, leg, reclined, floor.height_m, world)
     context.check_cancelled()
     context.progress(3, _PROGRESS_STEPS, "head")
     _fill_head(skeleton, solved, signals, world, filled)
@@ -92,7 +108,7 @@ def fill_motion(
     ]
     sure = nothing.is_sure
     if legs is not None:
-        known = _trunk_is_seen(motion, solved) & ~_low_hips(world, legs, floor)
+        known = _trunk_is_seen(motion, solved) & ~_low_hips(world, legs, floor) & (reclined == 0.0)
         sure = _sure(steps, contacts, known)
     context.progress(_PROGRESS_STEPS, _PROGRESS_STEPS, "filled")
     return FillResult(
@@ -307,5 +323,5 @@ def _sure(steps: Footsteps, contacts: Contacts, known: BoolArray) -> BoolArray:
     out = contacts.is_sure & known
     for start, end, sure in zip(steps.start_tick, steps.end_tick, steps.is_sure, strict=True):
         if not sure:
-            out[start:end] = False
+            out[start:end] &= contacts.state[start:end] != STAND
     return out

@@ -23,7 +23,8 @@ def write_trc(path: Path, points: LabelledPoints) -> Path:
     """Write points as a TRC file.
 
     The times in the file start at 0. The coordinates have three decimals, so the resolution is one
-    micrometre. The coordinates of a point that is not measured are blank.
+    micrometre. A point that is not measured is left out: readers that split rows at white space would take
+    blank cells for the coordinates of the next point.
 
     Returns:
         The path of the file.
@@ -31,8 +32,9 @@ def write_trc(path: Path, points: LabelledPoints) -> Path:
     Raises:
         StoreError: The file cannot be written.
     """
-    rate, frames, count = f"{points.fps:g}", len(points.x_in_world_m), len(points.names)
-    names = [" ".join(name.split()) for name in points.names]
+    measured = points.measured_points()
+    names = [" ".join(name.split()) for name, kept in zip(points.names, measured, strict=True) if kept]
+    rate, frames, count = f"{points.fps:g}", len(points.x_in_world_m), len(names)
     axes = "\t".join(f"{axis}{number}" for number in range(1, count + 1) for axis in "XYZ")
     lines = [
         f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
@@ -42,9 +44,9 @@ def write_trc(path: Path, points: LabelledPoints) -> Path:
         f"\t\t{axes}",
         "",
     ]
-    table = (_MM_PER_M * points.x_in_world_m @ _FILE_FROM_WORLD.T + 0.0).reshape(frames, 3 * count)
-    cell = np.where(np.repeat(points.measured_points(), 3), "\t%.3f", "\t%.0s")
-    row = "%d\t%.6f" + "".join(cell.tolist())
+    centres = points.x_in_world_m[:, measured]
+    table = (_MM_PER_M * centres @ _FILE_FROM_WORLD.T + 0.0).reshape(frames, 3 * count)
+    row = "%d\t%.6f" + 3 * count * "\t%.3f"
     seconds = np.arange(frames) / points.fps
     lines += [row % (index + 1, seconds[index], *values) for index, values in enumerate(table)]
     write_text(path, "\n".join(lines) + "\n")

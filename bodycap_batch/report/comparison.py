@@ -16,12 +16,15 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, runs
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.formats.joint_positions import motion_from_positions, read_joint_positions
 from bodycap_batch.model.joint_angles import angle_curves, foot_curves
 from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.report.figures.motion_curves import Take, draw_motion_curves
 from bodycap_batch.report.figures.svg import element, path_through, svg_image, text
 
 MOTION_FILE = "motion.bvh"
+_TRUTH_FILES = ("gt/joints.npz", "joints.npz")
+"""True joint positions in a folder without `MOTION_FILE`."""
 _NAMES = ("A", "B")
 _PATH_SIZE, _PATH_MARGIN = 460.0, 26.0
 """Size and margin of the drawing of the paths, SVG units."""
@@ -49,12 +52,13 @@ class Comparison:
 
 
 def load_take(path: Path, name: str, start_s: float = 0.0) -> Take:
-    """Read a motion from a BVH file or a results folder.
+    """Read a motion from a BVH file, a results folder or a truth of joint positions.
 
     In a results folder, ``joints.csv`` says which joints were measured at which time.
 
     Args:
-        path: A BVH file, or a folder with ``motion.bvh``.
+        path: A BVH file, a file ``joints.npz`` with true joint positions, a folder with ``motion.bvh``, or a
+            capture folder with ``gt/joints.npz``.
         name: Name of the take.
         start_s: Time of the first tick on the axis of the comparison, seconds.
 
@@ -62,10 +66,17 @@ def load_take(path: Path, name: str, start_s: float = 0.0) -> Take:
         JobError: There is no motion, or a file cannot be read.
     """
     file = path / MOTION_FILE if path.is_dir() else path
+    if path.is_dir() and not file.is_file():
+        truths = [path / name for name in _TRUTH_FILES if (path / name).is_file()]
+        file = truths[0] if truths else file
     if not file.is_file():
         raise JobError(
-            "there is no motion to compare", path=file, hint="give a BVH file, or a folder with a motion.bvh"
+            "there is no motion to compare",
+            path=file,
+            hint="give a BVH file, a folder with a motion.bvh, or a truth as gt/joints.npz",
         )
+    if file.suffix.lower() == ".npz":
+        return Take(name=name, motion=_true_motion(file), start_s=start_s)
     _, motion = read_bvh(file)
     if motion is None:
         raise JobError("the BVH file contains no frames", path=file, hint="give a BVH file with a motion")
@@ -73,6 +84,17 @@ def load_take(path: Path, name: str, start_s: float = 0.0) -> Take:
     if path.is_dir() and table.is_file():
         motion = replace(motion, observed=_observed(table, motion))
     return Take(name=name, motion=motion, start_s=start_s)
+
+
+def _true_motion(file: Path) -> Motion:
+    motion = motion_from_positions(read_joint_positions(file))
+    if motion is None:
+        raise JobError(
+            "the file holds no motion of a body: it has no hips or only one time",
+            path=file,
+            hint="give a file whose names contain root, and at least two times",
+        )
+    return motion
 
 
 def _observed(table: Path, motion: Motion) -> BoolArray:

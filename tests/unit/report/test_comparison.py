@@ -12,6 +12,7 @@ import pytest
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.export.joint_tables import write_joint_table
 from bodycap_batch.formats.bvh import write_bvh
+from bodycap_batch.formats.joint_positions import ROLE_BY_TRUTH_NAME
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.report.comparison import compare, write_comparison
@@ -45,6 +46,43 @@ def test_the_same_motion_elsewhere_differs_by_nothing(tmp_path: Path) -> None:
         assert foot == pytest.approx(feet["B"][name], abs=1e-3)
     assert feet["A"]["left foot"]["stands"] == pytest.approx(stands[:, 0].mean(), abs=0.1)
     assert found.figures["motions"]["A"]["speed_m_s"] == pytest.approx(0.8, abs=0.01)
+
+
+@pytest.mark.parametrize("given", ["capture", "capture/gt", "capture/gt/joints.npz"])
+def test_a_truth_of_joint_positions_is_read(tmp_path: Path, given: str) -> None:
+    motion, stands = walking(90)
+    centres = motion.world_from_joint()[..., :3, 3]
+    roles = {role: name for name, role in ROLE_BY_TRUTH_NAME.items()}
+    known = [joint for joint, role in enumerate(motion.skeleton.roles) if role in roles]
+    (tmp_path / "capture" / "gt").mkdir(parents=True)
+    np.savez(
+        tmp_path / "capture" / "gt" / "joints.npz",
+        names=np.array([roles[motion.skeleton.roles[joint]] for joint in known]),
+        t=np.arange(90) / motion.fps,
+        world=centres[:, known],
+    )
+    found = compare(bvh(tmp_path, "a", motion), tmp_path / given)
+    angles = found.figures["angles"]
+    assert {"left elbow", "right elbow", "left knee", "right knee"} <= set(angles)
+    for each in angles.values():
+        assert each["mean_abs_deg"] < 0.1
+    feet = found.figures["feet"]
+    assert feet["B"]["left foot"]["stands"] == pytest.approx(stands[:, 0].mean(), abs=0.15)
+    truth = found.takes[1].motion
+    for joint, role in enumerate(truth.skeleton.roles):
+        if role:
+            own = truth.world_from_joint()[:, joint, :3, 3]
+            at = centres[:, motion.skeleton.roles.index(role)]
+            assert np.linalg.norm(own - at, axis=1).max() < 0.03
+
+
+def test_a_truth_without_hips_is_refused(tmp_path: Path) -> None:
+    motion, _ = walking(10)
+    np.savez(
+        tmp_path / "joints.npz", names=np.array(["left_knee"]), t=np.arange(10.0), world=np.zeros((10, 1, 3))
+    )
+    with pytest.raises(JobError, match="no hips"):
+        compare(bvh(tmp_path, "a", motion), tmp_path / "joints.npz")
 
 
 def test_a_bent_elbow_and_a_later_start_are_found(tmp_path: Path) -> None:
