@@ -229,8 +229,8 @@ class SynthOptions(Options):
         0.0,
         ge=0,
         le=90,
-        description="rotation of the true mounts of cameras on hands towards the wearer, in degrees; with 60, "
-        "they see chest, arms and legs in much of their pictures",
+        description="rotation of the true mounts of cameras on hands towards the wearer, in degrees; with "
+        "80, they see chest, arms and legs in much of their pictures",
     )
     arms_ahead: float = Field(
         0.0,

@@ -44,7 +44,7 @@ _TEXELS_PER_M = 300.0
 _PRINT_SHARE = 0.6
 """Share of the printed pattern in the colour of patterned cloth. Evidence: none."""
 _PRINT_M = 0.2
-"""Side (metres) of the squares that a printed pattern consists of. No two squares are equal. Evidence: none."""
+"""Side (metres) of the squares that a printed pattern consists of. All squares differ. Evidence: none."""
 _CLEARANCE_M = 0.02
 """A camera outside a limb is treated as inside the limb if its distance from the limb's surface is not larger
 than this threshold. Unit: metres."""
