@@ -72,6 +72,7 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap synth my_test/ --seconds 10
       bodycap synth hard/ --set exposure_s=0.02 --set rolling_shutter_s=0.02 --set body_in_view=true
       bodycap synth hidden/ --set body_in_view=true --set "pressed_s={left_palm: [2, 4]}"
+      bodycap synth cloth/ --set body_in_view=true --set clothes=patterned --set hands_inward_deg=80
       bodycap synth apart/ --set clocks=free --set sound=on
       bodycap synth inertial/ --set imu=true
       bodycap synth steps/ --poses --set walk=gait --seconds 30

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from bodycap_batch.model.measured_parts import BODY_PARTS, PartState, part_states
 from bodycap_batch.model.merge_data import MergeResult, filled_joints
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
+from bodycap_batch.overlay import LostView
 from bodycap_batch.report.drawn_scene import DrawnScene, common_times_s
 from bodycap_batch.report.figures.before_after import draw_before_and_after, find_unoptimised_bones
 from bodycap_batch.report.figures.camera_landmark_matrix import draw_camera_landmark_matrix
@@ -134,6 +136,7 @@ def _motion_curves(inputs: ReportInputs, budget: PageBudget) -> str:
 
 _CAUSE_CRITERIA = {
     LossCause.DARK: f"the mean brightness of the lost frame is below {DARK_BRIGHTNESS:.0f} of 255",
+    LossCause.WEARER: "according to the solved body, mostly the wearer is in the picture",
     LossCause.FAST: f"just before or after the lost frames, the camera turned more than {FAST_DEG:.0f}° per "
     "frame",
     LossCause.BLUR: f"the sharpness is below {BLUR_SHARPNESS_RATIO * 100:.0f} % of the sharpness of the "
@@ -178,10 +181,27 @@ def _cameras(
                 "frames": 0 if path is None else len(path.status),
                 "registered": 0 if path is None else int(path.registered.sum()),
                 "losses": len(camera_losses),
+                "sees": _lost_frames_see(inputs, name),
                 "causes": [(cause.value, frames) for cause, frames in causes.get(name, {}).items()],
             }
         )
     return sections
+
+
+_VIEW_WORDS = {
+    LostView.MAP: "should see a part of the map",
+    LostView.WEARER: "see mostly the wearer",
+    LostView.NOTHING: "see nothing of the map",
+    LostView.UNKNOWN: "have no predicted pose",
+}
+"""Words for what lost frames see."""
+
+
+def _lost_frames_see(inputs: ReportInputs, camera: str) -> list[tuple[int, str]]:
+    """Return the number of lost frames of a camera, and what they see, for each kind that occurs."""
+    views = inputs.lost_views.get(camera)
+    counts = Counter(() if views is None else views.view)
+    return [(counts[view], words) for view, words in _VIEW_WORDS.items() if counts[view]]
 
 
 def _time_span(inputs: ReportInputs) -> tuple[float, float]:
@@ -235,6 +255,10 @@ def _facts(diagnosed: DiagnosedLoss) -> str:
         parts.append(f"turned {diagnosed.loss.turn_deg:.0f}° per frame")
     if diagnosed.appearance is not None:
         parts.append(f"{diagnosed.appearance.corners} corners")
+    if diagnosed.loss.sees is not LostView.UNKNOWN:
+        parts.append(f"{diagnosed.loss.map_points:.0f} map points should be visible")
+    if np.isfinite(diagnosed.loss.body_share):
+        parts.append(f"the body covers {diagnosed.loss.body_share:.0%}")
     return ", ".join(parts)
 
 

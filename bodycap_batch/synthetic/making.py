@@ -82,18 +82,19 @@ def draw_subject(options: SynthOptions) -> Subject:
     length_s = max(options.seconds, last_s)
     sigmas = options.mount_sigma_deg, options.mount_sigma_m
     mount_rng = np.random.default_rng(seeds["mounts"])
+    inward_deg = options.hands_inward_deg
     motion: MovingBody
     if options.motion is not None:
         # With free clocks, the earliest camera starts at the start of the used part of the file.
         lead_s = max(0.0, -first_s) if options.clocks == "free" else 0.0
         start_s = options.motion_start_s + lead_s
         motion = load_clip(options.motion, start_s, length_s - 1.0 / options.fps)
-        mounts = draw_mounts(options.cameras, motion.skeleton, sigmas, mount_rng)
+        mounts = draw_mounts(options.cameras, motion.skeleton, sigmas, mount_rng, inward_deg)
     else:
         body = draw_body(
             options.subject_height_m, options.proportion_range, np.random.default_rng(seeds["body"])
         )
-        mounts = draw_mounts(options.cameras, body, sigmas, mount_rng)
+        mounts = draw_mounts(options.cameras, body, sigmas, mount_rng, inward_deg)
         style = WalkStyle(
             t_pose_s=options.t_pose_s,
             arms_ahead=options.arms_ahead,
@@ -241,7 +242,12 @@ def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRende
         bare=BareSurfaces(names=frozenset(options.bare), pictures=options.flat_pictures),
     )
     images = [surface.image for surface in surfaces]
-    wearer = Wearer(subject.motion.skeleton, subject.seeds["clothes"]) if options.body_in_view else None
+    patterned = options.clothes == "patterned"
+    wearer = (
+        Wearer(subject.motion.skeleton, subject.seeds["clothes"], patterned=patterned)
+        if options.body_in_view
+        else None
+    )
     atlas = Atlas(images + (wearer.images if wearer else []))
     if wearer:
         wearer.place_textures(atlas.origins[len(images) :])

@@ -220,6 +220,18 @@ class SynthOptions(Options):
         "are written to <camera>.timestamps.txt",
     )
     body_in_view: bool = Field(False, description="show the wearer's own body in the videos")
+    clothes: Literal["plain", "patterned"] = Field(
+        "plain",
+        description="with body_in_view: cloth of one colour with folds, or cloth with a printed pattern that "
+        "can be tracked like the room",
+    )
+    hands_inward_deg: float = Field(
+        0.0,
+        ge=0,
+        le=90,
+        description="rotation of the true mounts of cameras on hands towards the wearer, in degrees; with "
+        "80, they see chest, arms and legs in much of their pictures",
+    )
     arms_ahead: float = Field(
         0.0,
         ge=0,
@@ -390,6 +402,8 @@ class SynthOptions(Options):
                 "pressed_s cannot be used without body_in_view, because the chest is not visible; set "
                 "body_in_view"
             )
+        if self.clothes != "plain" and not self.body_in_view:
+            raise ValueError("clothes cannot be seen without body_in_view; set body_in_view")
         if self.pressed_s and self.motion is not None:
             raise ValueError(
                 "pressed_s cannot be used with motion, because the program does not change the motion of the "

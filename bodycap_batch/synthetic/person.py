@@ -12,7 +12,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
-from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions, split_side
+from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions, segment_axes, split_side
 
 
 def draw_body(height_m: float, proportion_range: float, rng: np.random.Generator) -> SkeletonModel:
@@ -117,6 +117,7 @@ def draw_mounts(
     skeleton: SkeletonModel,
     sigmas: tuple[float, float],
     rng: np.random.Generator,
+    inward_deg: float = 0.0,
 ) -> tuple[Mount, ...]:
     """Draw the true mounts of the cameras: the nominal mounts, rotated and shifted at random.
 
@@ -126,6 +127,8 @@ def draw_mounts(
         sigmas: Total standard deviations of the rotation (degrees) and of the shift (metres). The standard
             deviation for each of the three axes is 1/√3 of the total.
         rng: Source of randomness.
+        inward_deg: Rotation of the cameras on hands about the bone, from the thumb's side towards the side of
+            the palm, degrees.
 
     Raises:
         JobError: The skeleton has no joint on which a camera is mounted.
@@ -137,6 +140,19 @@ def draw_mounts(
         nominal = nominal_mount(camera, place[1], skeleton)
         turn = so3_exp(rng.normal(0.0, np.radians(sigmas[0]) / np.sqrt(3.0), 3))
         shift = rng.normal(0.0, sigmas[1] / np.sqrt(3.0), 3)
-        pose = make_transform(nominal.joint_from_cam[:3, :3] @ turn, nominal.joint_from_cam[:3, 3] + shift)
+        rotation = _towards_palm(skeleton, place[1], inward_deg) @ nominal.joint_from_cam[:3, :3] @ turn
+        pose = make_transform(rotation, nominal.joint_from_cam[:3, 3] + shift)
         out.append(Mount(camera=camera, role=place[1], joint_from_cam=pose, sigma_rad=0.0, sigma_m=0.0))
     return tuple(out)
+
+
+def _towards_palm(skeleton: SkeletonModel, role: str, degrees: float) -> FloatArray:
+    """Return a rotation (3,3) about the bone of a hand that turns the thumb's side towards the palm's side.
+
+    For other bones, it is the identity.
+    """
+    if not role.endswith("Hand"):
+        return np.eye(3)
+    along, forward, outward = segment_axes(skeleton, role).T
+    sense = np.sign(np.dot(np.cross(along, forward), -outward))
+    return np.asarray(so3_exp(along * sense * np.radians(degrees)))

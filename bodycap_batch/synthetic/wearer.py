@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions, split_side
 from bodycap_batch.synthetic import textures
+from bodycap_batch.synthetic.pictures import abstract
 from bodycap_batch.synthetic.surfaces import UINT8
 from bodycap_batch.synthetic.triangle_renderer import Triangles
 
@@ -39,6 +41,10 @@ _CAP_RINGS = 3
 """Number of rings of faces at each rounded end of a limb."""
 _TEXELS_PER_M = 300.0
 """Detail (texels per metre) of the body's textures."""
+_PRINT_SHARE = 0.6
+"""Share of the printed pattern in the colour of patterned cloth. Evidence: none."""
+_PRINT_M = 0.2
+"""Side (metres) of the squares that a printed pattern consists of. All squares differ. Evidence: none."""
 _CLEARANCE_M = 0.02
 """A camera outside a limb is treated as inside the limb if its distance from the limb's surface is not larger
 than this threshold. Unit: metres."""
@@ -58,9 +64,12 @@ class Wearer:
     Args:
         skeleton: Skeleton with the true proportions.
         seed: Seed of the textures of clothes and skin.
+        patterned: True: a pattern is printed on the clothes.
     """
 
-    def __init__(self, skeleton: SkeletonModel, seed: np.random.SeedSequence) -> None:
+    def __init__(
+        self, skeleton: SkeletonModel, seed: np.random.SeedSequence, *, patterned: bool = False
+    ) -> None:
         self._bones = _find_bones(skeleton)
         self.images: list[UINT8] = []
         dyes = np.random.default_rng(seed.spawn(1)[0])
@@ -70,9 +79,8 @@ class Wearer:
             size = float(np.linalg.norm(end - start)) + sum(radii), 2 * np.pi * max(radii)
             height, width = (max(16, round(side * _TEXELS_PER_M)) for side in size)
             dye = trousers if part in _TROUSERS else shirt
-            self.images.append(
-                _skin(height, width, rng) if part in _SKIN else _cloth(height, width, dye, rng)
-            )
+            image = _skin(height, width, rng) if part in _SKIN else _cloth(height, width, dye, rng)
+            self.images.append(_print_pattern(image, rng) if patterned and part not in _SKIN else image)
         self._limbs: list[_Limb] = []
 
     def place_textures(self, origins: FloatArray) -> None:
@@ -189,7 +197,10 @@ def _rounded_cone(
     circle = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * other
     vertices = np.array([centre + radius * circle for centre, radius in rings])
     rows, columns = vertices.shape[:2]
-    v, u = np.meshgrid(np.linspace(0.01, 0.99, rows), np.linspace(0.01, 0.99, columns), indexing="ij")
+    # The image is spread evenly over the surface from pole to pole.
+    lengths = np.linalg.norm(np.diff(vertices[:, 0], axis=0), axis=1)
+    heights = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
+    v, u = np.meshgrid(0.01 + 0.98 * heights, np.linspace(0.01, 0.99, columns), indexing="ij")
     texels = origin + np.stack([u * image.shape[1], v * image.shape[0]], axis=-1)
     ids = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]
@@ -257,3 +268,14 @@ def _cloth(height: int, width: int, dye: textures.Grey, rng: np.random.Generator
     folds = 0.9 + 0.12 * textures.fractal(height, width, 40.0, rng, 4)
     weave = 0.05 * rng.standard_normal((height, width), dtype=np.float32)
     return textures.tint_shade(folds + weave, dye)
+
+
+def _print_pattern(cloth: UINT8, rng: np.random.Generator) -> UINT8:
+    """Return cloth (H,W,3) with a printed pattern: shapes of different sizes and colours."""
+    side = round(_PRINT_M * _TEXELS_PER_M)
+    printed = np.empty_like(cloth)
+    for top in range(0, cloth.shape[0], side):
+        for left in range(0, cloth.shape[1], side):
+            part = printed[top : top + side, left : left + side]
+            part[:] = abstract(side, side, _TEXELS_PER_M, rng)[: part.shape[0], : part.shape[1]]
+    return np.asarray(cv2.addWeighted(cloth, 1.0 - _PRINT_SHARE, printed, _PRINT_SHARE, 0.0))

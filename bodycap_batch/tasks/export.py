@@ -46,11 +46,13 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
     from bodycap_batch.export import ExportInputs, export_results
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.merge_data import MergeResult
+    from bodycap_batch.overlay.lost_frame_views import predict_lost_views
 
     scene = load_map(task.map.path)
     paths = paths_of(task.registrations.values())
     clocks = load_clocks(task.clocks)
     found = RegisteredCameras.load(paths, scene.maps, clocks)
+    merge = None if task.merge is None else read_dataclass(MergeResult, task.merge.path, "merge")
     inputs = ExportInputs(
         out_dir=files / RESULTS_FOLDER,
         maps=scene.maps,
@@ -58,11 +60,12 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
         clocks=found.clocks,
         reference_camera=clocks.reference,
         selections=tuple(load_keyframes(artefact.path) for artefact in task.keyframes.values()),
-        merge=None if task.merge is None else read_dataclass(MergeResult, task.merge.path, "merge"),
+        merge=merge,
         partial_reason=task.failure,
         row_fraction=found.row_fraction,
         inertial=found.inertial,
         relative_poses=found.relative_poses(paths, task.segments),
+        lost_views=predict_lost_views(found.trajectories, scene.maps, found.clocks, merge),
         log={**scene.log, "reach": read_summary(task.clocks.path)["distances"]},
     )
     export_results(inputs, task.options, context)

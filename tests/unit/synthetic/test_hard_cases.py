@@ -1,5 +1,6 @@
 """Hard captures: a hand at the chest, the wearer's arms in view, a bare room."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -8,6 +9,7 @@ from bodycap_batch.synthetic.making import build_renderers, draw_subject
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.room import HEIGHT_M, BareSurfaces, build_room
 from bodycap_batch.synthetic.triangle_renderer import SceneRenderer
+from bodycap_batch.synthetic.wearer import Wearer
 
 SMALL = {"width": 64, "height": 48, "seconds": 5.0, "body_in_view": True}
 
@@ -70,6 +72,30 @@ def test_arms_held_ahead_are_in_view():
     assert np.median(shares[1.0]) > 0.03
 
 
+def test_hands_turned_inward_see_much_of_the_wearer():
+    times_s = np.arange(0.0, 5.0, 0.5)
+    shares = {
+        degrees: _body_ratios(
+            SynthOptions(**SMALL, seed=41, hands_inward_deg=degrees), "left_palm", times_s
+        ).mean()
+        for degrees in (0.0, 80.0)
+    }
+    assert shares[0.0] < 0.05
+    assert shares[80.0] > 0.2
+
+
+def test_patterned_clothes_have_many_corners_and_plain_ones_few():
+    corners = {}
+    for clothes in ("plain", "patterned"):
+        options = SynthOptions(**SMALL, seed=41, clothes=clothes)
+        skeleton = draw_subject(options).motion.skeleton
+        wearer = Wearer(skeleton, np.random.SeedSequence(1), patterned=clothes == "patterned")
+        shirt = max(wearer.images, key=lambda image: image.size)
+        smooth = cv2.GaussianBlur(cv2.cvtColor(shirt, cv2.COLOR_RGB2GRAY), (0, 0), 2.0)
+        corners[clothes] = len(cv2.SIFT.create().detect(smooth))
+    assert corners["patterned"] > 5 * max(corners["plain"], 20)
+
+
 def test_a_bare_room_has_pictures_on_its_walls_only():
     seed = np.random.SeedSequence(1)
     surfaces = build_room((1.0, 1.0), 20.0, seed, furnished=False, repeated_posters=True)
@@ -112,6 +138,7 @@ def test_a_bare_surface_has_only_its_flat_pictures(name):
         ({"pressed_s": {"torso": (1.0, 2.0)}, "body_in_view": True}, "no camera torso on a hand"),
         ({"pressed_s": {"left_palm": (2.0, 1.0)}, "body_in_view": True}, "is not after its start"),
         ({"pressed_s": {"left_palm": (1.0, 2.0)}}, "without body_in_view"),
+        ({"clothes": "patterned"}, "cannot be seen without body_in_view"),
     ],
 )
 def test_invalid_options_are_refused(values, message):
