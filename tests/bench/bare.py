@@ -83,7 +83,7 @@ def main(arguments: Sequence[str]) -> int:
     folders = map(Path, options.only) if options.only else _rendered(options)
     results = []
     for folder in folders:
-        results.append(run_and_score(folder, options.out / f"{folder.name}_{options.tag}"))
+        results.append(run_and_score(folder, options.out / f"{folder.name}_{options.tag}", options.motions))
         _write_line("\n".join(lines_of(results[-1])))
     _write_line(summary(results))
     (options.out / f"bare_{options.tag}.json").write_text(json.dumps(results, indent=1), encoding="utf-8")
@@ -104,7 +104,7 @@ def _rendered(options: argparse.Namespace) -> Iterator[Path]:
         yield folder
 
 
-def run_and_score(capture: Path, work: Path) -> dict[str, Any]:
+def run_and_score(capture: Path, work: Path, motions: Path) -> dict[str, Any]:
     """Run a job in a store of its own, if it did not run before, and score its results."""
     work.mkdir(parents=True, exist_ok=True)
     out, store = work / "out", work / "store"
@@ -121,10 +121,10 @@ def run_and_score(capture: Path, work: Path) -> dict[str, Any]:
     if results is None:
         text = (work / "stderr.txt").read_text(encoding="utf-8").strip().splitlines()
         return {**result, "error": text[-3:], "wrong_called_good": False}
-    return {**result, **score(capture, results, store)}
+    return {**result, **score(capture, results, store, motions)}
 
 
-def score(capture: Path, results: Path, store: Path) -> dict[str, Any]:
+def score(capture: Path, results: Path, store: Path, motions: Path) -> dict[str, Any]:
     """Return the figures of a job's results."""
     metrics = json.loads((results / "metrics.json").read_text(encoding="utf-8"))
     failure = {"stage": "merge", "message": ""} if results.name == "partial" else None
@@ -148,7 +148,7 @@ def score(capture: Path, results: Path, store: Path) -> dict[str, Any]:
     registered = {name: np.zeros(len(path.status), bool) for name, path in paths.items()}
     for name, (frames, _, _) in matched.items():
         registered[name][frames] = True
-    sees = _frames_that_see(capture, results, store, paths, truth, matched)
+    sees = _frames_that_see(capture, _last_map(results, store, paths), paths, truth, matched, motions)
     seen = {name: (int((mask & registered[name]).sum()), int(mask.sum())) for name, mask in sees.items()}
     total = sum(len(mask) for mask in registered.values())
     return {
@@ -220,21 +220,23 @@ def misplaced_blocks(camera: str, frames: Any, error_m: FloatArray) -> list[Misp
 
 def _frames_that_see(
     capture: Path,
-    results: Path,
-    store: Path,
+    scene_map: Map | None,
     paths: Mapping[str, Trajectory],
     truth: Mapping[str, TimedPoses],
     matched: Mapping[str, tuple[Any, FloatArray, FloatArray]],
+    motions: Path,
 ) -> dict[str, BoolArray]:
     """Return for each camera a mask (N,) of the frames whose true camera sees the map.
 
     Without the options of a synthetic capture, no frame is counted.
     """
     file = capture / "gt" / _OPTIONS_FILE
-    scene_map = _last_map(results, store, paths)
     if scene_map is None or not file.exists():
         return {}
-    options = SynthOptions.model_validate(json.loads(file.read_text(encoding="utf-8")))
+    settings = json.loads(file.read_text(encoding="utf-8"))
+    if settings.get("motion"):
+        settings["motion"] = motions / Path(settings["motion"]).name
+    options = SynthOptions.model_validate(settings)
     renderer = build_renderers(options, draw_subject(options))[0]
     surfaces = RayScene(renderer.room.vertices, renderer.room.faces)
     own = [path for name, path in paths.items() if name in matched and path.gauge == scene_map.gauge]
