@@ -231,10 +231,8 @@ def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRende
     camera = options.camera()
     focal, _ = focal_and_centre(camera)
     texels_per_m = min(_TEXELS_PER_PIXEL_M * float(focal.mean()), _MAX_TEXELS_PER_M)
-    root_path = subject.motion.pose(seconds_from_ns(common_ticks_ns(options)))[0][:, :2]
-    extent_x, extent_y = np.abs(root_path).max(axis=0).tolist()
     surfaces = build_room(
-        (extent_x, extent_y),
+        walked_extent_m(options, subject),
         texels_per_m,
         subject.seeds["room"],
         furnished=options.furnished,
@@ -267,6 +265,13 @@ def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRende
         )
         for mount in subject.mounts
     ]
+
+
+def walked_extent_m(options: SynthOptions, subject: Subject) -> tuple[float, float]:
+    """Return the maximum distances (metres) of the walk from the room's middle along x and y."""
+    root_path = subject.motion.pose(seconds_from_ns(common_ticks_ns(options)))[0][:, :2]
+    extent_x, extent_y = np.abs(root_path).max(axis=0).tolist()
+    return extent_x, extent_y
 
 
 def _render_in_order(

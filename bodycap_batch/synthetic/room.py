@@ -166,7 +166,7 @@ def build_room(
     Returns:
         The surfaces of the room. Their textures include the light of the lamps.
     """
-    half = [max(low, extent + MARGIN_M) for low, extent in zip(_MIN_HALF_M, half_extent_m, strict=True)]
+    half = half_size_m(half_extent_m)
     build = _Builder(seed, texels_per_m)
     bare = bare or BareSurfaces()
     plain = bare.names if furnished else bare.names | {"ceiling", "floor", "east"}
@@ -185,6 +185,15 @@ def build_room(
     lamps = np.stack([grid[0].ravel(), grid[1].ravel(), np.full(grid[0].size, HEIGHT_M - 0.12)], axis=-1)
     _add_lamp_housings(build, lamps)
     return light_surfaces(build.surfaces, lamps, rng)
+
+
+def half_size_m(half_extent_m: tuple[float, float]) -> list[float]:
+    """Return half of the room's size (metres) along x and y.
+
+    Args:
+        half_extent_m: Maximum distances (metres) of the walk from the room's middle along x and y.
+    """
+    return [max(low, extent + MARGIN_M) for low, extent in zip(_MIN_HALF_M, half_extent_m, strict=True)]
 
 
 def _build_shell(build: _Builder, half: list[float], plain: frozenset[str]) -> list[_Wall]:

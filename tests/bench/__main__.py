@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.bench import (
+    bare,
     batch,
     body,
     clocks,
@@ -46,6 +47,7 @@ _WITH_OPTIONS = {
     "clocks": clocks.main,
     "sync": sync.main,
     "body": body.main,
+    "bare": bare.main,
     "inertial": inertial.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
@@ -64,8 +66,8 @@ def main() -> int:
         "`spool`, `viewer`; with options of their own: `simulation`, "
         "`uncertainty`, `joining` or `solving` (the merge stage on simulated poses), `seeds` (the map "
         "with several seeds), `clocks` (from generated sound and motion), `sync` (ten minutes of sound), "
-        "`inertial` (gaps filled from a sensor), `body` (joints without cameras), and `long` (ten minutes "
-        "of three cameras)",
+        "`inertial` (gaps filled from a sensor), `body` (joints without cameras), `bare` (a camera at "
+        "plain surfaces), and `long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)

@@ -4,7 +4,8 @@ import av
 import numpy as np
 
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
-from tests.bench import long, ours, peers, poses, scaling, seeds, solving
+from bodycap_batch.synthetic import SynthOptions
+from tests.bench import bare, bare_draw, long, ours, peers, poses, scaling, seeds, solving
 from tests.bench.peer_pairs import AWAY_NS, FROM_OTHER, OWN_AGAIN, STEPS, pairs_of
 from tests.bench.rows import Row, row_of
 from tests.scenes import small_map
@@ -195,3 +196,35 @@ def test_a_long_capture_is_a_short_one_played_forwards_and_backwards(tmp_path):
     assert np.argmax(seen[:4]) == 3
     # The second time the picture is brighter by a tenth and has other noise.
     assert 1.05 < seen[5] / seen[1] < 1.2
+
+
+def _centres(count: int, start: int = 0) -> np.ndarray:
+    t = 0.1 * np.arange(start, start + count)
+    return np.stack([np.cos(t), np.sin(1.3 * t), 0.2 * t], axis=1)
+
+
+def test_a_misplaced_camera_does_not_bend_the_alignment_of_the_bench():
+    gauge = Similarity(0.3, so3_exp(np.array([0.2, -0.4, 1.0])), np.array([1.0, 2.0, 3.0]))
+    matched = {
+        name: (np.arange(60), gauge.apply(_centres(60, start)), _centres(60, start))
+        for name, start in (("torso", 0), ("left_palm", 20), ("right_palm", 40))
+    }
+    frames, mine, true = matched["right_palm"]
+    matched["right_palm"] = (frames, mine[0] + 3.0 * (mine - mine[0]), true)
+    found = bare.robust_alignment(matched)
+    np.testing.assert_allclose(found.scale * gauge.scale, 1.0, rtol=1e-9)
+
+
+def test_misplaced_frames_are_reported_as_blocks():
+    frames = np.array([0, 1, 2, 3, 10, 11, 12, 13])
+    error_m = np.array([0.0, 0.2, 0.0, 0.3, 0.0, 0.0, 0.11, 0.05])
+    blocks = bare.misplaced_blocks("torso", frames, error_m)
+    assert [(block.first, block.last, block.frames) for block in blocks] == [(1, 3, 2), (12, 12, 1)]
+    assert blocks[0].worst_cm == 30.0
+
+
+def test_the_share_of_plain_surfaces_follows_the_surfaces():
+    settings = {"cameras": ("torso",), "seconds": 1.0, "bare": ("ceiling",)}
+    every = {**settings, "bare": bare_draw.SURFACES}
+    assert bare_draw.bare_shares(SynthOptions.model_validate(settings)) == {"torso": 0.0}
+    assert bare_draw.bare_shares(SynthOptions.model_validate(every)) == {"torso": 1.0}

@@ -21,6 +21,7 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
     find_misregistered_images,
     inconsistent_match_ratio,
 )
+from bodycap_batch.mapping.validation.second_registration import confirm_images
 from bodycap_batch.mapping.validation.track_agreement import (
     evaluate_agreement,
     find_misplaced_images,
@@ -36,6 +37,10 @@ _MIN_PAIR_BUDGET = 2000
 """Number of untried pairs that a round of a repair may match in any case. The round may match a larger number
 of untried pairs only if at least that number of pairs was matched before. Otherwise the round matches only
 the pairs of misregistered keyframes. Evidence: none."""
+_CONFIRMED_ERROR_RATIO = 2.0
+"""Maximum error of a match that confirms the pose of a keyframe, as a multiple of the mapper's maximum
+reprojection error. Of 6, 8 and 12 px, all confirm the same keyframes within a few percent. Evidence:
+docs/decisions/mapping.md."""
 
 
 def repair_model(
@@ -48,7 +53,8 @@ def repair_model(
 
     A round is accepted if it increases the number of correctly registered keyframes. If this number stays the
     same, the round is accepted if it decreases the number of misregistered keyframes. At the end, all
-    keyframes that are still misregistered are removed.
+    keyframes that are still misregistered are removed, unless a second registration from the points of the
+    other keyframes finds them in the same place.
 
     Args:
         model: The largest model; not changed.
@@ -100,7 +106,7 @@ def repair_model(
             break
         model, wrong, pairs = other, still_wrong, other_pairs
     ratio = round(inconsistent_match_ratio(pairs), 4)
-    model, removed = _remove_images(model, wrong)
+    model, removed = _remove_images(model, _without_confirmed(context, model, pairs, wrong))
     if removed:
         adjust_unless_large(model, context)
     return model, {"rounds": log, "cut": removed, "contradicted_share": ratio}
@@ -130,7 +136,8 @@ def remove_without_adjustment(
         matches in inconsistent pairs before the removal.
     """
     pairs = evaluate_pairs(context.workspace, model)
-    kept, removed = _remove_images(model, _find_wrong_images(context, model, pairs))
+    wrong = _find_wrong_images(context, model, pairs)
+    kept, removed = _remove_images(model, _without_confirmed(context, model, pairs, wrong))
     return kept, removed, round(inconsistent_match_ratio(pairs), 4)
 
 
@@ -146,6 +153,27 @@ def _find_wrong_images(
     if model.num_reg_images() - len(wrong | misplaced) < MIN_MODEL_KEYFRAMES:
         return wrong
     return wrong | misplaced
+
+
+def _without_confirmed(
+    context: MappingContext,
+    model: pycolmap.Reconstruction,
+    pairs: Sequence[PairConsistency],
+    wrong: Collection[int],
+) -> set[int]:
+    """Return the ids of the wrong images without those whose pose a second registration confirms.
+
+    Images whose matches contradict the poses are never confirmed.
+
+    Args:
+        context: Workspace, mapper options.
+        model: The model.
+        pairs: The verified pairs of the model.
+        wrong: Ids of the images whose matches contradict the model.
+    """
+    max_error_px = _CONFIRMED_ERROR_RATIO * context.mapper_options().mapper.filter_max_reproj_error
+    confirmed = confirm_images(context.workspace, model, wrong, image_sequences(model), max_error_px)
+    return set(wrong) - (confirmed - find_misregistered_images(pairs))
 
 
 def _remove_images(model: Any, image_ids: set[int]) -> tuple[Any, list[str]]:

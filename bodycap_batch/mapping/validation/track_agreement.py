@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef
+from bodycap_batch.mapping.validation.second_registration import observed_points
 
 if TYPE_CHECKING:
     import pycolmap
@@ -62,7 +62,7 @@ def evaluate_agreement(workspace: Path, model: pycolmap.Reconstruction) -> list[
     """Compare the matches of all verified pairs of registered images with the points of a model."""
     import pycolmap
 
-    points = {int(number): _observed_points(model, number) for number in model.reg_image_ids()}
+    points = {int(number): observed_points(model, int(number)) for number in model.reg_image_ids()}
     out = []
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
@@ -82,15 +82,6 @@ def image_sequences(model: pycolmap.Reconstruction) -> list[list[int]]:
     for ref, number in refs:
         cameras.setdefault(ref.camera, []).append(number)
     return list(cameras.values())
-
-
-def _observed_points(model: pycolmap.Reconstruction, image_id: int) -> IntArray:
-    """Return the id (N,) of the point that each feature of an image observes; −1 without a point."""
-    image = model.image(image_id)
-    out = np.full(image.num_points2D(), -1, dtype=np.int64)
-    for feature in image.get_observation_point2D_idxs():
-        out[feature] = image.point2D(feature).point3D_id
-    return out
 
 
 def find_misplaced_images(pairs: Sequence[PairAgreement], sequences: Sequence[Sequence[int]]) -> set[int]:
