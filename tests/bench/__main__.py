@@ -27,6 +27,7 @@ from tests.bench import (
     peers,
     scaling,
     seeds,
+    shutter,
     simulation,
     solving,
     spool,
@@ -47,6 +48,7 @@ _WITH_OPTIONS = {
     "sync": sync.main,
     "body": body.main,
     "inertial": inertial.main,
+    "shutter": shutter.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
 
@@ -64,7 +66,8 @@ def main() -> int:
         "`spool`, `viewer`; with options of their own: `simulation`, "
         "`uncertainty`, `joining` or `solving` (the merge stage on simulated poses), `seeds` (the map "
         "with several seeds), `clocks` (from generated sound and motion), `sync` (ten minutes of sound), "
-        "`inertial` (gaps filled from a sensor), `body` (joints without cameras), and `long` (ten minutes "
+        "`inertial` (gaps filled from a sensor), `body` (joints without cameras), `shutter` (drawn readout "
+        "times against global shutters), and `long` (ten minutes "
         "of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
