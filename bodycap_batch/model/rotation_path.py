@@ -140,7 +140,7 @@ class RotationPath:
     def is_end(self) -> BoolArray:
         """Return a mask (N,): True if the rotation to the frame before or to the next frame is unknown."""
         _, known = self.steps()
-        return ~(np.concatenate([[False], known]) & np.concatenate([known, [False]]))
+        return np.asarray(~(np.concatenate([[False], known]) & np.concatenate([known, [False]])))
 
     def _rate_or(self, other: FloatArray) -> FloatArray:
         """Return the rates (N,3); for frames that are alone in their segments, the rates `other`."""
