@@ -37,6 +37,13 @@ _RATE_BATCH_FRAMES = 64
 _NOISE_FROM_QUARTILE = 1.57
 """Ratio of the root mean square length of a normally distributed vector in three dimensions to the first
 quartile of its length: sqrt(3 / 1.213). The first quartile of the squared length is 1.213 variances."""
+_EXTRAPOLATION_GAIN = 0.75
+"""Part of the change of a velocity that is continued beyond the last interval, for a frame at the end of a
+run of poses, in intervals. Evidence: docs/decisions/registration.md."""
+_END_RATE_SIGMA = 1.0
+"""Expected error of an extrapolated angular velocity, rad/s, added to the ratio. Evidence: none."""
+_END_RATE_SIGMA_RATIO = 0.3
+"""Expected error of an extrapolated angular velocity, as a ratio of this velocity. Evidence: none."""
 _EXTRAPOLATION_RATIO = 0.5
 """Expected error of an extrapolated angular velocity, as a ratio of the largest velocity around the frame.
 Evidence: docs/decisions/registration.md."""
@@ -121,12 +128,27 @@ class RotationPath:
         posed = RotationPath.from_steps(self.times_ns, step, known | both, shrunk=shrunk)
         # Without a neighbour with a pose on each side, poses do not tell the rate better than the matches.
         beside = np.concatenate([[False], both]) & np.concatenate([both, [False]])
-        return replace(posed, rate=np.where(beside[:, None], posed.rate, self._rate_or(posed.rate)))
+        rate = np.where(beside[:, None], posed.rate, self._rate_or(posed.rate))
+        # At the end of the matches, too, the rate is extrapolated from the other poses. The pose of the frame
+        # itself depends on its rate: together they drift away.
+        at_end = np.flatnonzero(has_pose & ~beside & self.is_alone())
+        mean = so3_log(np.swapaxes(step, 1, 2)) / (np.diff(self.times_ns) * 1e-9)[:, None]
+        outer = _extrapolated(np.where(both[:, None], mean, np.nan), at_end)
+        rate[at_end] = np.where(np.isfinite(outer), outer, rate[at_end])
+        return replace(posed, rate=rate)
+
+    def is_end(self) -> BoolArray:
+        """Return a mask (N,): True if the rotation to the frame before or to the next frame is unknown."""
+        _, known = self.steps()
+        return np.asarray(~(np.concatenate([[False], known]) & np.concatenate([known, [False]])))
 
     def _rate_or(self, other: FloatArray) -> FloatArray:
         """Return the rates (N,3); for frames that are alone in their segments, the rates `other`."""
-        size = np.bincount(self.segment)[self.segment]
-        return np.where((size > 1)[:, None], self.rate, other)
+        return np.where(self.is_alone()[:, None], other, self.rate)
+
+    def is_alone(self) -> BoolArray:
+        """Return a mask (N,): True if the rotations to both adjacent frames are unknown."""
+        return np.asarray(np.bincount(self.segment)[self.segment] == 1)
 
     def is_known(self, frame: int) -> bool:
         """Return True if the rotation between a frame and a frame beside it is known."""
@@ -228,6 +250,26 @@ def _end_rate(times_ns: IntArray, rotation: FloatArray, frames: IntArray) -> Flo
     step = so3_log(np.swapaxes(rotation[frames[:-1]], 1, 2) @ rotation[frames[1:]]) / interval_s[:, None]
     share = interval_s[0] / (interval_s[0] + interval_s[1])
     return np.asarray(step[0] + share * (step[0] - step[1]))
+
+
+def _extrapolated(slope: FloatArray, frame: IntArray) -> FloatArray:
+    """Return velocities (M,3) at the ends of runs of poses, without the poses of these frames.
+
+    Args:
+        slope: (N-1,3) mean velocity between each frame and the next frame; NaN if it is unknown.
+        frame: (M,) first or last frame of each run.
+
+    Returns:
+        The velocities; NaN for a frame that has no two neighbours with poses on one side.
+    """
+    nothing = np.full((3, 3), np.nan)
+    padded = np.concatenate([nothing, slope, nothing])
+    out = np.full((len(frame), 3), np.nan)
+    for own, inner, outer in ((3, 4, 5), (2, 1, 0)):
+        near, far = padded[frame + inner], padded[frame + outer]
+        value = np.where(np.isfinite(far), near + _EXTRAPOLATION_GAIN * (near - far), near)
+        out = np.where(np.isfinite(padded[frame + own]), value, out)
+    return out
 
 
 def _mean_rates(times_ns: IntArray, rotation: FloatArray, segment: IntArray) -> FloatArray:
@@ -404,6 +446,10 @@ class PosePath:
             )
             acceleration = np.where(inner, bend, np.where(np.isfinite(after), ahead, behind))
             acceleration[~np.isfinite(after) & ~np.isfinite(before)] = 0.0
+            # The position of a frame at an end depends on its own velocity. It is left out there.
+            ends = np.flatnonzero(~inner[:, 0])
+            outer = _extrapolated(slope, ends)
+            velocity[ends] = np.where(np.isfinite(outer), outer, velocity[ends])
         return PosePath(
             map_from_cam, rotation.with_poses(map_from_cam, shrunk=shrunk), velocity, acceleration
         )
@@ -473,7 +519,9 @@ class PosePath:
         move *= (np.median(x_in_cam[rows, 2]) if len(rows) else 1.0) / x_in_cam[rows, 2][:, None, None]
         jacobian = np.concatenate([turn, move, leverage_s[:, None, None] * turn], axis=2)
         noise = _RATE_NOISE_PX * pixel_scale(camera.width_px, camera.height_px) / camera.focal_px
-        change = _fit_frames(frame[rows], residual[rows], jacobian, noise, len(self.map_from_cam))
+        end = _END_RATE_SIGMA + _END_RATE_SIGMA_RATIO * np.linalg.norm(self.rotation.rate, axis=1)
+        end[~self.rotation.is_end()] = 0.0
+        change = _fit_frames(frame[rows], residual[rows], jacobian, noise, end)
         return replace(self, rotation=replace(self.rotation, rate=self.rotation.rate + change))
 
     def _shift_in_cam(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
@@ -508,7 +556,7 @@ def _turn_jacobian(ray: FloatArray) -> FloatArray:
 
 
 def _fit_frames(
-    frame: IntArray, residual: FloatArray, jacobian: FloatArray, noise: float, count: int
+    frame: IntArray, residual: FloatArray, jacobian: FloatArray, noise: float, end_sigma: FloatArray
 ) -> FloatArray:
     """Fit corrections of poses and angular velocities to residuals, frame by frame, robustly.
 
@@ -517,12 +565,12 @@ def _fit_frames(
         residual: (M,2) residuals.
         jacobian: (M,2,9) derivatives of the residuals with respect to turn, shift and angular velocity.
         noise: Standard deviation of a residual.
-        count: Number of frames.
+        end_sigma: (N,) least expected error of the angular velocity of each frame, rad/s.
 
     Returns:
-        The corrections (count,3) of the angular velocities, rad/s; 0 for a frame with too few residuals.
+        The corrections (N,3) of the angular velocities, rad/s; 0 for a frame with too few residuals.
     """
-    out = np.zeros((count, 3))
+    out = np.zeros((len(end_sigma), 3))
     frames, starts, sizes = np.unique(frame, return_index=True, return_counts=True)
     enough = sizes >= _MIN_RATE_POINTS
     if not enough.any():
@@ -544,7 +592,8 @@ def _fit_frames(
             right[part] = np.add.reduceat(
                 np.einsum("mia,mi->ma", weighted, residual[first:stop]), inner, axis=0
             )
-        prior = np.concatenate([np.full(6, 1e-6 / noise**2), np.full(3, 1.0 / sigma**2)])
+        prior = np.full((len(frames), 9), 1e-6 / noise**2)
+        prior[:, 6:] = 1.0 / np.maximum(sigma, end_sigma[frames])[:, None] ** 2
         normal[:, np.arange(9), np.arange(9)] += prior
         solution = np.asarray(-np.linalg.solve(normal, right[:, :, None])[:, :, 0], dtype=np.float64)
         size = np.linalg.norm(solution[enough, 6:], axis=1)

@@ -55,6 +55,8 @@ from bodycap_batch.tasks.rig import RIG
 from bodycap_batch.tasks.sound import SOUND, SoundTask, known_from_sound
 from bodycap_batch.tasks.stage import Stage, read_summary
 
+_REFINEMENTS = 2
+"""Maximum number of passes of the correction of rolling shutters. Evidence: docs/decisions/mapping.md."""
 ByCamera = Mapping[str, Artefact]
 
 
@@ -205,19 +207,25 @@ class Flow:
     ) -> tuple[Artefact, ByCamera]:
         """Remove the deformation of the map that rolling shutters cause, and solve all poses again.
 
-        If no camera has a rolling shutter, the map and the registrations are returned unchanged.
+        If no camera has a rolling shutter, the map and the registrations are returned unchanged. If the map
+        was built from keypoints that were not corrected, the first pass starts from wrong poses. Then there
+        is a second pass.
         """
         if not any(read_summary(artefact.path)["rolling"] for artefact in registrations.values()):
             return scene_map, registrations
-        task = RefineTask(
-            options=self._job.map,
-            capture=capture_ref(self._capture, self._cameras),
-            map=artefact_ref(scene_map),
-            registrations=refs_by_camera(registrations),
-        )
-        refined = self.runner.run(make_task(REFINE, task, threads=self._threads))
-        self._map_round += 1
-        return refined, self.register(refined, keyframes, registrations)
+        for _ in range(_REFINEMENTS):
+            task = RefineTask(
+                options=self._job.map,
+                capture=capture_ref(self._capture, self._cameras),
+                map=artefact_ref(scene_map),
+                registrations=refs_by_camera(registrations),
+            )
+            scene_map = self.runner.run(make_task(REFINE, task, threads=self._threads))
+            self._map_round += 1
+            registrations = self.register(scene_map, keyframes, registrations)
+            if not read_summary(scene_map.path).get("late"):
+                break
+        return scene_map, registrations
 
     def solve_rigs(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
         """Solve the poses of each synchronised rig again, from the observations of all cameras of the rig."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -98,16 +98,24 @@ def run_refine(task: RefineTask, context: StageContext, files: Path) -> None:
 
     paths = [load_registration(artefact.path).trajectory for artefact in task.registrations.values()]
     previous = load_map(task.map.path)
-    _save_map(
-        refine_map(
-            load_capture(task.capture, threads=context.threads), previous, paths, task.options, context
-        ),
-        files,
-    )
+    capture = load_capture(task.capture, threads=context.threads)
+    result = refine_map(capture, previous, paths, task.options, context)
+    _save_map(result, files, late=sorted(_rolling_cameras(result) - _rolling_cameras(previous)))
 
 
-def _save_map(result: MapResult, files: Path) -> None:
-    """Store a map with its workspace. Extending the map later needs the workspace."""
+def _rolling_cameras(result: MapResult) -> set[str]:
+    """Return the names of the cameras for whose rolling shutters a map is corrected."""
+    return {name for scene_map in result.maps for name in scene_map.readout_s}
+
+
+def _save_map(result: MapResult, files: Path, *, late: Sequence[str] = ()) -> None:
+    """Store a map with its workspace. Extending the map later needs the workspace.
+
+    Args:
+        result: The map.
+        files: Folder of the artefact.
+        late: Names of the cameras whose rolling shutters are corrected for the first time.
+    """
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.intrinsics.intrinsics_check import misfit_note
     from bodycap_batch.mapping.matching.flipped_cameras import flip_notes
@@ -121,6 +129,7 @@ def _save_map(result: MapResult, files: Path) -> None:
         files,
         keyframes=len(largest.keyframe_camera),
         points=len(largest.points),
+        late=list(late),
         notes=[
             *flip_notes(diagnostics),
             *(

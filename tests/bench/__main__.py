@@ -28,6 +28,7 @@ from tests.bench import (
     peers,
     scaling,
     seeds,
+    shutter,
     simulation,
     solving,
     spool,
@@ -49,6 +50,7 @@ _WITH_OPTIONS = {
     "body": body.main,
     "bare": bare.main,
     "inertial": inertial.main,
+    "shutter": shutter.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
 
@@ -67,7 +69,8 @@ def main() -> int:
         "`uncertainty`, `joining` or `solving` (the merge stage on simulated poses), `seeds` (the map "
         "with several seeds), `clocks` (from generated sound and motion), `sync` (ten minutes of sound), "
         "`inertial` (gaps filled from a sensor), `body` (joints without cameras), `bare` (a camera at "
-        "plain surfaces), and `long` (ten minutes of three cameras)",
+        "plain surfaces), `shutter` (drawn readout times against global shutters), and `long` (ten minutes "
+        "of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)

@@ -19,7 +19,7 @@ Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
-"rolling": true, "telemetry": [cameras], "real": [stages that are no stand-ins]}.
+"rolling": true, "late": number of maps, "telemetry": [cameras], "real": [stages that are no stand-ins]}.
 "fail" may be a list of stages."""
 
 
@@ -124,6 +124,14 @@ def placed(options: Json, arguments: Json, files: Path) -> None:
     (files / "summary.json").write_text(json.dumps(values))
 
 
+def refined(options: Json, arguments: Json, files: Path) -> None:
+    """The readout times are found late in the first `late` maps that are refined."""
+    before = Path(arguments["map"]["path"]) / "summary.json"
+    passes = json.loads(before.read_text()).get("passes", 0) + 1 if before.exists() else 1
+    late = ["torso"] if passes <= orders().get("late", 0) else []
+    (files / "summary.json").write_text(json.dumps({"notes": [], "passes": passes, "late": late}))
+
+
 def exported(options: Json, arguments: Json, files: Path) -> None:
     results = files / "results"
     (results / "trajectories").mkdir(parents=True)
@@ -159,6 +167,7 @@ EXTRA = {
     "check": checked,
     "inertial": with_sensor,
     "registration": registered,
+    "refine": refined,
     "export": exported,
     "places": placed,
     "report": reported,

@@ -410,6 +410,17 @@ def test_a_rolling_shutter_refines_the_map_and_solves_every_frame_again(bench: B
     assert bench.executed() == []
 
 
+@pytest.mark.parametrize(("late", "passes"), [(0, 1), (1, 2), (9, 2)])
+def test_a_readout_that_is_found_late_is_followed_by_a_second_pass(
+    bench: Bench, late: int, passes: int
+) -> None:
+    bench.order(rolling=True, late=late)
+    executed = bench.executed()
+    assert executed.count("refine") == passes
+    assert executed.count("registration torso") == 1 + passes
+    assert bench.executed() == []
+
+
 def stopped_at_the_order(bench: Bench, meanwhile: Callable[[], None] = lambda: None) -> list[Cancelled]:
     """Run in a thread until a stage hangs, as ordered, then stop it; returns how the run ended."""
     failures: list[Cancelled] = []

@@ -237,6 +237,43 @@ def test_smooth_motion_is_not_disturbed_by_fitted_rates() -> None:
     assert np.median(np.linalg.norm(change, axis=1)[2:-2]) < 0.05
 
 
+@pytest.mark.parametrize("lost", [[], [17, 18]])
+def test_velocities_at_the_ends_of_runs_do_not_depend_on_the_poses_there(lost: list[int]) -> None:
+    poses = poses_at(np.arange(FRAMES) * FRAME_S, 0.4)
+    poses[lost] = np.nan
+    ends = [0, FRAMES - 1] + ([lost[0] - 1, lost[-1] + 1] if lost else [])
+    disturbed = poses.copy()
+    disturbed[ends] = disturbed[ends] @ make_transform(so3_exp([0.02, -0.03, 0.01]), [0.03, 0.02, -0.05])
+    right, wrong = (PosePath.create(each, TIMES_NS) for each in (poses, disturbed))
+    assert np.allclose(wrong.velocity[ends], right.velocity[ends], atol=1e-9)
+    assert np.allclose(wrong.rotation.rate[ends], right.rotation.rate[ends], atol=1e-9)
+    # The path turns by 8 rad/s and moves at 3 m/s.
+    later, earlier = (poses_at(np.arange(FRAMES) * FRAME_S + delay, 0.4) for delay in (1e-5, -1e-5))
+    rate = so3_log(np.swapaxes(earlier[:, :3, :3], 1, 2) @ later[:, :3, :3]) / 2e-5
+    velocity = (later - earlier)[:, :3, 3] / 2e-5
+    assert np.linalg.norm(right.velocity - velocity, axis=1)[ends].max() < 0.8
+    assert np.linalg.norm(right.rotation.rate - rate, axis=1)[ends].max() < 2.0
+
+
+def test_observations_correct_an_extrapolated_rate() -> None:
+    points = directions(1500, seed=4) * np.random.default_rng(2).uniform(1.5, 4.0, (1500, 1))
+    poses = poses_at(np.arange(FRAMES) * FRAME_S, 0.4)
+    path = PosePath.create(poses, TIMES_NS)
+    rate = path.rotation.rate.copy()
+    rate[[0, 20]] += [1.5, -1.0, 0.5]
+    path = replace(path, rotation=replace(path.rotation, rate=rate))
+    px = [seen(frame, points, 0.4) for frame in range(FRAMES)]
+    rows = [np.flatnonzero(np.isfinite(each).all(axis=1)) for each in px]
+    frame = np.concatenate([np.full(len(each), number) for number, each in enumerate(rows)])
+    point = np.concatenate([points[each] for each in rows])
+    seen_px = np.concatenate([each[at] for each, at in zip(px, rows, strict=True)])
+    fitted = path.with_fitted_rates(LENS, frame, point, seen_px, READOUT_S).rotation.rate
+    later, earlier = (poses_at(delay, 0.4)[0, :3, :3] for delay in (1e-5, -1e-5))
+    assert np.linalg.norm(fitted[0] - so3_log(earlier.T @ later) / 2e-5) < 0.8
+    # In the middle of a run, the neighbours tell the rate, and it is not believed to be that wrong.
+    assert np.linalg.norm((fitted - rate)[20]) < 1.0
+
+
 def test_a_frame_with_few_observations_keeps_its_rate() -> None:
     poses = poses_at(np.arange(FRAMES) * FRAME_S, 0.4)
     path = PosePath.create(poses, TIMES_NS)
