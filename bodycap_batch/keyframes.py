@@ -201,6 +201,8 @@ def select_keyframes(
     options: KeyframeOptions,
     context: StageContext,
     keeper: FrameKeeper | None = None,
+    *,
+    with_matches: bool = False,
 ) -> KeyframeSelection:
     """Select the keyframes of one camera: the frames from which the map is built.
 
@@ -215,6 +217,7 @@ def select_keyframes(
         context: Progress and cancellation.
         keeper: Writes copies of frames. Every frame and every keyframe are passed to the keeper. None: no
             copies are written.
+        with_matches: True to match adjacent frames also if the camera has a global shutter.
 
     Returns:
         The frame indices of the keyframes, the sharpness of every frame, the tracking noise and the damaged
@@ -236,7 +239,7 @@ def select_keyframes(
     selected: list[int] = []
     novelty = [0.0]
     tracker = _KeyframeTracker(camera.camera, _coarse_mask(camera))
-    matcher = _frame_matcher(camera, tracker.mask)
+    matcher = _frame_matcher(camera, tracker.mask, with_matches=with_matches)
     recent: deque[_Candidate] = deque(maxlen=options.window)
     see, keep = (_ignore, _ignore) if keeper is None else (keeper.add_frame, keeper.add_keyframe)
     is_damaged = np.ones(count, dtype=bool)
@@ -294,10 +297,13 @@ def select_keyframes(
     )
 
 
-def _frame_matcher(camera: CaptureCamera, mask: BoolArray | None) -> FrameMatcher:
-    """Return the matcher of adjacent frames. It does nothing for a camera with a stated global shutter."""
+def _frame_matcher(camera: CaptureCamera, mask: BoolArray | None, *, with_matches: bool) -> FrameMatcher:
+    """Return the matcher of adjacent frames.
+
+    It does nothing for a camera with a stated global shutter, unless matches are requested.
+    """
     is_rolling = bool(camera.rolling_shutter_s) or not camera.rolling_shutter_known
-    return FrameMatcher(camera.name, camera.camera.width_px, mask, enabled=is_rolling)
+    return FrameMatcher(camera.name, camera.camera.width_px, mask, enabled=is_rolling or with_matches)
 
 
 def _without_frozen(

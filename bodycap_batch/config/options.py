@@ -245,6 +245,14 @@ class TelemetryOptions(Options):
     """Uses of the inertial sensors of the cameras. Without telemetry, these options have no effect."""
 
     gravity: bool = Field(True, description="the accelerometers determine the vertical of the world")
+    tracking: bool = Field(
+        True,
+        description="the gyroscopes measure how the cameras turn from frame to frame and from row to row",
+    )
+    search: bool = Field(
+        True,
+        description="lost frames are searched again near the poses that the inertial sensor gives",
+    )
     gaps: bool = Field(
         True,
         description="frames that are lost for up to a second get poses from the inertial sensor, with the "

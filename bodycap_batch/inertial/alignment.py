@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.inertial.samples import GyroOrientation, InertialSamples, samples_of_fit
+from bodycap_batch.inertial.samples import InertialSamples, samples_of_fit
 from bodycap_batch.model.geometry import so3_log
+from bodycap_batch.model.gyro_rates import GyroOrientation
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.telemetry.comparison import PictureGyroComparison, judge_rotations
 from bodycap_batch.telemetry.gyro_fit import GyroFit

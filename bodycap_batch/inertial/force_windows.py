@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.inertial.samples import GyroOrientation, InertialSamples, pinned_orientations
+from bodycap_batch.inertial.samples import InertialSamples, pinned_orientations
 from bodycap_batch.model.geometry import skew
+from bodycap_batch.model.gyro_rates import GyroOrientation
 from bodycap_batch.model.inertial_camera import ForceWindows
 from bodycap_batch.model.scene import Trajectory
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, set_array
 from bodycap_batch.model.geometry import so3_exp, so3_log
+from bodycap_batch.model.gyro_rates import GyroOrientation
 from bodycap_batch.telemetry.gyro_fit import GyroFit
 from bodycap_batch.telemetry.streams import Stream
 
@@ -67,33 +68,6 @@ def samples_of_fit(gyro: Stream, accelerometer: Stream | None, fit: GyroFit) -> 
         force_m_s2=force @ fit.cam_from_sensor.T,
         gaps_s=tuple((start_s - fit.delay_s, end_s - fit.delay_s) for start_s, end_s in gaps_s),
     )
-
-
-class GyroOrientation:
-    """The orientation of a camera that its gyroscope alone gives, relative to the first sample.
-
-    Args:
-        times_s: (N,) times of the samples, seconds.
-        rate_rad_s: (N,3) angular rates in the axes of the camera, rad/s.
-    """
-
-    def __init__(self, times_s: FloatArray, rate_rad_s: FloatArray) -> None:
-        self.times_s, self._rate = times_s, rate_rad_s
-        steps = 0.5 * (rate_rad_s[1:] + rate_rad_s[:-1]) * np.diff(times_s)[:, None]
-        self.rotation = np.concatenate([np.eye(3)[None], so3_exp(steps)])
-        shift = 1
-        while shift < len(self.rotation):  # products of all steps before each sample, by doubling
-            self.rotation[shift:] = self.rotation[:-shift] @ self.rotation[shift:]
-            shift *= 2
-
-    def at(self, times_s: FloatArray) -> FloatArray:
-        """Return the rotations (T,3,3) at times (T,), seconds. Outside the samples, the rate is constant."""
-        before = np.clip(np.searchsorted(self.times_s, times_s, side="right") - 1, 0, len(self.times_s) - 2)
-        step_s = times_s - self.times_s[before]
-        slope = np.diff(self._rate, axis=0)[before] / np.diff(self.times_s)[before, None]
-        inside = np.clip(step_s, 0.0, np.diff(self.times_s)[before])[:, None]
-        turned = self._rate[before] * step_s[:, None] + 0.5 * slope * inside**2
-        return np.asarray(self.rotation[before] @ so3_exp(turned))
 
 
 def pinned_orientations(

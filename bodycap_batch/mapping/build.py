@@ -23,7 +23,12 @@ from bodycap_batch.mapping.intrinsics.intrinsics_check import find_misfit_intrin
 from bodycap_batch.mapping.intrinsics.readout_profile import estimate_from_matches
 from bodycap_batch.mapping.intrinsics.readout_time import map_with_readouts
 from bodycap_batch.mapping.intrinsics.recalibration import recalibrate_if_misfit
-from bodycap_batch.mapping.intrinsics.shutters import known_readouts, turning_shutters, write_shutters
+from bodycap_batch.mapping.intrinsics.shutters import (
+    known_readouts,
+    turning_shutters,
+    with_gyroscopes,
+    write_shutters,
+)
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     CameraKeyframes,
@@ -127,7 +132,8 @@ def build_map_once(
     workspace.mkdir(parents=True, exist_ok=True)
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         ids = {item.camera: add_camera(database, capture.camera(item.camera)) for item in selections}
-    readouts = {**known_readouts(capture), **estimate_from_matches(capture, selections)}
+    estimated = with_gyroscopes(estimate_from_matches(capture, selections), selections)
+    readouts = {**known_readouts(capture), **estimated}
     shutters = turning_shutters(capture, selections, readouts)
     write_shutters(workspace, shutters)
     keyframes = [

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from pathlib import Path
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.inertial.camera_rotation import related_to_poses
 from bodycap_batch.mapping.inputs import calibrated_camera_ids, make_mapping_context
 from bodycap_batch.mapping.intrinsics.readout_time import (
     RollingShutterModel,
@@ -16,12 +18,14 @@ from bodycap_batch.mapping.intrinsics.readout_time import (
     map_with_readouts,
 )
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
+from bodycap_batch.mapping.intrinsics.shutters import read_shutters
 from bodycap_batch.mapping.matching.database import read_camera_ids, read_detected_px
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
 from bodycap_batch.mapping.reconstruction.model_files import read_model, write_models
 from bodycap_batch.mapping.reconstruction.two_step_adjustment import adjust_in_two_steps
 from bodycap_batch.mapping.results import make_result
+from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import MapResult, Trajectory
 
 
@@ -79,7 +83,7 @@ def refine_map(
             for image_id in model.reg_image_ids()
             if (px := read_detected_px(workspace, image_id)) is not None
         }
-        rolling = RollingShutterModel(model, paths, cameras, detected)
+        rolling = RollingShutterModel(model, paths, cameras, detected, _rotations(workspace, paths))
         rolling, readouts = estimate_readouts(rolling, cameras, settings, calibrated_ids, scene_map)
         readout_s = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         if readout_s:
@@ -103,3 +107,14 @@ def refine_map(
         map_with_readouts(item, readouts) for item, readouts in zip(result.maps, all_readouts, strict=True)
     ]
     return replace(result, maps=tuple(maps))
+
+
+def _rotations(workspace: Path, paths: Mapping[str, Trajectory]) -> dict[str, RotationPath]:
+    """Return the rotation of each camera whose gyroscope corrected its keyframes, by camera name."""
+    out = {}
+    for name, shutter in read_shutters(workspace, paths).items():
+        if shutter.path.gyro is not None:
+            gyro = related_to_poses(shutter.path.gyro, paths[name])
+            if gyro is not None:
+                out[name] = RotationPath.from_gyro(paths[name].times_ns, gyro)
+    return out

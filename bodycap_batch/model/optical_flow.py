@@ -200,7 +200,7 @@ class ImageMotion:
 
 
 def estimate_coarse_motion(
-    first: GreyImage, second: GreyImage, px: Pixels, width_px: int
+    first: GreyImage, second: GreyImage, px: Pixels, width_px: int, expected: FloatArray | None = None
 ) -> ImageMotion | None:
     """Estimate the homography from one image to another, as the initial motion for tracking.
 
@@ -214,6 +214,8 @@ def estimate_coarse_motion(
         second: Reduced second image, from `make_coarse_image`.
         px: (N,2) points in the first image, in pixels of the full-size image.
         width_px: Width of the full-size images, pixels.
+        expected: (3,3) expected homography, in pixels of the full-size images with COLMAP's origin, from
+            which the search starts; None if it is unknown.
 
     Returns:
         The motion, or None if too few points agree on a motion.
@@ -221,7 +223,16 @@ def estimate_coarse_motion(
     scale = first.shape[1] / width_px
     chosen = px[np.linspace(0, len(px) - 1, min(len(px), _COARSE_POINTS)).astype(int)] if len(px) else px
     start = np.ascontiguousarray(chosen * scale - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
-    best, inliers = _fit_homography(first, second, start, None)
+    best, inliers = None, 0
+    # This matrix converts OpenCV's pixels of the reduced images to COLMAP's pixels of the full-size images.
+    full_from_coarse = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, scale]])
+    if expected is not None and len(start):
+        arrived = apply_homography(start, np.linalg.inv(full_from_coarse) @ expected @ full_from_coarse)
+        best, inliers = _fit_homography(first, second, start, arrived)
+    if inliers < _RELIABLE_RATIO * len(start):
+        homography, count = _fit_homography(first, second, start, None)
+        if count > inliers:
+            best, inliers = homography, count
     if inliers < _RELIABLE_RATIO * len(start):
         for shift in _match_image_pieces(first, second):
             homography, count = _fit_homography(first, second, start, start + shift)
@@ -229,8 +240,6 @@ def estimate_coarse_motion(
                 best, inliers = homography, count
     if best is None or inliers < _MIN_INLIERS:
         return None
-    # This matrix converts OpenCV's pixels of the reduced images to COLMAP's pixels of the full-size images.
-    full_from_coarse = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, scale]])
     return ImageMotion(
         np.asarray(full_from_coarse @ best @ np.linalg.inv(full_from_coarse)),
         inliers >= _RELIABLE_RATIO * len(start),

@@ -14,6 +14,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import so3_exp, so3_log
+from bodycap_batch.model.gyro_rates import GyroRates
 from bodycap_batch.model.optical_flow import pixel_scale, unit_directions
 from bodycap_batch.model.rolling_shutter import row_delay
 
@@ -69,12 +70,15 @@ class RotationPath:
         rotation: (N,3,3) orientation of each frame: segment_from_cam.
         segment: (N,) number of the segment of each frame, not decreasing.
         rate: (N,3) angular velocity at the time of each frame, in the camera frame, rad/s.
+        gyro: What the gyroscope of the camera measured; None if there is none. Near a frame time that its
+            samples cover, it replaces the cubic.
     """
 
     times_ns: IntArray
     rotation: FloatArray
     segment: IntArray
     rate: FloatArray
+    gyro: GyroRates | None = None
 
     @staticmethod
     def from_steps(
@@ -106,6 +110,29 @@ class RotationPath:
                 rate = _without_noise(rate, _mean_rates(times_ns, rotation, segment))
         return RotationPath(times_ns, rotation, segment, rate)
 
+    @staticmethod
+    def from_gyro(times_ns: IntArray, gyro: GyroRates, other: RotationPath | None = None) -> RotationPath:
+        """Return the path that a gyroscope measured.
+
+        Args:
+            times_ns: (N,) frame times, nanoseconds.
+            gyro: The measured angular velocities.
+            other: The path where the gyroscope has no samples; None if it is unknown there.
+        """
+        step, known, rate = gyro.at_frames(times_ns)
+        if other is not None:
+            other_step, other_known = other.steps()
+            step = np.where(known[:, None, None], step, other_step)
+            rate = np.where(_covered(times_ns, gyro)[:, None], rate, other.rate)
+            known = known | other_known
+        return replace(RotationPath.from_steps(times_ns, step, known, rate), gyro=gyro)
+
+    def measured(self) -> BoolArray:
+        """Return a mask (N,) of the frames at whose times the gyroscope has samples."""
+        if self.gyro is None:
+            return np.zeros(len(self.times_ns), dtype=bool)
+        return _covered(self.times_ns, self.gyro)
+
     def steps(self) -> tuple[FloatArray, BoolArray]:
         """Return the rotations (N-1,3,3) between adjacent frames, and a mask (N-1,) of the known ones."""
         step = np.swapaxes(self.rotation[1:], 1, 2) @ self.rotation[:-1]
@@ -127,15 +154,15 @@ class RotationPath:
         step[both] = np.swapaxes(rotation[1:], 1, 2)[both] @ rotation[:-1][both]
         posed = RotationPath.from_steps(self.times_ns, step, known | both, shrunk=shrunk)
         # Without a neighbour with a pose on each side, poses do not tell the rate better than the matches.
-        beside = np.concatenate([[False], both]) & np.concatenate([both, [False]])
+        beside = np.concatenate([[False], both]) & np.concatenate([both, [False]]) & ~self.measured()
         rate = np.where(beside[:, None], posed.rate, self._rate_or(posed.rate))
         # At the end of the matches, too, the rate is extrapolated from the other poses. The pose of the frame
         # itself depends on its rate: together they drift away.
-        at_end = np.flatnonzero(has_pose & ~beside & self.is_alone())
+        at_end = np.flatnonzero(has_pose & ~beside & ~self.measured() & self.is_alone())
         mean = so3_log(np.swapaxes(step, 1, 2)) / (np.diff(self.times_ns) * 1e-9)[:, None]
         outer = _extrapolated(np.where(both[:, None], mean, np.nan), at_end)
         rate[at_end] = np.where(np.isfinite(outer), outer, rate[at_end])
-        return replace(posed, rate=rate)
+        return replace(posed, rate=rate, gyro=self.gyro)
 
     def is_end(self) -> BoolArray:
         """Return a mask (N,): True if the rotation to the frame before or to the next frame is unknown."""
@@ -143,8 +170,11 @@ class RotationPath:
         return np.asarray(~(np.concatenate([[False], known]) & np.concatenate([known, [False]])))
 
     def _rate_or(self, other: FloatArray) -> FloatArray:
-        """Return the rates (N,3); for frames that are alone in their segments, the rates `other`."""
-        return np.where(self.is_alone()[:, None], other, self.rate)
+        """Return the rates (N,3); for frames that are alone in their segments, the rates `other`.
+
+        A measured rate is kept.
+        """
+        return np.where((self.is_alone() & ~self.measured())[:, None], other, self.rate)
 
     def is_alone(self) -> BoolArray:
         """Return a mask (N,): True if the rotations to both adjacent frames are unknown."""
@@ -158,10 +188,12 @@ class RotationPath:
     def row_uncertainty(self, frame: int, readout_s: float) -> float:
         """Return the expected error (radians) of the turn from the middle row of a frame to its other rows.
 
-        It is the root mean square over the rows. It is 0 if the rotations to both adjacent frames are known.
-        Otherwise the angular velocity is extrapolated, and its error is a part of the velocities around the
-        frame.
+        It is the root mean square over the rows. It is 0 if the rotations to both adjacent frames are known,
+        and if a gyroscope measured the turn. Otherwise the angular velocity is extrapolated, and its error is
+        a part of the velocities around the frame.
         """
+        if self.measured()[frame]:
+            return 0.0
         around = slice(max(0, frame - 1), frame + 2)
         if len(self.times_ns[around]) == 3 and (self.segment[around] == self.segment[frame]).all():
             return 0.0
@@ -200,9 +232,17 @@ class RotationPath:
     def rotvec_to_instant(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
         """Return the rotation vectors (M,3) of `frame_from_instant`, rad.
 
-        Between two frames of a segment, the rotation vector is a cubic polynomial of time. Outside a segment,
-        the angular velocity is constant.
+        Near a frame whose turn a gyroscope measured, it is this turn. Otherwise, between two frames of a
+        segment, the rotation vector is a cubic polynomial of time. Outside a segment, the angular velocity is
+        constant.
         """
+        if self.gyro is not None and len(frame):
+            seconds: FloatArray = np.asarray(self.times_ns[frame] * 1e-9, dtype=np.float64)
+            turn = self.gyro.rotvec_between(seconds, delay_s)
+            without = np.flatnonzero(~self.measured()[frame])
+            if len(without):
+                turn[without] = replace(self, gyro=None).rotvec_to_instant(frame[without], delay_s[without])
+            return turn
         other = np.clip(frame + np.where(delay_s < 0.0, -1, 1), 0, len(self.times_ns) - 1)
         inside = (other != frame) & (self.segment[other] == self.segment[frame])
         rate = self.rate[frame]
@@ -224,6 +264,13 @@ class RotationPath:
             + u**2 * (u - 1.0) * span * end_rate
         )
         return turn
+
+
+def _covered(times_ns: IntArray, gyro: GyroRates) -> BoolArray:
+    """Return a mask (N,) of the frames for which samples cover the time halfway to both adjacent frames."""
+    seconds: FloatArray = np.asarray(times_ns * 1e-9, dtype=np.float64)
+    half_s = 0.5 * float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+    return gyro.covers(seconds - half_s, seconds + half_s)
 
 
 def _spline_rates(times_ns: IntArray, rotation: FloatArray, segment: IntArray) -> FloatArray:
@@ -486,7 +533,8 @@ class PosePath:
         A hand shakes faster than its video can tell from frame to frame. But the rows of a frame are exposed
         one after another, so the observations of a frame tell its angular velocity. A correction of the
         velocity is fitted together with a correction of the pose, and only the velocity is used. The usual
-        size of the corrections of a camera is the prior of each of them.
+        size of the corrections of a camera is the prior of each of them. An angular velocity that a gyroscope
+        measured is kept.
 
         Args:
             camera: The camera model.
@@ -498,6 +546,8 @@ class PosePath:
         Source: Albl, Kukelova, Pajdla, "R6P - Rolling shutter absolute camera pose", CVPR 2015, for the model
             of a frame with an angular velocity.
         """
+        if self.rotation.measured().all():
+            return self
         moved = camera.unproject(self.px_at_mid_row(camera, frame, points, px, readout_s))
         pose = self.map_from_cam[frame]
         x_in_cam = np.einsum("mji,mj->mi", pose[:, :3, :3], points - pose[:, :3, 3])
@@ -522,6 +572,7 @@ class PosePath:
         end = _END_RATE_SIGMA + _END_RATE_SIGMA_RATIO * np.linalg.norm(self.rotation.rate, axis=1)
         end[~self.rotation.is_end()] = 0.0
         change = _fit_frames(frame[rows], residual[rows], jacobian, noise, end)
+        change[self.rotation.measured()] = 0.0
         return replace(self, rotation=replace(self.rotation, rate=self.rotation.rate + change))
 
     def _shift_in_cam(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:

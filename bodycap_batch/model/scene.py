@@ -17,6 +17,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.frame_matches import FrameMatches
+from bodycap_batch.model.gyro_rates import GyroRates
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 
 _FEATURE_STRIDE = 1 << 24
@@ -88,7 +89,9 @@ class KeyframeSelection:
             moves. An empty array means that no frame is frozen.
         motion_px: Largest median displacement of corners since a keyframe, pixels of an image with a long
             side of 640 px. It is infinity if it is unknown.
-        matches: Matches between adjacent frames; None if the camera is known to have a global shutter.
+        matches: Matches between adjacent frames; None if the camera is known to have a global shutter and
+            no telemetry is used.
+        gyro: Angular velocities that the gyroscope of the camera measured; None if it cannot be used.
     """
 
     camera: str
@@ -100,6 +103,7 @@ class KeyframeSelection:
     frozen: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     motion_px: float = float("inf")
     matches: FrameMatches | None = None
+    gyro: GyroRates | None = None
 
     def __post_init__(self) -> None:
         set_array(self, "frames", (None,), np.int64)

@@ -42,7 +42,7 @@ from bodycap_batch.tasks.clocks import (
 from bodycap_batch.tasks.export import EXPORT, ExportTask
 from bodycap_batch.tasks.fill import FILL, FillTask
 from bodycap_batch.tasks.inertial import INERTIAL, InertialTask
-from bodycap_batch.tasks.inputs import BodyInput, stated_clocks
+from bodycap_batch.tasks.inputs import BodyInput, FileRef, stated_clocks
 from bodycap_batch.tasks.keyframes import KEYFRAMES, KeyframesTask
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE, ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import MERGE, BoardFootage, MergeTask
@@ -79,6 +79,8 @@ class Flow:
         self._cameras: dict[str, str] = {}
         self._map_round = 0
         self._with_telemetry = frozenset[str]()
+        self._with_gyro = frozenset[str]()
+        self._samples: Mapping[str, FileRef] = {}
 
     def __enter__(self) -> Flow:
         self.runner.__enter__()
@@ -101,7 +103,14 @@ class Flow:
         artefact = self.runner.run(task, [KEYFRAMES.modules] * (self.runner.parallel_tasks - 1))
         summary = read_summary(artefact.path)
         self.runner.expect_frames(int(summary["frames"]), int(summary.get("large_frames", 0)))
-        self._with_telemetry = frozenset(summary.get("telemetry", ()))
+        found = {
+            camera.name: samples_input(camera, self._settings.store.digests)
+            for camera in self._capture.cameras
+        }
+        self._samples = {name: samples for name, samples in found.items() if samples is not None}
+        self._with_telemetry = frozenset(summary.get("telemetry", ())) | self._samples.keys()
+        if self._job.telemetry.tracking:
+            self._with_gyro = self._with_telemetry
         self.runner.report_notes(artefact, "check")
         if len(self._capture.cameras) > 1:
             self._sound = self._start_sound()
@@ -118,7 +127,10 @@ class Flow:
             make_task(
                 KEYFRAMES,
                 KeyframesTask(
-                    options=self._job.keyframes, capture=capture_ref(capture, self._cameras, [camera])
+                    options=self._job.keyframes,
+                    capture=capture_ref(capture, self._cameras, [camera]),
+                    with_gyro=camera.name in self._with_gyro,
+                    samples=self._samples.get(camera.name) if camera.name in self._with_gyro else None,
                 ),
                 camera=camera.name,
                 threads=threads,
@@ -279,18 +291,17 @@ class Flow:
         Without telemetry, or if all uses are switched off, the registrations are returned unchanged.
         """
         options = self._job.telemetry
-        if not any(options.model_dump().values()):
+        if not (options.gravity or options.gaps):
             return registrations
         tasks = []
         for camera in self._capture.cameras:
-            samples = samples_input(camera, self._settings.store.digests)
-            if samples is None and camera.name not in self._with_telemetry:
+            if camera.name not in self._with_telemetry:
                 continue
             task = InertialTask(
                 options=options,
                 capture=capture_ref(self._capture, self._cameras, [camera]),
                 registration=artefact_ref(registrations[camera.name]),
-                samples=samples,
+                samples=self._samples.get(camera.name),
             )
             tasks.append(make_task(INERTIAL, task, camera=camera.name))
         used = self.runner.run_all(tasks)
@@ -473,6 +484,8 @@ class Flow:
             if not LEAST_POSED <= summary["localised"] <= summary["frames"] - LEAST_LOST:
                 continue
             task = self._group_task(own, self._capture.cameras, scene_map, registrations, keyframes)
+            if self._job.telemetry.search and own.name in self._with_telemetry:
+                task = replace(task, with_sensor=True, samples=self._samples.get(own.name))
             yield make_task(RECOVER, task, camera=own.name)
 
     def _group_task(

@@ -11,6 +11,7 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.relative_pose import RelativePose
 from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration
@@ -32,10 +33,10 @@ from bodycap_batch.registration.poses.trajectory import (
     solve_camera,
     solve_rig,
 )
-from bodycap_batch.registration.poses.turning_tracks import rotation_from_matches, turn_tracks
+from bodycap_batch.registration.poses.turning_tracks import rotation_of_camera, turn_tracks
 from bodycap_batch.registration.recovery.path_smoothing import smooth_if_final
 from bodycap_batch.registration.tracking.frame_ranges import TrackCache, track_all
-from bodycap_batch.registration.tracking.klt import Tracks, select_keyframe_points
+from bodycap_batch.registration.tracking.klt import MeasuredTurns, Tracks, select_keyframe_points
 
 
 def register_frames(
@@ -71,9 +72,12 @@ def register_frames(
         return _registration_without_map(camera, selection, offered)
     criteria = acceptance_criteria(camera, selection, options)
     points_by_keyframe = select_keyframe_points(scene_map, camera.name)
-    tracks = track_all(camera, points_by_keyframe, TrackCache.from_registration(previous), context)
+    solved = None if previous is None else previous.trajectory
+    rotation = rotation_of_camera(camera, scene_map, selection, solved)
+    turns = measured_turns(scene_map.cameras[camera.name], rotation)
+    cache = TrackCache.from_registration(previous)
+    tracks = track_all(camera, points_by_keyframe, cache, context, turns)
     context.progress(0, 0, "misplaced keyframes")
-    rotation = rotation_from_matches(camera, scene_map, selection)
     scene_map, tracks, misplaced = _track_without_misplaced(
         camera, scene_map, tracks, criteria, context, rotation
     )
@@ -164,8 +168,18 @@ def _track_without_misplaced(
         return scene_map, tracks, nothing
     cache = TrackCache(tracks, sorted(select_keyframe_points(scene_map, camera.name)))
     remaining = map_without_keyframes(scene_map, misplaced)
-    tracks = track_all(camera, select_keyframe_points(remaining, camera.name), cache, context)
+    turns = measured_turns(scene_map.cameras[camera.name], rotation)
+    tracks = track_all(camera, select_keyframe_points(remaining, camera.name), cache, context, turns)
     return remaining, tracks, scene_map.keyframe_frame[misplaced]
+
+
+def measured_turns(lens: Camera, rotation: RotationPath | None) -> MeasuredTurns | None:
+    """Return the rotations between frames that a gyroscope measured; None if there are none."""
+    if rotation is None or rotation.gyro is None:
+        return None
+    step, _ = rotation.steps()
+    measured = rotation.measured()
+    return MeasuredTurns(lens=lens, step=step, known=measured[1:] & measured[:-1])
 
 
 def _offered_keyframes(selection: KeyframeSelection, previous: Registration | None) -> IntArray:

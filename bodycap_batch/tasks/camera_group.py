@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from bodycap_batch.config.options import RegistrationOptions
-from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, FileRef
 from bodycap_batch.tasks.registration import NOT_ROUNDS
 
 
@@ -23,6 +23,9 @@ class CameraGroupTask:
         registrations: The registration of each camera, by camera name, in the order of `cameras`.
         offsets_s: Stated clock offset of each camera that shares a trigger, seconds, by camera name. Empty if
             the cameras share no trigger.
+        with_sensor: True to search the lost frames of the first camera near the poses of its inertial sensor.
+        samples: The file with inertial samples beside the video of the first camera; None if the samples are
+            in the video, or if they are not used.
     """
 
     options: RegistrationOptions = field(metadata=NOT_ROUNDS)
@@ -32,3 +35,5 @@ class CameraGroupTask:
     map: ArtefactRef
     registrations: Mapping[str, ArtefactRef]
     offsets_s: Mapping[str, float]
+    with_sensor: bool = False
+    samples: FileRef | None = None

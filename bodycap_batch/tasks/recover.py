@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.inputs import paths_of
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import RIG_POSES
 from bodycap_batch.tasks.registration import save_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
+
+if TYPE_CHECKING:
+    from bodycap_batch.capture import CaptureCamera
+    from bodycap_batch.telemetry.streams import CameraTelemetry
 
 _MEMORY_MB = 900
 """Memory to reserve (MB) for a recovery task. Recovery holds a limited number of keyframes and frames in
@@ -24,6 +30,7 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
     from bodycap_batch.registration import (
         RecoveryInputs,
         recover_lost_frames,
+        search_near_sensor,
         with_rotation,
         withdraw_contradicted_poses,
     )
@@ -46,11 +53,28 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
         in_rig=in_rig,
     )
     registration = recover_lost_frames(load_registration(paths[0]), inputs, task.options, context)
+    if task.with_sensor:
+        telemetry = _telemetry(capture.cameras[0], task)
+        registration = search_near_sensor(registration, inputs, telemetry, task.options, context)
     misplaced = scene.diagnostics.misplaced.get(task.cameras[0], ())
     registration = withdraw_contradicted_poses(registration, scene.maps, misplaced)
     save_registration(registration, capture.cameras[0], files, rolling=read_summary(paths[0])["rolling"])
     if in_rig:
         write_dataclass(read_dataclass(RigPoses, paths[0], RIG_POSES), files, RIG_POSES)
+
+
+def _telemetry(camera: CaptureCamera, task: CameraGroupTask) -> CameraTelemetry:
+    """Return the telemetry of the first camera; without samples if they cannot be read."""
+    from bodycap_batch.telemetry import read_telemetry
+    from bodycap_batch.telemetry.comparison import all_times_ns
+    from bodycap_batch.telemetry.streams import CameraTelemetry
+
+    try:
+        return read_telemetry(
+            camera.videos, all_times_ns(camera, task.capture.config.cameras[0]), camera.name
+        )
+    except CaptureError:  # the stage that uses the sensors reports it
+        return CameraTelemetry()
 
 
 RECOVER = Stage(

@@ -55,6 +55,14 @@ _SHAKE_QUANTILE = 0.75
 _MAX_AUTOCORRELATION = 0.98
 """Largest autocorrelation of successive residuals that is believed: at 30 frames per second, residuals that
 last for 1.7 s. Evidence: none."""
+_LAGS = 8
+"""Largest distance (pairs) of residuals whose products count: twice the length of a pair of poses."""
+_GROWTH_BY_TRIMMING = 1.255
+"""Factor of the standard deviations because the largest tenth of the residuals is left out, which makes the
+others look more exact than they are. Origin: the asymptotic variance of such an estimate for three normally
+distributed components, 1 / 0.717, instead of 0.797 / 0.9."""
+_DELAY_FLOOR_S = 1e-4
+"""Standard deviation that is added to that of the delay, seconds. Evidence: docs/decisions/telemetry.md."""
 _LEAST_NOISE_RAD_S = 1e-4
 """Least noise of a rotation per second, rad/s, for data without noise."""
 
@@ -225,6 +233,8 @@ class _Problem:
         from scipy.spatial.transform import Rotation
 
         kept = first.kept
+        # The error of a rotation does not depend on the time between the frames; that of its rate does.
+        weight = self._interval_s / float(np.median(self._interval_s))
         turned = self.measured(first.delay_s)
         bias = turned[kept].mean(axis=0) - first.rotation.T @ self._seen[kept].mean(axis=0) / first.ratio
         prior = np.concatenate(
@@ -241,7 +251,7 @@ class _Problem:
             return np.asarray(math.exp(x[8]) * (self.measured(x[6], x[7]) - x[3:6]) @ rotation.T)
 
         def residuals(x: FloatArray) -> FloatArray:
-            own = (self._seen - predicted(x))[kept].ravel() / first.noise_rad_s
+            own = (weight * (self._seen - predicted(x)))[kept].ravel() / first.noise_rad_s
             deviation = x.copy()
             deviation[:3] = (Rotation.from_rotvec(x[:3]) * start_rotation).as_rotvec()
             return np.concatenate([own, prior * deviation])
@@ -252,7 +262,14 @@ class _Problem:
         information = slope.T @ slope
         sigma = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information)), 0.0))
         error = self._seen - predicted(found.x)
-        sigma *= _growth_by_autocorrelation(error, kept)
+        weighted = weight * error
+        noise_rad_s = max(float(np.sqrt((weighted[kept] ** 2).mean())), _LEAST_NOISE_RAD_S)
+        sigma *= _growth_by_autocorrelation(weighted, kept) * noise_rad_s / first.noise_rad_s
+        rows = slice(0, 3 * int(kept.sum()))
+        robust = _robust_sigma(information, slope[rows], np.asarray(found.fun)[rows])
+        ends_s = self._start_s[kept], self._end_s[kept]
+        shared = _sigma_of_frames(information, slope[rows], ends_s, noise_rad_s / first.noise_rad_s)
+        sigma = _GROWTH_BY_TRIMMING * np.maximum(np.maximum(sigma, shared), robust)
         seen = self._seen[kept]
         ratio = math.exp(float(found.x[8]))
         rate = self.measured(float(found.x[6]), float(found.x[7])) - found.x[3:6]
@@ -260,7 +277,7 @@ class _Problem:
         shakes = [_typical_shake(each, self._start_s, self._end_s) for each in (rate, self._seen / plausible)]
         return GyroFit(
             delay_s=float(found.x[6]),
-            delay_sigma_s=float(sigma[6]),
+            delay_sigma_s=float(np.hypot(sigma[6], _DELAY_FLOOR_S)),
             drift=float(found.x[7]),
             middle_s=self._middle_s,
             drift_sigma=float(sigma[7]),
@@ -277,6 +294,53 @@ class _Problem:
             picture_rms_rad_s=float(np.sqrt(((seen - seen.mean(axis=0)) ** 2).sum(axis=1).mean())),
             pairs=int(kept.sum()),
         )
+
+
+def _robust_sigma(information: FloatArray, slope: FloatArray, residual: FloatArray) -> FloatArray:
+    """Return standard deviations (U,) from the products of residuals that are near in time.
+
+    Fast turns determine the delay, and the errors of the rotations are larger in them. Pairs that share a
+    frame have correlated errors.
+
+    Args:
+        information: (U,U) information of the U unknowns.
+        slope: (3N,U) derivatives of the residuals of N pairs, in the order of time.
+        residual: (3N,) residuals.
+
+    Source: Newey and West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation
+        consistent covariance matrix", 1987.
+    """
+    score = (slope * residual[:, None]).reshape(-1, 3, slope.shape[1]).sum(axis=1)
+    spread = score.T @ score
+    for lag in range(1, min(_LAGS, len(score) - 1) + 1):
+        product = score[lag:].T @ score[:-lag]
+        spread += (1.0 - lag / (_LAGS + 1.0)) * (product + product.T)
+    inverse = np.linalg.pinv(information)
+    return np.asarray(np.sqrt(np.maximum(np.diag(inverse @ spread @ inverse), 0.0)))
+
+
+def _sigma_of_frames(
+    information: FloatArray, slope: FloatArray, ends_s: tuple[FloatArray, FloatArray], noise: float
+) -> FloatArray:
+    """Return standard deviations (U,) for errors that belong to frames, not to pairs.
+
+    The error of a pose is in the pairs that end with it and, with the other sign, in those that start with
+    it. Where the derivatives of these pairs have different signs, the errors add up.
+
+    Args:
+        information: (U,U) information of the U unknowns.
+        slope: (3N,U) derivatives of the residuals of N pairs.
+        ends_s: Times (N,) of the first and of the second frame of each pair, seconds.
+        noise: Standard deviation of a residual.
+    """
+    _, frame = np.unique(np.concatenate(ends_s), return_inverse=True)
+    own = slope.reshape(-1, 3, slope.shape[1])
+    effect = np.zeros((int(frame.max()) + 1, *own.shape[1:]))
+    np.add.at(effect, frame[: len(own)], -own)
+    np.add.at(effect, frame[len(own) :], own)
+    spread = 0.5 * noise**2 * np.einsum("fki,fkj->ij", effect, effect)
+    inverse = np.linalg.pinv(information)
+    return np.asarray(np.sqrt(np.maximum(np.diag(inverse @ spread @ inverse), 0.0)))
 
 
 def _growth_by_autocorrelation(error: FloatArray, kept: BoolArray) -> float:

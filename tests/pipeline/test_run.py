@@ -342,16 +342,17 @@ def test_a_round_that_withdraws_wrong_poses_loses_no_frames(
 @pytest.mark.parametrize("name", ["torso.imu.csv", "torso.gcsv"])
 def test_sensors_are_used_where_there_are_samples(bench: Bench, name: str) -> None:
     (bench.folder / name).write_text("samples")
-    assert set(bench.executed()) == {*ALL, "inertial torso"}
+    after = {"telemetry": {"tracking": False, "search": False}}
+    assert set(bench.executed(**after)) == {*ALL, "inertial torso"}
     used = json.loads((bench.out / "result.ply").read_text())["registrations"]
     assert {camera: json.loads(content)[0] for camera, content in used.items()} == {
         "torso": "inertial",
         "left_palm": "registration",
     }
     (bench.folder / name).write_text("other samples")
-    assert bench.executed() == ["inertial torso"]
+    assert bench.executed(**after) == ["inertial torso"]
     (bench.folder / name).unlink()
-    assert bench.executed() == LAST
+    assert bench.executed(**after) == LAST
     assert "inertial" not in {
         stage["stage"] for stage in json.loads((bench.out / "run.json").read_text())["stages"]
     }
@@ -362,11 +363,19 @@ def test_sensors_are_used_where_the_video_has_telemetry(bench: Bench) -> None:
     assert "inertial left_palm" in bench.executed()
 
 
+def test_samples_are_an_input_of_the_keyframes_of_their_camera(bench: Bench) -> None:
+    bench.run()
+    (bench.folder / "torso.imu.csv").write_text("samples")
+    executed = bench.executed()
+    assert "keyframes torso" in executed
+    assert "keyframes left_palm" not in executed
+
+
 def test_telemetry_that_is_switched_off_changes_nothing(bench: Bench) -> None:
     bench.run()
     before = {name: data for name, data in bench.results().items() if name != "job.yaml"}
     (bench.folder / "torso.imu.csv").write_text("samples")
-    assert bench.executed(telemetry={"gravity": False, "gaps": False}) == []
+    assert bench.executed(telemetry=dict.fromkeys(("gravity", "tracking", "search", "gaps"), False)) == []
     assert {name: data for name, data in bench.results().items() if name != "job.yaml"} == before
 
 

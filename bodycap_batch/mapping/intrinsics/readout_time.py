@@ -16,7 +16,7 @@ from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust, sub_model
 from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
 from bodycap_batch.mapping.reconstruction.reprojection import image_residuals_px
-from bodycap_batch.model.rotation_path import PosePath
+from bodycap_batch.model.rotation_path import PosePath, RotationPath
 from bodycap_batch.model.scene import Map, Trajectory
 
 if TYPE_CHECKING:
@@ -162,6 +162,7 @@ class RollingShutterModel:
         cameras: The capture's cameras by name.
         detected_px: Detected positions (N,2) of all keypoints of each image whose keypoints are at other
             positions in the model, by image id.
+        rotations: Rotations that gyroscopes measured, by camera name.
     """
 
     def __init__(
@@ -170,11 +171,13 @@ class RollingShutterModel:
         trajectories: Mapping[str, Trajectory],
         cameras: Mapping[str, CaptureCamera],
         detected_px: Mapping[int, FloatArray] | None = None,
+        rotations: Mapping[str, RotationPath] | None = None,
     ) -> None:
         self._model = model
         self._detected_px = detected_px or {}
+        self._rotations = rotations or {}
         self._paths = {
-            name: PosePath.create(path.gauge_from_cam, path.times_ns, shrunk=False)
+            name: PosePath.create(path.gauge_from_cam, path.times_ns, self._rotations.get(name), shrunk=False)
             for name, path in trajectories.items()
         }
         self._trajectories = trajectories
@@ -215,7 +218,7 @@ class RollingShutterModel:
         out = copy.copy(self)
         out._paths = dict(self._paths)
         for name, trajectory in self._trajectories.items():
-            path = PosePath.create(trajectory.gauge_from_cam, trajectory.times_ns)
+            path = PosePath.create(trajectory.gauge_from_cam, trajectory.times_ns, self._rotations.get(name))
             own = [item for item in self._keypoints if item.camera == name]
             out._paths[name] = path
             if own and readout_s.get(name) and name in corrected:
@@ -267,9 +270,9 @@ class RollingShutterModel:
             kept |= {item.image_id for item in keyframes[start : start + size]}
         part = sub_model(self._model, kept)
         sideways = [name for name, camera in self._intrinsics.items() if camera.sideways]
-        return RollingShutterModel(part, self._trajectories, self._cameras, self._detected_px).with_sideways(
-            sideways
-        )
+        return RollingShutterModel(
+            part, self._trajectories, self._cameras, self._detected_px, self._rotations
+        ).with_sideways(sideways)
 
     def with_sideways(self, sideways: Collection[str]) -> RollingShutterModel:
         """Return a copy with changed row directions.

@@ -6,13 +6,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from bodycap_batch.capture import Capture
 from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
+from bodycap_batch.inertial import camera_rotation
 from bodycap_batch.mapping.intrinsics.readout_time import Readout, stated_readout
-from bodycap_batch.model.rotation_fit import fit_rotation_path
 from bodycap_batch.model.rotation_path import TurningShutter
 from bodycap_batch.model.scene import KeyframeSelection, Map
 
+_MAX_SIGMAS = 3.0
+"""Maximum difference of two readout times that agree, in its standard deviations. Evidence: none."""
+_MIN_READOUT_S, _MIN_SIGMAS = 0.002, 5.0
+"""Minimum readout time (seconds) of a rolling shutter, and its minimum in standard deviations: the same as
+for readout times from the map."""
 _FOLDER = "shutters"
 """Name of the folder with the shutters, in the workspace folder. Each camera with a rolling shutter has a
 file."""
@@ -25,6 +32,40 @@ def known_readouts(capture: Capture) -> dict[str, Readout]:
         for camera in capture.cameras
         if camera.rolling_shutter_known and camera.rolling_shutter_s
     }
+
+
+def with_gyroscopes(
+    readouts: Mapping[str, Readout], selections: Sequence[KeyframeSelection]
+) -> dict[str, Readout]:
+    """Return the readout times together with those that were estimated with gyroscopes, by camera name.
+
+    The mean of both is used, weighted by their information. If they contradict each other, the one with the
+    smaller standard deviation is used.
+
+    Args:
+        readouts: Readout times from matches between adjacent frames.
+        selections: The keyframes of the cameras, with what the gyroscopes measured.
+    """
+    out = dict(readouts)
+    for selection in selections:
+        own, gyro = readouts.get(selection.camera), selection.gyro
+        if own is None or gyro is None or not gyro.readout_sigma_s or not np.isfinite(gyro.readout_s):
+            continue
+        value = np.array([gyro.readout_s, own.best_s])
+        sigma = np.array([gyro.readout_sigma_s, own.sigma_s])
+        weight = 1.0 / sigma**2
+        if abs(value[0] - value[1]) > _MAX_SIGMAS * float(np.hypot(*sigma)):
+            weight = np.where(sigma == sigma.min(), weight, 0.0)
+        best_s, sigma_s = float(weight @ value / weight.sum()), float(weight.sum() ** -0.5)
+        is_rolling = abs(best_s) > max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s)
+        out[selection.camera] = replace(
+            own,
+            seconds=best_s if is_rolling else 0.0,
+            sigma_s=sigma_s,
+            source="estimated" if is_rolling else "none found",
+            best_s=best_s,
+        )
+    return out
 
 
 def readouts_of_maps(maps: Sequence[Map]) -> dict[str, Readout]:
@@ -40,7 +81,7 @@ def readouts_of_maps(maps: Sequence[Map]) -> dict[str, Readout]:
 def turning_shutters(
     capture: Capture, selections: Sequence[KeyframeSelection], readouts: Mapping[str, Readout]
 ) -> dict[str, TurningShutter]:
-    """Estimate the rotation of each camera with a rolling shutter, from matches between adjacent frames.
+    """Estimate the rotation of each camera with a rolling shutter, from its gyroscope or its pictures.
 
     Args:
         capture: All cameras.
@@ -48,17 +89,18 @@ def turning_shutters(
         readouts: The readout times by camera name.
 
     Returns:
-        The shutters by camera name. Cameras without matches or without a readout time have none.
+        The shutters by camera name. Cameras without a rotation or without a readout time have none.
     """
     out = {}
     for selection in selections:
         readout = readouts.get(selection.camera)
-        if readout is None or not readout.seconds or selection.matches is None:
+        if readout is None or not readout.seconds:
             continue
         camera = capture.camera(selection.camera)
         lens = replace(camera.camera, sideways=readout.sideways)
-        path = fit_rotation_path(selection.matches, lens, camera.times_ns, readout.seconds)
-        out[selection.camera] = TurningShutter(lens, path, readout.seconds)
+        path = camera_rotation(selection, lens, camera.times_ns, readout.seconds)
+        if path is not None:
+            out[selection.camera] = TurningShutter(lens, path, readout.seconds)
     return out
 
 

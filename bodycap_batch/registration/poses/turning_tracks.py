@@ -8,36 +8,36 @@ from dataclasses import replace
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.model.rotation_fit import fit_rotation_path
+from bodycap_batch.inertial import camera_rotation
 from bodycap_batch.model.rotation_path import RotationPath, rotate_to_mid_row
-from bodycap_batch.model.scene import KeyframeSelection, Map, Registration
+from bodycap_batch.model.scene import KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.registration.poses.rig_members import RegisteredCamera
 from bodycap_batch.registration.tracking.klt import Tracks
 
 
-def rotation_from_matches(
-    camera: CaptureCamera, scene_map: Map, selection: KeyframeSelection
+def rotation_of_camera(
+    camera: CaptureCamera, scene_map: Map, selection: KeyframeSelection, solved: Trajectory | None = None
 ) -> RotationPath | None:
-    """Return the rotation of a camera with a rolling shutter over time, from matches of adjacent frames.
+    """Return the rotation of a camera over time, from its gyroscope or from matches of adjacent frames.
 
     Args:
         camera: The camera.
         scene_map: The map that the camera is registered against.
         selection: The keyframes of the camera, with the matches.
+        solved: Poses of the camera from an earlier round; None if there are none.
 
     Returns:
-        The rotation; None for a camera with a global shutter, and if there are no matches.
+        The rotation; without a gyroscope None for a camera with a global shutter, and if there are no
+        matches.
     """
     readout_s = scene_map.readout_s.get(camera.name, 0.0)
-    if not readout_s or selection.matches is None:
-        return None
-    return fit_rotation_path(selection.matches, scene_map.cameras[camera.name], camera.times_ns, readout_s)
+    return camera_rotation(selection, scene_map.cameras[camera.name], camera.times_ns, readout_s, solved)
 
 
 def with_rotation(
     camera: CaptureCamera, registration: Registration, maps: Sequence[Map], selection: KeyframeSelection
 ) -> RegisteredCamera:
-    """Return a camera with its registration, and with its rotation from matches if it has a rolling shutter.
+    """Return a camera with its registration, and with its rotation if that is known.
 
     Args:
         camera: The camera.
@@ -47,7 +47,9 @@ def with_rotation(
     """
     gauge = registration.trajectory.gauge
     own_map = next((scene_map for scene_map in maps if scene_map.gauge == gauge), None)
-    rotation = None if own_map is None else rotation_from_matches(camera, own_map, selection)
+    rotation = (
+        None if own_map is None else rotation_of_camera(camera, own_map, selection, registration.trajectory)
+    )
     return RegisteredCamera(camera=camera, registration=registration, rotation=rotation)
 
 
@@ -60,8 +62,8 @@ def turn_tracks(camera: str, scene_map: Map, tracks: Tracks, rotation: RotationP
         tracks: The tracks of the camera.
         rotation: The rotation of the camera; None to return the tracks unchanged.
     """
-    if rotation is None:
+    lens, readout_s = scene_map.cameras[camera], scene_map.readout_s.get(camera, 0.0)
+    if rotation is None or not readout_s:
         return tracks
-    lens, readout_s = scene_map.cameras[camera], scene_map.readout_s[camera]
     px = rotate_to_mid_row(lens, rotation, tracks.frame, tracks.px.astype(np.float64), readout_s)
     return replace(tracks, px=px.astype(np.float32))

@@ -149,7 +149,7 @@ def find_lost_poses(
     if statistics is None:
         return registration
     times = times_in_intervals(path.times_ns)
-    localiser = _make_localiser(scene_map, capture, path, options, context, rotation)
+    localiser = make_localiser(scene_map, capture, path, options, context, rotation)
     interval_search = _IntervalSearch(
         camera=camera,
         scene_map=scene_map,
@@ -176,7 +176,7 @@ def find_lost_poses(
     return replace(registration, trajectory=smooth_weak_centres(path, ~lost))
 
 
-def _make_localiser(
+def make_localiser(
     scene_map: Map,
     capture: Capture,
     path: Trajectory,

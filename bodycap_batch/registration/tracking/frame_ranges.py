@@ -12,7 +12,7 @@ import numpy as np
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.scene import FrameStatus, Registration
-from bodycap_batch.registration.tracking.klt import KeyframePoints, Tracks, track_range
+from bodycap_batch.registration.tracking.klt import KeyframePoints, MeasuredTurns, Tracks, track_range
 
 _MIN_RANGE_FRAMES = 15
 """Minimum number of frames in the last part of a frame range, if the range is split between threads. A
@@ -48,6 +48,7 @@ def track_all(
     points_by_keyframe: Mapping[int, KeyframePoints],
     cache: TrackCache | None,
     context: StageContext,
+    turns: MeasuredTurns | None = None,
 ) -> Tracks:
     """Track map points in every interval between successive keyframes, or use the tracks of an earlier round.
 
@@ -57,6 +58,7 @@ def track_all(
         cache: Tracks of an earlier round. They are used in intervals that have the same two keyframes as
             before.
         context: Threads, progress and cancellation.
+        turns: Rotations between frames that a gyroscope measured; None if there are none.
 
     Returns:
         All tracks of the camera, ordered by frame, keyframe and feature.
@@ -72,9 +74,8 @@ def track_all(
             _reusable(cache.tracks, [interval for interval in intervals if interval in cached], count)
         )
     missing = _merge_ranges([interval for interval in intervals if interval not in cached], count)
-    parts += _track_ranges(
-        camera, points_by_keyframe, _split_by_thread(missing, frames, context.threads), context
-    )
+    ranges = _split_by_thread(missing, frames, context.threads)
+    parts += _track_ranges(camera, points_by_keyframe, ranges, context, turns)
     return Tracks.join_and_clear(parts)  # no other reference exists, so the memory is released
 
 
@@ -83,6 +84,7 @@ def _track_ranges(
     points_by_keyframe: Mapping[int, KeyframePoints],
     ranges: list[tuple[int, int]],
     context: StageContext,
+    turns: MeasuredTurns | None,
 ) -> list[Tracks]:
     """Track several ranges of frames in parallel, each on one thread.
 
@@ -101,7 +103,7 @@ def _track_ranges(
 
         stoppable = replace(context, cancelled=lambda: stopped.is_set() or context.cancelled())
         parts = []
-        for part in track_range(camera, points_by_keyframe, *ranges[index], stoppable):
+        for part in track_range(camera, points_by_keyframe, *ranges[index], stoppable, turns):
             parts.append(part)
             if part.frame[0] > position[index]:
                 report(int(part.frame[0]))

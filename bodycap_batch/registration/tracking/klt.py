@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.core.arrays import BoolArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.optical_flow import (
     GreyImage,
     ImageMotion,
@@ -23,6 +24,7 @@ from bodycap_batch.model.optical_flow import (
     make_coarse_image,
     pixel_scale,
     track_points,
+    unit_directions,
 )
 from bodycap_batch.model.scene import Map
 
@@ -170,6 +172,42 @@ def grid_sample(cell: IntArray, score: IntArray, count: int) -> IntArray:
     return np.asarray(order[by_rank[:count]])
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredTurns:
+    """Rotations between adjacent frames that a gyroscope measured.
+
+    Attributes:
+        lens: Intrinsics of the camera.
+        step: (N-1,3,3) rotation later_from_earlier of each frame and the next frame.
+        known: (N-1,) True if it was measured.
+    """
+
+    lens: Camera
+    step: FloatArray
+    known: BoolArray
+
+    def motion(self, first: int, second: int) -> FloatArray | None:
+        """Return the homography (3,3) of far points between two adjacent frames; None if it is unknown.
+
+        It is in pixels of the full-size images with COLMAP's origin. The distortion of the lens is
+        approximated.
+        """
+        import cv2
+
+        if second != first + 1 or not self.known[first]:
+            return None
+        fractions = np.linspace(0.1, 0.9, _GRID_CELLS)
+        grid = np.stack(np.meshgrid(fractions * self.lens.width_px, fractions * self.lens.height_px), axis=-1)
+        px = grid.reshape(-1, 2)
+        arrived = self.lens.project(unit_directions(self.lens.unproject(px)) @ self.step[first].T)
+        seen = np.isfinite(arrived).all(axis=1)
+        seen &= (np.abs(arrived - px) < max(self.lens.width_px, self.lens.height_px)).all(axis=1)
+        if seen.sum() < _GRID_CELLS:
+            return None
+        homography, _ = cv2.findHomography(px[seen], arrived[seen])
+        return None if homography is None else np.asarray(homography, dtype=np.float64)
+
+
 @dataclass(frozen=True, slots=True)
 class _VideoFrame:
     """A video frame at full size for tracking and at reduced size for estimating image motion."""
@@ -255,6 +293,7 @@ def track_range(
     start: int,
     stop: int,
     context: StageContext,
+    turns: MeasuredTurns | None = None,
 ) -> Iterator[Tracks]:
     """Track from every keyframe in [start, stop) forward to the next and backward to the previous keyframe.
 
@@ -267,6 +306,7 @@ def track_range(
         start: First frame. Forward tracking starts at the first keyframe at or after this frame.
         stop: One past the last frame.
         context: Cancellation.
+        turns: Rotations between frames that a gyroscope measured; None if there are none.
     """
     forward: _ActiveTracks | None = None
     previous: _VideoFrame | None = None
@@ -275,7 +315,7 @@ def track_range(
         context.check_cancelled()
         frame = _VideoFrame(camera, index, grey, make_coarse_image(grey))
         if previous is not None:
-            motion = _estimate_motion(previous, frame, forward)
+            motion = _estimate_motion(previous, frame, forward, turns)
             buffered.append(_buffer(previous, motion, forward))
             if forward is not None and forward.advance(previous, frame, motion):
                 yield forward.observe(index)
@@ -337,18 +377,23 @@ def _close_tracks(
 
 
 def _estimate_motion(
-    first: _VideoFrame, second: _VideoFrame, active: _ActiveTracks | None
+    first: _VideoFrame,
+    second: _VideoFrame,
+    active: _ActiveTracks | None,
+    turns: MeasuredTurns | None = None,
 ) -> ImageMotion | None:
     """Estimate the motion of the whole image from the active tracks.
 
-    If too few tracks are active, corners are detected and used instead.
+    If too few tracks are active, corners are detected and used instead. The search starts from the rotation
+    that a gyroscope measured, if there is one.
     """
+    expected = None if turns is None else turns.motion(first.index, second.index)
     if active is not None and len(active.px) >= _MIN_MOTION_POINTS:
         points = active.px
     else:
         scale = first.grey.shape[1] / first.coarse.shape[1]
         points = detect_corners(first.coarse, _MIN_MOTION_POINTS, _CORNER_SPACING_PX) * np.float32(scale)
-    return estimate_coarse_motion(first.coarse, second.coarse, points, first.grey.shape[1])
+    return estimate_coarse_motion(first.coarse, second.coarse, points, first.grey.shape[1], expected)
 
 
 def _track_back(

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from bodycap_batch.inertial import align_sensor
-from bodycap_batch.inertial.samples import GyroOrientation, pinned_orientations
+from bodycap_batch.inertial.samples import pinned_orientations
 from bodycap_batch.model.geometry import Similarity, rotation_angle_rad, so3_exp
+from bodycap_batch.model.gyro_rates import GyroOrientation
 from bodycap_batch.telemetry.streams import GYROSCOPE, CameraTelemetry
 from tests.inertial import Hand, Sensor, solved
 

@@ -177,9 +177,9 @@ def test_only_cameras_with_a_rolling_shutter_get_one() -> None:
     px = np.array([[100.0, 100.0], [400.0, 300.0]], np.float32)
     matches = FrameMatches(camera="head", frame=np.zeros(2, np.int64), first_px=px, second_px=px)
     selections: Any = [
-        SimpleNamespace(camera="head", matches=matches),
-        SimpleNamespace(camera="hips", matches=None),
-        SimpleNamespace(camera="torso", matches=matches),
+        SimpleNamespace(camera="head", gyro=None, matches=matches),
+        SimpleNamespace(camera="hips", gyro=None, matches=None),
+        SimpleNamespace(camera="torso", gyro=None, matches=matches),
     ]
     readouts["torso"] = Readout(0.0, 0.01, "none found", 0.0)
     assert list(turning_shutters(capture, selections, readouts)) == ["head"]

@@ -108,9 +108,9 @@ HASHED = {
     "sound": CAMERAS | {"clocks", "telemetry"},
     # The clocks stage compares the distances between the cameras with the reach of the body.
     "clocks": CAMERAS | {"clocks", "mapping", "telemetry"},
-    "keyframes": CAMERAS | {"keyframes"},
-    **dict.fromkeys(("map", "extend", "refine"), CAMERAS | {"mapping"}),
-    **dict.fromkeys(("registration", "rig", "recover"), CAMERAS | {"registration"}),
+    "keyframes": CAMERAS | {"keyframes", "telemetry"},
+    **dict.fromkeys(("map", "extend", "refine"), CAMERAS | {"mapping", "inertial", "telemetry"}),
+    **dict.fromkeys(("registration", "rig", "recover"), CAMERAS | {"registration", "inertial", "telemetry"}),
     # Merging reads marker boards from the images, and explains a failure by mirrored cameras.
     "merge": BODY | {"merging", "calibration", "mapping"},
     "fill": BODY | {"fill"},

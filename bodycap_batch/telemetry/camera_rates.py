@@ -1,0 +1,85 @@
+"""Relate the gyroscope of a camera to its pictures before poses exist, from matches of adjacent frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.model.frame_matches import FrameMatches
+from bodycap_batch.model.geometry import so3_log
+from bodycap_batch.model.gyro_rates import GyroRates
+from bodycap_batch.model.rotation_fit import MatchedRays, fit_to_rays
+from bodycap_batch.telemetry.comparison import judge_rotations
+from bodycap_batch.telemetry.gyro_fit import GyroFit
+from bodycap_batch.telemetry.match_fit import fit_to_matches
+from bodycap_batch.telemetry.picture_rotation import PictureRotation
+from bodycap_batch.telemetry.streams import CameraTelemetry, Stream
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelatedGyro:
+    """The gyroscope of a camera, related to its pictures.
+
+    Attributes:
+        rates: What it measured; None if it cannot be used.
+        reason: Sentence that says why it is used or not.
+    """
+
+    rates: GyroRates | None
+    reason: str
+
+
+def relate_gyro(camera: CaptureCamera, matches: FrameMatches, telemetry: CameraTelemetry) -> RelatedGyro:
+    """Estimate rotation, bias and delay of a gyroscope, and the readout time, from matches of pictures.
+
+    Args:
+        camera: The camera.
+        matches: Matches between adjacent frames.
+        telemetry: The telemetry of the camera.
+    """
+    gyro = telemetry.gyro
+    if gyro is None or len(gyro.times_s) < 2:
+        return RelatedGyro(rates=None, reason="the camera recorded no gyroscope")
+    if not camera.calibrated:
+        return RelatedGyro(rates=None, reason="without a calibration, pictures show no angles")
+    times_s = np.asarray(camera.times_ns * 1e-9, dtype=np.float64)
+    stated_s = camera.rolling_shutter_s if camera.rolling_shutter_known else None
+    rays = MatchedRays.of(matches, camera.camera, len(times_s))
+    path = fit_to_rays(rays, camera.times_ns, stated_s or 0.0, with_rates=False)
+    step, known = path.steps()
+    compared = judge_rotations(_rotations(step[known], times_s, known), gyro, telemetry, focal_known=True)
+    if compared.verdict != "agrees" or compared.fit is None:
+        return RelatedGyro(rates=None, reason=compared.reason)
+    if stated_s is None and camera.may_be_sideways:
+        return RelatedGyro(rates=_rates(gyro, compared.fit), reason=compared.reason)
+    better = fit_to_matches(rays, times_s, gyro, camera.camera, compared.fit, stated_s)
+    if better is None:
+        return RelatedGyro(rates=_rates(gyro, compared.fit), reason=compared.reason)
+    readout = (better.readout_s, better.readout_sigma_s)
+    return RelatedGyro(rates=_rates(gyro, better.fit, readout), reason=compared.reason)
+
+
+def _rotations(step: FloatArray, times_s: FloatArray, known: BoolArray) -> PictureRotation:
+    return PictureRotation(
+        start_s=times_s[:-1][known],
+        end_s=times_s[1:][known],
+        turn_rad=-so3_log(step).reshape(-1, 3),
+        spread_rad=np.zeros(len(step)),
+    )
+
+
+def _rates(
+    gyro: Stream, fit: GyroFit, readout: tuple[float, float] = (float("nan"), float("inf"))
+) -> GyroRates:
+    """Return the samples in the axes and on the clock of the camera."""
+    delay_s = fit.delay_s + fit.drift * (gyro.times_s - fit.middle_s)
+    return GyroRates(
+        times_s=gyro.times_s - delay_s,
+        rate_rad_s=(gyro.values - fit.bias_rad_s) @ fit.cam_from_sensor.T,
+        gaps_s=np.array(gyro.gaps_s).reshape(-1, 2) - fit.delay_s,
+        readout_s=readout[0],
+        readout_sigma_s=readout[1],
+    )
