@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from bodycap_batch.config.mounts import MOTION_PLACES, MOUNT_NAMES, mount_of
+from bodycap_batch.config.mounts import MOTION_PLACES, PLACES_TEXT, mount_of
 from bodycap_batch.core.errors import CaptureError, JobError
 
 VIDEO_SUFFIXES = frozenset(
@@ -316,10 +316,10 @@ def _refuse_unknown_mounts(named: list[tuple[str, Path]], is_known: Callable[[st
             f"the place of {', '.join(path.name for _, path in unknown)} on the body is unknown, because the "
             "name does not contain a place",
             path=folder,
-            hint="rename each video, or the folder of its chapters, after its place (for example torso.mp4); "
-            f"or give the place of each video, for example --camera {first}=torso; "
-            f"{_motion_hint(named)}or run `bodycap init {shlex.quote(folder.name)}`, which writes a job.yaml "
-            f"with a blank per place. The places are {', '.join(MOUNT_NAMES)}",
+            hint=f"give the place of each video, for example --camera {first}=torso; or rename each video, "
+            f"or the folder of its chapters, after its place (torso.mp4); {_motion_hint(named)}or run "
+            f"`bodycap init {shlex.quote(folder.name)}`, which writes a job.yaml with a blank per place. "
+            f"The places are {PLACES_TEXT}",
         )
 
 

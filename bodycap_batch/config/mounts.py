@@ -54,6 +54,13 @@ ROLES = tuple(dict.fromkeys(role for _, role in _MOUNT_BY_SPELLING.values()))
 MOUNT_NAMES = tuple(dict.fromkeys(mount for mount, _ in _MOUNT_BY_SPELLING.values()))
 """The preferred name of each place on the body where a camera can be mounted, for messages and help texts."""
 
+PLACES_TEXT = (
+    ", ".join(_MOUNT_NAME[role] for role in _CENTRAL_SPELLINGS)
+    + "; and with left_ or right_ before it "
+    + ", ".join(_MOUNT_NAME[part] for part in _SIDED_SPELLINGS)
+)
+"""All places in few words, for messages."""
+
 MOTION_PLACES = ("torso", "left_palm", "right_palm")
 """The places that a run can find from the motion of the cameras. It needs one camera at each. Evidence:
 docs/decisions/places.md."""

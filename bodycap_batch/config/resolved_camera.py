@@ -187,7 +187,7 @@ def _mount_origin(config: CameraConfig, places: Sequence[str]) -> Origin:
     if config.segment is not None or config.mount is not None:
         return Origin(source="job file", value=str(config.segment or config.mount))
     if config.role is None and places:
-        return Origin(source="motion", value=f"found by the run: one of {', '.join(places)}")
+        return Origin(source="motion", value=f"found by the run, one of {', '.join(places)}")
     if config.role is None:
         return Origin(source="default", value="unknown")
     return Origin(source="camera name", value=place_of_role(config.role))

@@ -75,6 +75,7 @@ def test_the_command_line_gives_the_places_of_other_names(tmp_path: Path) -> Non
         load_job(tmp_path)
     assert "--camera GOPRO2=torso" in str(caught.value.hint)
     assert "bodycap init" in str(caught.value.hint)
+    assert "with left_ or right_ before it palm, upper_arm" in str(caught.value.hint)
     job = load_job(tmp_path, Overrides(mounts={"gopro1": "torso", "gopro2.mp4": "left_hand"}))
     assert {camera.name: camera.role for camera in job.capture.cameras} == {
         "GOPRO2": "LeftHand",
