@@ -100,7 +100,7 @@ def fill_motion(
                 lay_legs(skeleton, leg, reclined, floor.height_m, world)
     context.check_cancelled()
     context.progress(3, _PROGRESS_STEPS, "head")
-    _fill_head(skeleton, solved, signals, world, filled)
+    _fill_head(skeleton, solved, (signals, reclined), world, filled)
     _follow_parents(skeleton, solved, filled, motion.local_rotation, world)
     local = _local_rotations(skeleton, world)
     local[:, solved & _parent_kept(skeleton, filled)] = motion.local_rotation[
@@ -230,16 +230,19 @@ def _fill_legs(
 def _fill_head(
     skeleton: SkeletonModel,
     solved: BoolArray,
-    signals: TrunkSignals,
+    trunk: tuple[TrunkSignals, FloatArray],
     world: FloatArray,
     filled: BoolArray,
 ) -> None:
-    """Write the poses of neck and head if neither is measured."""
+    """Write the poses of neck and head if neither is measured.
+
+    `trunk` holds the signals of the trunk, and (T,) 1 where the person lies.
+    """
     neck, head = skeleton.index_of_role("Neck"), skeleton.index_of_role("Head")
     if head is None or solved[head] or (neck is not None and solved[neck]):
         return
     start = skeleton.parents[head] if neck is None else skeleton.parents[neck]
-    rotations = head_rotations(signals, world[:, start, :3, :3])
+    rotations = head_rotations(trunk[0], world[:, start, :3, :3], trunk[1])
     for joint, rotation in ((neck, rotations[0]), (head, rotations[1])):
         if joint is not None:
             _rotate_with_parent(skeleton, joint, world)

@@ -27,8 +27,12 @@ class Pages:
         self.requested_urls: list[str] = []
 
     def open(self, address: str, **options: Any) -> Any:
-        """Open a new page; the options are those of Playwright's `new_context`."""
-        page = self.browser.new_context(**{"viewport": {"width": 1100, "height": 800}, **options}).new_page()
+        """Open a new page; the options are those of Playwright's `new_context`.
+
+        Without other options, the motion does not play by itself.
+        """
+        usual = {"viewport": {"width": 1100, "height": 800}, "reduced_motion": "reduce"}
+        page = self.browser.new_context(**{**usual, **options}).new_page()
         page.on("console", lambda line: self._record(line.type, line.text))
         page.on("pageerror", lambda error: self._record("error", str(error)))
         page.on("request", lambda request: self.requested_urls.append(request.url))

@@ -183,6 +183,7 @@ if (section) {
   if (data.body && view.look) {
     section.querySelector("[data-layer=follow]").checked = true;
     view.look("person");
+    if (!window.matchMedia("(prefers-reduced-motion: reduce)").matches) timeline.toggle();
   }
   if (location.protocol !== "file:" && new URLSearchParams(location.search).has("videos")) {
     fetch("videos.json").then((answer) => answer.json()).then((videos) => {

@@ -29,7 +29,7 @@ function styleColour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
-const PERSON_MARGIN = 1.35; // height of the view of a person, in heights of the person
+const PERSON_MARGIN = 1.25; // height of the view of a person, in heights of the person
 
 class Solid {
   constructor(holder, data, three) {
@@ -267,21 +267,37 @@ class Solid {
     this.dirty = true;
   }
 
+  // Return the greatest height of the person from the soles to the top of the head, so that a person who stands up
+  // stays in the view.
+  personHeight() {
+    const { centres, count } = this.data.body;
+    let height = 0;
+    for (let start = 0; start < centres.length; start += 3 * count) {
+      let [low, high] = [Infinity, -Infinity];
+      for (let i = start + 2; i < start + 3 * count; i += 3) {
+        low = Math.min(low, centres[i]);
+        high = Math.max(high, centres[i]);
+      }
+      height = Math.max(height, high - low);
+    }
+    return height;
+  }
+
   // Show the person alone, from the front, the left side, above, or obliquely.
   look(name) {
     const { centres, orbit } = this;
-    const { across, joints } = this.data.body;
-    let [forward, height] = [-0.5 * Math.PI, 0];
+    const { across, count } = this.data.body;
+    let forward = -0.5 * Math.PI;
     if (across) {
       const [left, right] = across.map((joint) => centres.subarray(3 * joint, 3 * joint + 3));
       forward = Math.atan2(right[0] - left[0], left[1] - right[1]);
     }
     let [low, high] = [Infinity, -Infinity];
-    for (let joint = 0; joint < joints.length; joint++) {
+    for (let joint = 0; joint < count; joint++) {
       low = Math.min(low, centres[3 * joint + 2]);
       high = Math.max(high, centres[3 * joint + 2]);
     }
-    height = Math.max(high - low, 0.5 * this.unit);
+    const height = Math.max(this.personHeight(), 0.5 * this.unit);
     const wide = Math.max(1, 0.8 / this.camera.aspect);
     const distance = (PERSON_MARGIN * 0.5 * height * wide) / Math.tan((0.5 * this.camera.fov * Math.PI) / 180);
     const turned = { front: 0, side: 0.5 * Math.PI, top: 0, person: 0.6 }[name];

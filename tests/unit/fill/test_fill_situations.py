@@ -16,7 +16,7 @@ from bodycap_batch.fill.leg_geometry import leg_geometry
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.completion import complete_skeleton
 from bodycap_batch.model.fill_data import FillResult
-from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp
 from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.model.skeleton_presets import load_skeleton
 
@@ -272,6 +272,24 @@ def test_a_person_who_lies_has_legs_along_the_trunk(lean: float) -> None:
     leg = poses[body.roles.index("LeftFoot")] - poses[body.roles.index("LeftUpLeg")]
     assert -up @ leg > 0.9 * np.linalg.norm(up) * np.linalg.norm(leg)
     assert poses[:, 2].min() > -0.02
+    rotations = result.motion.world_from_joint()[60, :, :3, :3]
+    chest, head = (rotations[body.roles.index(role)] for role in ("Spine1", "Head"))
+    np.testing.assert_allclose(head, chest, atol=0.02)
+
+
+def test_the_head_of_a_person_who_bows_is_raised_but_not_beyond_the_neck() -> None:
+    trunk = still(5.0)
+    trunk.lean_rad[:] = np.radians(85.0) * np.sin(np.pi * smooth((times(trunk) - 1.0) / 3.0)) ** 2
+    result = filled(trunk)
+    check_feet(result)
+    assert certain_steps(result) == 0
+    roles = result.motion.skeleton.roles
+    rotations = result.motion.world_from_joint()[..., :3, :3]
+    chest, head = (rotations[:, roles.index(role)] for role in ("Spine1", "Head"))
+    between = np.degrees(rotation_angle_rad(np.swapaxes(chest, -1, -2) @ head))
+    assert between.max() < 60.0
+    assert between.max() > 30.0
+    assert np.degrees(rotation_angle_rad(head[20:21])) < 5.0
 
 
 def test_a_person_who_kneels_down_takes_no_step() -> None:
