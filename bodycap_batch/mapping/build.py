@@ -63,7 +63,8 @@ def build_map(
 ) -> MapResult:
     """Reconstruct the room and the keyframe poses by incremental structure from motion.
 
-    If the map contradicts a given calibration, the map is built again with refined intrinsics.
+    If the map contradicts a given calibration, the map is built again with refined intrinsics. If the matches
+    of one camera contradict the matches of the other cameras, the map is built again without this camera.
 
     Args:
         capture: All cameras.
@@ -93,7 +94,29 @@ def build_map(
             raise unusable
         return again
 
-    return recalibrate_if_misfit(result, capture, build_again, refused)
+    try:
+        return recalibrate_if_misfit(result, capture, build_again, refused)
+    except EstimationError as error:
+        camera = result.diagnostics.details.get("repair", {}).get("contradicting_camera")
+        if error is not refused or camera is None:
+            raise
+        without, unusable = build_map_once(
+            capture,
+            [item for item in selections if item.camera != camera],
+            _without_initial_pair_of(camera, options),
+            replace(context, work_dir=context.work_dir / "without"),
+            skeletal_above,
+        )
+        if unusable is not None:
+            raise
+    return replace(without, log=replace(without.diagnostics, contradicting_cameras=(camera,)).to_log())
+
+
+def _without_initial_pair_of(camera: str, options: MapOptions) -> MapOptions:
+    """Return the options without the initial pair, if one of its frames belongs to a camera."""
+    if camera not in {name.rpartition(":")[0] for name in options.init_frames or ()}:
+        return options
+    return options.model_copy(update={"init_frames": None})
 
 
 def _require_motion(selections: Sequence[KeyframeSelection]) -> None:

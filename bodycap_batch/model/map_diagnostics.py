@@ -10,6 +10,7 @@ _UNDECIDED_GROUPS = "mirror_images"
 _FLIPPED_CAMERAS = "mirrored_cameras"
 _INITIAL_PAIR = "named_initial_pair"
 _EXCLUDED_FROM_PAIR = "left_out"
+_CONTRADICTING_CAMERAS = "contradicting_cameras"
 _MISFIT_FACTORS = "misfitting_lenses"
 _RECALIBRATED = "freed_lenses"
 _REFINED_INTRINSICS = "found_lenses"
@@ -42,6 +43,8 @@ class MapDiagnostics:
         undecided_groups: Pairs of camera groups whose images are mirrored relative to each other. All cameras
             of both groups are kept, because it is unknown which group is mirrored.
         flipped_cameras: Names of the cameras that were excluded because their images are mirrored.
+        contradicting_cameras: Names of the cameras that were excluded because their matches contradict the
+            matches of the other cameras.
         excluded_from_pair: Names of the excluded cameras that belong to the user's initial image pair. If
             there is such a camera, mapping did not use the user's pair.
         misfit_factors: By camera name, the focal length that fits the map, divided by the given focal length.
@@ -59,6 +62,7 @@ class MapDiagnostics:
 
     undecided_groups: tuple[CameraGroups, ...] = ()
     flipped_cameras: tuple[str, ...] = ()
+    contradicting_cameras: tuple[str, ...] = ()
     excluded_from_pair: tuple[str, ...] = ()
     misfit_factors: Mapping[str, float] | None = None
     recalibrated: tuple[str, ...] = ()
@@ -78,6 +82,7 @@ class MapDiagnostics:
         return MapDiagnostics(
             undecided_groups=tuple(_groups(groups) for groups in log.get(_UNDECIDED_GROUPS, ())),
             flipped_cameras=tuple(log.get(_FLIPPED_CAMERAS, ())),
+            contradicting_cameras=tuple(log.get(_CONTRADICTING_CAMERAS, ())),
             excluded_from_pair=tuple(log.get(_INITIAL_PAIR, {}).get(_EXCLUDED_FROM_PAIR, ())),
             misfit_factors=log.get(_MISFIT_FACTORS),
             recalibrated=tuple(log.get(_RECALIBRATED, ())),
@@ -102,6 +107,8 @@ class MapDiagnostics:
             log[_UNDECIDED_GROUPS] = [[list(one), list(other)] for one, other in self.undecided_groups]
         if self.flipped_cameras:
             log[_FLIPPED_CAMERAS] = list(self.flipped_cameras)
+        if self.contradicting_cameras:
+            log[_CONTRADICTING_CAMERAS] = list(self.contradicting_cameras)
         if self.excluded_from_pair:
             log[_INITIAL_PAIR] = {
                 "failed": "a mirrored camera was left out",

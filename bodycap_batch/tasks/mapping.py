@@ -119,6 +119,7 @@ def _save_map(result: MapResult, files: Path, *, late: Sequence[str] = ()) -> No
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.intrinsics.intrinsics_check import misfit_note
     from bodycap_batch.mapping.matching.flipped_cameras import flip_notes
+    from bodycap_batch.mapping.validation.epipolar_consistency import contradicting_camera_note
 
     workspace = files / "workspace"
     os.rename(result.workspace, workspace)
@@ -132,6 +133,7 @@ def _save_map(result: MapResult, files: Path, *, late: Sequence[str] = ()) -> No
         late=list(late),
         notes=[
             *flip_notes(diagnostics),
+            *map(contradicting_camera_note, diagnostics.contradicting_cameras),
             *(
                 misfit_note(camera, factor, freed=camera in diagnostics.recalibrated)
                 for camera, factor in sorted((diagnostics.misfit_factors or {}).items())

@@ -75,6 +75,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--number", type=int, default=6, metavar="N", help="number of captures (6)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the draws (1)")
     parser.add_argument("--out", type=Path, required=True, help="folder of the captures and results")
+    parser.add_argument("--width", type=int, default=640, metavar="PX", help="width of the pictures (640)")
     parser.add_argument("--only", nargs="*", default=[], metavar="FOLDER", help="captures with truth instead")
     parser.add_argument("--tag", default="job", help="name of the results, to compare versions (job)")
     parser.add_argument("--motions", type=Path, default=DATA / "motions", help="folder of BVH files")
@@ -92,7 +93,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _rendered(options: argparse.Namespace) -> Iterator[Path]:
     """Yield the folder of each drawn capture; captures that exist are not rendered again."""
-    for drawn in draw_captures(options.number, options.seed, options.motions):
+    for drawn in draw_captures(options.number, options.seed, options.motions, options.width):
         folder = options.out / drawn.name
         if not folder.exists():
             command = [*BODYCAP, "synth", str(folder), *command_line(drawn.settings)]

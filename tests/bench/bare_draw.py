@@ -53,13 +53,14 @@ class BareCapture:
         return SynthOptions.model_validate(self.settings)
 
 
-def draw_captures(number: int, seed: int, motions: Path) -> Iterator[BareCapture]:
+def draw_captures(number: int, seed: int, motions: Path, width_px: int = 640) -> Iterator[BareCapture]:
     """Yield captures of 4 to 6 seconds: recorded motions and built-in walks, one third with rolling shutters.
 
     Args:
         number: Number of captures.
         seed: Seed of all draws. A capture does not depend on the number of captures.
         motions: Folder of BVH files. Without files, all captures show built-in walks.
+        width_px: Width of the pictures, px; a multiple of 8. The lens is scaled with it.
     """
     lengths = {path: _length_s(path) for path in sorted(motions.glob("*.bvh"))}
     sources = [None, *(path for path, length in lengths.items() if length > 4.0)]
@@ -72,10 +73,20 @@ def draw_captures(number: int, seed: int, motions: Path) -> Iterator[BareCapture
             most = max(shares, key=lambda name: shares[name])
             rest = [share for name, share in shares.items() if name != most]
             if MIN_SHARE <= shares[most] <= MAX_SHARE and max(rest) < MIN_SHARE:
-                yield BareCapture(f"bare_{seed}_{index:02}", settings, most, shares)
+                yield BareCapture(f"bare_{seed}_{index:02}", _with_width(settings, width_px), most, shares)
                 break
         else:
             raise SystemExit(f"no capture of {source} shows enough of the plain surfaces")
+
+
+def _with_width(settings: dict[str, Any], width_px: int) -> dict[str, Any]:
+    """Return the options with another size of the pictures, 4:3."""
+    ratio = width_px / 640
+    out = {**settings, "width": width_px, "height": 3 * width_px // 4}
+    if "lens_params" in settings:
+        params = settings["lens_params"]
+        out["lens_params"] = (*(ratio * value for value in params[:4]), *params[4:])
+    return out
 
 
 def bare_shares(options: SynthOptions) -> dict[str, float]:

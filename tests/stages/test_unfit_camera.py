@@ -42,6 +42,39 @@ def test_the_camera_that_does_not_fit_is_left_out(wrong: str, tmp_path: Path) ->
     assert result.report.scale.metres_per_map_unit == pytest.approx(1.0, abs=0.1)
 
 
+def _on_a_table(path: Trajectory) -> Trajectory:
+    poses = np.array(path.gauge_from_cam)
+    noise = np.random.default_rng(3).normal(scale=0.003, size=(len(poses), 3))
+    poses[:] = poses[0]
+    poses[:, :3, 3] += np.array([1.0, 0.5, -0.2]) + noise
+    return replace(path, gauge_from_cam=poses)
+
+
+def _second_half_of(path: Trajectory, other: Trajectory) -> Trajectory:
+    poses, half = np.array(path.gauge_from_cam), len(path.times_ns) // 2
+    poses[half:] = other.gauge_from_cam[half:]
+    return replace(path, gauge_from_cam=poses)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["on a table", "of another time", "half of another time"])
+def test_a_camera_of_another_place_or_time_does_not_end_the_job(fault: str, tmp_path: Path) -> None:
+    walk = make_walk(np.random.default_rng(1), off_deg=6.0, off_m=0.015)
+    rng = np.random.default_rng(7)
+    paths = {name: record(walk, name, rng, seconds=5.0) for name in ROLES}
+    late = record(walk, "left_palm", rng, seconds=5.0, shift_s=4.0)
+    paths["left_palm"] = {
+        "on a table": _on_a_table(paths["left_palm"]),
+        "of another time": late,
+        "half of another time": _second_half_of(paths["left_palm"], late),
+    }[fault]
+    inputs = make_inputs(walk, list(paths.values()))
+    result = merge_trajectories(inputs, MergeOptions(), StageContext(work_dir=tmp_path))
+    assert set(result.unused_cameras) == {"left_palm"}
+    scale = result.report.scale
+    assert abs(scale.metres_per_map_unit - 1.0) < 3.0 * scale.relative_sigma
+
+
 def test_two_cameras_that_do_not_fit_are_refused_as_before(tmp_path: Path) -> None:
     paths, walk = _walk_with({"left_palm": 30.0, "right_palm": 0.01})
     with pytest.raises(ImplausibleBody, match="not possible for a person") as caught:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -127,6 +127,36 @@ def inconsistent_match_ratio(pairs: Sequence[PairConsistency]) -> float:
     """Return the fraction of all matches of the given pairs that belong to inconsistent pairs."""
     wrong = sum(pair.matches for pair in pairs if pair.is_inconsistent)
     return wrong / max(1, sum(pair.matches for pair in pairs))
+
+
+def find_contradicting_camera(pairs: Sequence[PairConsistency], cameras: Mapping[int, str]) -> str | None:
+    """Return the one camera without which the matches of an inconsistent map are consistent.
+
+    Args:
+        pairs: The verified pairs of the map.
+        cameras: Name of the camera of each image, by image id.
+
+    Returns:
+        The name of the camera; None if the map is consistent, or if not exactly one camera explains the
+        inconsistent pairs.
+    """
+    if inconsistent_match_ratio(pairs) <= MAX_INCONSISTENT_RATIO:
+        return None
+    explained = []
+    for name in sorted(set(cameras.values())):
+        rest = [pair for pair in pairs if name not in (cameras[pair.first], cameras[pair.second])]
+        if rest and inconsistent_match_ratio(rest) <= MAX_INCONSISTENT_RATIO:
+            explained.append(name)
+    return explained[0] if len(explained) == 1 else None
+
+
+def contradicting_camera_note(camera: str) -> str:
+    """Return the note for the user on a camera that was left out."""
+    return (
+        f"camera {camera} is left out: its matches contradict the map, and without this camera the map is "
+        "consistent; check that its video is of the same recording, that its zoom did not change, and that "
+        "its calibration is right"
+    )
 
 
 def check_consistency(ratio: float) -> EstimationError | None:

@@ -18,6 +18,7 @@ from bodycap_batch.mapping.reconstruction.model_files import registered_ids
 from bodycap_batch.mapping.validation.epipolar_consistency import (
     PairConsistency,
     evaluate_pairs,
+    find_contradicting_camera,
     find_misregistered_images,
     inconsistent_match_ratio,
 )
@@ -106,10 +107,15 @@ def repair_model(
             break
         model, wrong, pairs = other, still_wrong, other_pairs
     ratio = round(inconsistent_match_ratio(pairs), 4)
+    cameras = {
+        int(number): ImageRef.parse(model.image(number).name).camera for number in model.reg_image_ids()
+    }
+    camera = find_contradicting_camera(pairs, cameras)
     model, removed = _remove_images(model, _without_confirmed(context, model, pairs, wrong))
     if removed:
         adjust_unless_large(model, context)
-    return model, {"rounds": log, "cut": removed, "contradicted_share": ratio}
+    entries = {"rounds": log, "cut": removed, "contradicted_share": ratio}
+    return model, {**entries, "contradicting_camera": camera} if camera else entries
 
 
 def remove_misregistered(model: pycolmap.Reconstruction, context: MappingContext) -> tuple[Any, list[str]]:

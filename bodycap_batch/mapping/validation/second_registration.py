@@ -34,7 +34,7 @@ _MIN_OBSERVATIONS = 2
 _MAX_POINT_SIGMA = 0.05
 """Maximum standard deviation of a point, for lines of sight with an error of one pixel, as a fraction of its
 distance from the keyframe. Evidence: none."""
-_NEIGHBOURS = 2
+_NEIGHBOURS = 4
 """Number of doubtful keyframes before and after a keyframe that decide with it. Evidence:
 docs/decisions/mapping.md."""
 _MIN_CONFIRMED_RATIO = 0.5
