@@ -11,11 +11,13 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.inputs import calibrated_camera_ids, make_mapping_context
 from bodycap_batch.mapping.intrinsics.readout_time import (
+    Readout,
     RollingShutterModel,
     estimate_readouts,
     map_with_readouts,
 )
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
+from bodycap_batch.mapping.intrinsics.shutters import read_shutters
 from bodycap_batch.mapping.matching.database import read_camera_ids, read_detected_px
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
@@ -68,6 +70,12 @@ def refine_map(
     mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, skeletal_above)
     settings = mapping.mapper_options()
     cameras = {camera.name: camera for camera in capture.cameras}
+    from_matches = {
+        name: readout
+        for name, entry in previous.log.get("readouts_from_matches", {}).items()
+        if (readout := Readout(**entry)).seconds and readout.source != "stated"
+    }
+    rotations = {name: shutter.path for name, shutter in read_shutters(workspace, cameras).items()}
     models, all_readouts = [], []
     for number, scene_map in enumerate(previous.maps):
         context.check_cancelled()
@@ -79,8 +87,10 @@ def refine_map(
             for image_id in model.reg_image_ids()
             if (px := read_detected_px(workspace, image_id)) is not None
         }
-        rolling = RollingShutterModel(model, paths, cameras, detected)
-        rolling, readouts = estimate_readouts(rolling, cameras, settings, calibrated_ids, scene_map)
+        rolling = RollingShutterModel(model, paths, cameras, detected, rotations)
+        rolling, readouts = estimate_readouts(
+            rolling, cameras, settings, calibrated_ids, scene_map, from_matches
+        )
         readout_s = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         if readout_s:
             model = rolling.with_exact_rates(readout_s, scene_map.readout_s.keys()).corrected(readout_s)
