@@ -13,6 +13,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.inertial.camera_rotation import related_to_poses
 from bodycap_batch.mapping.inputs import calibrated_camera_ids, make_mapping_context
 from bodycap_batch.mapping.intrinsics.readout_time import (
+    Readout,
     RollingShutterModel,
     estimate_readouts,
     map_with_readouts,
@@ -72,6 +73,11 @@ def refine_map(
     mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, skeletal_above)
     settings = mapping.mapper_options()
     cameras = {camera.name: camera for camera in capture.cameras}
+    from_matches = {
+        name: readout
+        for name, entry in previous.log.get("readouts_from_matches", {}).items()
+        if (readout := Readout(**entry)).seconds and readout.source != "stated"
+    }
     models, all_readouts = [], []
     for number, scene_map in enumerate(previous.maps):
         context.check_cancelled()
@@ -84,7 +90,9 @@ def refine_map(
             if (px := read_detected_px(workspace, image_id)) is not None
         }
         rolling = RollingShutterModel(model, paths, cameras, detected, _rotations(workspace, paths))
-        rolling, readouts = estimate_readouts(rolling, cameras, settings, calibrated_ids, scene_map)
+        rolling, readouts = estimate_readouts(
+            rolling, cameras, settings, calibrated_ids, scene_map, from_matches
+        )
         readout_s = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         if readout_s:
             model = rolling.with_exact_rates(readout_s, scene_map.readout_s.keys()).corrected(readout_s)
@@ -110,11 +118,15 @@ def refine_map(
 
 
 def _rotations(workspace: Path, paths: Mapping[str, Trajectory]) -> dict[str, RotationPath]:
-    """Return the rotation of each camera whose gyroscope corrected its keyframes, by camera name."""
+    """Return the rotation of each camera whose keyframes were corrected, by camera name.
+
+    It comes from the camera's gyroscope if that corrected the keyframes, else from matches between frames.
+    """
     out = {}
     for name, shutter in read_shutters(workspace, paths).items():
-        if shutter.path.gyro is not None:
-            gyro = related_to_poses(shutter.path.gyro, paths[name])
-            if gyro is not None:
-                out[name] = RotationPath.from_gyro(paths[name].times_ns, gyro)
+        gyro = shutter.path.gyro
+        if gyro is None:
+            out[name] = shutter.path
+        elif (related := related_to_poses(gyro, paths[name])) is not None:
+            out[name] = RotationPath.from_gyro(paths[name].times_ns, related)
     return out

@@ -38,13 +38,19 @@ _RATE_BATCH_FRAMES = 64
 _NOISE_FROM_QUARTILE = 1.57
 """Ratio of the root mean square length of a normally distributed vector in three dimensions to the first
 quartile of its length: sqrt(3 / 1.213). The first quartile of the squared length is 1.213 variances."""
-_EXTRAPOLATION_GAIN = 0.75
-"""Part of the change of a velocity that is continued beyond the last interval, for a frame at the end of a
-run of poses, in intervals. Evidence: docs/decisions/registration.md."""
-_END_RATE_SIGMA = 1.0
-"""Expected error of an extrapolated angular velocity, rad/s, added to the ratio. Evidence: none."""
-_END_RATE_SIGMA_RATIO = 0.3
-"""Expected error of an extrapolated angular velocity, as a ratio of this velocity. Evidence: none."""
+_END_RATE_SIGMA = 0.2
+"""Expected error of the angular velocity of a frame at the end of a run of poses, rad/s. Evidence:
+docs/decisions/registration.md."""
+_END_RATE_SIGMA_RATIO = 0.4
+"""The same error as a ratio of this velocity. Both are added. Evidence: docs/decisions/registration.md."""
+_MIN_END_POINTS = 60
+"""Minimum number of observations of a frame at the end of a run of poses for the larger expected error.
+Evidence: none."""
+_SPEED_PERCENTILE = 90.0
+"""Percentile of the speeds of a camera from which its largest plausible speed is computed. Evidence: none."""
+_MAX_SPEED_RATIO = 2.0
+"""Ratio of the largest plausible speed of a camera to the percentile of its speeds. Faster steps are errors
+of poses. Evidence: docs/decisions/registration.md."""
 _EXTRAPOLATION_RATIO = 0.5
 """Expected error of an extrapolated angular velocity, as a ratio of the largest velocity around the frame.
 Evidence: docs/decisions/registration.md."""
@@ -156,11 +162,11 @@ class RotationPath:
         # Without a neighbour with a pose on each side, poses do not tell the rate better than the matches.
         beside = np.concatenate([[False], both]) & np.concatenate([both, [False]]) & ~self.measured()
         rate = np.where(beside[:, None], posed.rate, self._rate_or(posed.rate))
-        # At the end of the matches, too, the rate is extrapolated from the other poses. The pose of the frame
-        # itself depends on its rate: together they drift away.
+        # Without matches, the rate at an end is that between its neighbours. The pose of the frame itself
+        # depends on its rate: together they drift away.
         at_end = np.flatnonzero(has_pose & ~beside & ~self.measured() & self.is_alone())
         mean = so3_log(np.swapaxes(step, 1, 2)) / (np.diff(self.times_ns) * 1e-9)[:, None]
-        outer = _extrapolated(np.where(both[:, None], mean, np.nan), at_end)
+        outer = _velocity_at_ends(np.where(both[:, None], mean, np.nan), at_end)
         rate[at_end] = np.where(np.isfinite(outer), outer, rate[at_end])
         return replace(posed, rate=rate, gyro=self.gyro)
 
@@ -299,8 +305,11 @@ def _end_rate(times_ns: IntArray, rotation: FloatArray, frames: IntArray) -> Flo
     return np.asarray(step[0] + share * (step[0] - step[1]))
 
 
-def _extrapolated(slope: FloatArray, frame: IntArray) -> FloatArray:
+def _velocity_at_ends(slope: FloatArray, frame: IntArray) -> FloatArray:
     """Return velocities (M,3) at the ends of runs of poses, without the poses of these frames.
+
+    It is the mean velocity between both neighbours on the side where there are poses. To continue its change
+    is hardly more exact, but doubles the noise.
 
     Args:
         slope: (N-1,3) mean velocity between each frame and the next frame; NaN if it is unknown.
@@ -309,14 +318,20 @@ def _extrapolated(slope: FloatArray, frame: IntArray) -> FloatArray:
     Returns:
         The velocities; NaN for a frame that has no two neighbours with poses on one side.
     """
-    nothing = np.full((3, 3), np.nan)
+    nothing = np.full((2, 3), np.nan)
     padded = np.concatenate([nothing, slope, nothing])
-    out = np.full((len(frame), 3), np.nan)
-    for own, inner, outer in ((3, 4, 5), (2, 1, 0)):
-        near, far = padded[frame + inner], padded[frame + outer]
-        value = np.where(np.isfinite(far), near + _EXTRAPOLATION_GAIN * (near - far), near)
-        out = np.where(np.isfinite(padded[frame + own]), value, out)
-    return out
+    first = np.where(np.isfinite(padded[frame + 2]), padded[frame + 3], np.nan)
+    return np.where(np.isfinite(padded[frame + 1]), padded[frame], first)
+
+
+def _plausible(slope: FloatArray) -> FloatArray:
+    """Return velocities (N,3), shortened to the largest plausible speed."""
+    speed = np.linalg.norm(slope, axis=1)
+    known = np.isfinite(speed)
+    if not known.any():
+        return slope
+    limit = _MAX_SPEED_RATIO * float(np.percentile(speed[known], _SPEED_PERCENTILE))
+    return np.asarray(slope * np.where(speed > limit, limit / np.maximum(speed, 1e-300), 1.0)[:, None])
 
 
 def _mean_rates(times_ns: IntArray, rotation: FloatArray, segment: IntArray) -> FloatArray:
@@ -475,6 +490,7 @@ class PosePath:
             interval_s = np.diff(times_ns) * 1e-9
             slope = np.diff(map_from_cam[:, :3, 3], axis=0) / interval_s[:, None]
             slope[~near_in_time(times_ns)] = np.nan
+            slope = _plausible(slope)
             nothing = np.full((1, 3), np.nan)
             before, after = np.concatenate([nothing, slope]), np.concatenate([slope, nothing])
             span = np.concatenate([interval_s[:1], 0.5 * (interval_s[1:] + interval_s[:-1]), interval_s[-1:]])
@@ -495,7 +511,7 @@ class PosePath:
             acceleration[~np.isfinite(after) & ~np.isfinite(before)] = 0.0
             # The position of a frame at an end depends on its own velocity. It is left out there.
             ends = np.flatnonzero(~inner[:, 0])
-            outer = _extrapolated(slope, ends)
+            outer = _velocity_at_ends(slope, ends)
             velocity[ends] = np.where(np.isfinite(outer), outer, velocity[ends])
         return PosePath(
             map_from_cam, rotation.with_poses(map_from_cam, shrunk=shrunk), velocity, acceleration
@@ -627,6 +643,7 @@ def _fit_frames(
     if not enough.any():
         return out
     sigma = _RATE_SIGMA
+    loose = np.where(sizes >= _MIN_END_POINTS, end_sigma[frames], 0.0)
     solution: FloatArray = np.zeros((len(frames), 9))
     position = np.repeat(np.arange(len(frames)), sizes)
     for _ in range(_RATE_FITS):
@@ -644,7 +661,7 @@ def _fit_frames(
                 np.einsum("mia,mi->ma", weighted, residual[first:stop]), inner, axis=0
             )
         prior = np.full((len(frames), 9), 1e-6 / noise**2)
-        prior[:, 6:] = 1.0 / np.maximum(sigma, end_sigma[frames])[:, None] ** 2
+        prior[:, 6:] = 1.0 / np.maximum(sigma, loose)[:, None] ** 2
         normal[:, np.arange(9), np.arange(9)] += prior
         solution = np.asarray(-np.linalg.solve(normal, right[:, :, None])[:, :, 0], dtype=np.float64)
         size = np.linalg.norm(solution[enough, 6:], axis=1)

@@ -13,7 +13,7 @@ import numpy as np
 
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.mapping.intrinsics.readout_time import Readout
+from bodycap_batch.mapping.intrinsics.readout_time import Readout, groups_of_equal_cameras
 from bodycap_batch.model.frame_matches import FrameMatches
 from bodycap_batch.model.optical_flow import pixel_scale
 from bodycap_batch.model.rotation_fit import MatchedRays, fit_to_rays
@@ -176,7 +176,7 @@ def estimate_from_matches(capture: Capture, selections: Sequence[KeyframeSelecti
         if found is not None:
             sideways[camera.name], profiles[camera.name] = found
     out: dict[str, Readout] = {}
-    for names in _groups_of_equal_cameras(capture, list(profiles)):
+    for names in groups_of_equal_cameras(capture.camera(name) for name in profiles):
         single = {name: _estimate([profiles[name]]) for name in names}
         joint = _estimate([profiles[name] for name in names]) if len(names) > 1 else None
         if joint is not None and not _agree(list(single.values()), joint):
@@ -197,17 +197,6 @@ def _best_direction(selection: KeyframeSelection, camera: CaptureCamera) -> tupl
     if len(found) < 2:
         return found[0] if found else None
     return min(found, key=lambda item: _estimate([item[1]]).cost)
-
-
-def _groups_of_equal_cameras(capture: Capture, names: Sequence[str]) -> list[list[str]]:
-    """Group cameras that may be of one model: equal intrinsics, image size and frame rate."""
-    groups: dict[object, list[str]] = {}
-    for name in names:
-        camera = capture.camera(name)
-        lens = camera.camera
-        key = (lens.model, lens.width_px, lens.height_px, round(camera.nominal_fps, 2), lens.params.tobytes())
-        groups.setdefault(key, []).append(name)
-    return list(groups.values())
 
 
 def _agree(single: Sequence[_Estimate], joint: _Estimate) -> bool:

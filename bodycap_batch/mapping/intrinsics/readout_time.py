@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust, sub_model
 from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
 from bodycap_batch.mapping.reconstruction.reprojection import image_residuals_px
-from bodycap_batch.model.rotation_path import PosePath, RotationPath
+from bodycap_batch.model.rotation_path import PosePath, RotationPath, near_in_time
 from bodycap_batch.model.scene import Map, Trajectory
 
 if TYPE_CHECKING:
@@ -95,38 +95,74 @@ class Readout:
         Source: Birge, "The calculation of errors by the method of least squares", 1932, for the standard
             deviation of a mean of values that scatter more than their standard deviations.
         """
-        value = np.array([item.best_s for item in others])
-        sigma = np.array([item.sigma_s for item in others])
-        if len(others) == 0 or not np.isfinite(sigma).all() or not sigma.all():
+        mean = _weighted_mean(others, _MAX_POOLED_SIGMAS)
+        if mean is None or list(others) == [self]:
             return self
-        weight = 1.0 / sigma**2
-        mean = float((weight * value).sum() / weight.sum())
-        deviation = (value - mean) / sigma
-        if np.abs(deviation).max() > _MAX_POOLED_SIGMAS:
-            return self
-        scatter = max(1.0, float((deviation**2).sum()) / max(1, len(others) - 1))
-        sigma_s = float(np.hypot(np.sqrt(scatter / weight.sum()), _MODEL_SIGMA_RATIO * mean))
-        return replace(self, best_s=mean, sigma_s=sigma_s)
+        best_s, sigma_s = mean
+        sigma_s = float(np.hypot(sigma_s, _MODEL_SIGMA_RATIO * best_s))
+        return replace(self, seconds=best_s, best_s=best_s, sigma_s=sigma_s, source="estimated")
 
-    def with_other_estimate(self, other_s: float) -> Readout:
-        """Return the readout time with a standard deviation that covers the difference to another estimate.
+    def with_other_estimate(self, other: Readout) -> Readout:
+        """Return the mean of the readout time from the residuals of a map and that from matches.
 
         The residuals of a map hold only the points that agree with the map. If they contradict the matches
         between adjacent frames, the matches are right.
 
         Args:
-            other_s: Readout time (seconds) from matches between adjacent frames.
+            other: The readout time from matches between adjacent frames.
         """
-        difference_s = abs(self.best_s - other_s)
-        if difference_s > _MAX_DIFFERENCE_S:
-            return replace(self, seconds=other_s, sigma_s=difference_s, source="estimated", best_s=other_s)
-        sigma_s = float(np.hypot(self.sigma_s, 0.5 * difference_s))
-        return replace(self, seconds=self.best_s, sigma_s=sigma_s, source="estimated")
+        mean = _weighted_mean([self, other], np.inf)
+        difference_s = abs(self.best_s - other.best_s)
+        if difference_s > _MAX_DIFFERENCE_S or mean is None:
+            sigma_s = max(difference_s, other.sigma_s)
+            return replace(
+                self, seconds=other.best_s, sigma_s=sigma_s, source="estimated", best_s=other.best_s
+            )
+        best_s = mean[0]
+        # The angular velocities of both estimates are those of splines, with the same systematic error.
+        sigma_s = float(np.hypot(mean[1], _MODEL_SIGMA_RATIO * best_s))
+        return replace(self, seconds=best_s, best_s=best_s, sigma_s=sigma_s, source="estimated")
 
     @property
     def significance(self) -> float:
         """Ratio of the readout time to its standard deviation; 0 if no readout time was found."""
         return abs(self.seconds) / self.sigma_s if self.sigma_s else 0.0
+
+
+def _weighted_mean(readouts: Sequence[Readout], max_sigmas: float) -> tuple[float, float] | None:
+    """Return the weighted mean of readout times and its standard deviation, seconds.
+
+    Args:
+        readouts: The readout times.
+        max_sigmas: Maximum deviation of a readout time from the mean, in its standard deviations.
+
+    Returns:
+        Mean and standard deviation; None if a standard deviation is unknown, or if a value deviates more.
+    """
+    value = np.array([item.best_s for item in readouts])
+    sigma = np.array([item.sigma_s for item in readouts])
+    if len(readouts) == 0 or not np.isfinite(sigma).all() or not sigma.all():
+        return None
+    weight = 1.0 / sigma**2
+    mean = float((weight * value).sum() / weight.sum())
+    deviation = (value - mean) / sigma
+    if np.abs(deviation).max() > max_sigmas:
+        return None
+    scatter = max(1.0, float((deviation**2).sum()) / max(1, len(readouts) - 1))
+    return mean, float(np.sqrt(scatter / weight.sum()))
+
+
+def groups_of_equal_cameras(cameras: Iterable[CaptureCamera]) -> list[list[str]]:
+    """Return groups of names of cameras with equal intrinsics, image size and frame rate.
+
+    These cameras may be of one model.
+    """
+    groups: dict[object, list[str]] = {}
+    for camera in cameras:
+        lens = camera.camera
+        key = (lens.model, lens.width_px, lens.height_px, round(camera.nominal_fps, 2), lens.params.tobytes())
+        groups.setdefault(key, []).append(camera.name)
+    return list(groups.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +198,9 @@ class RollingShutterModel:
         cameras: The capture's cameras by name.
         detected_px: Detected positions (N,2) of all keypoints of each image whose keypoints are at other
             positions in the model, by image id.
-        rotations: Rotations that gyroscopes measured, by camera name.
+        rotations: Rotations of the cameras by camera name, from gyroscopes or from matches between adjacent
+            frames. They are used for the exact velocities of frames beside a frame without a pose. For an
+            estimate of the readout time, only those from gyroscopes are used: the others are too smooth.
     """
 
     def __init__(
@@ -176,8 +214,9 @@ class RollingShutterModel:
         self._model = model
         self._detected_px = detected_px or {}
         self._rotations = rotations or {}
+        measured = {name: path for name, path in self._rotations.items() if path.gyro is not None}
         self._paths = {
-            name: PosePath.create(path.gauge_from_cam, path.times_ns, self._rotations.get(name), shrunk=False)
+            name: PosePath.create(path.gauge_from_cam, path.times_ns, measured.get(name), shrunk=False)
             for name, path in trajectories.items()
         }
         self._trajectories = trajectories
@@ -189,6 +228,7 @@ class RollingShutterModel:
             for image_id in model.reg_image_ids()
         }
         self._keypoints = [self._keypoints_of(image_id) for image_id in sorted(model.reg_image_ids())]
+        self._inner = {name: inner_poses(path) for name, path in trajectories.items()}
 
     def corrected(self, readout_s: Mapping[str, float]) -> pycolmap.Reconstruction:
         """Return a copy of the model in which all keypoints are at their corrected positions.
@@ -260,7 +300,7 @@ class RollingShutterModel:
             keyframes.sort(key=lambda item: ImageRef.parse(self._model.image(item.image_id).name).frame)
             speed = [
                 float(np.median(np.abs(self._px_at_mid_row(item, _TRIAL_STEP_S) - item.px)))
-                if len(item.px)
+                if self._tells_readout(item)
                 else 0.0
                 for item in keyframes
             ]
@@ -270,9 +310,10 @@ class RollingShutterModel:
             kept |= {item.image_id for item in keyframes[start : start + size]}
         part = sub_model(self._model, kept)
         sideways = [name for name, camera in self._intrinsics.items() if camera.sideways]
-        return RollingShutterModel(
+        smaller = RollingShutterModel(
             part, self._trajectories, self._cameras, self._detected_px, self._rotations
-        ).with_sideways(sideways)
+        )
+        return smaller.with_sideways(sideways)
 
     def with_sideways(self, sideways: Collection[str]) -> RollingShutterModel:
         """Return a copy with changed row directions.
@@ -292,6 +333,7 @@ class RollingShutterModel:
         settings: pycolmap.IncrementalPipelineOptions,
         calibrated_ids: Sequence[int],
         start_s: Mapping[str, float] | None = None,
+        from_matches: Mapping[str, Readout] | None = None,
     ) -> dict[str, Readout]:
         """Estimate the readout time of each camera, from adjustments of the map with a few trial values.
 
@@ -303,6 +345,7 @@ class RollingShutterModel:
             calibrated_ids: Database ids of the calibrated cameras.
             start_s: Readout times (seconds) for which the poses were estimated, by camera name. The search
                 starts from them; from 0 for any other camera.
+            from_matches: Readout times from matches between adjacent frames, by camera name.
 
         Returns:
             Readout time of each camera with a trajectory, by camera name. Readout times that are given in the
@@ -345,15 +388,20 @@ class RollingShutterModel:
             if max(map(abs, step_s.values())) < _CONVERGED_S:
                 break
             before = after
-        start_s = {name: value for name, value in (start_s or {}).items() if name in unknown}
-        # Equal cameras start from the same value, which was estimated from the matches of all of them.
-        equal: dict[float, list[Readout]] = {value: [] for value in start_s.values()}
-        for name, value in start_s.items():
-            if abs(out[name].best_s - value) <= _MAX_DIFFERENCE_S:
-                equal[value].append(out[name])
-        for name, value in start_s.items():
-            out[name] = out[name].pooled(equal[value]).with_other_estimate(value)
-        return out
+        others = from_matches or {}
+
+        def contradicted(name: str) -> bool:
+            return name in others and abs(out[name].best_s - others[name].best_s) > _MAX_DIFFERENCE_S
+
+        found = {name for name in unknown if out[name].seconds or name in others}
+        pooled = dict(out)
+        for names in groups_of_equal_cameras(self._cameras[name] for name in unknown):
+            equal = [name for name in names if name in found and not contradicted(name)]
+            for name in found.intersection(names):
+                pooled[name] = out[name].pooled([out[other] for other in equal])
+        return pooled | {
+            name: pooled[name].with_other_estimate(other) for name, other in others.items() if name in unknown
+        }
 
     def undetermined(self, reason: str) -> dict[str, Readout]:
         """Return readout times without an estimation, by camera name.
@@ -389,6 +437,11 @@ class RollingShutterModel:
             self._points(image, feature),
         )
 
+    def _tells_readout(self, item: _Keypoints) -> bool:
+        """Return True if the velocity of a keyframe is known from poses on both sides."""
+        inner = self._inner.get(item.camera)
+        return len(item.px) > 0 and inner is not None and bool(inner[item.frame[0]])
+
     def _points(self, image: Any, feature: IntArray) -> FloatArray:
         """Return the positions (N,3), in map units, of the points that some features of an image observe."""
         points = image.points2D
@@ -399,13 +452,21 @@ class RollingShutterModel:
     def _residuals(self, model: pycolmap.Reconstruction) -> dict[str, FloatArray]:
         """Return the residuals (observed minus projected position, px) of each camera, by camera name.
 
-        The order of the residuals is the same for every copy of the model.
+        The order of the residuals is the same for every copy of the model. Keyframes without poses on both
+        sides are left out: their velocities are extrapolated.
         """
         out: dict[str, list[FloatArray]] = {name: [] for name in self._intrinsics}
-        for item in self._keypoints:
+        for item in filter(self._tells_readout, self._keypoints):
             residuals = image_residuals_px(model, model.image(item.image_id), item.feature)
             out[item.camera].append(residuals.ravel())
         return {name: np.concatenate([np.zeros(0), *parts]) for name, parts in out.items()}
+
+
+def inner_poses(trajectory: Trajectory) -> BoolArray:
+    """Return a mask (N,): True if a frame and both neighbouring frames have poses and are near in time."""
+    both = trajectory.localised[1:] & trajectory.localised[:-1] & near_in_time(trajectory.times_ns)
+    none = np.zeros(1, dtype=bool)
+    return np.asarray(np.concatenate([none, both]) & np.concatenate([both, none]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -478,6 +539,7 @@ def estimate_readouts(
     settings: pycolmap.IncrementalPipelineOptions,
     calibrated_ids: Sequence[int],
     corrected: Map | None = None,
+    from_matches: Mapping[str, Readout] | None = None,
 ) -> tuple[RollingShutterModel, dict[str, Readout]]:
     """Estimate the readout time of each camera, and whether the sensor's rows are columns of the image.
 
@@ -491,6 +553,7 @@ def estimate_readouts(
         calibrated_ids: Database ids of the calibrated cameras.
         corrected: The map whose readout times and row directions were estimated before; None if there is
             none. The search starts from them.
+        from_matches: Readout times from matches between adjacent frames, by camera name.
 
     Returns:
         The model with the row directions that fit best; the readout times by camera name.
@@ -502,7 +565,7 @@ def estimate_readouts(
     rolling = rolling.with_sideways(stated)
     try:
         part = rolling.most_dynamic_subset()
-        readouts = part.estimate(settings, calibrated_ids, start_s)
+        readouts = part.estimate(settings, calibrated_ids, start_s, from_matches)
         turned = {
             name
             for name in readouts

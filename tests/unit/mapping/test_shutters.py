@@ -240,8 +240,3 @@ def test_a_camera_whose_residuals_tell_nothing_takes_the_readout_of_equal_camera
     lost = _estimate(0.029, 0.001).pooled([_estimate(0.0171, 0.0003), _estimate(0.0167, 0.0003)])
     assert lost.best_s == pytest.approx(0.0169, abs=1e-5)
     assert lost.sigma_s < 0.001
-
-
-def test_a_readout_that_contradicts_the_matches_has_the_difference_as_sigma() -> None:
-    found = _estimate(0.024, 0.0001).with_other_estimate(0.022)
-    assert (found.seconds, found.sigma_s) == (0.024, pytest.approx(0.001, abs=1e-5))

@@ -251,8 +251,9 @@ def test_velocities_at_the_ends_of_runs_do_not_depend_on_the_poses_there(lost: l
     later, earlier = (poses_at(np.arange(FRAMES) * FRAME_S + delay, 0.4) for delay in (1e-5, -1e-5))
     rate = so3_log(np.swapaxes(earlier[:, :3, :3], 1, 2) @ later[:, :3, :3]) / 2e-5
     velocity = (later - earlier)[:, :3, 3] / 2e-5
-    assert np.linalg.norm(right.velocity - velocity, axis=1)[ends].max() < 0.8
-    assert np.linalg.norm(right.rotation.rate - rate, axis=1)[ends].max() < 2.0
+    # Its velocity changes by up to 0.8 m/s in a frame interval.
+    assert np.linalg.norm(right.velocity - velocity, axis=1)[ends].max() < 1.3
+    assert np.linalg.norm(right.rotation.rate - rate, axis=1)[ends].max() < 3.0
 
 
 def test_observations_correct_an_extrapolated_rate() -> None:
