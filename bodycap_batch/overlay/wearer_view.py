@@ -39,11 +39,11 @@ that rotates the bone. Origin: circumferences of an adult (upper arm 0.30, forea
 none."""
 _SIDE_BRANCH_M = 0.08
 """Radius (metres) of the capsule from a joint of the trunk to a joint of a limb. Evidence: none."""
-_UNMEASURED_SIGMA_M = 0.05
+_UNMEASURED_SIGMA_M = 0.02
 """Standard deviation (metres) of the position of a joint that no camera measured. Evidence: none."""
 _SIGMAS = 1.0
 """Number of standard deviations of the joints' positions by which each capsule is dilated. Evidence: none."""
-_MAX_MARGIN_M = 0.04
+_MAX_MARGIN_M = 0.02
 """Maximum dilation of a capsule, metres. A body whose position is less certain than that would hide a large
 part of the room. Evidence: none."""
 _LENS_CLEARANCE_M = 0.01

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_POSED
+from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_LOST_SHARE, LEAST_POSED
 from bodycap_batch.config.models import CameraConfig, Job
 from bodycap_batch.config.mounts import MOTION_PLACES, mount_of
 from bodycap_batch.core.errors import BodycapError, CaptureError, EstimationError, JobError
@@ -42,7 +43,7 @@ from bodycap_batch.tasks.clocks import (
 from bodycap_batch.tasks.export import EXPORT, ExportTask
 from bodycap_batch.tasks.fill import FILL, FillTask
 from bodycap_batch.tasks.inertial import INERTIAL, InertialTask
-from bodycap_batch.tasks.inputs import BodyInput, FileRef, stated_clocks
+from bodycap_batch.tasks.inputs import BodyInput, CaptureRef, FileRef, stated_clocks
 from bodycap_batch.tasks.keyframes import KEYFRAMES, KeyframesTask
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE, ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import MERGE, BoardFootage, MergeTask
@@ -54,6 +55,7 @@ from bodycap_batch.tasks.report import REPORT
 from bodycap_batch.tasks.rig import RIG
 from bodycap_batch.tasks.sound import SOUND, SoundTask, known_from_sound
 from bodycap_batch.tasks.stage import Stage, read_summary
+from bodycap_batch.tasks.wearer import WEARER, WearerTask
 
 _REFINEMENTS = 2
 """Maximum number of passes of the correction of rolling shutters. Evidence: docs/decisions/mapping.md."""
@@ -78,6 +80,7 @@ class Flow:
         self._threads = settings.threads
         self._cameras: dict[str, str] = {}
         self._map_round = 0
+        self._wearer: Artefact | None = None
         self._with_telemetry = frozenset[str]()
         self._with_gyro = frozenset[str]()
         self._samples: Mapping[str, FileRef] = {}
@@ -145,14 +148,16 @@ class Flow:
         """Build the map of all keyframes and return its artefact."""
         task = MapTask(
             options=self._job.map,
-            capture=capture_ref(self._capture, self._cameras),
+            capture=self._footage(),
             keyframes=refs_by_camera(keyframes),
         )
         body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
         later: list[Stage[Any]] = [*body, EXPORT, REPORT]
         # Mapping keeps one core busy. Meanwhile, another core loads the libraries of the last stages.
         preload = [[module for stage in later for module in stage.modules]] if self._threads > 1 else []
-        artefact = self.runner.run(make_task(MAP, task, threads=self._threads), preload)
+        artefact = self.runner.run(
+            make_task(MAP, task, map_round=self._map_round, threads=self._threads), preload
+        )
         if self._sound is not None:
             self._sound.result()  # The sound is compared in much less time, so this does not wait.
         self.runner.report_notes(artefact, "map")
@@ -175,7 +180,7 @@ class Flow:
                 REGISTRATION,
                 RegistrationTask(
                     options=self._job.registration,
-                    capture=capture_ref(self._capture, self._cameras, [camera]),
+                    capture=self._footage([camera]),
                     keyframes=refs_by_camera({camera.name: keyframes[camera.name]}),
                     map=artefact_ref(scene_map),
                     previous=optional_ref(None if previous is None else previous[camera.name]),
@@ -228,7 +233,7 @@ class Flow:
         for _ in range(_REFINEMENTS):
             task = RefineTask(
                 options=self._job.map,
-                capture=capture_ref(self._capture, self._cameras),
+                capture=self._footage(),
                 map=artefact_ref(scene_map),
                 registrations=refs_by_camera(registrations),
             )
@@ -299,7 +304,7 @@ class Flow:
                 continue
             task = InertialTask(
                 options=options,
-                capture=capture_ref(self._capture, self._cameras, [camera]),
+                capture=self._footage([camera]),
                 registration=artefact_ref(registrations[camera.name]),
                 samples=self._samples.get(camera.name),
             )
@@ -318,9 +323,7 @@ class Flow:
             EstimationError: The data do not support a skeleton.
         """
         assert self._body is not None
-        footage = BoardFootage(
-            capture=capture_ref(self._capture, self._cameras), keyframes=refs_by_camera(keyframes)
-        )
+        footage = BoardFootage(capture=self._footage(), keyframes=refs_by_camera(keyframes))
         task = MergeTask(
             options=self._job.merge,
             map=artefact_ref(scene_map),
@@ -338,6 +341,46 @@ class Flow:
         """Pose the joints that no camera measured, and return the artefact of the motion of all joints."""
         task = FillTask(mode=self._job.fill, merge=artefact_ref(merged))
         return self.runner.run(make_task(FILL, task, threads=self._threads))
+
+    def find_wearer(self, results: StageResults) -> Artefact | None:
+        """Find the wearer's body in the pictures of each camera.
+
+        Returns:
+            The artefact; None if the body covers little of the pictures of every camera that lost frames.
+        """
+        assert results.map is not None
+        assert results.clocks is not None
+        assert results.filled is not None
+        summaries = {name: read_summary(artefact.path) for name, artefact in results.registrations.items()}
+        lossy = {
+            name
+            for name, summary in summaries.items()
+            if summary["localised"] < (1.0 - LEAST_LOST_SHARE) * summary["frames"]
+        }
+        if not lossy:
+            return None
+        task = WearerTask(
+            map=artefact_ref(results.map),
+            registrations=refs_by_camera(results.registrations),
+            clocks=artefact_ref(results.clocks),
+            merge=artefact_ref(results.filled),
+        )
+        artefact = self.runner.run(make_task(WEARER, task))
+        return artefact if lossy.intersection(read_summary(artefact.path)["masked"]) else None
+
+    @contextmanager
+    def without_wearer(self, wearer: Artefact) -> Iterator[None]:
+        """Leave out the wearer's body, as `find_wearer` found it, in all tasks that run in this context.
+
+        The notes of these tasks are held back until `runner.release_notes`.
+        """
+        self._wearer = wearer
+        self._map_round += 1
+        with self.runner.held_notes():
+            try:
+                yield
+            finally:
+                self._wearer = None
 
     def export(self, results: StageResults) -> Artefact:
         """Write the result files and return their artefact.
@@ -403,9 +446,13 @@ class Flow:
         )
         return self.runner.run(make_task(CLOCKS, task))
 
+    def _footage(self, cameras: Sequence[CameraConfig] | None = None) -> CaptureRef:
+        """Return the videos of all or some cameras, with the wearer's body in them if it is known."""
+        return replace(capture_ref(self._capture, self._cameras, cameras), wearer=optional_ref(self._wearer))
+
     def _start_sound(self) -> Future[Artefact]:
         """Compare the sound of the cameras, beside the keyframes if there are threads for both."""
-        task = make_task(SOUND, SoundTask(capture=capture_ref(self._capture, self._cameras)))
+        task = make_task(SOUND, SoundTask(capture=self._footage()))
         if self._threads > 1:
             return self.runner.start(task)
         done = Future[Artefact]()
@@ -460,7 +507,7 @@ class Flow:
         self._map_round += 1
         task = ExtendTask(
             options=self._job.map,
-            capture=capture_ref(self._capture, self._cameras),
+            capture=self._footage(),
             keyframes=refs_by_camera(keyframes),
             map=artefact_ref(scene_map),
             extra={name: tuple(frames) for name, frames in wanted.items()},
@@ -502,7 +549,7 @@ class Flow:
         return CameraGroupTask(
             options=self._job.registration,
             cameras=tuple(names),
-            capture=capture_ref(self._capture, self._cameras, ordered),
+            capture=self._footage(ordered),
             keyframes=refs_by_camera({name: keyframes[name] for name in names}),
             map=artefact_ref(scene_map),
             registrations=refs_by_camera({name: registrations[name] for name in names}),

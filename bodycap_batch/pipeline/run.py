@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from bodycap_batch.pipeline.results import (
     stored_name,
     write_results_file,
 )
+from bodycap_batch.pipeline.second_pass import repeat_without_wearer
 from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.pipeline.stage_results import StageResults
 from bodycap_batch.report.summary import ResultSummary, summary_of_folder
@@ -105,8 +107,24 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     flow.check()
     yield "check"
     results.stage = "keyframes"
-    results.keyframes = keyframes = flow.keyframes()
+    results.keyframes = flow.keyframes()
     yield "keyframes"
+    yield from _run_pass(job, flow, results)
+    repeat_without_wearer(job, flow, results, lambda second: deque(_run_pass(job, flow, second), maxlen=0))
+    yield "fill"
+    results.preview = flow.start_preview(results) if job.export.preview else None
+    results.exported = flow.export(results)
+    yield "export"
+    results.reported = flow.report(results)
+    yield "report"
+    if results.preview is not None:
+        results.previewed = results.preview.result()
+        yield "preview"
+
+
+def _run_pass(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
+    """Run the stages from the map to `fill`, and yield the name of each stage but `fill`."""
+    keyframes = results.keyframes
     results.stage = "map"
     results.map = scene_map = flow.map(keyframes)
     yield "map"
@@ -126,15 +144,6 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     if results.merged is not None:
         results.stage = "fill"
         results.filled = flow.fill(results.merged)
-    yield "fill"
-    results.preview = flow.start_preview(results) if job.export.preview else None
-    results.exported = flow.export(results)
-    yield "export"
-    results.reported = flow.report(results)
-    yield "report"
-    if results.preview is not None:
-        results.previewed = results.preview.result()
-        yield "preview"
 
 
 def _run_until(

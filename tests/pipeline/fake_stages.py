@@ -19,8 +19,9 @@ Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
-"rolling": true, "late": number of maps, "telemetry": [cameras], "real": [stages that are no stand-ins]}.
-"fail" may be a list of stages."""
+ "masked": [cameras], "without_wearer": localised frames of each masked camera,
+ "rolling": true, "late": number of maps, "telemetry": [cameras], "real": [stages that are no stand-ins]}.
+ "fail" may be a list of stages; "fail_second" is one that fails without the wearer."""
 
 
 def orders() -> dict[str, Any]:
@@ -57,6 +58,9 @@ def stage(name: str) -> Any:
                 time.sleep(0.05)
         if name in as_list(orders().get("fail")) and meant:
             raise EstimationError(f"{name} does not work out", hint="film more")
+        repeats = (arguments.get("capture") or {}).get("wearer") is not None
+        if repeats and orders().get("fail_second") == name:
+            raise EstimationError(f"{name} does not work out without the wearer", hint="film more")
         if name == "check" and any("unreadable" in text for text in videos(arguments["job"])):
             raise CaptureError("the file cannot be read as a video", hint="copy the video again")
         if orders().get("fill") == name:
@@ -105,6 +109,8 @@ def registered(options: Json, arguments: Json, files: Path) -> None:
     again = json.loads((Path(before["path"]) / "summary.json").read_text())["round"] + 1 if before else 0
     wanted = [*orders().get("wanted", []), *[[]] * 9][again]
     localised = [*orders().get("localised", []), *[10] * 9][again]
+    if arguments["capture"]["wearer"] is not None:
+        localised = orders()["without_wearer"]
     rolling = bool(orders().get("rolling"))
     frames = localised + orders().get("lost", {}).get(arguments["capture"]["config"]["cameras"][0]["name"], 0)
     values = {
@@ -130,6 +136,20 @@ def refined(options: Json, arguments: Json, files: Path) -> None:
     passes = json.loads(before.read_text()).get("passes", 0) + 1 if before.exists() else 1
     late = ["torso"] if passes <= orders().get("late", 0) else []
     (files / "summary.json").write_text(json.dumps({"notes": [], "passes": passes, "late": late}))
+
+
+def recovered(options: Json, arguments: Json, files: Path) -> None:
+    before = Path(next(iter(arguments["registrations"].values()))["path"])
+    (files / "summary.json").write_bytes((before / "summary.json").read_bytes())
+
+
+def merged(options: Json, arguments: Json, files: Path) -> None:
+    (files / "summary.json").write_text(json.dumps({"notes": ["a note"], "unused_cameras": {}}))
+
+
+def found_wearer(options: Json, arguments: Json, files: Path) -> None:
+    masked = orders().get("masked", [])
+    (files / "summary.json").write_text(json.dumps({"masked": masked, "shares": dict.fromkeys(masked, 0.4)}))
 
 
 def exported(options: Json, arguments: Json, files: Path) -> None:
@@ -168,6 +188,9 @@ EXTRA = {
     "inertial": with_sensor,
     "registration": registered,
     "refine": refined,
+    "recover": recovered,
+    "merge": merged,
+    "wearer": found_wearer,
     "export": exported,
     "places": placed,
     "report": reported,
@@ -189,6 +212,7 @@ NAMES = (
     "inertial",
     "merge",
     "fill",
+    "wearer",
     "export",
     "preview",
     "report",

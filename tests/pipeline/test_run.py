@@ -406,7 +406,7 @@ def test_lost_frames_are_recovered_once_against_the_final_map(
 
 def test_nothing_is_recovered_if_too_few_frames_have_a_pose(bench: Bench) -> None:
     bench.order(lost={"torso": 9}, localised=[19])
-    assert bench.executed() == ALL
+    assert "recover torso" not in bench.executed()
 
 
 def test_a_rolling_shutter_refines_the_map_and_solves_every_frame_again(bench: Bench) -> None:
@@ -428,6 +428,66 @@ def test_a_readout_that_is_found_late_is_followed_by_a_second_pass(
     assert executed.count("refine") == passes
     assert executed.count("registration torso") == 1 + passes
     assert bench.executed() == []
+
+
+def pictures_used(bench: Bench) -> bool:
+    """Return whether the results come from pictures without the wearer."""
+    used = json.loads((bench.out / "result.ply").read_text())
+    captures = [json.loads(used[name])[2]["capture"] for name in ("map",)]
+    captures += [json.loads(content)[2]["capture"] for content in used["registrations"].values()]
+    without = {capture["wearer"] is not None for capture in captures}
+    assert len(without) == 1, "the map and the registrations of different passes do not fit together"
+    return without.pop()
+
+
+@pytest.mark.parametrize(("localised", "is_used"), [(38, True), (30, False), (29, False)])
+def test_map_and_registration_are_repeated_without_the_wearer_and_used_if_better(
+    bench: Bench, localised: int, is_used: bool
+) -> None:
+    bench.order(lost={"torso": 10}, localised=[30], masked=["torso"], without_wearer=localised)
+    executed = bench.executed()
+    repeated = ("map", "registration torso", "registration left_palm", "clocks", "merge", "fill")
+    assert [executed.count(name) for name in repeated] == [2] * len(repeated)
+    assert [executed.count(name) for name in ("wearer", "keyframes torso", "export", "report")] == [1] * 4
+    assert pictures_used(bench) == is_used
+    (note,) = {event.what for event in bench.events if "wearer covers" in event.what}
+    assert "40% of torso" in note
+    assert (f"{2 * localised} instead of 60 frames" in note) == is_used
+    assert ("the first results are better" in note) == (not is_used)
+    record = json.loads((bench.out / "run.json").read_text())
+    assert [stage["round"] for stage in record["stages"] if stage["stage"] == "map"] == [0, 1]
+    assert bench.executed() == []
+
+
+def test_without_lost_frames_the_wearer_is_not_searched_for(bench: Bench) -> None:
+    bench.order(localised=[30], masked=["torso"], without_wearer=40)
+    assert bench.executed() == ALL
+
+
+@pytest.mark.parametrize("masked", [[], ["left_palm"]], ids=str)
+def test_nothing_is_repeated_if_the_wearer_covers_little_of_the_cameras_that_lost_frames(
+    bench: Bench, masked: list[str]
+) -> None:
+    bench.order(lost={"torso": 2}, localised=[30], masked=masked, without_wearer=40)
+    executed = bench.executed()
+    assert executed.count("wearer") == 1
+    assert executed.count("map") == 1
+    assert not pictures_used(bench)
+
+
+def test_the_mask_can_be_switched_off_without_repeating_the_first_pass(bench: Bench) -> None:
+    bench.order(lost={"torso": 2}, localised=[30], masked=["torso"], without_wearer=40)
+    assert "wearer" not in bench.executed(registration={"wearer_mask": "off"})
+    executed = bench.executed()
+    assert executed.count("map") == 1
+    assert executed.count("wearer") == 1
+    assert pictures_used(bench)
+
+
+def test_a_second_pass_that_fails_leaves_the_first_results(bench: Bench) -> None:
+    bench.order(lost={"torso": 2}, localised=[30], masked=["torso"], without_wearer=40, fail_second="map")
+    bench.run()
+    assert not pictures_used(bench)
 
 
 def stopped_at_the_order(bench: Bench, meanwhile: Callable[[], None] = lambda: None) -> list[Cancelled]:

@@ -29,6 +29,9 @@ _CONTRAST_THRESHOLD = 0.02
 """Contrast threshold of the detector. It is half of OpenCV's default, because blurred walls and ceilings
 have little contrast. Evidence: docs/decisions/mapping.md."""
 
+_WEARER_SURPLUS = 3
+"""Number of features that are detected for each feature that is kept, if the wearer's body is left out.
+Many of them lie on the body. Evidence: none."""
 _POOR_RATIO = 0.5
 """Fraction of the maximum number of features below which a frame is poor in features. Features of such a
 frame are detected again in the full frame, with `_POOR_CONTRAST_THRESHOLD`. Evidence:
@@ -66,22 +69,26 @@ def extract_features(
     import cv2
 
     detectors = [
-        cv2.SIFT.create(count, contrastThreshold=_CONTRAST_THRESHOLD, enable_precise_upscale=True)
+        cv2.SIFT.create(
+            count * (1 if camera.wearer is None else _WEARER_SURPLUS),
+            contrastThreshold=_CONTRAST_THRESHOLD,
+            enable_precise_upscale=True,
+        )
         for _ in range(context.threads)
     ]
     if context.threads == 1:
         for index, rgb in camera.read(frames, colour=True):
             context.check_cancelled()
-            yield index, _detect_features(detectors[0], camera, rgb)
+            yield index, _detect_features(detectors[0], camera, index, rgb)
         return
     free: SimpleQueue[Any] = SimpleQueue()
     for detector in detectors:
         free.put(detector)
 
-    def work(rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
+    def work(index: int, rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
         detector = free.get()
         try:
-            return _detect_features(detector, camera, rgb)
+            return _detect_features(detector, camera, index, rgb)
         finally:
             free.put(detector)
 
@@ -89,7 +96,7 @@ def extract_features(
         waiting: deque[tuple[int, Future[SiftFeatures]]] = deque()
         for index, rgb in camera.read(frames, colour=True):
             context.check_cancelled()
-            waiting.append((index, pool.submit(work, rgb)))
+            waiting.append((index, pool.submit(work, index, rgb)))
             if len(waiting) > 2 * context.threads:
                 frame, job = waiting.popleft()
                 yield frame, job.result()
@@ -97,8 +104,10 @@ def extract_features(
             yield frame, job.result()
 
 
-def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
-    """Return the features of one RGB image (H,W,3) that lie inside the camera's mask.
+def _detect_features(
+    detector: Any, camera: CaptureCamera, frame: int, rgb: npt.NDArray[np.uint8]
+) -> SiftFeatures:
+    """Return the features of one RGB image (H,W,3) that lie where the room is visible.
 
     Features are detected in a reduced image. If there are few, for example on a bare ceiling, they are
     detected in the full frame.
@@ -111,8 +120,10 @@ def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.u
     whole = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     grey = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
     found, raw = detector.detectAndCompute(grey, None)
-    count = detector.getNFeatures()
-    if len(found) < _POOR_RATIO * count:
+    requested = count = detector.getNFeatures()
+    if camera.wearer is not None:
+        requested //= _WEARER_SURPLUS
+    if len(found) < _POOR_RATIO * requested:
         sensitive = cv2.SIFT.create(
             count, contrastThreshold=_POOR_CONTRAST_THRESHOLD, enable_precise_upscale=True
         )
@@ -125,9 +136,11 @@ def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.u
     pixels = (np.array([keypoint.pt for keypoint in found]) + CV2_PIXEL_OFFSET_PX) * scale
     shape = np.array([(keypoint.size * scale[0] / 2.0, np.radians(keypoint.angle)) for keypoint in found])
     keypoints = np.column_stack([pixels, shape]).astype(np.float32)
-    keep = (
-        camera.is_unmasked(keypoints[:, :2]) if camera.mask is not None else np.ones(len(found), dtype=bool)
-    )
+    is_masked = camera.mask is not None or camera.wearer is not None
+    keep = camera.is_unmasked(keypoints[:, :2], frame) if is_masked else np.ones(len(found), dtype=bool)
+    if camera.wearer is not None and keep.sum() > requested:
+        response = np.where(keep, [keypoint.response for keypoint in found], -np.inf)
+        keep[np.argsort(-response, kind="stable")[requested:]] = False
     keypoints = keypoints[keep]
     column = np.clip(keypoints[:, 0].astype(int), 0, width - 1)
     row = np.clip(keypoints[:, 1].astype(int), 0, height - 1)

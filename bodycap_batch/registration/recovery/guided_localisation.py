@@ -184,8 +184,8 @@ class GuidedLocaliser:
         readout_ratio: Readout time as a fraction of the frame interval.
         shutter: The rolling shutter with the rotation of the camera from matches between adjacent frames.
             None: the rotation is unknown, or the shutter is global.
-        is_unmasked: Function from pixels (N,2) to a mask (N,) of the pixels that the camera's mask does not
-            cover.
+        is_unmasked: Function from pixels (N,2) and a frame index to a mask (N,) of the pixels at which the
+            room is visible.
     """
 
     lens: Camera
@@ -194,7 +194,7 @@ class GuidedLocaliser:
     exposure_ratio: float
     readout_ratio: float = 0.0
     shutter: TurningShutter | None = None
-    is_unmasked: Callable[[FloatArray], BoolArray]
+    is_unmasked: Callable[[FloatArray, int], BoolArray]
 
     def localise(
         self,
@@ -263,7 +263,7 @@ class GuidedLocaliser:
         if len(rows) < _MIN_MATCHES:
             return None
         matches = match_patches(self.patches, view, rows, level)
-        matches = matches.select(self.is_unmasked(matches.px))
+        matches = matches.select(self.is_unmasked(matches.px, view.frame))
         return self._solve(view, matches, level) if len(matches.point) >= _MIN_MATCHES else None
 
     def _solve(self, view: PredictedView, matches: PatchMatches, level: SearchLevel) -> PoseEstimate | None:
