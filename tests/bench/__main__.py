@@ -22,6 +22,7 @@ from tests.bench import (
     field,
     inertial,
     joining,
+    lenses,
     long,
     ours,
     peers,
@@ -33,6 +34,7 @@ from tests.bench import (
     sync,
     uncertainty,
     viewer,
+    violent,
 )
 from tests.bench.rows import DATA, LAB, Row, row_of, rows_in
 
@@ -47,6 +49,8 @@ _WITH_OPTIONS = {
     "sync": sync.main,
     "body": body.main,
     "inertial": inertial.main,
+    "lenses": lenses.main,
+    "violent": violent.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
 
@@ -64,8 +68,9 @@ def main() -> int:
         "`spool`, `viewer`; with options of their own: `simulation`, "
         "`uncertainty`, `joining` or `solving` (the merge stage on simulated poses), `seeds` (the map "
         "with several seeds), `clocks` (from generated sound and motion), `sync` (ten minutes of sound), "
-        "`inertial` (gaps filled from a sensor), `body` (joints without cameras), and `long` (ten minutes "
-        "of three cameras)",
+        "`inertial` (gaps filled from a sensor), `violent` (whole jobs with and without sensors), "
+        "`lenses` (named profiles in the adjustment), `body` (joints without cameras), and "
+        "`long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)
