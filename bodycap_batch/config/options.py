@@ -253,6 +253,9 @@ class TelemetryOptions(Options):
         True,
         description="the gyroscopes measure how the cameras turn from frame to frame and from row to row",
     )
+    gps: bool = Field(
+        True, description="GPS positions give the place of the world on the Earth; the scale is not changed"
+    )
     search: bool = Field(
         True,
         description="lost frames are searched again near the poses that the inertial sensor gives",

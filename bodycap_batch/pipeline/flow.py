@@ -276,7 +276,7 @@ class Flow:
         Without telemetry, or if all uses are switched off, the registrations are returned unchanged.
         """
         options = self._job.telemetry
-        if not (options.gravity or options.gaps):
+        if not (options.gravity or options.gaps or options.gps):
             return registrations
         tasks = []
         for camera in self._capture.cameras:

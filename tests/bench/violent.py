@@ -28,7 +28,7 @@ from bodycap_batch.synthetic.imu_options import ImuOptions
 from tests.bench import ours
 from tests.bench.rows import Row
 
-USES = ("gravity", "blur", "tracking", "search", "gaps")
+USES = ("gravity", "blur", "tracking", "gps", "search", "gaps")
 SHORT_S = 0.5
 """Longest stretch of lost frames that counts as short, seconds."""
 
