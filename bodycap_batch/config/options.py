@@ -253,9 +253,16 @@ class TelemetryOptions(Options):
     """Uses of the inertial sensors of the cameras. Without telemetry, these options have no effect."""
 
     gravity: bool = Field(True, description="the accelerometers determine the vertical of the world")
+    blur: bool = Field(
+        True,
+        description="exposure times and gyroscopes predict the motion blur, and keyframes are selected by it",
+    )
     tracking: bool = Field(
         True,
         description="the gyroscopes measure how the cameras turn from frame to frame and from row to row",
+    )
+    gps: bool = Field(
+        True, description="GPS positions give the place of the world on the Earth; the scale is not changed"
     )
     search: bool = Field(
         True,

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.export.earth import earth_of_world
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.target_frames import (
     WORLD,
@@ -64,6 +65,8 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
         out["contradicted_clocks"] = contradicted
     if inputs.inertial:
         out["telemetry"] = {name: item.figures() for name, item in inputs.inertial.items()}
+    if (earth := earth_of_world(inputs)) is not None:
+        out["earth"] = earth.figures()
     if inputs.relative_poses:
         out["relative_poses"] = [_relative_pose_metrics(inputs, item) for item in inputs.relative_poses]
     if inputs.merge is not None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,24 +49,24 @@ def write_verified_bvh(path: Path, motion: Motion, options: ExportOptions) -> Pa
     return path
 
 
-def write_verified_glb(path: Path, motion: Motion) -> Path:
+def write_verified_glb(path: Path, motion: Motion, earth: Mapping[str, Any] | None = None) -> Path:
     """Write a GLB file, read it back, compare it with the motion, and return the path.
 
     Raises:
         StoreError: The file cannot be written, or it differs by more than 0.1 mm or 0.01° when read back.
     """
-    write_glb(path, motion)
+    write_glb(path, motion, earth=earth)
     _verify(path, motion, read_glb)
     return path
 
 
-def write_verified_usd(path: Path, motion: Motion) -> Path:
+def write_verified_usd(path: Path, motion: Motion, earth: Mapping[str, Any] | None = None) -> Path:
     """Write a USD file, read it back, compare it with the motion, and return the path.
 
     Raises:
         StoreError: The file cannot be written, or it differs by more than 0.1 mm or 0.01° when read back.
     """
-    write_usd(path, motion)
+    write_usd(path, motion, earth)
     _verify(path, motion, read_usd)
     return path
 

@@ -16,6 +16,7 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.blender_scene import collect_blender_scene
+from bodycap_batch.export.earth import earth_of_world
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.fill_report import FILL_FILE, write_fill_report
 from bodycap_batch.export.frame_table import write_frame_table
@@ -99,13 +100,14 @@ def _motion_writers(
     """
     folder, measured = inputs.out_dir, _measured_joints(inputs, motion)
     animated, centres = apply_layout(motion, options), points_from_motion(motion, measured)
-    aligned = align_axes_with_bones(animated)
+    aligned, place = align_axes_with_bones(animated), earth_of_world(inputs)
+    earth = None if place is None else place.figures()
     markers = points_from_motion(motion, None if options.filled_markers else measured)
     return {
         "bvh": lambda: [write_verified_bvh(folder / "motion.bvh", animated, options)],
-        "glb": lambda: [write_verified_glb(folder / "motion.glb", aligned)],
+        "glb": lambda: [write_verified_glb(folder / "motion.glb", aligned, earth)],
         "fbx": lambda: [write_fbx(folder / "motion.fbx", aligned)],
-        "usd": lambda: [write_verified_usd(folder / "motion.usd", animated)],
+        "usd": lambda: [write_verified_usd(folder / "motion.usd", animated, earth)],
         "c3d": lambda: [write_c3d(folder / "joints.c3d", centres)],
         "trc": lambda: [write_trc(folder / "joints.trc", markers)],
         "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m)],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ _EXTENT_MARGIN_M = 0.3
 and feet extend beyond their joints by less than this margin."""
 
 
-def write_usd(path: Path, motion: Motion) -> Path:
+def write_usd(path: Path, motion: Motion, earth: Mapping[str, Any] | None = None) -> Path:
     """Write a motion as a skinned, animated mannequin.
 
     The time codes are frame numbers, counted from 0. The mesh is bound to the joints in the T-pose. The joint
@@ -35,6 +36,8 @@ def write_usd(path: Path, motion: Motion) -> Path:
     Args:
         path: Path of the file (``.usd``, ``.usda``, ``.usdc``), which is replaced atomically.
         motion: The motion, in world axes and metres.
+        earth: Place of the world on the Earth as plain JSON values, for the custom data ``earth`` of the
+            layer; None if it is unknown. The transform is a list of 16 numbers, row by row.
 
     Returns:
         The path of the file.
@@ -68,6 +71,8 @@ def write_usd(path: Path, motion: Motion) -> Path:
     animation = _define_animation(stage, motion, tokens)
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
     _define_mesh(stage, make_mannequin(motion.skeleton), skeleton)
+    if earth is not None:
+        stage.GetRootLayer().customLayerData = {"earth": _layer_data(earth)}
     with atomic_replacement(path) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
             raise StoreError(
@@ -222,3 +227,13 @@ def read_usd(path: Path) -> Motion:
         observed=np.ones((len(frames), count), dtype=bool),
         hips_in_root_m=translations[:, 1] if hips_move else None,
     )
+
+
+def _layer_data(earth: Mapping[str, Any]) -> dict[str, Any]:
+    """Return plain JSON values as values of a layer: lists of numbers as arrays."""
+    from pxr import Vt
+
+    return {
+        name: Vt.DoubleArray(np.ravel(value).tolist()) if isinstance(value, list) else value
+        for name, value in earth.items()
+    }

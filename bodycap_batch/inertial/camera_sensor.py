@@ -10,11 +10,18 @@ from bodycap_batch.config.options import TelemetryOptions
 from bodycap_batch.inertial.alignment import align_sensor
 from bodycap_batch.inertial.force_windows import force_windows
 from bodycap_batch.inertial.gap_filling import FilledGaps, constants_of_clip, fill_gaps
+from bodycap_batch.model.earth import GpsFixes
 from bodycap_batch.model.gravity import fit_gravity
 from bodycap_batch.model.inertial_camera import InertialCamera, SensorRelation
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.telemetry.gyro_fit import GyroFit
-from bodycap_batch.telemetry.streams import CameraTelemetry
+from bodycap_batch.telemetry.streams import CameraTelemetry, GpsTrack
+
+_MAX_DILUTION = 10.0
+"""Maximum dilution of precision of a used position. Origin: receivers call a larger one poor."""
+_SIGMA_PER_DILUTION_M, _UNKNOWN_SIGMA_M = 2.5, 5.0
+"""Standard deviation of a horizontal coordinate (metres) per dilution of precision, and if the dilution is
+unknown. Origin: usual range errors of consumer's receivers."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,8 +63,24 @@ def use_sensor(trajectory: Trajectory, telemetry: CameraTelemetry, options: Tele
         windows=windows if options.gravity and windows is not None and len(windows.times_s) else None,
         filled=filled.filled,
         refused=filled.refused,
+        gps=_gps_fixes(telemetry.gps) if options.gps and telemetry.gps is not None else None,
     )
     return UsedSensor(camera=camera, trajectory=filled.trajectory)
+
+
+def _gps_fixes(track: GpsTrack) -> GpsFixes | None:
+    """Return the usable positions of a GPS receiver; None if there are none."""
+    unknown = ~np.isfinite(track.dilution)
+    usable = (track.fix != 0) & (unknown | (track.dilution < _MAX_DILUTION))
+    if not usable.any():
+        return None
+    sigma_m = np.where(unknown, _UNKNOWN_SIGMA_M, _SIGMA_PER_DILUTION_M * np.nan_to_num(track.dilution))
+    return GpsFixes(
+        times_s=track.times_s[usable],
+        latitude_longitude_deg=track.latitude_longitude_deg[usable],
+        altitude_m=track.altitude_m[usable],
+        sigma_m=np.maximum(sigma_m[usable], _SIGMA_PER_DILUTION_M),
+    )
 
 
 def _relation(fit: GyroFit) -> SensorRelation:

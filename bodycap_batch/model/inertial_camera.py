@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, set_array
+from bodycap_batch.model.earth import GpsFixes
 from bodycap_batch.model.geometry import Similarity, rotation_angle_rad
 
 
@@ -123,6 +124,7 @@ class InertialCamera:
         filled: Number of lost frames that got a pose from the sensor.
         refused: Number of lost frames in short gaps whose poses were too uncertain, or contradicted the poses
             beside them.
+        gps: GPS positions of the camera; None if there are none, or if they are not used.
     """
 
     camera: str
@@ -134,6 +136,7 @@ class InertialCamera:
     windows: ForceWindows | None = None
     filled: int = 0
     refused: int = 0
+    gps: GpsFixes | None = None
 
     def figures(self) -> dict[str, Any]:
         """Return verdict and relation as plain JSON values for ``metrics.json``."""

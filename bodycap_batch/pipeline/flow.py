@@ -83,6 +83,7 @@ class Flow:
         self._wearer: Artefact | None = None
         self._with_telemetry = frozenset[str]()
         self._with_gyro = frozenset[str]()
+        self._with_blur = frozenset[str]()
         self._samples: Mapping[str, FileRef] = {}
 
     def __enter__(self) -> Flow:
@@ -114,6 +115,8 @@ class Flow:
         self._with_telemetry = frozenset(summary.get("telemetry", ())) | self._samples.keys()
         if self._job.telemetry.tracking:
             self._with_gyro = self._with_telemetry
+        if self._job.telemetry.blur:
+            self._with_blur = frozenset(summary.get("telemetry", ()))
         self.runner.report_notes(artefact, "check")
         if len(self._capture.cameras) > 1:
             self._sound = self._start_sound()
@@ -133,7 +136,12 @@ class Flow:
                     options=self._job.keyframes,
                     capture=capture_ref(capture, self._cameras, [camera]),
                     with_gyro=camera.name in self._with_gyro,
-                    samples=self._samples.get(camera.name) if camera.name in self._with_gyro else None,
+                    with_blur=camera.name in self._with_blur,
+                    samples=(
+                        self._samples.get(camera.name)
+                        if camera.name in self._with_gyro | self._with_blur
+                        else None
+                    ),
                 ),
                 camera=camera.name,
                 threads=threads,
@@ -296,7 +304,7 @@ class Flow:
         Without telemetry, or if all uses are switched off, the registrations are returned unchanged.
         """
         options = self._job.telemetry
-        if not (options.gravity or options.gaps):
+        if not (options.gravity or options.gaps or options.gps):
             return registrations
         tasks = []
         for camera in self._capture.cameras:

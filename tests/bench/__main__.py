@@ -23,6 +23,7 @@ from tests.bench import (
     field,
     inertial,
     joining,
+    lenses,
     long,
     ours,
     peers,
@@ -35,6 +36,7 @@ from tests.bench import (
     sync,
     uncertainty,
     viewer,
+    violent,
 )
 from tests.bench.rows import DATA, LAB, Row, row_of, rows_in
 
@@ -51,6 +53,8 @@ _WITH_OPTIONS = {
     "bare": bare.main,
     "inertial": inertial.main,
     "shutter": shutter.main,
+    "lenses": lenses.main,
+    "violent": violent.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
 
@@ -68,7 +72,8 @@ def main() -> int:
         "`spool`, `viewer`; with options of their own: `simulation`, "
         "`uncertainty`, `joining` or `solving` (the merge stage on simulated poses), `seeds` (the map "
         "with several seeds), `clocks` (from generated sound and motion), `sync` (ten minutes of sound), "
-        "`inertial` (gaps filled from a sensor), `body` (joints without cameras), `bare` (a camera at "
+        "`inertial` (gaps filled from a sensor), `violent` (whole jobs with and without sensors), "
+        "`lenses` (named profiles in the adjustment), `body` (joints without cameras), `bare` (a camera at "
         "plain surfaces), `shutter` (drawn readout times against global shutters), and `long` (ten minutes "
         "of three cameras)",
     )

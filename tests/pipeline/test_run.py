@@ -375,7 +375,12 @@ def test_telemetry_that_is_switched_off_changes_nothing(bench: Bench) -> None:
     bench.run()
     before = {name: data for name, data in bench.results().items() if name != "job.yaml"}
     (bench.folder / "torso.imu.csv").write_text("samples")
-    assert bench.executed(telemetry=dict.fromkeys(("gravity", "tracking", "search", "gaps"), False)) == []
+    assert (
+        bench.executed(
+            telemetry=dict.fromkeys(("gravity", "blur", "tracking", "gps", "search", "gaps"), False)
+        )
+        == []
+    )
     assert {name: data for name, data in bench.results().items() if name != "job.yaml"} == before
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ def write_glb(
     motion: Motion,
     *,
     file_from_up: FloatArray | None = None,
+    earth: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a motion as a skinned, animated mannequin.
 
@@ -48,6 +50,8 @@ def write_glb(
         motion: The motion, in world axes and metres.
         file_from_up: (3,3) additional rotation of the whole scene; None for no rotation. It is needed if a
             converter, such as Blender, applies the inverse rotation to the scene.
+        earth: Place of the world on the Earth as plain JSON values, for the extras of the file; None if it is
+            unknown. Its transform starts from the world (z up), not from the axes of the file.
 
     Raises:
         StoreError: The file cannot be written.
@@ -91,7 +95,11 @@ def write_glb(
         accessors=buffer.accessors,
         bufferViews=buffer.views,
         buffers=[gl.Buffer(byteLength=len(buffer.data))],
-        extras={"fps": motion.fps, "start_s": motion.start_ns / 1e9},
+        extras={
+            "fps": motion.fps,
+            "start_s": motion.start_ns / 1e9,
+            **({} if earth is None else {"earth": dict(earth)}),
+        },
     )
     document.set_binary_blob(bytes(buffer.data))
     with atomic_replacement(Path(path)) as temporary:

@@ -95,6 +95,24 @@ def test_round_trip(tmp_path: Path, motion: Motion) -> None:
 
 
 @pytest.mark.parametrize("motion", [reaching(3), hanging(3)], ids=["T", "hanging"])
+def test_the_place_on_the_earth_is_in_glb_and_usd_files(tmp_path: Path, motion: Motion) -> None:
+    from pxr import Sdf
+    from pygltflib import GLTF2
+
+    from bodycap_batch.formats.usd import write_usd
+
+    earth = {"latitude_deg": 48.1, "east_north_up_from_world": np.eye(4).tolist(), "fixes": 12}
+    for name, place in (("with", earth), ("without", None)):
+        write_glb(tmp_path / f"{name}.glb", motion, earth=place)
+        write_usd(tmp_path / f"{name}.usda", motion, place)
+        assert GLTF2().load(str(tmp_path / f"{name}.glb")).extras.get("earth") == place
+        data = Sdf.Layer.FindOrOpen(str(tmp_path / f"{name}.usda")).customLayerData
+        assert data.get("earth", {}).get("latitude_deg") == (None if place is None else 48.1)
+    placed = Sdf.Layer.FindOrOpen(str(tmp_path / "with.usda")).customLayerData["earth"]
+    np.testing.assert_allclose(placed["east_north_up_from_world"], np.eye(4).ravel())
+
+
+@pytest.mark.parametrize("motion", [reaching(3), hanging(3)], ids=["T", "hanging"])
 def test_the_skin_binds_every_joint_at_the_t_pose(tmp_path: Path, motion: Motion) -> None:
     write_glb(tmp_path / "a.glb", motion)
     parsed = Parsed(tmp_path / "a.glb")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -124,10 +125,14 @@ def test_samples_of_another_motion_are_not_used(drawn: tuple[Arm, FloatArray, Fr
     assert "agree" in found.reason or "stabilised" in found.reason
 
 
-def test_without_a_calibration_the_gyroscope_is_not_used(
-    drawn: tuple[Arm, FloatArray, FrameMatches],
+@pytest.mark.parametrize(("factor", "used"), [(1.0, True), (1.2, False)])
+def test_a_lens_without_calibration_is_used_if_it_agrees_with_the_gyroscope(
+    drawn: tuple[Arm, FloatArray, FrameMatches], factor: float, used: bool
 ) -> None:
     arm, times_s, matches = drawn
-    found = relate_gyro(camera(times_s, calibrated=False), matches, SENSOR.samples(arm, FRAMES / FPS))
-    assert found.rates is None
-    assert "calibration" in found.reason
+    params = LENS.params * np.array([factor, factor, 1.0, 1.0])
+    lens = replace(LENS, params=params, refine=True)
+    samples = SENSOR.samples(arm, FRAMES / FPS)
+    found = relate_gyro(camera(times_s, calibrated=False, camera=lens), matches, samples)
+    assert (found.rates is not None) == used
+    assert used or "focal length" in found.reason
