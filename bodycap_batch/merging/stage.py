@@ -39,7 +39,13 @@ from bodycap_batch.merging.graph.joint_covariance import (
     skeleton_covariance,
 )
 from bodycap_batch.merging.graph.joint_distance_limits import soft_limits
-from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution, hinge_deviations, joint_gaps
+from bodycap_batch.merging.graph.motion_graph import (
+    MotionGraph,
+    MotionSolution,
+    hinge_deviations,
+    joint_gaps,
+    posture_deviations,
+)
 from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, max_window_ticks, solve_windows
 from bodycap_batch.merging.projection.project import project_motion
 from bodycap_batch.merging.reporting.report import MotionFacts, build_report
@@ -227,6 +233,7 @@ def _solve_body(
                 joint_sigma_m=sigma_percentiles(inputs.skeleton.roles, covariance, observed),
                 flexion_sigma_deg=flexion_percentiles(inputs.skeleton.roles, flexion_rad, observed),
                 joint_gap_m=joint_gaps(bones, solution.world_from_bone),
+                posture_sigmas=posture_deviations(bones, solution.world_from_bone),
                 hinge_off_plane_m=hinge_deviations(inputs.skeleton, bones, solution.world_from_bone),
                 contacts=contact_statistics(contacts, solution.world_from_bone, fps),
                 rule_violation_m={rule.name: rule.violation_m(solution.world_from_bone) for rule in rules},

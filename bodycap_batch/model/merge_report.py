@@ -205,6 +205,8 @@ class MountReport:
         sigma_m: Sigma of the position, metres per axis.
         from_prior_deg: Angle between the solved rotation and the prior rotation, degrees.
         from_prior_m: Distance between the solved position and the prior position, metres.
+        from_usual_deg: Angle between the solved rotation and the usual rotation with the selected roll; None
+            if the job gives the rotation.
         known_to: Sentence about the uncertainty of the mount, with advice.
     """
 
@@ -216,6 +218,7 @@ class MountReport:
     sigma_m: float
     from_prior_deg: float
     from_prior_m: float
+    from_usual_deg: float | None = field(default=None, metadata=_OMIT_NONE)
     known_to: str
 
 
@@ -346,6 +349,8 @@ class MergeReport:
         joined_cameras: By name of a camera in an aligned map, the uncertainty of the map's pose.
         joint_gap_m: By role of a joint, percentiles of its gap: the distance, metres, between the ends of the
             two bones that meet at the joint.
+        posture_sigmas: By role of a joint, distance of its rotation from the rest pose, in sigmas of its
+            everyday range (root mean square over ticks and axes).
         joint_sigma_m: By role of a joint, then by ``observed`` or ``filled``, percentiles of the sigma of the
             joint's centre, metres per axis.
         flexion_sigma_deg: By role of the bone below an elbow or a knee, then by ``observed`` or ``filled``,
@@ -370,6 +375,7 @@ class MergeReport:
     unused_cameras: Mapping[str, str]
     joined_cameras: Mapping[str, AlignedCameraReport]
     joint_gap_m: Mapping[str, Percentiles]
+    posture_sigmas: Mapping[str, float]
     joint_sigma_m: Mapping[str, Mapping[str, Percentiles]]
     flexion_sigma_deg: Mapping[str, Mapping[str, Percentiles]]
     hinge_off_plane_m: Mapping[str, Percentiles]

@@ -8,6 +8,7 @@ from typing import Any
 
 from bodycap_batch.core.percent import format_percent
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
+from bodycap_batch.report.body_doubts import body_doubt_criteria
 from bodycap_batch.report.camera_pairs import distance_criteria, shared_segment_criteria
 from bodycap_batch.report.grades import Criterion, Grade, grade_value
 from bodycap_batch.report.metric_paths import metric_path
@@ -167,6 +168,7 @@ def unknown_clocks(metrics: Mapping[str, Any]) -> list[str]:
 
 def _criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
     yield from _frame_criteria(metrics)
+    yield from _frozen_criteria(metrics["cameras"])
     yield from _map_criteria(metrics)
     if "merge" in metrics:
         yield from _body_criteria(metrics["merge"])
@@ -203,6 +205,25 @@ def _frame_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
             metric=metric_path("cameras", name, "coverage"),
             value=share,
         )
+
+
+def _frozen_criteria(cameras: Mapping[str, Mapping[str, Any]]) -> Iterator[Criterion]:
+    """Yield the criterion about frozen parts of the videos, if there are any."""
+    counts = {name: int(camera.get("status", {}).get("FROZEN", 0)) for name, camera in cameras.items()}
+    name = max(counts, key=lambda name: counts[name], default=None)
+    if name is None or not counts[name]:
+        return
+    share = counts[name] / max(int(cameras[name]["frames"]), 1)
+    yield Criterion(
+        subject="cameras",
+        name="Frozen parts",
+        grade=max(Grade.FAIR, grade_value(share, 0.0, 1.0 - _FAIR_CAMERA_COVERAGE)),
+        finding=f"{name}: {counts[name]:,} frames repeat one picture although the camera moves",
+        rationale="A recording that stops for a while often loses time as well: all later frames of this "
+        "camera are then too early. Compare the picture with the other cameras after the frozen part.",
+        metric=metric_path("cameras", name, "status", "FROZEN"),
+        value=float(counts[name]),
+    )
 
 
 def _map_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
@@ -390,6 +411,7 @@ def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
             "poses are wrong.",
         )
     yield from _mount_criteria(merge.get("mounts", {}))
+    yield from body_doubt_criteria(merge)
     yield from _unused_camera_criteria(merge.get("unused_cameras", {}))
 
 

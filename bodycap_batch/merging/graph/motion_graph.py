@@ -385,6 +385,25 @@ def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, 
     return out
 
 
+def posture_deviations(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, float]:
+    """Return by role how far each joint's rotation is from the rest pose, in sigmas of its everyday range.
+
+    The value is the root mean square over all ticks and the three axes. It is below 1 for most activities.
+
+    Args:
+        bones: Bones of the graph.
+        world_from_bone: (T,B,4,4) solved poses of the bones.
+    """
+    out = {}
+    for index, bone in enumerate(bones):
+        if bone.parent >= 0:
+            parent = np.swapaxes(world_from_bone[:, bone.parent, :3, :3], 1, 2)
+            turn = so3_log(bone.mean_rotation.T @ parent @ world_from_bone[:, index, :3, :3])
+            squares = np.einsum("ti,ij,tj->t", turn, np.linalg.inv(bone.rotation_covariance), turn)
+            out[bone.role] = float(np.sqrt(squares.mean() / 3.0))
+    return out
+
+
 def hinge_deviations(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray
 ) -> dict[str, FloatArray]:

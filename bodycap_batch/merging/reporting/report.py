@@ -9,7 +9,12 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body_calibration.calibrate_body import BodyCalibration
-from bodycap_batch.merging.body_calibration.camera_roll import hanging_tracks, has_unknown_roll, roll_deg
+from bodycap_batch.merging.body_calibration.camera_roll import (
+    hanging_tracks,
+    has_unknown_roll,
+    roll_deg,
+    with_roll,
+)
 from bodycap_batch.merging.body_calibration.scale import ScaleSource, chi_square
 from bodycap_batch.merging.cameras.side_check import swapped_sides
 from bodycap_batch.merging.cameras.track import CameraTrack
@@ -77,6 +82,8 @@ class MotionFacts:
         flexion_sigma_deg: By role of the bone below a hinge, then by ``observed`` or ``filled`` ticks,
             percentiles of the sigma of the flexion, degrees.
         joint_gap_m: By role of a joint, (T,) distance of the joint from its place on the parent bone, metres.
+        posture_sigmas: By role of a joint, distance of its rotation from the rest pose, in sigmas of its
+            everyday range (root mean square).
         hinge_off_plane_m: By role of the joint at the far end of a hinged bone, (T,) distance of this joint
             from the plane of the hinge, metres.
         contacts: By foot, how often the foot stands, and how fast the foot slides while it stands.
@@ -92,6 +99,7 @@ class MotionFacts:
     joint_sigma_m: Mapping[str, Mapping[str, Mapping[str, float]]]
     flexion_sigma_deg: Mapping[str, Mapping[str, Mapping[str, float]]]
     joint_gap_m: Mapping[str, FloatArray]
+    posture_sigmas: Mapping[str, float]
     hinge_off_plane_m: Mapping[str, FloatArray]
     contacts: Mapping[str, Mapping[str, float]]
     rule_violation_m: Mapping[str, FloatArray]
@@ -132,6 +140,7 @@ def build_report(
         unused_cameras=dict(facts.unused),
         joined_cameras=dict(facts.aligned),
         joint_gap_m=_percentiles_by_name(facts.joint_gap_m),
+        posture_sigmas={role: round(sigmas, 4) for role, sigmas in facts.posture_sigmas.items()},
         joint_sigma_m=_sigmas_by_role(facts.joint_sigma_m),
         flexion_sigma_deg=_sigmas_by_role(facts.flexion_sigma_deg),
         hinge_off_plane_m=_percentiles_by_name(facts.hinge_off_plane_m),
@@ -271,6 +280,11 @@ def _mount_report(prior: Mount, solved: Mount, calibration: BodyCalibration) -> 
     rotation = prior.joint_from_cam[:3, :3].T @ solved.joint_from_cam[:3, :3]
     shift = solved.joint_from_cam[:3, 3] - prior.joint_from_cam[:3, 3]
     search = next((each for each in calibration.rolls if each.camera == solved.camera), None)
+    is_reference = solved.camera == calibration.reference_prior.camera
+    rolled = (
+        calibration.reference_prior if is_reference else with_roll(prior, search.chosen_deg if search else 0)
+    )
+    from_usual = rolled.joint_from_cam[:3, :3].T @ solved.joint_from_cam[:3, :3]
     runner_up = None if search is None else search.runner_up()
     return MountReport(
         role=solved.role,
@@ -285,6 +299,9 @@ def _mount_report(prior: Mount, solved: Mount, calibration: BodyCalibration) -> 
         sigma_m=round(solved.sigma_m, 5),
         from_prior_deg=round(float(np.degrees(rotation_angle_rad(rotation))), 3),
         from_prior_m=round(float(np.linalg.norm(shift)), 5),
+        from_usual_deg=round(float(np.degrees(rotation_angle_rad(from_usual))), 3)
+        if has_unknown_roll(prior)
+        else None,
         known_to=describe_mount(solved, t_pose=calibration.t_pose_ns is not None),
     )
 
