@@ -197,7 +197,12 @@ def readouts_in(results: Path) -> dict[str, Readout]:
     for part in mapping.get("rolling_shutter", [])[:1]:
         found.update(part)
     return {
-        name: (each["seconds"], each["sigma_s"], each["source"], each["best_s"])
+        name: (
+            each["seconds"],
+            float("inf") if each["sigma_s"] is None else each["sigma_s"],
+            each["source"],
+            each["best_s"],
+        )
         for name, each in sorted(found.items())
     }
 

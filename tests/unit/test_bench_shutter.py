@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -53,3 +54,19 @@ def test_figures_of_a_capture_and_its_twin() -> None:
     assert "in 0;" in lines[0]
     assert "50% inside 2 sigma" in lines[1]
     assert "2 ms or more: 1; found although global: 1" in lines[2]
+
+
+def test_a_readout_that_is_not_determined_has_no_finite_sigma(tmp_path: Path) -> None:
+    unknown = {"seconds": 0.0, "sigma_s": None, "source": "not determined", "best_s": 0.01}
+    refined = {"seconds": 0.012, "sigma_s": 0.0005, "source": "estimated", "best_s": 0.012}
+    metrics = {
+        "mapping": {
+            "readouts_from_matches": {"palm": unknown, "torso": unknown},
+            "rolling_shutter": [{"torso": refined}],
+        }
+    }
+    (tmp_path / "metrics.json").write_text(json.dumps(metrics), encoding="utf-8")
+    assert shutter.readouts_in(tmp_path) == {
+        "palm": (0.0, float("inf"), "not determined", 0.01),
+        "torso": (0.012, 0.0005, "estimated", 0.012),
+    }

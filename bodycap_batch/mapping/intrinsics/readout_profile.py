@@ -27,8 +27,9 @@ _LAST_STEP_S = 0.001
 _MAX_READOUT_S = 0.033
 """Maximum readout time that is searched, seconds. Origin: sensors of phones and action cameras need 8 to 33
 ms."""
-_CONVERGED_S = 0.00005
-"""Change of the readout time at which the search ends, seconds. Evidence: none."""
+_GRID_S = 0.0005
+"""Distance of the centres of parabolas in the last search, seconds. Cameras share them, so that costs are
+computed once. The minimum of a parabola is not on the grid. Evidence: docs/decisions/mapping.md."""
 _MAX_SEARCHES = 4
 """Maximum number of parabolas in the last search. Evidence: none."""
 _SCALE_PX = 1.5
@@ -220,9 +221,10 @@ def _estimate(profiles: Sequence[_Profile]) -> _Estimate:
     for _ in range(_MAX_SEARCHES):
         grid = [centre - step_s, centre, centre + step_s]
         best = centre + step_s * _parabola_minimum(np.array([cost(value) for value in grid]))
-        if abs(best - centre) < _CONVERGED_S and step_s == _LAST_STEP_S:
+        nearest = round(_GRID_S * round(best / _GRID_S), 6)
+        if nearest == centre and step_s == _LAST_STEP_S:
             break
-        centre, step_s = round(best, 6), _LAST_STEP_S
+        centre, step_s = nearest, _LAST_STEP_S
     grid = [centre - step_s, centre, centre + step_s]
     costs = [np.stack([item.pair_costs(value) for value in grid]) for item in profiles]
     sigma_s = _standard_deviation(costs, [item.speeds() for item in profiles], step_s)

@@ -57,9 +57,9 @@ _MAX_POOLED_SIGMAS = 3.0
 deviations. With a larger deviation, the cameras do not share the mean. Evidence: none."""
 _BLOCKS = 8
 """Number of blocks of successive keyframes from which a standard deviation is estimated. Evidence: none."""
-_FLOOR_SIGMA_S = 0.0001
-"""Standard deviation that is added to each estimate, seconds, because the path between frames is a spline.
-Evidence: none."""
+_FLOOR_SIGMA_S = 0.0002
+"""Standard deviation that is added to each estimate and to each mean of equal cameras, seconds, because the
+path between frames is a spline. Evidence: docs/decisions/mapping.md."""
 _LOSS_PX = 1.0
 """Width (px) of the robust weight function of a residual. Evidence: none."""
 _MAX_RESIDUAL_PX = 8.0
@@ -98,8 +98,8 @@ class Readout:
         mean = _weighted_mean(others, _MAX_POOLED_SIGMAS)
         if mean is None or list(others) == [self]:
             return self
-        best_s, sigma_s = mean
-        sigma_s = float(np.hypot(sigma_s, _MODEL_SIGMA_RATIO * best_s))
+        best_s = mean[0]
+        sigma_s = float(np.linalg.norm([mean[1], _FLOOR_SIGMA_S, _MODEL_SIGMA_RATIO * best_s]))
         return replace(self, seconds=best_s, best_s=best_s, sigma_s=sigma_s, source="estimated")
 
     def with_other_estimate(self, other: Readout) -> Readout:

@@ -112,6 +112,8 @@ def camera_of(
     film: Film, *, known: bool = False, stated_s: float = 0.0, may_be_sideways: bool = False
 ) -> Any:
     return SimpleNamespace(
+        name="head",
+        nominal_fps=1.0 / FRAME_S,
         camera=replace(LENS, sideways=film.sideways and known),
         may_be_sideways=may_be_sideways,
         rolling_shutter_known=known,
