@@ -77,13 +77,13 @@ class _SightLines:
         images, owners, information, vectors = [], [], [], []
         for number, ids in observed.items():
             features = np.flatnonzero(ids >= 0)
-            if len(features) == 0:
-                continue
             image = model.image(number)
             camera = model.camera(image.camera_id)
-            own = np.array([rows[int(point)] for point in ids[features]])
+            own = np.array([rows[int(point)] for point in ids[features]], dtype=np.int64)
             pose = image.cam_from_world().inverse().matrix()
             rays = np.column_stack([camera.cam_from_img(_features_px(image)[features]), np.ones(len(own))])
+            # Some lenses have no line of sight for pixels near the border.
+            own, rays = own[np.isfinite(rays).all(axis=1)], rays[np.isfinite(rays).all(axis=1)]
             rays = rays @ pose[:, :3].T
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
             distance = np.linalg.norm(points[own] - pose[:, 3], axis=1)
@@ -158,7 +158,7 @@ def _images_found_again(
 ) -> set[int]:
     """Return the doubtful images that a second registration finds in the same place."""
     sound = {int(number) for number in model.reg_image_ids()} - set(doubtful)
-    if not doubtful or not sound:
+    if not doubtful or not sound or not model.num_points3D():
         return set()
     observed = {int(number): observed_points(model, int(number)) for number in model.reg_image_ids()}
     lines = _SightLines.create(model, observed)

@@ -262,6 +262,21 @@ def test_a_misplaced_block_is_not_confirmed(
     assert confirmed == set()
 
 
+def test_without_points_no_image_is_confirmed(
+    built: tuple[Any, FloatArray, MappingContext, set[Any]],
+) -> None:
+    model, _, mapping, _ = built
+    empty = copy.deepcopy(model)
+    for point in list(empty.point3D_ids()):
+        empty.delete_point3D(point)
+    sequences = image_sequences(empty)
+    assert confirm_images(mapping.workspace, empty, sequences[0][:3], sequences, 8.0) == set()
+    # All images of the model are doubtful: no image is left that determines points.
+    assert confirm_images(mapping.workspace, model, sequences[0], sequences, 8.0) == set()
+    # The only images that are left see nothing in common with the doubtful ones.
+    assert confirm_images(mapping.workspace, model, sequences[0][:-1], sequences, 8.0) == set()
+
+
 def test_a_further_model_without_points_is_dropped(
     built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
