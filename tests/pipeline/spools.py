@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -103,6 +104,16 @@ class SpoolFixture:
         started = self.folder / "started"
         wait_for(lambda: started.exists() and bool(started.read_text()))
         return int(started.read_text())
+
+
+def remove_in_use(folder: Path) -> None:
+    """Remove a folder into which another process may write meanwhile."""
+
+    def removed() -> bool:
+        shutil.rmtree(folder, ignore_errors=True)
+        return not folder.exists()
+
+    wait_for(removed)
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 30.0) -> None:
