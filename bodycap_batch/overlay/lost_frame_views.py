@@ -25,11 +25,13 @@ none."""
 _CELLS = (10, 8)
 """Number of columns and rows of the cells of a picture."""
 _MIN_BODY_SHARE = 0.4
-"""Minimum share of the body in the picture of a frame that sees the wearer. Evidence:
-docs/decisions/report.md."""
+"""Minimum share of the body in the picture of a frame that sees the wearer. Evidence: none."""
 _MAX_GAP_NS = 1_000_000_000
 """Maximum time, nanoseconds, between two localised frames between which a pose is interpolated. It is used
 without a body. Evidence: none."""
+_MAX_SIGMA_M = 0.1
+"""Maximum sigma, metres per axis, of a joint on the solved body whose camera gets a predicted pose. Evidence:
+docs/decisions/report.md."""
 _MAX_POINTS = 4000
 """Maximum number of map points that are projected. A larger map is thinned, and each point counts more."""
 
@@ -40,7 +42,7 @@ class LostView(StrEnum):
     MAP: A part of the map, in front of the wearer.
     WEARER: Mostly the wearer's body, and hardly anything of the map.
     NOTHING: Neither a part of the map nor much of the wearer.
-    UNKNOWN: The pose cannot be predicted.
+    UNKNOWN: The pose cannot be predicted, or the prediction is too uncertain.
     """
 
     MAP = "MAP"
@@ -87,7 +89,8 @@ def predict_lost_views(
     """Predict what the lost frames of each camera see.
 
     With a body, the pose of a lost frame is that of the camera on the solved body. Without a body, it is
-    interpolated between the localised frames before and after it.
+    interpolated between the localised frames before and after it. Frames whose poses merging removed are
+    lost.
 
     Args:
         trajectories: The trajectory of each camera, in the gauge of the camera's map.
@@ -102,7 +105,7 @@ def predict_lost_views(
     merged = {} if merge is None else {path.camera: path for path in merge.trajectories}
     out = {}
     for path in trajectories:
-        lost = np.flatnonzero(~path.localised)
+        lost = np.flatnonzero(~merged.get(path.camera, path).localised)
         scene = scenes.get(path.gauge)
         if scene is None or path.camera not in scene.cameras:
             out[path.camera] = _unknown(path.camera, lost)
@@ -113,9 +116,9 @@ def predict_lost_views(
             nothing = np.full((len(lost), 4, 4), np.nan)
             body = predict_wearer_view(merge, path.camera, lens, common_ns, nothing)
             points = [merge.world_from_map[key].apply(scenes[key].points) for key in merge.world_from_map]
-            out[path.camera] = _views(
-                path.camera, lost, body.world_from_cam, np.concatenate(points), lens, body
-            )
+            poses = body.world_from_cam.copy()
+            poses[~(_sigma_m(merge, path.camera, common_ns) <= _MAX_SIGMA_M)] = np.nan
+            out[path.camera] = _views(path.camera, lost, poses, np.concatenate(points), lens, body)
             continue
         found = np.flatnonzero(path.localised)
         poses, inside = poses_at(
@@ -124,6 +127,20 @@ def predict_lost_views(
         poses[~inside] = np.nan
         out[path.camera] = _views(path.camera, lost, poses, scene.points, lens, None)
     return out
+
+
+def _sigma_m(merge: MergeResult, camera: str, common_ns: IntArray) -> FloatArray:
+    """Return the sigma (L,) of the joint that carries a camera, metres per axis; NaN if it is unknown.
+
+    Args:
+        merge: The solved body.
+        camera: Camera name.
+        common_ns: (L,) common times, nanoseconds. The sigma is that of the nearest tick before.
+    """
+    role = next(mount.role for mount in merge.mounts if mount.camera == camera)
+    ticks_ns = merge.times_ns()
+    tick = np.clip(np.searchsorted(ticks_ns, common_ns, side="right") - 1, 0, len(ticks_ns) - 1)
+    return np.asarray(merge.joint_sigma_m()[tick, merge.skeleton.index_of_role(role)])
 
 
 def _views(

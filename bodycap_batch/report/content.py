@@ -192,7 +192,7 @@ _VIEW_WORDS = {
     LostView.MAP: "should see a part of the map",
     LostView.WEARER: "see mostly the wearer",
     LostView.NOTHING: "see nothing of the map",
-    LostView.UNKNOWN: "have no predicted pose",
+    LostView.UNKNOWN: "have no reliable predicted pose",
 }
 """Words for what lost frames see."""
 

@@ -698,7 +698,7 @@ def test_lost_frames_that_see_the_map_are_separated_from_those_that_see_nothing(
     for view, words in (
         (LostView.MAP, "30 lost frames should see a part of the map"),
         (LostView.NOTHING, "30 lost frames see nothing of the map"),
-        (LostView.UNKNOWN, "30 lost frames have no predicted pose"),
+        (LostView.UNKNOWN, "30 lost frames have no reliable predicted pose"),
     ):
         assert words in written(_seeing(inputs, "torso", view), tmp_path)
 

@@ -42,6 +42,7 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
     evaluate_pairs,
     find_misregistered_images,
 )
+from bodycap_batch.mapping.validation.near_points import remove_near_points
 from bodycap_batch.mapping.validation.repair import remove_misregistered, repair_model
 from bodycap_batch.mapping.validation.second_registration import confirm_images
 from bodycap_batch.mapping.validation.track_agreement import (
@@ -436,6 +437,62 @@ def test_transient_points_are_removed_if_enough_others_remain(
     assert remove_transient_points(pycolmap.Reconstruction(model), {"cam": seen_ns * 10}) == 0
     # All keyframes at nearly one time: no point is static, so none can be removed.
     assert remove_transient_points(pycolmap.Reconstruction(model), {"cam": seen_ns // 100}) == 0
+
+
+def _two_cameras(near_images: int) -> pycolmap.Reconstruction:
+    """Return a model of 40 shared points at a depth of 4, and of 20 points 0.2 before one of the cameras.
+
+    The near points are seen by the last `near_images` of the four palm's images, which see nothing else.
+    """
+    rng = np.random.default_rng(3)
+    model = pycolmap.Reconstruction()
+    for number in (1, 2):
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(model="PINHOLE", width=640, height=480, params=_CAMERA.params, camera_id=number)
+        )
+    far = rng.uniform((-1, -1, 3.8), (1, 1, 4.2), (40, 3))
+    near = rng.uniform((-0.1, -0.1, 0.19), (0.1, 0.1, 0.21), (20, 3))
+    names = [("torso", 0), ("torso", 1), *(("palm", frame) for frame in range(4))]
+    tracks: dict[tuple[str, int], pycolmap.Track] = {}
+    for number, (camera, frame) in enumerate(names, start=1):
+        is_near = camera == "palm" and frame >= 4 - near_images
+        seen = near if is_near else far
+        shift = np.array([0.02 * number, 0.0, 0.0])
+        image = pycolmap.Image(
+            name=ImageRef(camera, frame).name,
+            keypoints=_CAMERA.project(seen - shift),
+            camera_id=1 + (camera == "palm"),
+            image_id=number,
+        )
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), -shift))
+        for index in range(len(seen)):
+            track = tracks.setdefault(("near" if is_near else "far", index), pycolmap.Track())
+            track.add_element(number, index)
+    for (kind, index), track in tracks.items():
+        model.add_point3D((near if kind == "near" else far)[index], track, np.zeros(3, np.uint8))
+    return model
+
+
+def test_near_points_that_only_one_camera_sees_are_removed_with_their_keyframes() -> None:
+    model = _two_cameras(near_images=2)
+    assert (model.num_points3D(), model.num_reg_images()) == (60, 6)
+    assert remove_near_points(model) == 20
+    assert model.num_points3D() == 40
+    left = [ImageRef.parse(model.image(number).name) for number in model.reg_image_ids()]
+    assert sorted((ref.camera, ref.frame) for ref in left) == [
+        ("palm", 0),
+        ("palm", 1),
+        ("torso", 0),
+        ("torso", 1),
+    ]
+    assert remove_near_points(model) == 0
+
+
+def test_a_camera_that_shares_no_points_keeps_its_near_points() -> None:
+    # Its usual depth is unknown: the near points may be a desk.
+    model = _two_cameras(near_images=4)
+    assert remove_near_points(model) == 0
+    assert model.num_reg_images() == 6
 
 
 @pytest.mark.parametrize(("share", "gain"), [(0.0, 0.6), (0.25, 1.4)])

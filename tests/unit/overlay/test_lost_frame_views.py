@@ -10,6 +10,7 @@ from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.scene import FrameStatus, Map, Trajectory
 from bodycap_batch.overlay import LostView, predict_lost_views
 from bodycap_batch.report import ReportInputs
+from tests.bodies import CAMERAS
 from tests.reports import report_inputs
 
 LOST = slice(20, 25)
@@ -49,9 +50,9 @@ def test_a_camera_that_looks_at_the_chest_sees_the_wearer() -> None:
     chest, hand = (skeleton.index_of_role(role) for role in ("Spine1", "LeftHand"))
     poses = inputs.merge.motion.world_from_joint()
     middle = (LOST.start + LOST.stop) // 2
-    # 25 cm before the chest, looking back at it, 10 cm above its joint.
+    # 28 cm before the bone of the chest, looking back at it.
     front = poses[middle, chest] @ make_transform(
-        np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), [0.0, -0.40, 0.1]
+        np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), [0.0, -0.28, 0.1]
     )
     mounts = tuple(
         replace(mount, joint_from_cam=np.linalg.inv(poses[middle, hand]) @ front)
@@ -84,3 +85,15 @@ def test_without_a_body_a_long_gap_has_no_prediction() -> None:
 def _slowed(path: Trajectory, factor: int) -> Trajectory:
     assert path.status[LOST.start] is not FrameStatus.REGISTERED
     return replace(path, times_ns=path.times_ns[0] + factor * (path.times_ns - path.times_ns[0]))
+
+
+def test_an_uncertain_body_gives_no_prediction() -> None:
+    inputs = report_inputs(points=4000, lost=LOST)
+    assert inputs.merge is not None
+    assert inputs.merge.joint_covariance_m2 is not None
+    covariance = inputs.merge.joint_covariance_m2 + 0.3**2 * np.eye(3)
+    for merge in (
+        replace(inputs.merge, joint_covariance_m2=covariance),
+        replace(inputs.merge, joint_covariance_m2=None),
+    ):
+        assert _views(replace(inputs, merge=merge)) == {camera: {LostView.UNKNOWN} for camera in CAMERAS}
