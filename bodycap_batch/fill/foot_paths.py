@@ -40,6 +40,11 @@ floor. Source: as `_HEEL_RISE_RAD`."""
 _CLEARANCE_M = 0.075
 """Height (metres) of the lowest point of the foot above the floor where it is highest in a swing. Evidence:
 docs/decisions/filling.md."""
+_LOW_CLEARANCE_M = 0.05
+"""The same for steps in place, aside and back. For slow steps forward it is between both. Evidence:
+docs/decisions/filling.md."""
+_FULL_CLEARANCE_AT = 0.7
+"""Speed, as a share of `_FULL_SPEED`, above which the foot is lifted by `_CLEARANCE_M`. Evidence: none."""
 REACH_SHARE = 0.992
 """Maximum distance between hip and ankle of a standing foot, as a share of the length of the leg. With a
 longer distance, the heel is raised. Derivation: the limit at which the knee is kept from a sudden stop."""
@@ -311,6 +316,8 @@ def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg
     end = standing_ankle(leg, second.place, second.heading, np.array([arriving]))[0]
     speed = (start[1] - start[0])[:2] * count
     travel = _quintic(phase, start[1, :2], speed, end[:2])
+    share = min(strength**2 / _FULL_CLEARANCE_AT, 1.0)
+    clearance = _LOW_CLEARANCE_M + share * (_CLEARANCE_M - _LOW_CLEARANCE_M)
     # The drop is limited to what the foot has while it rolls over the ball.
     rise = second.place[2] - first.place[2]
     # The foot rises before it moves ahead to a higher place, and sinks after it has moved over a lower place.
@@ -321,7 +328,7 @@ def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg
     path.heading_rad[inside] = first.heading + _smooth(phase) * (second.heading - first.heading)
     path.ankle_m[inside, :2] = travel
     path.ankle_m[inside, 2] = (
-        floor + leg.drop_m(pitch, toe) + _CLEARANCE_M * np.sin(np.pi * phase**_CLEARANCE_POWER) ** 2
+        floor + leg.drop_m(pitch, toe) + clearance * np.sin(np.pi * phase**_CLEARANCE_POWER) ** 2
     )
 
 

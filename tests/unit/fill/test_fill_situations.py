@@ -157,6 +157,8 @@ def test_turning_on_the_spot_turns_the_feet_without_certain_steps(angle: float) 
     assert certain_steps(result) == 0
     steps = result.report.footsteps
     assert np.degrees(steps.heading_rad[-2:].mean()) == pytest.approx(angle, abs=20.0)
+    low, _ = soles(result)
+    assert low.max() < 0.06, "the feet are not lifted as in a march"
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0)], ids=["left", "right", "back"])
