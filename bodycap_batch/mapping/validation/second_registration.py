@@ -40,6 +40,9 @@ docs/decisions/mapping.md."""
 _MIN_CONFIRMED_RATIO = 0.5
 """Minimum fraction of these keyframes, with the keyframe itself, that a second registration finds in the same
 place. One keyframe in a misplaced block may agree by chance. Evidence: docs/decisions/mapping.md."""
+_MIN_CONFIRMED = 2
+"""Minimum number of these keyframes. A single doubtful keyframe is never confirmed. Evidence:
+docs/decisions/mapping.md."""
 _SEED = 0
 """Seed of RANSAC."""
 
@@ -132,7 +135,7 @@ def confirm_images(
     """Return the doubtful images whose pose a second registration confirms.
 
     An image is confirmed if the second registration finds it in the same place, and also at least half of the
-    doubtful images next to it.
+    doubtful images next to it. A single doubtful image is not confirmed.
 
     Args:
         workspace: Folder of the database with verified matches.
@@ -148,7 +151,7 @@ def confirm_images(
             agrees = np.isin(sequence[start:stop], sorted(found))
             for place in np.flatnonzero(agrees).tolist():
                 near = agrees[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1]
-                if near.mean() >= _MIN_CONFIRMED_RATIO:
+                if near.sum() >= max(_MIN_CONFIRMED, _MIN_CONFIRMED_RATIO * len(near)):
                     out.add(sequence[start + place])
     return out
 

@@ -242,6 +242,7 @@ def test_a_correct_block_with_many_wrong_features_is_kept(
     sequences = image_sequences(blurred)
     assert find_misplaced_images(agreement, sequences) == set(block)
     assert confirm_images(mapping.workspace, blurred, block, sequences, 8.0) == set(block)
+    assert confirm_images(mapping.workspace, blurred, block[:1], sequences, 8.0) == set()
     kept, removed = remove_misregistered(blurred, mapping)
     assert removed == []
     assert _rms(kept, poses) < 0.01
