@@ -658,10 +658,6 @@ def test_recommendations_follow_from_measurements(inputs: ReportInputs) -> None:
     assert any("skeleton" in each.how for each in recommendations)
 
 
-@pytest.mark.parametrize(
-    ("source", "is_recommended"),
-    [("height", True), ("skeleton", False)],
-)
 def _seeing(inputs: ReportInputs, camera: str, view: LostView) -> ReportInputs:
     """Return the results with the view of each lost frame of one camera."""
     path = inputs.path(camera)
@@ -703,6 +699,10 @@ def test_lost_frames_that_see_the_map_are_separated_from_those_that_see_nothing(
         assert words in written(_seeing(inputs, "torso", view), tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("source", "is_recommended"),
+    [("height", True), ("skeleton", False)],
+)
 def test_a_given_skeleton_is_not_recommended_again(
     inputs: ReportInputs, source: str, is_recommended: bool
 ) -> None:
