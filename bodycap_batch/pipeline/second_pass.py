@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
+from bodycap_batch.config.lost_frames import LEAST_LOST_SHARE
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.pipeline.flow import Flow
@@ -13,27 +14,15 @@ from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.tasks.stage import read_summary
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class _Quality:
-    """How good the results of a pass are, by their own measures; the first field that differs decides.
-
-    Attributes:
-        cameras: Number of cameras that the body was solved with.
-        localised: Number of localised frames of all cameras.
-    """
-
-    cameras: int
-    localised: int
-
-
 def repeat_without_wearer(
     job: Job, flow: Flow, results: StageResults, run_pass: Callable[[StageResults], object]
 ) -> None:
     """Repeat map, registration and body once without the wearer, and use the results if they are better.
 
     Only cameras are masked in whose pictures the solved body covers much (`find_wearer`). If there are none,
-    nothing is repeated. The second pass is better if more cameras are part of the body, or if as many are and
-    more frames are localised. Otherwise the results of the first pass stay.
+    nothing is repeated. The second pass is better if more cameras are part of the body, or if as many are,
+    more frames are localised, and no camera loses a notable part of its frames. Otherwise the results of the
+    first pass stay.
 
     Args:
         job: The job.
@@ -48,7 +37,7 @@ def repeat_without_wearer(
         return
     second, before = StageResults(stage=results.stage, keyframes=results.keyframes), len(flow.runner.records)
     with flow.without_wearer(wearer):
-        is_better = _run(second, run_pass) and _quality(second) > _quality(results)
+        is_better = _run(second, run_pass) and _is_better(second, results)
         if is_better:
             flow.runner.release_notes()
     seconds = sum(record.seconds for record in flow.runner.records[before:])
@@ -81,7 +70,8 @@ def _describe(wearer: Artefact, first: StageResults, used: StageResults | None, 
     outcome = (
         "the first results are better and are used"
         if used is None
-        else f"{_quality(used).localised} instead of {_quality(first).localised} frames are localised"
+        else f"{sum(_localised(used).values())} instead of {sum(_localised(first).values())} frames are "
+        "localised"
     )
     return (
         f"the wearer covers much of the pictures ({shares}), so the map was made again without the wearer, "
@@ -89,9 +79,25 @@ def _describe(wearer: Artefact, first: StageResults, used: StageResults | None, 
     )
 
 
-def _quality(results: StageResults) -> _Quality:
-    """Return how good the results of a pass are."""
+def _is_better(second: StageResults, first: StageResults) -> bool:
+    """Return whether the results of the second pass are better, by their own measures."""
+    unused_second, unused_first = _unused_cameras(second), _unused_cameras(first)
+    if unused_second != unused_first:
+        return unused_second < unused_first
+    before, after = _localised(first), _localised(second)
+    kept = all(after.get(name, 0) >= (1.0 - LEAST_LOST_SHARE) * number for name, number in before.items())
+    return kept and sum(after.values()) > sum(before.values())
+
+
+def _unused_cameras(results: StageResults) -> int:
+    """Return the number of cameras that are not part of the body."""
     assert results.merged is not None
-    unused = read_summary(results.merged.path)["unused_cameras"]
-    registered = [read_summary(artefact.path) for artefact in results.registrations.values()]
-    return _Quality(-len(unused), sum(int(summary["localised"]) for summary in registered))
+    return len(read_summary(results.merged.path)["unused_cameras"])
+
+
+def _localised(results: StageResults) -> dict[str, int]:
+    """Return the number of localised frames of each camera, by camera name."""
+    return {
+        name: int(read_summary(artefact.path)["localised"])
+        for name, artefact in results.registrations.items()
+    }

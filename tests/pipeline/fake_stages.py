@@ -19,7 +19,7 @@ Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
- "masked": [cameras], "without_wearer": localised frames of each masked camera,
+ "masked": [cameras], "without_wearer": localised frames, of each camera or {camera: frames},
  "rolling": true, "late": number of maps, "telemetry": [cameras], "real": [stages that are no stand-ins]}.
  "fail" may be a list of stages; "fail_second" is one that fails without the wearer."""
 
@@ -109,10 +109,12 @@ def registered(options: Json, arguments: Json, files: Path) -> None:
     again = json.loads((Path(before["path"]) / "summary.json").read_text())["round"] + 1 if before else 0
     wanted = [*orders().get("wanted", []), *[[]] * 9][again]
     localised = [*orders().get("localised", []), *[10] * 9][again]
+    camera = arguments["capture"]["config"]["cameras"][0]["name"]
     if arguments["capture"]["wearer"] is not None:
-        localised = orders()["without_wearer"]
+        without = orders()["without_wearer"]
+        localised = without[camera] if isinstance(without, dict) else without
     rolling = bool(orders().get("rolling"))
-    frames = localised + orders().get("lost", {}).get(arguments["capture"]["config"]["cameras"][0]["name"], 0)
+    frames = localised + orders().get("lost", {}).get(camera, 0)
     values = {
         "round": again,
         "wanted": wanted,

@@ -489,6 +489,13 @@ def test_the_mask_can_be_switched_off_without_repeating_the_first_pass(bench: Be
     assert pictures_used(bench)
 
 
+def test_a_second_pass_in_which_a_camera_loses_frames_is_not_used(bench: Bench) -> None:
+    without = {"torso": 60, "left_palm": 25}
+    bench.order(lost={"torso": 10}, localised=[30], masked=["torso"], without_wearer=without)
+    bench.run()
+    assert not pictures_used(bench)
+
+
 def test_a_second_pass_that_fails_leaves_the_first_results(bench: Bench) -> None:
     bench.order(lost={"torso": 2}, localised=[30], masked=["torso"], without_wearer=40, fail_second="map")
     bench.run()
