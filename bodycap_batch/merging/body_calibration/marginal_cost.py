@@ -24,7 +24,7 @@ from bodycap_batch.merging.graph.error_modes import POSTURE_BIAS_SHARE, ErrorMod
 from bodycap_batch.merging.graph.joint_priors import samples_per_gesture
 from bodycap_batch.model.geometry import so3_exp
 
-_VARIATION_SHARE = 0.1
+_VARIATION_SHARE = 0.2
 """Variance of a joint's rotation within a capture, as a fraction of the variance of its everyday range.
 
 Evidence: docs/decisions/body_calibration.md.
