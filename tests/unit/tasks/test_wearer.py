@@ -76,6 +76,28 @@ def test_only_cameras_with_much_of_the_wearer_in_view_are_masked(tmp_path: Path)
     assert view.covers(middle, np.array([10])).all()
 
 
+def test_a_camera_that_sees_the_room_where_the_body_should_be_is_not_masked(tmp_path: Path) -> None:
+    inputs = _looking_at_the_chest(report_inputs(), "left_palm")
+    (scene,) = inputs.maps
+    own = np.flatnonzero(np.array(scene.keyframe_camera) == "left_palm")
+    columns, rows = np.meshgrid(np.linspace(10, 630, 30), np.linspace(10, 470, 20))
+    px = np.tile(np.column_stack([columns.ravel(), rows.ravel()]), (len(own), 1))
+    keyframe = np.repeat(own, columns.size)
+    evenly = replace(
+        scene,
+        obs_keyframe=keyframe,
+        obs_point=np.zeros(len(px), dtype=np.int64),
+        obs_feature=np.tile(np.arange(columns.size), len(own)),
+        obs_px=px,
+    )
+    files = tmp_path / "wearer"
+    files.mkdir()
+    run_wearer(_task(replace(inputs, maps=(evenly,)), tmp_path), StageContext(work_dir=tmp_path), files)
+    summary = read_summary(files)
+    assert summary["masked"] == []
+    assert 0.7 < summary["seen_through"]["left_palm"] < 1.4
+
+
 def test_the_mask_is_part_of_the_key_of_tasks_that_read_pictures() -> None:
     capture = CaptureRef(config=CaptureConfig.model_construct(), digests={"torso": "a"})
     masked = replace(capture, wearer=ArtefactRef(path=Path("store"), digest="b"))
