@@ -24,7 +24,7 @@ from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.camera_clock import ClockRelation
-from bodycap_batch.overlay.wearer_view import WearerView
+from bodycap_batch.model.wearer_view import WearerView
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame

@@ -14,8 +14,9 @@ from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import invert, poses_at, transform_points
 from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.scene import Map, Trajectory
+from bodycap_batch.model.wearer_view import WearerView
 from bodycap_batch.overlay.lens_field import field_margin, max_field_angle_rad
-from bodycap_batch.overlay.wearer_view import WearerView, predict_wearer_view
+from bodycap_batch.overlay.wearer_prediction import predict_wearer_view
 
 _MIN_POINTS = 30
 """Minimum number of visible map points in a frame that sees a part of the map. Evidence: none."""

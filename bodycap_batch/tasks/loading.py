@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from bodycap_batch.capture import Capture, KeptFrames
     from bodycap_batch.model.camera_clock import CaptureClocks
     from bodycap_batch.model.scene import KeyframeSelection, MapResult, Registration
-    from bodycap_batch.overlay.wearer_view import WearerView
+    from bodycap_batch.model.wearer_view import WearerView
 
 CLOCKS_NAME = "clocks"
 """Name of the file, without suffix, that holds the clocks of a capture."""
@@ -55,7 +55,7 @@ def load_capture(
 def _load_wearer(wearer: ArtefactRef | None, camera: str) -> WearerView | None:
     """Return the wearer's body in the pictures of a camera; None if this camera is not masked."""
     from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.overlay.wearer_view import WearerView
+    from bodycap_batch.model.wearer_view import WearerView
 
     name = wearer_name(camera)
     if wearer is None or not (wearer.path / f"{name}.json").exists():

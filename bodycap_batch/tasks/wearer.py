@@ -17,7 +17,7 @@ from bodycap_batch.tasks.stage import Stage, write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.model.scene import Map
-    from bodycap_batch.overlay.wearer_view import WearerView
+    from bodycap_batch.model.wearer_view import WearerView
 
 _MIN_SHARE = 0.15
 """Minimum share of the body in the pictures of a camera that is masked: the mean over all frames in which the
@@ -52,7 +52,7 @@ def run_wearer(task: WearerTask, context: StageContext, files: Path) -> None:
     """Predict the body in the pictures, and store the cameras in which it covers much."""
     from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
     from bodycap_batch.model.merge_data import MergeResult
-    from bodycap_batch.overlay.wearer_view import predict_wearer_view
+    from bodycap_batch.overlay.wearer_prediction import predict_wearer_view
 
     maps = {item.gauge: item for item in load_map(task.map.path).maps}
     found = RegisteredCameras.load(

@@ -14,7 +14,7 @@ from bodycap_batch.capture.masks import read_mask
 from bodycap_batch.config.job import load_job
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.optical_flow import detect_corners
-from bodycap_batch.overlay.wearer_view import WearerView
+from bodycap_batch.model.wearer_view import WearerView
 from bodycap_batch.pipeline.inputs import camera_digest
 from bodycap_batch.store.digests import FileDigests
 from tests.videos import textured_frame, write_video

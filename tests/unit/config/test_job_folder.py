@@ -235,7 +235,7 @@ def test_cameras_on_one_bone_make_no_body(tmp_path: Path) -> None:
 def test_a_name_is_asked_for_instead_of_guessed(tmp_path: Path) -> None:
     with pytest.raises(JobError, match=r"GX010007\.MP4") as caught:
         load_job(folder(tmp_path, "torso.mp4", "GX010007.MP4"))
-    assert "left_palm" in str(caught.value.hint)
+    assert "left_ or right_ before it palm" in str(caught.value.hint)
     assert "folder" in str(caught.value.hint)
 
 

@@ -60,6 +60,7 @@ class _Pan:
     """A camera that pans along the wall from `start`; its picture may be mirrored or upside down."""
 
     mask = None
+    wearer = None
 
     def __init__(
         self, name: str, start: int, *, mirrored: bool = False, upside_down: bool = False, count: int = 6

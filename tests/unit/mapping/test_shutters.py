@@ -67,6 +67,7 @@ class _Pan:
     """A camera that pans along the wall."""
 
     mask = None
+    wearer = None
 
     def __init__(self, name: str) -> None:
         self.name = name

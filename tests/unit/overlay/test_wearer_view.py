@@ -9,7 +9,8 @@ import pytest
 
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, transform_points
-from bodycap_batch.overlay.wearer_view import WearerView, predict_wearer_view
+from bodycap_batch.model.wearer_view import WearerView
+from bodycap_batch.overlay.wearer_prediction import predict_wearer_view
 from tests.bodies import merged, reaching
 
 PINHOLE = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))

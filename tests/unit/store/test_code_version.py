@@ -114,7 +114,11 @@ HASHED = {
     # Merging reads marker boards from the images, and explains a failure by mirrored cameras.
     "merge": BODY | {"merging", "calibration", "mapping"},
     "fill": BODY | {"fill"},
-    "export": BODY | {"export"},
+    # The places of unnamed cameras follow from their paths alone.
+    "places": CAMERAS | {"camera_places"},
+    "wearer": CAMERAS | {"overlay"},
+    # The table of frames says what each lost frame should see.
+    "export": BODY | {"export", "overlay"},
     "report": BODY | {"report", "overlay"},
     "preview": BODY | {"preview", "overlay"},
 }

@@ -13,7 +13,7 @@ from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclas
 from bodycap_batch.model.camera_clock import CaptureClocks, FrameTiming
 from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.scene import MapResult
-from bodycap_batch.overlay.wearer_view import WearerView
+from bodycap_batch.model.wearer_view import WearerView
 from bodycap_batch.report import ReportInputs
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import CLOCKS_NAME, wearer_name
