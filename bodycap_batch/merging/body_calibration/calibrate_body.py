@@ -28,7 +28,6 @@ from bodycap_batch.merging.body_calibration.camera_roll import (
 )
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
 from bodycap_batch.merging.body_calibration.limb_scales import limb_scales
-from bodycap_batch.merging.body_calibration.marginal_cost import MarginalCost
 from bodycap_batch.merging.body_calibration.marker_board import LocatedBoard, locate_board
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import PostureHints, take_samples
@@ -92,7 +91,7 @@ class BodyCalibration:
 
     Attributes:
         scale: The metric scale, combined from all of its sources.
-        bones_alone: The scale from the bones without other sources. At this scale `MarginalCost` has
+        bones_alone: The scale from the bones without other sources. At this scale the calibration graph has
             the lowest cost.
         limbs: One scale per limb, estimated from the cameras of this limb. The scales are a diagnostic only.
         mounts: The solved mounts with their sigmas. The mount of the reference camera is the first.
@@ -176,9 +175,9 @@ def calibrate_body(
     graph = CalibrationGraph(inputs.skeleton, bones, samples, priors, provisional, step)
     graph.solve(provisional)
     graph.widen_joint_priors()
-    estimate = estimate_scale(MarginalCost(graph), graph, provisional)
+    estimate = estimate_scale(graph, provisional)
     if graph.test_hinges():
-        estimate = estimate_scale(MarginalCost(graph), graph, estimate.scale)
+        estimate = estimate_scale(graph, estimate.scale)
     poses = graph.poses()
     scene = SceneContext(
         points_m=estimate.scale * map_points_of(inputs, tracks[0].camera),

@@ -31,7 +31,6 @@ from bodycap_batch.merging.graph.factors import (
     add_mount_measurements,
     add_mount_prior,
     bone_key,
-    hinge_sigma_m,
     insert_mount_points,
     mount_from_points,
     mount_jacobian,
@@ -45,7 +44,7 @@ from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 
 JOINT_PRIOR_SCALE = 4.0
-"""Usual factor on the sigmas of the joint rotation priors in this graph.
+"""Factor on the sigmas of the joint rotation priors in this graph.
 
 The graph applies each prior once per sampled tick. Without the factor, these repeated priors would outweigh
 the measurements. Evidence: none.
@@ -95,7 +94,6 @@ class CalibrationGraph:
         self._slack_map = JOINT_SLACK_M * np.sqrt(samples.correlated_samples) / provisional
         self._values: Any = None
         self._scale, self._first_joint_factor = 1.0, 0
-        self._joint_prior_scale = JOINT_PRIOR_SCALE
         self.slack_factor = 1.0
         self.mounts = {name: np.array(priors[name].joint_from_cam) for name in samples.cameras}
 
@@ -110,11 +108,6 @@ class CalibrationGraph:
         return self._bones
 
     @property
-    def rest_bones(self) -> tuple[Bone, ...]:
-        """Bones with the joint priors and the hinges that the graph uses outside a T-pose."""
-        return self._rest_bones
-
-    @property
     def priors(self) -> Mapping[str, Mount]:
         """Mount prior of each camera, by camera name."""
         return self._priors
@@ -123,33 +116,6 @@ class CalibrationGraph:
     def scale(self) -> float:
         """Scale of the last solution, metres per map unit."""
         return self._scale
-
-    def with_joint_priors(self, bones: Sequence[Bone], prior_scale: float) -> CalibrationGraph:
-        """Return an unsolved graph with the same data and hinges, and other joint rotation priors.
-
-        Args:
-            bones: Bones with the new priors.
-            prior_scale: Factor on the sigmas of the new priors. It replaces `JOINT_PRIOR_SCALE`.
-        """
-        out = CalibrationGraph(self._skeleton, self._bones, self._samples, self._priors, 1.0, self._step)
-        out._slack_map, out.slack_factor = self._slack_map, self.slack_factor
-        out._hinges, out._joint_prior_scale = self._hinges, prior_scale
-        out.mounts = dict(self.mounts)
-        out.set_joint_priors(bones)
-        return out
-
-    def set_joint_priors(self, bones: Sequence[Bone]) -> None:
-        """Replace the joint rotation priors. The next solution starts from the last solution.
-
-        Args:
-            bones: Bones with the new priors. Their hinges are not used.
-        """
-        self._rest_bones = tuple(bones)
-
-    def hinge_sigmas_m(self, scale: float) -> FloatArray:
-        """Return the sigma (metres) of each hinge's distances at a scale in metres per map unit."""
-        slack_m = scale * self.slack_factor * self._slack_map
-        return np.array([hinge_sigma_m(hinge, slack_m) for hinge in self._hinges])
 
     def set_samples(self, samples: CalibrationSamples) -> None:
         """Replace the camera poses. The next solution starts from the last solution.
@@ -356,9 +322,7 @@ class CalibrationGraph:
         slack_m = scale * self.slack_factor * self._slack_map
         repetitions = float(np.sqrt(max(self._samples.posture.t_pose.sum(), 1)))
         return (
-            JointFactors(
-                self._rest_bones, self._hinges, prior_scale=self._joint_prior_scale, slack_m=slack_m
-            ),
+            JointFactors(self._rest_bones, self._hinges, prior_scale=JOINT_PRIOR_SCALE, slack_m=slack_m),
             JointFactors(self._t_pose_bones, self._hinges, prior_scale=repetitions, slack_m=slack_m),
         )
 

@@ -107,44 +107,25 @@ class LinearisedCalibration:
             ) from error
 
     def _reduced(self, common_jacobian: FloatArray | None) -> ReducedSystem:
-        free = self.eliminate_poses(common_jacobian)
-        jacobian = free.jacobian
-        covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
-        leverage = free.pose_leverage + np.einsum("ri,ij,rj->r", jacobian, covariance, jacobian)
-        return ReducedSystem(jacobian=jacobian, covariance=covariance, redundancy=1.0 - leverage)
-
-    def eliminate_poses(self, common_jacobian: FloatArray | None = None) -> EliminatedPoses:
-        """Eliminate the bone poses of all ticks from the rows.
-
-        Args:
-            common_jacobian: (R,P) derivatives of the rows with respect to P additional unknowns that all
-                ticks share; None without such unknowns.
-
-        Returns:
-            The rows without the poses.
-
-        Raises:
-            numpy.linalg.LinAlgError: The equations of a tick are singular.
-        """
         matrix = self.linear.matrix
         mounts = np.concatenate(list(self.mount_columns.values()))
         jacobian = matrix[:, mounts].toarray()
         if common_jacobian is not None:
             jacobian = np.hstack([jacobian, common_jacobian])
         pose_leverage = np.zeros(matrix.shape[0])
-        half_log_det = np.zeros(len(self.world_from_bone))
         by_column = matrix.tocsc()
         for tick in range(len(self.world_from_bone)):
             start = self.linear.columns[bone_key(tick, 0)]
             columns = by_column[:, start : start + 6 * len(self.body.bones)]
             rows = np.unique(columns.indices)
             dense = columns[rows].toarray()
-            information = dense.T @ dense
-            half_log_det[tick] = 0.5 * np.linalg.slogdet(information)[1]
-            half = dense @ np.linalg.inv(information)
+            normal = np.linalg.inv(dense.T @ dense)
+            half = dense @ normal
             jacobian[rows] -= half @ (dense.T @ jacobian[rows])
             pose_leverage[rows] = (half * dense).sum(axis=1)
-        return EliminatedPoses(jacobian=jacobian, pose_leverage=pose_leverage, half_log_det=half_log_det)
+        covariance = np.linalg.inv(jacobian.T @ jacobian)
+        leverage = pose_leverage + np.einsum("ri,ij,rj->r", jacobian, covariance, jacobian)
+        return ReducedSystem(jacobian=jacobian, covariance=covariance, redundancy=1.0 - leverage)
 
     def variance_factor(self, reduced: ReducedSystem, row_type: RowType, prior: float = 1.0) -> float:
         """Return the variance factor of one row type: the actual variance divided by the assumed variance.
@@ -224,22 +205,6 @@ class LinearisedCalibration:
     def _by_camera(self, changes: FloatArray) -> dict[str, FloatArray]:
         """Split the changes (6·C,M) of the mounts of C cameras into one array (6,M) per camera."""
         return {camera: changes[6 * index : 6 * index + 6] for index, camera in enumerate(self.mount_columns)}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EliminatedPoses:
-    """The rows of a calibration graph, after the bone poses of all ticks were eliminated.
-
-    Attributes:
-        jacobian: (R,U) derivatives of the rows with respect to U unknowns: the unknowns of all mounts, then
-            the additional unknowns that all ticks share.
-        pose_leverage: (R,) contribution of the poses to the leverage of each row, 0 to 1.
-        half_log_det: (K,) half the logarithm of the determinant of each tick's information matrix.
-    """
-
-    jacobian: FloatArray
-    pose_leverage: FloatArray
-    half_log_det: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

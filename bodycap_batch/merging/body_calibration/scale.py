@@ -3,8 +3,8 @@
 A map has no unit. The scale is the number of metres per map unit. The scale has these sources, listed by
 their names in the report:
 
-- ``skeleton``, ``height``, ``mean stature``: the bones. `estimate_scale` finds the scale with the lowest
-  cost (``marginal_cost.py``); `scale_from_bones` adds the uncertainty of the bone lengths
+- ``skeleton``, ``height``, ``mean stature``: the bones. `estimate_scale` finds the scale at which the
+  calibration graph has the lowest cost; `scale_from_bones` adds the uncertainty of the bone lengths
   (`PROPORTION_SIGMA` in ``skeleton_error_modes.py``). The name says where the bone lengths come from.
 - ``floor``: the height of the reference camera's joint over the floor, see `scale_from_floor`. The module
   ``world/floor.py`` finds the floor that the person walks on.
@@ -25,7 +25,7 @@ Other modules estimate scales for other purposes. These scales are not used in t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,12 +67,12 @@ Evidence: none.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleEstimate:
-    """The result of `estimate_scale`: the scale with the lowest cost.
+    """The result of `estimate_scale`: the scale at which the calibration graph has the lowest cost.
 
     Attributes:
         scale: Metres per map unit.
         sigma_log: Sigma of the logarithm of the scale, from the curvature of the cost.
-        costs: Pairs (scale, cost), one for every scale that was tried.
+        costs: Pairs (scale, cost), one for every solution of the graph.
         mount_slope: By camera, change of joint_from_cam (4,4) per unit of log scale.
     """
 
@@ -114,16 +114,13 @@ class MetricScale:
     sources: tuple[ScaleSource, ...]
 
 
-def estimate_scale(
-    cost_of: Callable[[float], float], graph: CalibrationGraph, provisional: float
-) -> ScaleEstimate:
-    """Find the scale with the lowest cost.
+def estimate_scale(graph: CalibrationGraph, provisional: float) -> ScaleEstimate:
+    """Find the scale at which a calibration graph has the lowest cost.
 
     The search fits a parabola to the costs at three values of log scale, and moves to the minimum of the
     parabola. It does this twice: first with a coarse step between the three values, then with a fine step.
 
     Args:
-        cost_of: Function that returns the cost of a scale, as `MarginalCost` does.
         graph: The calibration graph. At the end, its last solution is at the returned scale.
         provisional: Initial value of the scale, metres per map unit.
 
@@ -131,15 +128,13 @@ def estimate_scale(
         The scale, its uncertainty, and the dependence of the mounts on the scale.
     """
     costs: dict[float, float] = {}
+    mounts: dict[float, dict[str, FloatArray]] = {}
 
     def cost(log_scale: float) -> float:
         if log_scale not in costs:
-            costs[log_scale] = cost_of(float(np.exp(log_scale)))
+            costs[log_scale] = graph.solve(float(np.exp(log_scale)))
+            mounts[log_scale] = {name: pose.copy() for name, pose in graph.mounts.items()}
         return costs[log_scale]
-
-    def mounts(log_scale: float) -> dict[str, FloatArray]:
-        graph.solve(float(np.exp(log_scale)))
-        return {name: pose.copy() for name, pose in graph.mounts.items()}
 
     centre, curvature = float(np.log(provisional)), 0.0
     for step in (_COARSE_STEP, _FINE_STEP):
@@ -150,10 +145,18 @@ def estimate_scale(
                 centre += float(0.5 * (low - high) / (curvature * step)) if curvature > 0.0 else 0.0
                 break
             centre += step if high < low else -step
-    below, above = mounts(centre - _FINE_STEP), mounts(centre + _FINE_STEP)
-    slope = {name: (above[name] - below[name]) / (2.0 * _FINE_STEP) for name in above}
-    # The caller uses the mounts of the graph's last solution.
-    graph.solve(float(np.exp(centre)))
+    cost(centre)
+    for side in (-_FINE_STEP, _FINE_STEP):
+        if not any((x - centre) * side > 0.0 for x in costs):
+            # No solution exists yet on this side of the minimum. The slope of the mounts needs a solution on
+            # both sides.
+            cost(centre + side)
+    below, above = (_nearest_solution(mounts, centre, sign * _FINE_STEP) for sign in (-1.0, 1.0))
+    width = above - below
+    slope = {name: (mounts[above][name] - mounts[below][name]) / width for name in mounts[above]}
+    # Solve at the minimum once more, because the caller uses the mounts of the graph's last solution.
+    costs.pop(centre)
+    cost(centre)
     return ScaleEstimate(
         scale=float(np.exp(centre)),
         sigma_log=max(1.0 / np.sqrt(curvature), _MIN_SIGMA) if curvature > 0 else 1.0,
@@ -162,13 +165,24 @@ def estimate_scale(
     )
 
 
+def _nearest_solution(
+    mounts: Mapping[float, Mapping[str, FloatArray]], centre: float, offset: float
+) -> float:
+    """Return the solved log scale nearest to ``centre + offset``.
+
+    If the offset is positive, only solutions above the centre are considered. If the offset is negative, only
+    solutions below the centre are considered.
+    """
+    return min((x for x in mounts if (x - centre) * offset > 0.0), key=lambda x: abs(x - centre - offset))
+
+
 def scale_from_bones(
     estimate: ScaleEstimate, *, is_measured: bool, has_height: bool, clock_sigma: float = 0.0
 ) -> ScaleSource:
     """Return the scale from the bones with the uncertainty of their lengths and of the clocks.
 
     Args:
-        estimate: The scale with the lowest cost.
+        estimate: The scale at which the calibration graph has the lowest cost.
         is_measured: True if the bone lengths of the subject were measured.
         has_height: True if the skeleton was scaled to the subject's height.
         clock_sigma: Sigma of the scale's logarithm that the sigmas of the clocks cause.

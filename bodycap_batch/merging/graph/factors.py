@@ -122,7 +122,8 @@ class JointFactors:
         }
         self._noise = {index: _joint_noise(bone, prior_scale, slack_m) for index, bone in self._children}
         self._hinge_noises = [
-            gtsam.noiseModel.Isotropic.Sigma(1, hinge_sigma_m(hinge, slack_m)) for hinge in hinges
+            gtsam.noiseModel.Isotropic.Sigma(1, float(np.hypot(HINGE_SLACK_RATIO * slack_m, hinge.sigma_m)))
+            for hinge in hinges
         ]
         self._anchors = [
             [gtsam.Pose3(gtsam.Rot3(), anchor) for anchor in hinge.anchors_m] for hinge in hinges
@@ -137,11 +138,6 @@ class JointFactors:
             upper, following = bone_key(tick, hinge.upper), bone_key(tick, hinge.following)
             for anchor in anchors:
                 graph.add(gtsam.RangeFactorWithTransformPose3(upper, following, hinge.range_m, noise, anchor))
-
-
-def hinge_sigma_m(hinge: Hinge, slack_m: float) -> float:
-    """Return the sigma (metres) of a hinge's distances, for joints with the slack `slack_m` (metres)."""
-    return float(np.hypot(HINGE_SLACK_RATIO * slack_m, hinge.sigma_m))
 
 
 def _joint_noise(bone: Bone, prior_scale: float, slack_m: float) -> Any:

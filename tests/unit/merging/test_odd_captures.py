@@ -186,8 +186,7 @@ class _Sliding:
 
 
 def test_a_cost_without_minimum_leaves_the_scale_unknown():
-    sliding = _Sliding()
-    estimate = estimate_scale(sliding.solve, sliding, 1.0)
+    estimate = estimate_scale(_Sliding(), 1.0)
     assert estimate.sigma_log == 1.0
     assert np.isfinite(estimate.mount_slope["cam"]).all()
 
