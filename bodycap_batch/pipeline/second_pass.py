@@ -37,42 +37,46 @@ def repeat_without_wearer(
         return
     second, before = StageResults(stage=results.stage, keyframes=results.keyframes), len(flow.runner.records)
     with flow.without_wearer(wearer):
-        is_better = _run(second, run_pass) and _is_better(second, results)
+        failure = _run(second, run_pass)
+        is_better = not failure and _is_better(second, results)
         if is_better:
             flow.runner.release_notes()
     seconds = sum(record.seconds for record in flow.runner.records[before:])
-    flow.runner.note(_describe(wearer, results, second if is_better else None, seconds), "registration")
+    if failure:
+        outcome = f"it gave no body ({failure}), so the first results are used"
+    elif is_better:
+        before_count, after_count = (sum(_localised(item).values()) for item in (results, second))
+        outcome = f"{after_count} instead of {before_count} frames are localised"
+    else:
+        outcome = "the first results are better and are used"
+    flow.runner.note(_describe(wearer, seconds, outcome), "registration")
     if is_better:
         for item in fields(StageResults):
             setattr(results, item.name, getattr(second, item.name))
 
 
-def _run(second: StageResults, run_pass: Callable[[StageResults], object]) -> bool:
-    """Run the second pass, and return whether it gave a body."""
+def _run(second: StageResults, run_pass: Callable[[StageResults], object]) -> str:
+    """Run the second pass, and return why it gave no body; "" if it gave one."""
     try:
         run_pass(second)
-    except EstimationError:
-        return False
-    return second.filled is not None
+    except EstimationError as error:
+        return error.message
+    if second.filled is not None:
+        return ""
+    assert second.failure is not None  # The job asks for a body, and this pass gave none.
+    return second.failure.message
 
 
-def _describe(wearer: Artefact, first: StageResults, used: StageResults | None, seconds: float) -> str:
+def _describe(wearer: Artefact, seconds: float, outcome: str) -> str:
     """Return a note for the user about the second pass.
 
     Args:
         wearer: The artefact with the wearer's body in the pictures.
-        first: The results of the first pass.
-        used: The results of the second pass; None if they are not used.
         seconds: Time that the tasks of the second pass took.
+        outcome: Which results are used, and why.
     """
     summary = read_summary(wearer.path)
     shares = ", ".join(f"{summary['shares'][name]:.0%} of {name}" for name in summary["masked"])
-    outcome = (
-        "the first results are better and are used"
-        if used is None
-        else f"{sum(_localised(used).values())} instead of {sum(_localised(first).values())} frames are "
-        "localised"
-    )
     return (
         f"the wearer covers much of the pictures ({shares}), so the map was made again without the wearer, "
         f"which took {seconds:.0f} s: {outcome}"

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Mapping
@@ -30,11 +32,18 @@ def orders() -> dict[str, Any]:
 
 
 def made_of(value: Any) -> Any:
-    """Replace every reference to an artefact in a value by the content of the artefact."""
+    """Replace every reference to an artefact in a value by the content of the artefact.
+
+    The wearer is made of all stages of the first pass, which quotes in quotes would make enormous: a digest
+    stands for it.
+    """
     if isinstance(value, Mapping):
         if value.keys() == {"path", "digest"}:
             return made_of(value["path"])
-        return {key: made_of(part) for key, part in value.items() if key not in ("video", "out", "job")}
+        parts = {key: made_of(part) for key, part in value.items() if key not in ("video", "out", "job")}
+        if parts.get("wearer"):
+            parts["wearer"] = hashlib.sha256(parts["wearer"].encode()).hexdigest()
+        return parts
     if isinstance(value, list):
         return [made_of(part) for part in value]
     if isinstance(value, str) and (Path(value) / "made_of.txt").is_file():
@@ -58,7 +67,7 @@ def stage(name: str) -> Any:
                 time.sleep(0.05)
         if name in as_list(orders().get("fail")) and meant:
             raise EstimationError(f"{name} does not work out", hint="film more")
-        repeats = (arguments.get("capture") or {}).get("wearer") is not None
+        repeats = re.search(r'"wearer\\*": \\*"', json.dumps(made_of(arguments))) is not None
         if repeats and orders().get("fail_second") == name:
             raise EstimationError(f"{name} does not work out without the wearer", hint="film more")
         if name == "check" and any("unreadable" in text for text in videos(arguments["job"])):

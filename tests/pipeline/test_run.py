@@ -496,10 +496,13 @@ def test_a_second_pass_in_which_a_camera_loses_frames_is_not_used(bench: Bench) 
     assert not pictures_used(bench)
 
 
-def test_a_second_pass_that_fails_leaves_the_first_results(bench: Bench) -> None:
-    bench.order(lost={"torso": 2}, localised=[30], masked=["torso"], without_wearer=40, fail_second="map")
+@pytest.mark.parametrize("stage", ["map", "merge"])
+def test_a_second_pass_that_fails_leaves_the_first_results_and_says_why(bench: Bench, stage: str) -> None:
+    bench.order(lost={"torso": 2}, localised=[30], masked=["torso"], without_wearer=40, fail_second=stage)
     bench.run()
     assert not pictures_used(bench)
+    (note,) = {event.what for event in bench.events if "wearer covers" in event.what}
+    assert f"it gave no body ({stage} does not work out without the wearer)" in note
 
 
 def stopped_at_the_order(bench: Bench, meanwhile: Callable[[], None] = lambda: None) -> list[Cancelled]:
