@@ -402,7 +402,7 @@ def test_frames_still_lost_next_to_found_ones_are_searched_again(
     """The search starts from the frames found, which are not tracked, and ends if nothing is found."""
     asked = []
 
-    def accepted_poses(propagation: Propagation, limits: AcceptanceCriteria) -> dict[int, PoseEstimate]:
+    def accepted_poses(propagation: Propagation) -> dict[int, PoseEstimate]:
         interval = propagation.interval
         asked.append((interval.start, interval.stop))
         if len(asked) > 1:

@@ -14,7 +14,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Trajectory
 from bodycap_batch.registration.recovery import sensor_search
-from bodycap_batch.registration.recovery.recover import RecoveryInputs
+from bodycap_batch.registration.recovery.recover import RecoveryInputs, make_localiser
 from bodycap_batch.registration.recovery.sensor_search import search_near_sensor
 from bodycap_batch.telemetry.streams import CameraTelemetry
 from tests.stages.test_recovery import (  # the fixtures are used by their names
@@ -30,6 +30,7 @@ from tests.stages.test_recovery import (  # the fixtures are used by their names
 
 __all__ = ["context", "pictures"]
 SIGMA_RAD, SIGMA_M = np.radians(0.5), 0.06
+SHUTTER_RAD = 0.005
 
 
 def sensor_path(path: Trajectory, off_m: float) -> Trajectory:
@@ -48,11 +49,18 @@ def sensor_path(path: Trajectory, off_m: float) -> Trajectory:
 
 
 def searched(
-    shown: list[np.ndarray], off_m: float, context: StageContext, monkeypatch: pytest.MonkeyPatch
+    shown: list[np.ndarray],
+    off_m: float,
+    context: StageContext,
+    monkeypatch: pytest.MonkeyPatch,
+    shutter: Any = None,
 ) -> Trajectory:
     before = _tracked()
     filled = SimpleNamespace(trajectory=sensor_path(before.trajectory, off_m))
     monkeypatch.setattr(sensor_search, "use_sensor", lambda *_: filled)
+    monkeypatch.setattr(
+        sensor_search, "make_localiser", lambda *each: replace(make_localiser(*each), shutter=shutter)
+    )
     video = _SolvedVideo(shown)
     capture: Any = SimpleNamespace(cameras=(video,), camera=lambda _: video)
     selection = KeyframeSelection(
@@ -73,6 +81,30 @@ def test_frames_are_found_near_the_poses_of_the_sensor(
     assert len(found) >= len(LOST) // 2
     off_m = np.linalg.norm(path.gauge_from_cam[:, :3, 3] - PATH[:, :3, 3], axis=1)[found]
     assert off_m.max() < 0.04  # the sensor is 0.05 m off, with an equal sigma
+
+
+class _ExtrapolatedShutter:
+    """A rolling shutter in whose frames the angular velocity is extrapolated."""
+
+    path = SimpleNamespace(is_known=lambda _: False)
+
+    def uncertainty(self, _: int) -> float:
+        return SHUTTER_RAD
+
+
+def test_the_covariance_of_a_found_pose_contains_the_error_of_the_shutter(
+    pictures: list[np.ndarray], context: StageContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without = searched(pictures, 0.05, context, monkeypatch)
+    monkeypatch.undo()
+    shutter = _ExtrapolatedShutter()
+    path = searched(pictures, 0.05, context, monkeypatch, shutter)
+    found = [frame for frame in LOST if path.localised[frame]]
+    assert len(found) >= len(LOST) // 2
+    added = (path.covariance - without.covariance)[found]
+    np.testing.assert_allclose(added[:, [0, 1, 2], [0, 1, 2]], SHUTTER_RAD**2, rtol=1e-6)
+    # The walls of the room are between 1 and 4 m from the camera.
+    assert ((added[:, 3, 3] > SHUTTER_RAD**2) & (added[:, 3, 3] < (4.0 * SHUTTER_RAD) ** 2)).all()
 
 
 def test_poses_that_contradict_the_sensor_are_not_accepted(

@@ -19,6 +19,7 @@ from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
 from bodycap_batch.registration.poses.pose_outliers import ISOLATED_INLIER_FACTOR, isolated_poses
 from bodycap_batch.registration.poses.rig_members import RegisteredCamera
 from bodycap_batch.registration.poses.turning_tracks import with_rotation
+from bodycap_batch.registration.recovery.accepted_poses import accepted_pose, with_poses
 from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser, PoseEstimate
 from bodycap_batch.registration.recovery.motion_prior import (
     MAX_DISAGREEMENT,
@@ -42,9 +43,6 @@ from bodycap_batch.registration.recovery.search_images import (
 
 _SMOOTHING_MARGIN = 8
 """Number of frames on either side of an interval that are smoothed together with it. Evidence: none."""
-_MIN_INLIER_WEIGHT_RATIO = 0.5
-"""Minimum inlier weight ratio of an accepted pose: the weight of the inliers divided by the weight of all
-matches. Evidence: none."""
 _MAX_PASSES = 5
 """Maximum number of passes over the lost intervals. Each pass starts from the poses of the previous pass, and
 reaches frames deeper inside the intervals. Evidence: docs/decisions/registration.md."""
@@ -247,7 +245,7 @@ class _IntervalSearch:
             keyframe_rows=seed_rows,
             statistics=self.statistics,
         )
-        return _accepted_poses(Propagation(self.localiser, interval), self.localiser.criteria)
+        return _accepted_poses(Propagation(self.localiser, interval))
 
 
 def _extended_intervals(has_pose: BoolArray, before: BoolArray, frozen: BoolArray) -> list[tuple[int, int]]:
@@ -275,12 +273,10 @@ def _smooth(estimates: Mapping[int, PoseEstimate], interval: LostInterval) -> Sm
     return smooth_centres(frames, interval.times[frames], positions, tracked, interval.statistics)
 
 
-def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> dict[int, PoseEstimate]:
+def _accepted_poses(propagation: Propagation) -> dict[int, PoseEstimate]:
     """Search an interval and return the accepted poses with smoothed centres, by frame.
 
-    A pose is accepted if it has enough support, if its centre is near the smoothed centre, and if the sigma
-    of the centre is small. If the angular velocity of a camera with a rolling shutter is extrapolated in the
-    frame, its error adds to the covariance.
+    A pose is accepted if its centre is near the smoothed centre, and if `accepted_pose` accepts it.
     """
     estimates = propagation.run()
     if not estimates:
@@ -289,17 +285,10 @@ def _accepted_poses(propagation: Propagation, criteria: AcceptanceCriteria) -> d
     smoothed = _smooth(estimates, propagation.interval)
     accepted = {}
     for frame, estimate in estimates.items():
-        pose, covariance = estimate.conditioned_on_centre(smoothed.positions[frame])
-        shutter = propagation.localiser.shutter
-        unsure = 0.0 if shutter is None else shutter.uncertainty(frame)
-        covariance = covariance + np.diag(np.repeat([unsure, unsure * estimate.depth], 3) ** 2)
-        sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
-        if (
-            estimate.has_support(criteria.min_inliers, _MIN_INLIER_WEIGHT_RATIO)
-            and smoothed.disagreement[frame] < MAX_DISAGREEMENT
-            and sigma < criteria.max_sigma_depth * estimate.depth
-        ):
-            accepted[frame] = replace(estimate, cam_from_map=pose, covariance=covariance)
+        if smoothed.disagreement[frame] < MAX_DISAGREEMENT:
+            pose = accepted_pose(estimate, smoothed.positions[frame], propagation.localiser, frame)
+            if pose is not None:
+                accepted[frame] = pose
     return accepted
 
 
@@ -307,28 +296,11 @@ def _merge_into(
     path: Trajectory, poses: Mapping[int, PoseEstimate], criteria: AcceptanceCriteria
 ) -> Trajectory:
     """Return the trajectory with additional poses. Isolated poses are not added."""
-    has_pose: BoolArray = path.localised.copy()
-    inliers = path.inliers.copy()
-    for frame, estimate in poses.items():
-        has_pose[frame], inliers[frame] = True, estimate.inliers
+    merged = with_poses(path, poses)
     min_inliers = ISOLATED_INLIER_FACTOR * criteria.min_inliers
-    isolated = isolated_poses(has_pose, inliers, min_inliers) | _single_poses(has_pose)
-    matrices, covariance = path.gauge_from_cam.copy(), path.covariance.copy()
-    status, error_px = list(path.status), path.error_px.copy()
-    for frame, estimate in poses.items():
-        if isolated[frame]:
-            continue
-        matrices[frame], covariance[frame] = invert(estimate.cam_from_map), estimate.covariance
-        status[frame], error_px[frame] = FrameStatus.REGISTERED, estimate.error_px
-    inliers = np.where([value.localised for value in status], inliers, path.inliers)
-    return replace(
-        path,
-        gauge_from_cam=matrices,
-        covariance=covariance,
-        status=tuple(status),
-        inliers=inliers,
-        error_px=error_px,
-    )
+    isolated = isolated_poses(merged.localised, merged.inliers, min_inliers)
+    isolated |= _single_poses(merged.localised)
+    return with_poses(path, {frame: pose for frame, pose in poses.items() if not isolated[frame]})
 
 
 def _single_poses(has_pose: BoolArray) -> BoolArray:

@@ -12,9 +12,10 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.inertial import use_sensor
 from bodycap_batch.model.geometry import invert, so3_log
-from bodycap_batch.model.scene import FrameStatus, Registration, Trajectory
+from bodycap_batch.model.scene import Registration, Trajectory
 from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
 from bodycap_batch.registration.poses.turning_tracks import with_rotation
+from bodycap_batch.registration.recovery.accepted_poses import accepted_pose, with_poses
 from bodycap_batch.registration.recovery.guided_localisation import (
     GuidedLocaliser,
     NeighbourPose,
@@ -26,8 +27,6 @@ from bodycap_batch.registration.recovery.recover import RecoveryInputs, make_loc
 from bodycap_batch.registration.recovery.search_images import read_pyramids
 from bodycap_batch.telemetry.streams import CameraTelemetry
 
-_MIN_INLIER_WEIGHT_RATIO = 0.5
-"""Minimum inlier weight ratio of an accepted pose: the same as for lost frames without a sensor."""
 _MAX_DISTANCE = 22.5
 """Maximum squared Mahalanobis distance between the found pose and that of the sensor. Origin: the 99.9 %
 quantile of χ² with six degrees of freedom."""
@@ -77,7 +76,7 @@ def search_near_sensor(
                 estimate = _pose_near(localiser, search_frame, filled)
                 if estimate is not None:
                     found[frame] = estimate
-    return replace(registration, trajectory=_with_poses(path, found)) if found else registration
+    return replace(registration, trajectory=with_poses(path, found)) if found else registration
 
 
 def _pose_near(
@@ -95,16 +94,9 @@ def _pose_near(
     else:
         neighbour = NeighbourPose(prior)
     found = localiser.localise(search_frame, [prior], neighbour, expected.position)
-    criteria = localiser.criteria
-    if found is None or not found.has_support(criteria.min_inliers, _MIN_INLIER_WEIGHT_RATIO):
+    if found is None or _distance(found, expected) > _MAX_DISTANCE:
         return None
-    if _distance(found, expected) > _MAX_DISTANCE:
-        return None
-    pose, covariance = found.conditioned_on_centre(fuse(found.position, expected.position)[0])
-    sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
-    if sigma >= criteria.max_sigma_depth * found.depth:
-        return None
-    return replace(found, cam_from_map=pose, covariance=covariance)
+    return accepted_pose(found, fuse(found.position, expected.position)[0], localiser, frame)
 
 
 def _distance(found: PoseEstimate, expected: PoseEstimate) -> float:
@@ -113,21 +105,3 @@ def _distance(found: PoseEstimate, expected: PoseEstimate) -> float:
     shift = invert(found.cam_from_map)[:3, 3] - invert(expected.cam_from_map)[:3, 3]
     difference: FloatArray = np.concatenate([np.ravel(turn), found.cam_from_map[:3, :3] @ shift])
     return float(difference @ np.linalg.solve(found.covariance + expected.covariance, difference))
-
-
-def _with_poses(path: Trajectory, found: dict[int, PoseEstimate]) -> Trajectory:
-    """Return a trajectory with the found poses."""
-    matrices, covariance = path.gauge_from_cam.copy(), path.covariance.copy()
-    status, inliers, error_px = list(path.status), path.inliers.copy(), path.error_px.copy()
-    for frame, estimate in found.items():
-        matrices[frame], covariance[frame] = invert(estimate.cam_from_map), estimate.covariance
-        status[frame], inliers[frame] = FrameStatus.REGISTERED, estimate.inliers
-        error_px[frame] = estimate.error_px
-    return replace(
-        path,
-        gauge_from_cam=matrices,
-        covariance=covariance,
-        status=tuple(status),
-        inliers=inliers,
-        error_px=error_px,
-    )
