@@ -19,11 +19,20 @@ MAPPING = ("map", "registration", "recover")
 """Stages that do the same as the peers: they estimate the pose of every frame."""
 
 
-def run(row: Row, work: Path) -> dict[str, Any]:
-    """Run one job without earlier results, in a store of its own, and evaluate it; return plain values."""
-    out = work / "out"
+def run(row: Row, work: Path, store: Path | None = None) -> dict[str, Any]:
+    """Run one job, by default without earlier results in a store of its own, and evaluate it.
+
+    Args:
+        row: The job.
+        work: Folder for the results.
+        store: A store that several jobs have in common.
+
+    Returns:
+        Plain values.
+    """
+    out, store = work / "out", store or work / "store"
     work.mkdir(parents=True, exist_ok=True)
-    command = [*BODYCAP, "run", str(row.capture), "--out", str(out), "--store", str(work / "store")]
+    command = [*BODYCAP, "run", str(row.capture), "--out", str(out), "--store", str(store)]
     started, before = time.monotonic(), _children_cpu_s()
     with (work / "stderr.txt").open("w+", encoding="utf-8") as errors:
         job = subprocess.Popen(
@@ -56,7 +65,7 @@ def run(row: Row, work: Path) -> dict[str, Any]:
         "camera_seconds": camera_seconds(out / "frames.csv"),
         "peak_memory_mb": record["peak_memory_mb"],
         "report": score(out, row),
-        "covariance": poses.consistency(out, work / "store", row.truth),
+        "covariance": poses.consistency(out, store, row.truth),
         "metrics": metrics,
     }
 

@@ -2,8 +2,11 @@
 
 ``python -m tests.bench violent FOLDER [FOLDER ...]``: captures of videos with true paths. Where a camera has
 no ``.imu.csv``, the samples of a consumer's sensor are drawn from a smooth path through its true poses. Each
-capture runs with all uses of the telemetry and without any. Printed: frames with a pose, the error of the
-paths, frames that are more than 10 cm off, and lost frames in stretches of up to half a second.
+capture runs without any use of the telemetry, and with all uses; with ``--separate``, the uses are also added
+one after another. Jobs of one capture have one store, so that stages in common run once. Printed for each
+job: frames with a pose, the error of the paths, frames that are more than 10 cm off, lost frames in stretches
+of up to half a second and in longer ones. Compared with the job without sensors: how many frames of its short
+lost stretches have a pose, and the errors on the frames that both jobs localised.
 """
 
 from __future__ import annotations
@@ -15,20 +18,32 @@ import shutil
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.model.geometry import make_transform, rotation_from_quat_xyzw
+from bodycap_batch.core.arrays import BoolArray, FloatArray, runs
+from bodycap_batch.model.geometry import align_points, make_transform, rotation_from_quat_xyzw
 from bodycap_batch.synthetic.imu import write_imu
 from bodycap_batch.synthetic.imu_options import ImuOptions
 from tests.bench import ours
 from tests.bench.rows import Row
 
 USES = ("gravity", "blur", "tracking", "gps", "search", "gaps")
+PLAIN = "without"
+"""Name of the job without any use of the telemetry."""
+JOBS = {
+    PLAIN: (),
+    "tracking": ("gravity", "blur", "tracking", "gps"),
+    "search": ("gravity", "blur", "tracking", "gps", "search"),
+    "with": USES,
+}
+"""Uses of the telemetry by name of the job; the middle ones run with ``--separate``."""
+OFF_CM = 10.0
+"""Error (cm) above which a pose is called wrong."""
 SHORT_S = 0.5
 """Longest stretch of lost frames that counts as short, seconds."""
 
@@ -62,14 +77,14 @@ def prepare(capture: Path, work: Path, end_s: float | None) -> Path:
             poses, length_s = smooth_path(folder / "gt" / f"{video.stem}.tum")
             seed = np.random.SeedSequence([7, number])
             write_imu(folder, video.stem, ImuOptions(), length_s, poses, seed)
-    for name, used in (("without", False), ("with", True)):
+    for name, uses in JOBS.items():
         job: dict[str, Any] = {
             "name": name,
             "capture": {
                 "cameras": [{"name": v.stem, "video": str(v)} for v in sorted(folder.glob("*.mp4"))],
                 "calibration": str(folder / "calib.json"),
             },
-            "telemetry": dict.fromkeys(USES, used),
+            "telemetry": {use: use in uses for use in USES},
             "export": {"formats": ["tum", "csv"], "preview": False},
         }
         if end_s is not None:
@@ -78,53 +93,116 @@ def prepare(capture: Path, work: Path, end_s: float | None) -> Path:
     return folder
 
 
-def lost_stretches(frames: Path) -> tuple[int, int]:
-    """Return the number of lost frames in stretches of up to `SHORT_S`, and in longer ones."""
-    status: dict[str, list[tuple[float, bool]]] = defaultdict(list)
-    with frames.open(newline="", encoding="utf-8") as stream:
+@dataclass(frozen=True)
+class Frames:
+    """The frames of all cameras of a job.
+
+    Attributes:
+        posed: By camera, (N,) True for frames with a pose.
+        inertial: By camera, (N,) True for frames whose pose comes from the sensor alone.
+        times_s: By camera, (N,) times.
+        error_cm: By camera, (N,) error of each frame; NaN without a pose.
+    """
+
+    posed: dict[str, BoolArray]
+    inertial: dict[str, BoolArray]
+    times_s: dict[str, FloatArray]
+    error_cm: dict[str, FloatArray]
+
+    def short(self) -> dict[str, BoolArray]:
+        """Return a mask (N,) of each camera's lost frames in stretches of up to `SHORT_S` between poses."""
+        out = {}
+        for camera, posed in self.posed.items():
+            times_s = self.times_s[camera]
+            out[camera] = np.zeros(len(posed), dtype=bool)
+            for start, stop in runs(~posed):
+                inside = start > 0 and stop < len(posed)
+                if inside and times_s[stop] - times_s[start - 1] <= SHORT_S + 1e-6:
+                    out[camera][start:stop] = True
+        return out
+
+
+def frames_of(results: Path, truth: Path) -> Frames:
+    """Read the frames of a job, and compare their poses with the truth under one similarity."""
+    status: dict[str, list[tuple[float, str]]] = defaultdict(list)
+    with (results / "frames.csv").open(newline="", encoding="utf-8") as stream:
         for line in csv.DictReader(row for row in stream if not row.startswith("#")):
-            status[line["camera"]].append((float(line["time"]), line["status"] == "LOST"))
-    short = long = 0
-    for rows in status.values():
-        times_s, lost = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]])))
-        for first, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-            span_s = float(times_s[min(stop, len(times_s) - 1)] - times_s[max(first - 1, 0)])
-            if span_s <= SHORT_S + 1e-6 and first > 0 and stop < len(times_s):
-                short += stop - first
-            else:
-                long += stop - first
-    return short, long
+            status[line["camera"]].append((float(line["time"]), line["status"]))
+    times_s = {camera: np.array([row[0] for row in rows]) for camera, rows in status.items()}
+    posed = {camera: np.array([row[1] != "LOST" for row in rows]) for camera, rows in status.items()}
+    inertial = {camera: np.array([row[1] == "INERTIAL" for row in rows]) for camera, rows in status.items()}
+    found, true, error_cm = {}, {}, {}
+    for camera in status:
+        found[camera] = np.full((len(times_s[camera]), 3), np.nan)
+        if posed[camera].any():
+            table = np.loadtxt(results / "trajectories" / f"{camera}.tum", ndmin=2)
+            found[camera][posed[camera]] = table[:, 1:4]
+        true[camera] = smooth_path(truth / f"{camera}.tum")[0](times_s[camera])[:, :3, 3]
+    known = np.concatenate([posed[camera] for camera in status])
+    places, truths = (np.concatenate(list(each.values())) for each in (found, true))
+    fit = align_points(places[known], truths[known])
+    for camera in status:
+        error_cm[camera] = 100.0 * np.linalg.norm(fit.apply(found[camera]) - true[camera], axis=1)
+    return Frames(posed, inertial, times_s, error_cm)
 
 
-def measure(capture: Path, work: Path, end_s: float | None, threads: int) -> list[dict[str, Any]]:
-    """Run a capture with and without its sensors, and return the figures of both."""
+def figures(frames: Frames, plain: Frames | None) -> dict[str, Any]:
+    """Return the figures of a job, compared with the job without sensors."""
+    error_cm = np.concatenate(list(frames.error_cm.values()))
+    posed = np.concatenate(list(frames.posed.values()))
+    short = np.concatenate(list(frames.short().values()))
+    inertial = np.concatenate(list(frames.inertial.values()))
+    out: dict[str, Any] = {
+        "frames": len(posed),
+        "posed": int(posed.sum()),
+        "inertial": int(inertial.sum()),
+        "short": int(short.sum()),
+        "long": int((~posed & ~short).sum()),
+        "rmse": _rms(error_cm[posed]),
+        "max": float(error_cm[posed].max()),
+        "off": int((error_cm[posed] > OFF_CM).sum()),
+        "cameras": {
+            camera: (int(frames.posed[camera].sum()), _rms(errors[frames.posed[camera]]))
+            for camera, errors in frames.error_cm.items()
+        },
+    }
+    if plain is not None:
+        lost = np.concatenate(list(plain.short().values()))
+        common = np.concatenate(list(plain.posed.values())) & posed
+        before_cm = np.concatenate(list(plain.error_cm.values()))
+        out |= {
+            "short_without": int(lost.sum()),
+            "of_them_posed": int((lost & posed).sum()),
+            "common": int(common.sum()),
+            "common_rmse": (_rms(before_cm[common]), _rms(error_cm[common])),
+        }
+        gained = posed & np.isnan(before_cm)
+        out |= {"gained": int(gained.sum()), "gained_rmse": _rms(error_cm[gained])}
+    return out
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+
+
+def measure(
+    capture: Path, work: Path, end_s: float | None, threads: int, *, separate: bool = False
+) -> list[dict[str, Any]]:
+    """Run a capture with and without its sensors, and return the figures of all jobs."""
     work.mkdir(parents=True)
     folder = prepare(capture, work, end_s)
-    out = []
-    for name in ("without", "with"):
+    out: list[dict[str, Any]] = []
+    plain: Frames | None = None
+    for name in JOBS if separate else (PLAIN, "with"):
         arguments = ("--skeleton", "none", "--threads", str(threads))
         row = Row(f"{capture.name} {name}", work / f"{name}.yaml", folder / "gt", arguments)
-        result = ours.run(row, work / name)
+        result = ours.run(row, work / name, work / "store")
         if "trajectories" not in result.get("report", {}):
             out.append({"name": row.name, "error": result.get("error") or result.get("report")})
             continue
-        total = result["report"]["trajectories"]["total"]
-        short, long = lost_stretches(work / name / "out" / "frames.csv")
-        out.append(
-            {
-                "name": row.name,
-                "frames": total["frames"],
-                "posed": total["registered"],
-                "short": short,
-                "long": long,
-                **{key: 100.0 * total["ate_m"][key] for key in ("rmse", "max")},
-                "cameras": {
-                    camera: (figures["registered"], 100.0 * (figures["ate_m"] or {"rmse": np.nan})["rmse"])
-                    for camera, figures in result["report"]["trajectories"]["cameras"].items()
-                },
-            }
-        )
+        frames = frames_of(work / name / "out", folder / "gt")
+        out.append({"name": row.name, **figures(frames, plain)})
+        plain = frames if name == PLAIN else plain
     return out
 
 
@@ -133,6 +211,7 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="make bench ARGS=violent", description=__doc__)
     parser.add_argument("captures", type=Path, nargs="+", help="folders of captures with truth")
     parser.add_argument("--end-s", type=float, help="end of the used part, seconds; default: all")
+    parser.add_argument("--separate", action="store_true", help="add the uses one after another")
     parser.add_argument("--work", type=Path, help="folder for the jobs; default: a temporary one")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", type=Path, help="file for all figures as JSON")
@@ -141,7 +220,10 @@ def main(arguments: Sequence[str]) -> int:
     with tempfile.TemporaryDirectory(prefix="bodycap-bench-") as temporary:
         work = options.work or Path(temporary)
         for capture in options.captures:
-            for row in measure(capture, work / capture.name, options.end_s, options.threads):
+            done = measure(
+                capture, work / capture.name, options.end_s, options.threads, separate=options.separate
+            )
+            for row in done:
                 rows.append(row)
                 print(json.dumps(row), flush=True)
     if options.json:

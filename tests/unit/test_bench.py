@@ -5,7 +5,7 @@ import numpy as np
 
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 from bodycap_batch.synthetic import SynthOptions
-from tests.bench import bare, bare_draw, long, ours, peers, poses, scaling, seeds, solving
+from tests.bench import bare, bare_draw, long, ours, peers, poses, scaling, seeds, solving, violent
 from tests.bench.peer_pairs import AWAY_NS, FROM_OTHER, OWN_AGAIN, STEPS, pairs_of
 from tests.bench.rows import Row, row_of
 from tests.scenes import small_map
@@ -228,3 +228,33 @@ def test_the_share_of_plain_surfaces_follows_the_surfaces():
     every = {**settings, "bare": bare_draw.SURFACES}
     assert bare_draw.bare_shares(SynthOptions.model_validate(settings)) == {"torso": 0.0}
     assert bare_draw.bare_shares(SynthOptions.model_validate(every)) == {"torso": 1.0}
+
+
+def test_frames_of_a_violent_capture_are_compared_with_the_truth_and_with_the_job_without_sensors(tmp_path):
+    """Frame 3 is lost without sensors and 20 cm off with them; the last frames end the clip."""
+    times_s = np.arange(12) / 30.0
+    places = np.stack([np.sin(3.0 * times_s), times_s, times_s**2], axis=1)
+    tums = np.column_stack([times_s, places, np.tile([0.0, 0.0, 0.0, 1.0], (12, 1))])
+    (tmp_path / "gt").mkdir()
+    np.savetxt(tmp_path / "gt" / "torso.tum", tums)
+    found = {}
+    for name, lost, off_m in (("without", [3, 10, 11], 0.0), ("with", [10, 11], 0.2)):
+        (tmp_path / name / "trajectories").mkdir(parents=True)
+        solved = tums.copy()
+        solved[3, 3] += off_m
+        kept = [frame for frame in range(12) if frame not in lost]
+        np.savetxt(tmp_path / name / "trajectories" / "torso.tum", solved[kept])
+        status = ["LOST" if frame in lost else "REGISTERED" for frame in range(12)]
+        if name == "with":
+            status[3] = "INERTIAL"
+        rows = [f"torso,{time},{each}" for time, each in zip(times_s.tolist(), status, strict=True)]
+        text = "# a comment\ncamera,time,status\n" + "\n".join(rows) + "\n"
+        (tmp_path / name / "frames.csv").write_text(text, encoding="utf-8")
+        found[name] = violent.frames_of(tmp_path / name, tmp_path / "gt")
+    plain = violent.figures(found["without"], None)
+    assert (plain["posed"], plain["short"], plain["long"], plain["off"]) == (9, 1, 2, 0)
+    assert plain["rmse"] < 0.01
+    used = violent.figures(found["with"], found["without"])
+    assert (used["posed"], used["inertial"], used["short"], used["off"]) == (10, 1, 0, 1)
+    assert (used["short_without"], used["of_them_posed"], used["gained"], used["common"]) == (1, 1, 1, 9)
+    assert used["gained_rmse"] == used["max"] > 10.0
