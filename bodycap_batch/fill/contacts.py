@@ -69,6 +69,13 @@ _STILL_SPEED = 0.06
 docs/decisions/filling.md."""
 _STEPPING_SPEED = 0.24
 """Speed (m/s) above which a person must step. Evidence: as `_STILL_SPEED`."""
+_SITTING_RATIO = 1.5
+"""Maximum ratio of the horizontal to the vertical speed of hips that move onto a chair or up from it, over
+standing feet. Derivation: to sit down, the hips move backward by 0.3 to 0.45 m and downward by 0.35 to 0.4 m;
+the two movements do not have the same course."""
+_UPRIGHT_SHARE = 0.95
+"""Height of the hips, as a share of that on straight legs, below which a person may be sitting down.
+Derivation: a walking person is above it."""
 _TURN_RADIUS_M = 0.25
 """Radius (metres) by which the rate of a turn on the spot is converted to a speed. Evidence: none."""
 
@@ -211,12 +218,18 @@ class _StepSignals:
     is_restless: BoolArray
 
 
-def find_contacts(signals: TrunkSignals) -> Contacts:
-    """Return which feet stand at each tick, from the signals of the trunk and the hands."""
+def find_contacts(signals: TrunkSignals, standing_m: float | None = None) -> Contacts:
+    """Return which feet stand at each tick, from the signals of the trunk and the hands.
+
+    Args:
+        signals: The signals of the trunk and the hands.
+        standing_m: Height (metres) of the hips of a standing person in the world; None if it is unknown, for
+            example because the floor was not measured.
+    """
     stride = max(1, round(signals.fps / 30.0))
     ticks = len(signals.heading_rad)
     chosen = np.arange(0, ticks, stride)
-    evidence = _evidence(signals, signals.fps / stride)
+    evidence = _evidence(signals, signals.fps / stride, standing_m)
     evidence = _Evidence(*(_advanced(part, signals.fps) for part in evidence.parts()))
     coarse = _Evidence(evidence.by_state[chosen], evidence.by_signal[chosen])
     period_s = _step_period_s(signals)[chosen]
@@ -260,7 +273,24 @@ def _advanced(values: FloatArray, fps: float) -> FloatArray:
     return np.asarray((1.0 - alpha) * values[before] + alpha * values[after])
 
 
-def _evidence(signals: TrunkSignals, coarse_fps: float) -> _Evidence:
+def _speed_away(signals: TrunkSignals, standing_m: float | None) -> FloatArray:
+    """Return the speed (T,) of the hips over the floor, without what sitting down and standing up explain.
+
+    A person who sits down moves the hips backward and down, and one who stands up moves them forward and up.
+    """
+    speed = signals.speed_m_per_s()
+    if standing_m is None:
+        return speed
+    velocity, forward = signals.velocity_m_per_s[:, :2], signals.forward()
+    rising = signals.velocity_m_per_s[:, 2]
+    along = (velocity * forward).sum(axis=1)
+    low = signals.slow_hips_m[:, 2] < _UPRIGHT_SHARE * standing_m
+    explained = np.where(low & (along * rising > 0.0), _SITTING_RATIO * np.abs(rising), 0.0)
+    rest = np.sign(along) * np.maximum(np.abs(along) - explained, 0.0)
+    return np.asarray(np.linalg.norm(velocity + (rest - along)[:, None] * forward, axis=1))
+
+
+def _evidence(signals: TrunkSignals, coarse_fps: float, standing_m: float | None) -> _Evidence:
     weight = _EVIDENCE_HZ / coarse_fps
 
     def limited(values: FloatArray) -> FloatArray:
@@ -275,7 +305,7 @@ def _evidence(signals: TrunkSignals, coarse_fps: float) -> _Evidence:
         ]
     )
     side = by_signal.sum(axis=1)
-    speed = np.hypot(signals.speed_m_per_s(), _TURN_RADIUS_M * signals.yaw_rate_rad_per_s)
+    speed = np.hypot(_speed_away(signals, standing_m), _TURN_RADIUS_M * signals.yaw_rate_rad_per_s)
     spread = 0.5 * (_STEPPING_SPEED - _STILL_SPEED)
     middle = 0.5 * (_STEPPING_SPEED + _STILL_SPEED)
     stepping = np.clip((speed - middle) / spread, -2.0, 4.0)

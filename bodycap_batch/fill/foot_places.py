@@ -55,6 +55,13 @@ _LEVEL_PERCENTILE = 10.0
 _MAX_SHIFT_M = 0.22
 """Distance (metres) that the hips may move over standing feet before a foot takes a step. Derivation: the
 length of a foot from the ankle to the ball, with a margin."""
+_SITTING_BACK = 1.0
+"""Distance that the hips may move backward over standing feet while they sink, in addition to `_MAX_SHIFT_M`,
+as a ratio to the distance by which they are lower than those of a standing person. Derivation: on a chair the
+hips are about 0.4 m lower than in standing, and a thigh of 0.42 m behind the knees."""
+_MIN_UPRIGHT_S = 0.3
+"""Minimum time (s) for which a person stands upright before or after sitting on a chair, if this time
+determines where the feet stand. Evidence: none."""
 _MAX_TURN_RAD = np.radians(35.0)
 """Angle by which the trunk may turn over standing feet before a foot takes a step. Evidence: none."""
 _ADJUSTING_S = 0.4
@@ -83,7 +90,8 @@ def place_feet(
     """
     stances: list[_Stance] = []
     for side in (0, 1):
-        stances += _split_long_stances(_stances(contacts, side), contacts, signals)
+        sunk_m = _sunk_m(signals, legs[side], floor_m)
+        stances += _split_long_stances(_stances(contacts, side), contacts, signals, sunk_m)
     stances.sort(key=lambda each: (each.start, each.side))
     places = [_place(each, contacts, signals, legs[each.side], floor_m) for each in stances]
     out = np.array([place for place, _ in places]).reshape(-1, 2)
@@ -127,10 +135,24 @@ def _stances(contacts: Contacts, side: int) -> list[_Stance]:
     ]
 
 
-def _split_long_stances(stances: list[_Stance], contacts: Contacts, signals: TrunkSignals) -> list[_Stance]:
-    """Insert steps into periods of standing in which the hips move away from the feet or turn."""
+def _sunk_m(signals: TrunkSignals, leg: LegGeometry, floor_m: float) -> FloatArray:
+    """Return how far (T,) the hips are below those of a person who is not upright; 0 if upright, metres."""
+    standing_m = leg.length_m + leg.ankle_height_m
+    sunk_m = standing_m - (signals.slow_hips_m[:, 2] - floor_m)
+    return np.asarray(np.where(sunk_m > (1.0 - _LOW_SHARE) * standing_m, sunk_m, 0.0))
+
+
+def _split_long_stances(
+    stances: list[_Stance], contacts: Contacts, signals: TrunkSignals, sunk_m: FloatArray
+) -> list[_Stance]:
+    """Insert steps into periods of standing in which the hips move away from the feet or turn.
+
+    A person who sits down moves the hips backward, and one who stands up moves them forward, over feet that
+    stay. `sunk_m` (T,) tells how far the hips are below those of a standing person.
+    """
     out: list[_Stance] = []
     hips, heading = signals.slow_hips_m[:, :2], signals.heading_rad
+    forward = signals.forward()
     gap = max(2, round(_ADJUSTING_S * signals.fps))
     for stance in stances:
         start = stance.start
@@ -144,7 +166,10 @@ def _split_long_stances(stances: list[_Stance], contacts: Contacts, signals: Tru
         # The left foot steps first: both feet must not leave the floor at the same time.
         delay = gap * stance.side
         while tick < stance.end:
-            moved = np.hypot(*(hips[tick] - hips[anchor])) > _MAX_SHIFT_M
+            shift = hips[tick] - hips[anchor]
+            along = float(shift @ forward[anchor])
+            usual = np.clip(along, -_SITTING_BACK * sunk_m[tick], _SITTING_BACK * sunk_m[anchor])
+            moved = np.hypot(*(shift - usual * forward[anchor])) > _MAX_SHIFT_M
             turned = abs(heading[tick] - heading[anchor]) > _MAX_TURN_RAD
             if (moved or turned) and tick + delay + 2 * gap < stance.end:
                 lift = tick + delay
@@ -168,6 +193,10 @@ def _place(
     still: BoolArray = state == STAND
     if still.any():
         chosen = ticks[still]
+        upright = chosen[_sunk_m(signals, leg, floor_m)[chosen] == 0.0]
+        if len(upright) >= _MIN_UPRIGHT_S * signals.fps:
+            # A person who sits down leaves the feet where the person stood.
+            chosen = upright
         # A foot that stands for long was placed at the start and is lifted at the end: the middle is robust.
         width = _STANDING_WIDTH
         base = np.median(signals.hips_m[chosen, :2], axis=0)

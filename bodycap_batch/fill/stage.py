@@ -67,10 +67,8 @@ def fill_motion(
     first = int(np.argmax(solved))
     world, filled = motion.world_from_joint(), np.zeros(len(solved), dtype=bool)
     signals = trunk_signals(motion, first, _hands(skeleton, solved))
-    legs = leg_geometry(skeleton)
-    if legs is not None and any(solved[[leg.hip, leg.knee, leg.ankle]].any() for leg in legs):
-        legs = None
-    contacts = find_contacts(signals)
+    legs = _unmeasured_legs(skeleton, solved)
+    contacts = find_contacts(signals, _standing_m(legs) if floor_is_measured else None)
     context.check_cancelled()
     context.progress(1, _PROGRESS_STEPS, "steps")
     floor = FloorHeight(0.0, 0.0, "measured")
@@ -145,6 +143,19 @@ def _empty_report(motion: Motion, mode: FillMode) -> FillReport:
         floor_sigma_m=0.0,
         floor_source="measured",
     )
+
+
+def _unmeasured_legs(skeleton: SkeletonModel, solved: BoolArray) -> tuple[LegGeometry, LegGeometry] | None:
+    """Return both legs; None if the skeleton has none, or if a joint of the legs was measured."""
+    legs = leg_geometry(skeleton)
+    if legs is not None and any(solved[[leg.hip, leg.knee, leg.ankle]].any() for leg in legs):
+        return None
+    return legs
+
+
+def _standing_m(legs: tuple[LegGeometry, LegGeometry] | None) -> float | None:
+    """Return the height (metres) of the hips over the floor on straight legs; None without legs."""
+    return None if legs is None else min(leg.length_m + leg.ankle_height_m for leg in legs)
 
 
 def _hands(skeleton: SkeletonModel, solved: BoolArray) -> tuple[int | None, int | None]:

@@ -13,6 +13,7 @@ from functools import reduce
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.formats.mannequin_pose import move_to_pose, with_arms_apart
 from bodycap_batch.model.bone_axes import bone_ends_m, has_floor_root, main_children
 from bodycap_batch.model.skeleton import SkeletonModel, rest_pose
 from bodycap_batch.model.skeleton_presets import split_side
@@ -113,12 +114,16 @@ class _Part:
 def make_mannequin(skeleton: SkeletonModel) -> Mannequin:
     """Return the mesh of a person with the skeleton's proportions.
 
+    If the arms hang in the T-pose, the surface is made with the arms to the side, and is then moved back.
+
     Raises:
         ValueError: No bone has a length.
     """
+    own = skeleton
     lengths = np.linalg.norm(np.concatenate([skeleton.offsets_m[1:], skeleton.end_offsets_m]), axis=1)
     if not np.nanmax(lengths, initial=0.0) > 0.0:
         raise ValueError("no bone has a length")
+    skeleton = with_arms_apart(own)
     stature = _stature_m(skeleton)
     parts = _parts(skeleton, stature)
     distance = _body_field(parts, stature)
@@ -132,6 +137,8 @@ def make_mannequin(skeleton: SkeletonModel) -> Mannequin:
     _, normals = _value_and_gradient(distance, vertices, 0.25 * spacing)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     joints, weights = _weights(skeleton, parts, vertices, stature)
+    if skeleton is not own:
+        vertices, normals = move_to_pose(skeleton, own, (vertices, normals), (joints, weights))
     return Mannequin(vertices_m=vertices, normals=normals, faces=faces, joints=joints, weights=weights)
 
 

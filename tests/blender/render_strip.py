@@ -129,8 +129,10 @@ def main(folder: str, file: str, count: str = "12") -> None:
     scene.cycles.max_bounces = 1
     scene.cycles.device = "CPU"
     scene.render.threads_mode, scene.render.threads = "FIXED", 1
+    # A person on stairs rises out of a picture of the height of a person.
+    height_m = HEIGHT_M + max(place.z for place in places) - places[0].z
     scene.render.resolution_x = len(stills) * PIXELS
-    scene.render.resolution_y = round(PIXELS * HEIGHT_M / WIDTH_M)
+    scene.render.resolution_y = round(PIXELS * height_m / WIDTH_M)
     for view, turn in (("side", -0.5 * math.pi), ("front", 0.0)):
         angle = heading + turn
         out = Vector((math.cos(angle), math.sin(angle), 0.0))
@@ -139,8 +141,8 @@ def main(folder: str, file: str, count: str = "12") -> None:
             column = (number - 0.5 * (len(stills) - 1)) * WIDTH_M
             for item in still:
                 item.location = column * right - Vector((places[number].x, places[number].y, 0.0))
-        eye = 20.0 * out + Vector((0.0, 0.0, 0.46 * HEIGHT_M + 2.0))
-        look = (Vector((0.0, 0.0, 0.46 * HEIGHT_M)) - eye).to_track_quat("-Z", "Y").to_matrix().to_4x4()
+        eye = 20.0 * out + Vector((0.0, 0.0, 0.46 * height_m + 2.0))
+        look = (Vector((0.0, 0.0, 0.46 * height_m)) - eye).to_track_quat("-Z", "Y").to_matrix().to_4x4()
         camera.matrix_world = Matrix.Translation(eye) @ look
         scene.render.filepath = str(Path(folder) / f"{view}.png")
         bpy.ops.render.render(write_still=True)

@@ -233,6 +233,29 @@ def test_a_person_who_sits_down_bends_the_knees_over_standing_feet(height: float
     assert knee[1] < hip[1] - 0.1, "the knee points forward, to -y"
 
 
+@pytest.mark.parametrize("seated_s", [1.5, 6.0])
+def test_a_person_who_sits_down_on_a_chair_leaves_the_feet(seated_s: float) -> None:
+    """The hips move backward by 35 cm. Feet that stepped back and forward again would be a clear error."""
+    trunk = still(4.5 + seated_s)
+    time = times(trunk)
+    down = smooth((time - 1.5) / 1.2) - smooth((time - 2.0 - seated_s) / 1.2)
+    trunk.hips_m[:, 2] -= 0.4 * STANDING_M * down
+    trunk.hips_m[:, 1] += 0.35 * down
+    trunk.lean_rad[:] = 0.5 * np.sin(np.pi * down)
+    result = filled(trunk)
+    check_feet(result)
+    assert len(result.report.footsteps.side) == 2, "both feet stand all the time"
+    _, ankle = soles(result)
+    body = result.motion.skeleton
+    poses = result.motion.world_from_joint()[..., :3, 3]
+    seated = round((2.0 + 0.5 * seated_s + 0.6) * FPS)
+    hip, knee = (poses[seated, body.roles.index("Left" + part), 1] for part in ("UpLeg", "Leg"))
+    assert knee < hip - 0.25, "the thigh points forward, to -y"
+    # Before and after, the feet stand below the hips.
+    for tick in (10, -10):
+        assert np.abs(ankle[tick, :, 1] - trunk.hips_m[tick, 1]).max() < 0.1
+
+
 def test_a_jump_lifts_both_feet_and_lands_on_the_floor() -> None:
     trunk = still(5.0)
     time = times(trunk)

@@ -135,3 +135,39 @@ def test_a_skeleton_without_lengths_is_refused() -> None:
     )
     with pytest.raises(ValueError, match="no bone has a length"):
         make_mannequin(point)
+
+
+def hanging_arms(skeleton: SkeletonModel) -> SkeletonModel:
+    """Return the same body with narrow shoulders and a zero pose whose arms hang along the trunk."""
+    offsets, ends = skeleton.offsets_m.copy(), skeleton.end_offsets_m.copy()
+    for joint, role in enumerate(skeleton.roles):
+        if role in ("LeftArm", "RightArm"):
+            offsets[joint, 0] *= 0.75
+        if role.endswith("Hand"):
+            ends[joint] = [0.0, 0.0, -np.linalg.norm(ends[joint])]
+        if role.endswith(("ForeArm", "Hand")):
+            offsets[joint] = [0.0, 0.0, -np.linalg.norm(offsets[joint])]
+    return replace(skeleton, offsets_m=offsets, end_offsets_m=ends, tpose_rotation=None)
+
+
+def test_hands_of_hanging_arms_do_not_hold_the_hips() -> None:
+    skeleton = hanging_arms(person()[0])
+    mesh = make_mannequin(skeleton)
+    arm = np.array([role.endswith(("Shoulder", "Arm", "Hand")) for role in skeleton.roles])
+    end = np.array([role.endswith(("ForeArm", "Hand")) for role in skeleton.roles])
+    of_arm, of_end = (mask[mesh.joints[:, 0]][mesh.faces] for mask in (arm, end))
+    joined = of_end.any(axis=1) & ~of_arm.all(axis=1)
+    assert not joined.any(), "no triangle joins a hand or a forearm with the trunk or a leg"
+    # Lifted arms are as far from the hips as their bones are, and nothing is stretched between them.
+    local = np.tile(np.eye(3), (len(skeleton.joints), 1, 1))
+    local[skeleton.roles.index("LeftArm")] = so3_exp([0.0, -np.pi / 2.0, 0.0])
+    local[skeleton.roles.index("RightArm")] = so3_exp([0.0, np.pi / 2.0, 0.0])
+    root = rest_pose(skeleton)[:1, :3, 3]
+    moved = forward_kinematics(skeleton, root, local[None])[0] @ np.linalg.inv(rest_pose(skeleton))
+    at = np.concatenate([mesh.vertices_m, np.ones((len(mesh.vertices_m), 1))], axis=1)
+    lifted = np.einsum("vk,vkij,vj->vi", mesh.weights, moved[mesh.joints], at)[:, :3]
+    edges = mesh.faces[:, [0, 1]]
+    longest = np.linalg.norm(lifted[edges[:, 0]] - lifted[edges[:, 1]], axis=1).max()
+    # The grid has cells of 22 mm; an edge crosses two cells, and bends stretch it to twice its length.
+    assert longest < 0.12
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-6)
