@@ -113,8 +113,20 @@ def test_each_room_alone_leaves_compression_working(tmp_path: Path) -> None:
 
 
 def test_heavy_libraries_load_when_needed() -> None:
-    assert not modules_after("bodycap_batch.pipeline") & set(HEAVY)
+    assert not modules_after("bodycap_batch.pipeline") & {*HEAVY, "scipy"}
     assert not modules_after("bodycap_batch.cli") & {*HEAVY, "scipy"}
+
+
+@pytest.mark.parametrize(
+    ("loaded", "unneeded"),
+    [
+        ("bodycap_batch.clocks", "scipy.signal"),
+        ("bodycap_batch.mapping", "scipy"),
+        ("bodycap_batch.report.body_doubts", "scipy"),
+    ],
+)
+def test_parts_of_scipy_load_when_needed(loaded: str, unneeded: str) -> None:
+    assert unneeded not in modules_after(loaded)
 
 
 def test_help_answers() -> None:

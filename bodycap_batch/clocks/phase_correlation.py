@@ -13,9 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
-from scipy.ndimage import gaussian_filter1d
-from scipy.special import log_ndtr
+import scipy
 
 from bodycap_batch.clocks.sound_track import RATE_HZ, Samples
 
@@ -136,7 +134,7 @@ def find_peaks(
 
 def smoothed_energy(energy: Samples) -> Samples:
     """Return the energy of a correlation (N,), summed around each lag with Gaussian weights."""
-    smoothed = gaussian_filter1d(energy, SMOOTHING_S * RATE_HZ, mode="constant", truncate=3.0)
+    smoothed = scipy.ndimage.gaussian_filter1d(energy, SMOOTHING_S * RATE_HZ, mode="constant", truncate=3.0)
     return np.asarray(smoothed, np.float32)
 
 
@@ -150,7 +148,9 @@ def log_chance(height: float, lags: float) -> float:
         height: Height of the peak, in σ of the noise.
         lags: Number of lags that were searched.
     """
-    single = float(log_ndtr(-height / _TAIL_FACTOR)) + float(np.log(max(lags * _INDEPENDENT, 1.0)))
+    single = float(scipy.special.log_ndtr(-height / _TAIL_FACTOR)) + float(
+        np.log(max(lags * _INDEPENDENT, 1.0))
+    )
     return min(0.0, single)
 
 

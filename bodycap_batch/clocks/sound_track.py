@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from bodycap_batch.capture.timeline import ChapterClock, clock_of_chapter
 from bodycap_batch.capture.video import VideoFile, error_reason, open_container
@@ -47,9 +47,6 @@ _LEVEL_BLOCKS = 256
 _BATCH_SAMPLES = 10 * RATE_HZ
 """Number of samples of a piece of a track, if the clock of the frames runs faster or slower than that of the
 sound. Within a piece the difference is ignored: 0.5 ms at 50 ppm."""
-
-_HIGH_PASS = butter(4, _HIGH_PASS_HZ, "highpass", fs=RATE_HZ, output="sos")
-"""Coefficients of the filter with the limit `_HIGH_PASS_HZ`."""
 
 Samples = npt.NDArray[np.float32]
 
@@ -322,9 +319,21 @@ class _PieceReader:
         self._waiting = []
         if not len(samples):
             return
+        # Imported here, because the import takes a second and many captures have no sound.
+        from scipy.signal import sosfilt, sosfilt_zi
+
+        high_pass = _high_pass()
         if self._state is None:
-            self._state = sosfilt_zi(_HIGH_PASS) * samples[0]
+            self._state = sosfilt_zi(high_pass) * samples[0]
         # The same filter delays the sound of all cameras alike. The constant prevents tiny numbers, which are
         # slow.
-        filtered, self._state = sosfilt(_HIGH_PASS, samples + 1e-3, zi=self._state)
+        filtered, self._state = sosfilt(high_pass, samples + 1e-3, zi=self._state)
         self._parts.append(np.clip(np.rint(filtered), -32768, 32767).astype(np.int16))
+
+
+@cache
+def _high_pass() -> FloatArray:
+    """Return the coefficients of the filter with the limit `_HIGH_PASS_HZ`."""
+    from scipy.signal import butter
+
+    return np.asarray(butter(4, _HIGH_PASS_HZ, "highpass", fs=RATE_HZ, output="sos"))

@@ -73,15 +73,25 @@ class WearerView:
         out = np.full(len(rays), np.inf)
         for first in range(0, len(rays), _BLOCK_RAYS):
             part = slice(first, first + _BLOCK_RAYS)
-            directions = np.column_stack([rays[part], np.ones(len(rays[part]))])
-            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-            distance, along, share = _nearest_on_bones(directions, self.ends_in_cam_m[frame[part]])
-            radius = self.radius_m[frame[part]]
-            limit = (1.0 - share) * radius[..., 0] + share * radius[..., 1]
-            # Comparisons with NaN are False: a frame without a known body has no body.
-            hit = (distance < limit) & (along > 0.0)
-            out[part] = np.where(hit, along, np.inf).min(axis=1, initial=np.inf)
+            directions = _components(_directions(rays[part])[:, None])
+            out[part] = self._depth(directions, self.ends_in_cam_m[frame[part]], self.radius_m[frame[part]])
         return out
+
+    @staticmethod
+    def _depth(directions: FloatArray, ends: FloatArray, radius: FloatArray) -> FloatArray:
+        """Return the distance (...) of the body along rays, metres; infinity without body.
+
+        Args:
+            directions: (3,...,1) components of the directions of the rays.
+            ends: (...,B,2,3) start and end of each bone, for each ray or for all rays of a frame.
+            radius: (...,B,2) radius of each capsule at start and end, like `ends`.
+        """
+        start, end = _components(ends[..., 0, :]), _components(ends[..., 1, :])
+        distance, along, share = _nearest_on_bones(directions, start, end)
+        limit = (1.0 - share) * radius[..., 0] + share * radius[..., 1]
+        # Comparisons with NaN are False: a frame without a known body has no body.
+        hit = (distance < limit) & (along > 0.0)
+        return np.asarray(np.where(hit, along, np.inf).min(axis=-1, initial=np.inf))
 
     def share(self) -> FloatArray:
         """Return the share (N,) of each picture that the body covers, 0 to 1; NaN if it is unknown."""
@@ -91,28 +101,50 @@ class WearerView:
         rays = self.lens.unproject(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
         rays = rays[np.isfinite(rays).all(axis=1)]
         known = np.flatnonzero(self.is_known)
-        depth = self.depth_along_ray(np.tile(rays, (len(known), 1)), np.repeat(known, len(rays)))
+        directions = _components(_directions(rays)[None, :, None])
         out = np.full(len(self.radius_m), np.nan)
-        out[known] = np.isfinite(depth).reshape(len(known), len(rays)).mean(axis=1)
+        step = max(1, _BLOCK_RAYS // max(1, len(rays)))
+        for first in range(0, len(known), step):
+            frames = known[first : first + step]
+            depth = self._depth(directions, self.ends_in_cam_m[frames, None], self.radius_m[frames, None])
+            out[frames] = np.isfinite(depth).mean(axis=1)
         return out
 
 
-def _nearest_on_bones(directions: FloatArray, ends: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _directions(rays: FloatArray) -> FloatArray:
+    """Return the directions (M,3), of length 1, of viewing rays (M,2): x and y at depth 1."""
+    directions = np.column_stack([rays, np.ones(len(rays))])
+    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+def _components(vectors: FloatArray) -> FloatArray:
+    """Return vectors (...,3) as (3,...). Sums over a short last axis are slow."""
+    return np.ascontiguousarray(np.moveaxis(vectors, -1, 0))
+
+
+def _dot(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the scalar products (...) of vectors (3,...)."""
+    return np.asarray(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])
+
+
+def _nearest_on_bones(
+    ray: FloatArray, start: FloatArray, end: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Find where rays from the camera centre come nearest to bones.
 
     Args:
-        directions: (M,3) directions of the rays, of length 1.
-        ends: (M,B,2,3) start and end of each bone for each ray.
+        ray: (3,...,1) components of the directions of the rays, of length 1.
+        start: (3,...,B) components of the start of each bone.
+        end: (3,...,B) components of the end of each bone.
 
     Returns:
-        The distance (M,B) between ray and bone, the position (M,B) of the nearest point along the ray, and
-        its position (M,B) along the bone, 0 at the start and 1 at the end.
+        The distance (...,B) between ray and bone, the position (...,B) of the nearest point along the ray,
+        and its position (...,B) along the bone, 0 at the start and 1 at the end.
     """
-    start, bone = ends[..., 0, :], ends[..., 1, :] - ends[..., 0, :]
-    ray = directions[:, None, :]
-    bone_bone = np.maximum((bone**2).sum(axis=-1), _TINY)
-    ray_bone, ray_start = (ray * bone).sum(axis=-1), (ray * start).sum(axis=-1)
-    bone_start = (bone * start).sum(axis=-1)
+    bone = end - start
+    bone_bone = np.maximum(_dot(bone, bone), _TINY)
+    ray_bone, ray_start = _dot(ray, bone), _dot(ray, start)
+    bone_start = _dot(bone, start)
     across = np.maximum(bone_bone - ray_bone**2, _TINY)
     share = np.clip((ray_bone * ray_start - bone_start) / across, 0.0, 1.0)
     along = ray_start + share * ray_bone
@@ -120,5 +152,5 @@ def _nearest_on_bones(directions: FloatArray, ends: FloatArray) -> tuple[FloatAr
     behind = along < 0.0
     share = np.where(behind, np.clip(-bone_start / bone_bone, 0.0, 1.0), share)
     along = np.maximum(along, 0.0)
-    gap = start + share[..., None] * bone - along[..., None] * ray
-    return np.linalg.norm(gap, axis=-1), along, share
+    gap = np.stack([s + share * b - along * r for s, b, r in zip(start, bone, ray, strict=True)])
+    return np.sqrt(_dot(gap, gap)), along, share

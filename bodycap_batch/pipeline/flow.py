@@ -160,8 +160,8 @@ class Flow:
             keyframes=refs_by_camera(keyframes),
         )
         body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
-        later: list[Stage[Any]] = [*body, EXPORT, REPORT]
-        # Mapping keeps one core busy. Meanwhile, another core loads the libraries of the last stages.
+        later: list[Stage[Any]] = [REGISTRATION, *body, EXPORT, REPORT]
+        # Mapping keeps one core busy. Meanwhile, another core loads the libraries of later stages.
         preload = [[module for stage in later for module in stage.modules]] if self._threads > 1 else []
         artefact = self.runner.run(
             make_task(MAP, task, map_round=self._map_round, threads=self._threads), preload

@@ -29,7 +29,7 @@ from bodycap_batch.core.errors import (
     JobError,
     StoreError,
 )
-from bodycap_batch.core.memory import release_memory
+from bodycap_batch.core.memory import exempt_from_collection, release_memory
 from bodycap_batch.runner.memory_limit import (
     is_out_of_memory,
     lift_own_limit,
@@ -161,6 +161,7 @@ def _run(task: Task, store: Store, function: TaskFunction, parent: _Parent) -> N
     started, cpu_before = time.monotonic(), time.process_time()
     _pin_threads(task.threads)
     release_memory()
+    exempt_from_collection()
     _reset_peak_memory()
     for artefact in dict.fromkeys(store.artefacts_in(task.arguments)):
         store.verify(artefact)

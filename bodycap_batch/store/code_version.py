@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import hashlib
+import importlib.util
+import json
+import os
 import re
+import sys
 import threading
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -24,6 +29,8 @@ _NOT_COMPUTING = frozenset(
 options are also excluded: options affect results, but an artefact's key holds the values of the options
 separately."""
 _SKIPPED_SUFFIXES = (".pyc", ".pyo")
+_CACHE_NAME = "code_versions.json"
+"""Name of the file that keeps what was found in each source file. It lies beside Python's compiled files."""
 _reading = threading.Lock()
 """Lock that is held while sources are read, so that several jobs of one process parse each file only once."""
 
@@ -61,7 +68,8 @@ def algorithm_version(module: str) -> str:
     with _reading:
         for path in sorted(_closure(module)):
             digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
-            digest.update(_source(path).content + b"\0")
+            digest.update(_source(path).digest.encode() + b"\0")
+        _parsed_sources(_PACKAGE).save()
     return digest.hexdigest()[:16]
 
 
@@ -95,20 +103,77 @@ def _closure(module: str) -> set[Path]:
 
 
 class _Source(NamedTuple):
-    """What the digest of an algorithm needs from one file: the file's code and the modules that it names."""
+    """What the digest of an algorithm needs from one file: a digest of its code, and the modules it names."""
 
-    content: bytes
+    digest: str
     mentions: frozenset[str]
+
+
+class _ParsedSources:
+    """What was found in each source file of a package, kept in a file for later processes.
+
+    To parse all source files takes more than a second. An entry is used only for a file with the same
+    content. If the file of the entries cannot be read or written, the sources are parsed again.
+
+    Args:
+        package: Folder of the package.
+    """
+
+    def __init__(self, package: Path) -> None:
+        self._package = package
+        compiled = Path(importlib.util.cache_from_source(str(package / "__init__.py")))
+        self._path = compiled.with_name(_CACHE_NAME)
+        own = package / Path(__file__).relative_to(Path(__file__).parent.parent)
+        self._reader = hashlib.sha256(own.read_bytes()).hexdigest()
+        self._entries: dict[str, tuple[str, str, list[str]]] = {}
+        self._is_new = False
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            document = json.loads(self._path.read_text(encoding="utf-8"))
+            if document["reader"] == self._reader:
+                self._entries = {
+                    str(name): (str(content), str(digest), [str(module) for module in mentions])
+                    for name, (content, digest, mentions) in document["sources"].items()
+                }
+
+    def find(self, path: Path, content: bytes) -> _Source:
+        """Return what is in a source file with this content; the file is parsed if it is unknown."""
+        name, content_digest = path.relative_to(self._package).as_posix(), hashlib.sha256(content).hexdigest()
+        known = self._entries.get(name)
+        if known is not None and known[0] == content_digest:
+            return _Source(known[1], frozenset(known[2]))
+        tree = ast.parse(content, str(path))
+        mentions = frozenset(_mentions(tree)) - _NOT_COMPUTING
+        source = _Source(hashlib.sha256(code_text(tree).encode()).hexdigest(), mentions)
+        self._entries[name] = (content_digest, source.digest, sorted(mentions))
+        self._is_new = True
+        return source
+
+    def save(self) -> None:
+        """Write the entries if there are new ones and Python may write files beside the sources."""
+        if not self._is_new or sys.dont_write_bytecode:
+            return
+        self._is_new = False
+        text = json.dumps({"reader": self._reader, "sources": self._entries})
+        with contextlib.suppress(OSError):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            part = self._path.with_suffix(f".{os.getpid()}")
+            part.write_text(text, encoding="utf-8")
+            os.replace(part, self._path)
+
+
+@cache
+def _parsed_sources(package: Path) -> _ParsedSources:
+    """Return what was found in the source files of a package; read once in a process."""
+    return _ParsedSources(package)
 
 
 @cache
 def _source(path: Path) -> _Source:
-    """Read and parse a file; the result is cached, because many stages share files."""
+    """Read a file, and parse it if needed; the result is cached, because many stages share files."""
     content = path.read_bytes()
     if path.suffix != ".py":
-        return _Source(content, frozenset())
-    tree = ast.parse(content, str(path))
-    return _Source(code_text(tree).encode(), frozenset(_mentions(tree)) - _NOT_COMPUTING)
+        return _Source(hashlib.sha256(content).hexdigest(), frozenset())
+    return _parsed_sources(_PACKAGE).find(path, content)
 
 
 def _mentions(tree: ast.AST) -> Iterator[str]:

@@ -128,5 +128,5 @@ MERGE = Stage(
     task=MergeTask,
     function=run_merge,
     libraries=("scipy", "gtsam", *VISION_LIBRARIES),
-    modules=("bodycap_batch.merging", "gtsam", "scipy.optimize", "scipy.spatial.transform"),
+    modules=("bodycap_batch.merging.stage", "gtsam", "scipy.optimize", "scipy.spatial.transform"),
 )

@@ -107,5 +107,5 @@ REGISTRATION = Stage(
     task=RegistrationTask,
     function=run_registration,
     libraries=(*VISION_LIBRARIES, "pycolmap"),
-    modules=(*VISION_MODULES, "pycolmap"),
+    modules=(*VISION_MODULES, "pycolmap", "bodycap_batch.registration"),
 )

@@ -16,6 +16,7 @@ from bodycap_batch.tasks.registered_cameras import RegisteredCameras
 from bodycap_batch.tasks.stage import Stage, write_summary
 
 if TYPE_CHECKING:
+    from bodycap_batch.core.arrays import FloatArray
     from bodycap_batch.model.scene import Map
     from bodycap_batch.model.wearer_view import WearerView
 
@@ -68,10 +69,11 @@ def run_wearer(task: WearerTask, context: StageContext, files: Path) -> None:
         common_ns = found.clocks[path.camera].common_times_ns(path.times_ns)
         lens, poses = maps[path.gauge].cameras[path.camera], in_world[path.camera].gauge_from_cam
         view = predict_wearer_view(merge, path.camera, lens, common_ns, poses)
-        covered = view.share()[view.is_known]
+        share = view.share()
+        covered = share[view.is_known]
         shares[path.camera] = round(float(covered.mean()), 4) if len(covered) else 0.0
         if shares[path.camera] > _MIN_SHARE:
-            seen_through[path.camera] = round(_seen_through(view, maps[path.gauge]), 4)
+            seen_through[path.camera] = round(_seen_through(view, share, maps[path.gauge]), 4)
             if seen_through[path.camera] <= _MAX_SEEN_THROUGH:
                 views[path.camera] = view
     for camera, view in views.items():
@@ -79,16 +81,17 @@ def run_wearer(task: WearerTask, context: StageContext, files: Path) -> None:
     write_summary(files, shares=shares, seen_through=seen_through, masked=sorted(views))
 
 
-def _seen_through(view: WearerView, scene: Map) -> float:
+def _seen_through(view: WearerView, share: FloatArray, scene: Map) -> float:
     """Return the density of a map's observations where the body is, as a ratio of the density elsewhere.
 
     Args:
         view: The predicted body in the pictures of a camera.
+        share: (N,) share of each picture that the body covers.
         scene: The map in which the camera has keyframes.
     """
     is_own = np.array(scene.keyframe_camera) == view.camera
     used = is_own & view.is_known[np.where(is_own, scene.keyframe_frame, 0)]
-    area = float(view.share()[scene.keyframe_frame[used]].mean()) if used.any() else 0.0
+    area = float(share[scene.keyframe_frame[used]].mean()) if used.any() else 0.0
     own = used[scene.obs_keyframe]
     inside = view.covers(scene.obs_px[own], scene.keyframe_frame[scene.obs_keyframe[own]])
     if not inside.any() or not area:

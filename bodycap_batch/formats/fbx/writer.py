@@ -24,9 +24,9 @@ Derivation: FBX and GLB store single-precision numbers, and an animator cannot s
 
 _CONVERT_SCRIPT = Path(__file__).with_name("blender_script.py")
 
-_BEFORE_BLENDER_IMPORT = so3_exp([-np.pi / 2, 0.0, 0.0])
-"""Rotation of the whole scene in the GLB file. Blender's glTF importer rotates the scene by 90° about X. Both
-rotations cancel, so the axes of the joints are unchanged."""
+_BEFORE_BLENDER_IMPORT = (-np.pi / 2, 0.0, 0.0)
+"""Rotation vector (radians) of the whole scene in the GLB file. Blender's glTF importer rotates the scene by
+90° about X. Both rotations cancel, so the axes of the joints are unchanged."""
 
 
 def write_fbx(path: Path, motion: Motion) -> Path:
@@ -49,7 +49,7 @@ def write_fbx(path: Path, motion: Motion) -> Path:
     """
     with tempfile.TemporaryDirectory() as folder, atomic_replacement(path) as temporary:
         figure, report = Path(folder) / "figure.glb", Path(folder) / "report.json"
-        write_glb(figure, replace(motion, fps=GLB_FPS), file_from_up=_BEFORE_BLENDER_IMPORT)
+        write_glb(figure, replace(motion, fps=GLB_FPS), file_from_up=so3_exp(_BEFORE_BLENDER_IMPORT))
         frames = len(motion.root_in_world_m)
         done = run_script(
             _CONVERT_SCRIPT, [str(figure), str(temporary), str(report), repr(motion.fps), str(frames)]

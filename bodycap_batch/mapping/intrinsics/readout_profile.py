@@ -269,8 +269,7 @@ def _standard_deviation(costs: Sequence[FloatArray], speeds: Sequence[FloatArray
         speeds: (P,) speed of the picture in each pair of frames of each camera.
         step_s: The step, seconds.
     """
-    from scipy.stats import norm
-    from scipy.stats import t as student_t
+    from scipy.special import ndtri, stdtrit  # scipy.stats takes a second to import.
 
     total = np.sum([each.sum(axis=1) for each in costs], axis=0)
     blocks = [
@@ -282,7 +281,7 @@ def _standard_deviation(costs: Sequence[FloatArray], speeds: Sequence[FloatArray
         return float("inf")
     without = np.array([_newton_step(total - block) for block in blocks])
     # Few blocks often have similar estimates by chance.
-    few = student_t.ppf(0.975, len(blocks) - 1) / norm.ppf(0.975)
+    few = stdtrit(len(blocks) - 1, 0.975) / ndtri(0.975)
     variance = few**2 * (len(blocks) - 1) / len(blocks) * ((without - without.mean()) ** 2).sum()
     variance += 2.0 * _PARALLAX_COST_RATIO * total[1] / (total[0] - 2.0 * total[1] + total[2])
     every, speed = np.concatenate(list(costs), axis=1), np.concatenate(list(speeds))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -110,7 +110,8 @@ def rank_initial_pairs(workspace: Path, intrinsics: Mapping[str, CameraIntrinsic
         candidates = order[: max(_MAX_CANDIDATES, int((np.asarray(counts) >= _CANDIDATE_MATCHES).sum()))]
         rows = candidates[evenly_spaced(len(candidates), _MAX_CANDIDATES)]
         ids = [pycolmap.pair_id_to_image_pair(pairs[row]) for row in rows]
-        out = [_measure_pair(database, (int(a), int(b)), intrinsics) for a, b in ids]
+        images: dict[int, _PairImage] = {}
+        out = [_measure_pair(database, (int(a), int(b)), intrinsics, images) for a, b in ids]
     return sorted(out, key=lambda pair: (-pair.score, pair.ids))
 
 
@@ -150,7 +151,7 @@ def find_user_pair(
             )
         if not database.exists_two_view_geometry(*ids):
             return None
-        return _measure_pair(database, (ids[0], ids[1]), intrinsics)
+        return _measure_pair(database, (ids[0], ids[1]), intrinsics, {})
 
 
 def _nearest_keyframe(
@@ -168,18 +169,55 @@ def _nearest_keyframe(
     return min(candidates, key=lambda ref: abs(int(frame_numbers[camera][ref.frame]) - int(frame)))
 
 
+class _PairImage(NamedTuple):
+    """An image of a pair.
+
+    Attributes:
+        name: Name of the image.
+        camera: Its camera.
+        px: (N,2) pixels of its features.
+        directions: (N,3) unit directions of the features.
+    """
+
+    name: str
+    camera: Camera
+    px: FloatArray
+    directions: FloatArray
+
+
+def _read_image(
+    database: pycolmap.Database, number: int, intrinsics: Mapping[str, CameraIntrinsics]
+) -> _PairImage:
+    """Read the features of an image."""
+    name = database.read_image(number).name
+    camera = intrinsics[ImageRef.parse(name).camera].camera
+    px = np.asarray(database.read_keypoints(number), dtype=np.float64)[:, :2]
+    return _PairImage(name, camera, px, unit_directions(camera.unproject(px)))
+
+
 def _measure_pair(
-    database: pycolmap.Database, ids: tuple[int, int], intrinsics: Mapping[str, CameraIntrinsics]
+    database: pycolmap.Database,
+    ids: tuple[int, int],
+    intrinsics: Mapping[str, CameraIntrinsics],
+    images: dict[int, _PairImage],
 ) -> InitialPair:
-    """Measure the number of matches, the parallax and the coverage of a pair of images."""
+    """Measure the number of matches, the parallax and the coverage of a pair of images.
+
+    Args:
+        database: The database of the features and matches.
+        ids: Ids of the two images.
+        intrinsics: Intrinsics by camera name.
+        images: The images that were read so far, by id; the images of this pair are added.
+    """
     matches = np.asarray(database.read_two_view_geometry(*ids).inlier_matches)
-    names = (database.read_image(ids[0]).name, database.read_image(ids[1]).name)
-    cameras = [intrinsics[ImageRef.parse(name).camera].camera for name in names]
-    pixels = [
-        np.asarray(database.read_keypoints(number), dtype=np.float64)[matches[:, side], :2]
-        for side, number in enumerate(ids)
-    ]
-    rays = [unit_directions(camera.unproject(px)) for camera, px in zip(cameras, pixels, strict=True)]
+    for number in ids:
+        if number not in images:
+            images[number] = _read_image(database, number, intrinsics)
+    sides = [images[number] for number in ids]
+    names = (sides[0].name, sides[1].name)
+    cameras = [image.camera for image in sides]
+    pixels = [image.px[matches[:, side]] for side, image in enumerate(sides)]
+    rays = [image.directions[matches[:, side]] for side, image in enumerate(sides)]
     finite = np.isfinite(rays[0]).all(axis=1) & np.isfinite(rays[1]).all(axis=1)
     first, second = rays[0][finite], rays[1][finite]
     parallax, coverage = 0.0, 0.0

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.mapping.matching.database import ImageRef
@@ -65,6 +64,8 @@ def adjust_in_two_steps(
 
 def _count_shared_points(model: Any, images: IntArray) -> npt.NDArray[np.int16]:
     """Return the number (N,N) of points that both images of each pair observe."""
+    from scipy import sparse  # Most maps are not large, and the import takes half a second.
+
     observed = [
         np.array([points[index].point3D_id for index in image.get_observation_point2D_idxs()], dtype=np.int64)
         for image in map(model.image, images.tolist())

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef
 from bodycap_batch.mapping.validation.second_registration import observed_points
 
@@ -122,18 +123,38 @@ def _remove_blocks(
     partners: Mapping[int, Mapping[int, PairAgreement]], sequences: Sequence[Sequence[int]]
 ) -> list[tuple[int, ...]]:
     """Return the blocks that contradict the other images, in the order of their removal."""
-    remaining = {image: dict(of) for image, of in partners.items()}
+    ids, pairs = _pair_table(partners)
     removed = list[tuple[int, ...]]()
     while True:
-        left = ([image for image in sequence if remaining.get(image)] for sequence in sequences)
-        worst = min((_worst_block(sequence, remaining) for sequence in left), default=_NO_BLOCK)
+        degree = np.bincount(pairs[0], minlength=len(ids))
+        with_pairs = {image for image, count in zip(ids.tolist(), degree.tolist(), strict=True) if count}
+        left = ([image for image in sequence if image in with_pairs] for sequence in sequences)
+        worst = min((_worst_block(sequence, ids, pairs) for sequence in left), default=_NO_BLOCK)
         if worst.agreement >= _MIN_AGREEMENT:
             return removed
         removed.append(worst.images)
-        for image in worst.images:
-            for other in remaining.pop(image):
-                if other in remaining:
-                    del remaining[other][image]
+        pairs = pairs[:, ~np.isin(ids, worst.images)[pairs[:2]].any(axis=0)]
+
+
+def _pair_table(partners: Mapping[int, Mapping[int, PairAgreement]]) -> tuple[IntArray, IntArray]:
+    """Return pairs as arrays.
+
+    Args:
+        partners: By image, the pairs of the image, by the other image.
+
+    Returns:
+        (N,) ids of the images, increasing; (4,P) pairs, each in both directions: row of the first and of the
+            second image in these ids, number of judged matches, number of agreeing matches.
+    """
+    ids = np.array(sorted(partners), dtype=np.int64)
+    pairs = [
+        (image, other, pair.judged, pair.agreeing)
+        for image, others in partners.items()
+        for other, pair in others.items()
+    ]
+    table = np.array(pairs, dtype=np.int64).reshape(-1, 4).T
+    table[:2] = np.searchsorted(ids, table[:2])
+    return ids, table
 
 
 def _agrees(
@@ -163,28 +184,30 @@ _NO_BLOCK = _Block(1.0, 0, ())
 """Result of a test that found no misplaced block. The agreement of 1 is the largest possible fraction."""
 
 
-def _worst_block(sequence: Sequence[int], partners: Mapping[int, Mapping[int, PairAgreement]]) -> _Block:
+def _worst_block(sequence: Sequence[int], ids: IntArray, pairs: IntArray) -> _Block:
     """Return the block of successive images with the smallest agreement.
 
     Blocks with fewer than `_MIN_SUPPORT` judged matches with images outside the block are not tested.
 
     Args:
         sequence: Ids of one camera's images in the order of time.
-        partners: By image, the pairs of the image, by the other image.
+        ids: (N,) ids of all images, from `_pair_table`.
+        pairs: (4,P) pairs of the remaining images, from `_pair_table`.
     """
     count = len(sequence)
     longest = min(count, _MAX_BLOCK)
-    position = {image: index for index, image in enumerate(sequence)}
+    position = np.full(len(ids), -1)
+    position[np.searchsorted(ids, np.array(sequence, dtype=np.int64))] = np.arange(count)
+    own = pairs[:, position[pairs[0]] >= 0]
+    index, other = position[own[:2]]
+    lag = np.where(other >= 0, index - other, 0)
+    is_near = (lag > 0) & (lag < longest)
     # Rows: judged matches, agreeing matches. `near` holds the matches between images up to `longest` apart.
     total = np.zeros((2, count))
     near = np.zeros((2, longest, count))
-    for image, index in position.items():
-        for other, pair in partners[image].items():
-            counts = (pair.judged, pair.agreeing)
-            total[:, index] += counts
-            lag = index - position.get(other, index)
-            if 0 < lag < longest:
-                near[:, lag, index] += counts
+    for row, counts in enumerate(own[2:]):
+        np.add.at(total[row], index, counts)
+        np.add.at(near[row], (lag[is_near], index[is_near]), counts[is_near])
     sums = np.concatenate([np.zeros((2, 1)), total.cumsum(axis=1)], axis=1)
     inside, ending, worst = np.zeros((2, count)), np.zeros((2, count)), _NO_BLOCK
     for length in range(1, longest + 1):

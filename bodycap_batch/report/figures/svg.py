@@ -80,9 +80,11 @@ def bin_statistics(values: FloatArray, count: int) -> FloatArray:
     statistics = np.full((count, 3), np.nan)
     for index in range(count):
         part = values[edges[index] : max(edges[index + 1], edges[index] + 1)]
-        part = part[np.isfinite(part)]
+        part = np.sort(part[np.isfinite(part)])
         if len(part):
-            statistics[index] = part.min(), np.median(part), part.max()
+            # The median of sorted values. `np.median` takes ten times as long for short parts.
+            middle = 0.5 * (part[(len(part) - 1) // 2] + part[len(part) // 2])
+            statistics[index] = part[0], middle, part[-1]
     return statistics
 
 

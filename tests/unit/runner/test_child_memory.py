@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import sys
 
 import pytest
 
-from bodycap_batch.core.memory import release_memory
+from bodycap_batch.core.memory import exempt_from_collection, release_memory
 from bodycap_batch.runner.child_main import StepReporter
 
 _BLOCK, _COUNT = 64 * 1024, 1600
@@ -37,6 +38,18 @@ def test_memory_freed_by_earlier_tasks_is_released() -> None:
     release_memory()
     assert held - _resident_mb() > 80
     libc.free(blocks[-1])
+
+
+def test_the_objects_of_libraries_are_not_searched_again() -> None:
+    known: list[object] = [[] for _ in range(1000)]
+    exempt_from_collection()
+    try:
+        assert gc.get_freeze_count() > len(known)
+        new: list[object] = []
+        assert len(gc.get_objects()) < len(known)
+        assert any(item is new for item in gc.get_objects())
+    finally:
+        gc.unfreeze()
 
 
 def test_freed_memory_is_released_when_another_step_begins() -> None:

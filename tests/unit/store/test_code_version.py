@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import os
 import shutil
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -32,7 +34,12 @@ def parsed_once(path: Path) -> code_version._Source:
 
 def forget() -> None:
     """Forget the sources that were read."""
-    for remembered in (code_version.algorithm_version, code_version._source, code_version._files):
+    for remembered in (
+        code_version.algorithm_version,
+        code_version._source,
+        code_version._files,
+        code_version._parsed_sources,
+    ):
         remembered.cache_clear()
 
 
@@ -96,6 +103,67 @@ def test_each_file_is_parsed_once_and_only_when_a_stage_needs_it(
         code_version.algorithm_version(stage.module)
     assert str(unread / "mapping" / "build.py") in parsed
     assert set(parsed.values()) == {1}
+
+
+class TestKeptSources:
+    """What was found in the sources is kept for later processes."""
+
+    @pytest.fixture(autouse=True)
+    def may_write(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(sys, "dont_write_bytecode", False)
+        monkeypatch.setattr(sys, "pycache_prefix", None)
+
+    @staticmethod
+    def version(monkeypatch: pytest.MonkeyPatch) -> tuple[str, int]:
+        """The version in a new process, and the number of files that the process parsed."""
+        forget()
+        parse, parsed = ast.parse, []
+
+        def counting(source: bytes, filename: str) -> ast.AST:
+            parsed.append(filename)
+            return parse(source, filename)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(ast, "parse", counting)
+            return code_version.algorithm_version(STAGES["places"].module), len(parsed)
+
+    def test_no_file_is_parsed_twice(self, unread: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        first, parsed = self.version(monkeypatch)
+        assert parsed > 10
+        assert self.version(monkeypatch) == (first, 0)
+
+    def test_a_changed_file_is_parsed_again(self, unread: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        first, _ = self.version(monkeypatch)
+        path = unread / "tasks" / "places.py"
+        times = path.stat()
+        text = path.read_text(encoding="utf-8")
+        path.write_text(text.replace('name="places"', 'name="placed"'), encoding="utf-8")
+        os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # Neither time nor size tells the change.
+        assert path.stat().st_size == times.st_size
+        second, parsed = self.version(monkeypatch)
+        assert (second != first, parsed) == (True, 1)
+
+    def test_another_reader_reads_all_files(self, unread: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        first, before = self.version(monkeypatch)
+        reader = unread / "store" / "code_version.py"
+        reader.write_text(reader.read_text(encoding="utf-8") + "\n# other\n", encoding="utf-8")
+        assert self.version(monkeypatch) == (first, before)
+
+    @pytest.mark.parametrize("content", ["", "[1, 2]", '{"reader": 1}', "{", '{"sources": {"a": 1}}'])
+    def test_damage_does_not_matter(
+        self, unread: Path, monkeypatch: pytest.MonkeyPatch, content: str
+    ) -> None:
+        first = self.version(monkeypatch)
+        kept = unread / "__pycache__" / "code_versions.json"
+        kept.write_text(content, encoding="utf-8")
+        assert self.version(monkeypatch) == first
+
+    def test_a_folder_that_cannot_be_written_does_not_matter(
+        self, unread: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (unread / "__pycache__").write_text("not a folder", encoding="utf-8")
+        first = self.version(monkeypatch)
+        assert self.version(monkeypatch) == first
 
 
 READ_BY_ALL = {"config", "core", "formats", "model", "tasks"}
