@@ -26,7 +26,9 @@ _STATURE_RANGE_M = (0.5, 2.8)
 """Minimum and maximum stature, metres. Derivation: the range from small children to the tallest people, with
 a margin. A stature in centimetres or feet is outside this range and is therefore refused."""
 
-
+_MEASURED_PARTS = ("ForeArm", "Hand", "Leg", "Foot")
+"""Parts of limbs whose distance from the part above is the length of a long bone. These bones give the
+stature of a body."""
 _UP, _FORWARD, _LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 """Unit vectors of a standing body in the axes of the skeleton: z up, −y forward."""
 _NEXT_ROLE = {
@@ -68,8 +70,7 @@ def load_skeleton(preset: str, height_m: float | None = None) -> SkeletonModel:
             hint=f"use one of {', '.join(PRESETS)}",
         )
     height = MEAN_HEIGHT_M if height_m is None else height_m
-    low, high = _STATURE_RANGE_M
-    if not low <= height <= high:
+    if not is_plausible_stature(height):
         raise JobError(
             f"a body height of {height} m is not plausible",
             field="height_m",
@@ -96,6 +97,33 @@ def load_skeleton(preset: str, height_m: float | None = None) -> SkeletonModel:
         roles=names,
         bvh_channels=((),) * len(names),
     )
+
+
+def stature_from_limbs(skeleton: SkeletonModel) -> float | None:
+    """Return the stature, metres, of a usual person with the arms and legs of a skeleton.
+
+    It is the median over the long bones of the limbs. Real people have proportions that differ by some
+    percent; a larger difference shows that the unit of length is not the metre.
+
+    Returns:
+        The stature; None if the skeleton has no long bone of a limb with a role.
+    """
+    usual = load_skeleton("full_body", MEAN_HEIGHT_M)
+    ratios = []
+    for role in (f"{side}{part}" for side in ("Left", "Right") for part in _MEASURED_PARTS):
+        own, other = skeleton.index_of_role(role), usual.index_of_role(role)
+        if own is not None and other is not None:
+            lengths = [
+                float(np.linalg.norm(each)) for each in (skeleton.offsets_m[own], usual.offsets_m[other])
+            ]
+            ratios.append(lengths[0] / lengths[1])
+    return float(np.median(ratios)) * MEAN_HEIGHT_M if ratios else None
+
+
+def is_plausible_stature(height_m: float) -> bool:
+    """Return True if there are people with this stature, metres."""
+    low, high = _STATURE_RANGE_M
+    return low <= height_m <= high
 
 
 def split_side(role: str) -> tuple[str, str]:

@@ -21,6 +21,7 @@ from bodycap_batch.report.report_inputs import ReportInputs
 from bodycap_batch.report.verdict import (
     FAIR_GAP_S,
     GOOD_MOUNT_DEG,
+    cameras_in_own_maps,
     describe_lens_misfit,
     describe_scale_error,
 )
@@ -413,7 +414,15 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
             priority=2.8,
         )
     unknown = sorted(name for name, clock in inputs.clocks.items() if not clock.is_known)
-    if unknown:
+    own_maps = set() if inputs.metrics is None else cameras_in_own_maps(inputs.metrics)
+    if elsewhere := [name for name in unknown if name in own_maps]:
+        yield Recommendation(
+            action=f"Check that the video of {' and '.join(elsewhere)} is of this recording, and let all "
+            "cameras see the same places.",
+            reason=_clock_notes(inputs, elsewhere),
+            priority=2.95,
+        )
+    if unknown := [name for name in unknown if name not in own_maps]:
         yield Recommendation(
             action="Clap once, or hop once, while all cameras record with sound.",
             how="For this recording, read the time of an event in two videos and state `offset_s` of the "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -133,15 +133,15 @@ def _headline(
         "are not tracked",
     )
     first = f"The cameras {camera_phrases[cameras]}"
+    elsewhere = cameras_in_own_maps(metrics)
     unknown = unknown_clocks(metrics)
-    if unknown:
-        names = " and ".join(unknown)
-        clocks = "clock" if len(unknown) == 1 else "clocks"
-        first = (
-            f"The {clocks} of {names} {'is' if len(unknown) == 1 else 'are'} unknown, so the body is solved "
-            f"without {'it' if len(unknown) == 1 else 'them'}: clap once, or hop once, while all cameras "
-            f"record. {first}"
+    first = "".join(
+        (
+            _unknown_clock_sentence([name for name in unknown if name not in elsewhere]),
+            _other_place_sentence([name for name in unknown if name in elsewhere]),
+            first,
         )
+    )
     if failure is not None:
         return f"{first}; the body could not be solved."
     if body is None:
@@ -154,6 +154,37 @@ def _headline(
         "there is no motion",
     )
     return f"{first}, {conjunction} {body_phrases[body]}."
+
+
+def _unknown_clock_sentence(names: Sequence[str]) -> str:
+    if not names:
+        return ""
+    clocks, them = ("clock", "it") if len(names) == 1 else ("clocks", "them")
+    return (
+        f"The {clocks} of {' and '.join(names)} {'is' if len(names) == 1 else 'are'} unknown, so the body is "
+        f"solved without {them}: clap once, or hop once, while all cameras record. "
+    )
+
+
+def _other_place_sentence(names: Sequence[str]) -> str:
+    """Return a sentence about cameras with an unknown clock that have a map of their own."""
+    if not names:
+        return ""
+    videos, them = ("the video is", "it") if len(names) == 1 else ("the videos are", "them")
+    return (
+        f"The map of {' and '.join(names)} has no place in common with the other cameras, and the clock is "
+        f"unknown, so the body is solved without {them}: check that {videos} of this recording. "
+    )
+
+
+def cameras_in_own_maps(metrics: Mapping[str, Any]) -> set[str]:
+    """Return the names of the cameras whose map is not the main map.
+
+    Args:
+        metrics: The content of ``metrics.json``.
+    """
+    frames = {model["frame"] for model in metrics.get("models", ())} - {metrics["frame"]}
+    return {name for name, camera in metrics["cameras"].items() if camera["frame"] in frames}
 
 
 def unknown_clocks(metrics: Mapping[str, Any]) -> list[str]:
@@ -254,14 +285,20 @@ def _map_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
 
 
 def _one_map_criterion(metrics: Mapping[str, Any]) -> Criterion:
-    separate = {name for name, camera in metrics["cameras"].items() if camera["frame"] != metrics["frame"]}
+    outside = {name for name, camera in metrics["cameras"].items() if camera["frame"] != metrics["frame"]}
     lost = {name for name, camera in metrics["cameras"].items() if not camera["frames_registered"]}
+    unused = outside - lost - cameras_in_own_maps(metrics)
     joined = sorted(metrics.get("merge", {}).get("joined_cameras", {}))
-    if separate or lost:
-        grade, finding = (
-            Grade.POOR,
-            f"these cameras are not in the main map: {', '.join(sorted(separate | lost))}",
-        )
+    if outside or lost:
+        findings = []
+        if separate := (outside | lost) - unused:
+            findings.append(f"these cameras are not in the main map: {', '.join(sorted(separate))}")
+        if unused:
+            findings.append(
+                "these cameras are in the main map, but they are not part of the body, so their paths are "
+                f"not given in metres: {', '.join(sorted(unused))}"
+            )
+        grade, finding = Grade.POOR, "; ".join(findings)
     elif joined:
         grade = Grade.FAIR
         finding = (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,9 @@ from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.model.geometry import interpolate_pose, make_transform
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, forward_kinematics
+from bodycap_batch.model.skeleton_presets import MEAN_HEIGHT_M, is_plausible_stature, stature_from_limbs
+
+logger = logging.getLogger(__name__)
 
 
 class Clip:
@@ -48,13 +53,14 @@ class Clip:
         return np.asarray(poses[:, 0, :3, 3]), np.asarray(poses[..., :3, :3])
 
 
-def load_clip(path: Path, start_s: float, length_s: float) -> Clip:
+def load_clip(path: Path, start_s: float, length_s: float, height_m: float = MEAN_HEIGHT_M) -> Clip:
     """Read a BVH file as the motion of a capture.
 
     Args:
         path: Path of the BVH file.
         start_s: Time (seconds) in the recording at which the capture's common clock is zero.
         length_s: Duration of the capture, seconds.
+        height_m: Stature (metres) of the body if the file is neither in metres nor in centimetres.
 
     Raises:
         JobError: The file cannot be read, holds no motion, or is too short.
@@ -76,4 +82,37 @@ def load_clip(path: Path, start_s: float, length_s: float) -> Clip:
             field="motion",
             hint="set seconds or motion_start_s to a smaller value",
         )
-    return Clip(motion, start_s, length_s)
+    return Clip(_with_plausible_size(motion, path, height_m), start_s, length_s)
+
+
+def _with_plausible_size(motion: Motion, path: Path, height_m: float) -> Motion:
+    """Return a motion whose body has the size of a person.
+
+    Recordings of the CMU Graphics Lab Motion Capture Database have a unit of length of 5.6 cm. Read in
+    centimetres, such a body has a stature of 30 cm.
+
+    Args:
+        motion: The motion as read in metres or centimetres.
+        path: Path of the BVH file.
+        height_m: Stature of the body, metres, if its own size is not that of a person.
+    """
+    stature_m = stature_from_limbs(motion.skeleton)
+    if stature_m is None or stature_m <= 0.0 or is_plausible_stature(stature_m):
+        return motion
+    factor = height_m / stature_m
+    logger.warning(
+        "%s: the body has a stature of %.3g m in metres or centimetres; therefore its size is multiplied by "
+        "%.4g, which gives a stature of %.3g m",
+        path.name,
+        stature_m,
+        factor,
+        height_m,
+    )
+    body = motion.skeleton
+    hips = motion.hips_in_root_m
+    return replace(
+        motion,
+        skeleton=replace(body, offsets_m=factor * body.offsets_m, end_offsets_m=factor * body.end_offsets_m),
+        root_in_world_m=factor * motion.root_in_world_m,
+        hips_in_root_m=None if hips is None else factor * hips,
+    )

@@ -88,7 +88,7 @@ def draw_subject(options: SynthOptions) -> Subject:
         # With free clocks, the earliest camera starts at the start of the used part of the file.
         lead_s = max(0.0, -first_s) if options.clocks == "free" else 0.0
         start_s = options.motion_start_s + lead_s
-        motion = load_clip(options.motion, start_s, length_s - 1.0 / options.fps)
+        motion = load_clip(options.motion, start_s, length_s - 1.0 / options.fps, options.subject_height_m)
         mounts = draw_mounts(options.cameras, motion.skeleton, sigmas, mount_rng, inward_deg)
     else:
         body = draw_body(

@@ -91,7 +91,13 @@ class SynthOptions(Options):
         ),
     )
     subject_height_m: float = Field(
-        1.75, ge=1.2, le=2.2, description="body height of the person in the built-in walk, in metres"
+        1.75,
+        ge=1.2,
+        le=2.2,
+        description=(
+            "body height in metres of the person in the built-in walk, and in a BVH file in which no person "
+            "has the size of the body in metres or centimetres"
+        ),
     )
     walk: Literal["simple", "gait"] = Field(
         "simple",

@@ -18,6 +18,7 @@ from bodycap_batch.formats.bvh.reader import read_bvh
 from bodycap_batch.formats.bvh.roles import ROLES
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
+from bodycap_batch.model.skeleton_presets import is_plausible_stature, stature_from_limbs
 
 NO_ROLE = "none"
 """Word that a user writes in the job instead of a role to say that a joint has no role."""
@@ -56,17 +57,32 @@ def read_rig(path: Path | str, options: RigOptions | None = None) -> tuple[Skele
         The skeleton, and the motion in the file. The motion is None if the file has no frames.
 
     Raises:
-        JobError: The file cannot be read, or a joint, a role or the frame does not exist.
+        JobError: The file cannot be read, or a joint, a role or the frame does not exist, or no person has
+            the size of the body in metres or centimetres.
     """
     path, options = Path(path), options or RigOptions()
     skeleton, motion = read_bvh(path)
     if options.roles:
         skeleton = replace(skeleton, roles=_override_roles(path, skeleton, options.roles))
+    _check_size(path, skeleton)
     if options.tpose_frame is not None:
         skeleton = replace(
             skeleton, tpose_rotation=_tpose_rotations(path, skeleton, motion, options.tpose_frame)
         )
     return skeleton, None if motion is None else replace(motion, skeleton=skeleton)
+
+
+def _check_size(path: Path, skeleton: SkeletonModel) -> None:
+    """Check that the body has the size of a person. A wrong unit of length makes all results too large."""
+    stature_m = stature_from_limbs(skeleton)
+    if stature_m is not None and not is_plausible_stature(stature_m):
+        raise JobError(
+            f"a person with the arms and legs of this skeleton is {stature_m:.3g} m tall",
+            path=path,
+            field="skeleton",
+            hint="the file must be in metres or centimetres: multiply all lengths by the unit of the file in "
+            "centimetres, for example 2.54 for inches or 5.644 for CMU recordings",
+        )
 
 
 def _override_roles(path: Path, skeleton: SkeletonModel, user_roles: Mapping[str, str]) -> tuple[str, ...]:

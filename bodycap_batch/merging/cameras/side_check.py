@@ -22,8 +22,8 @@ _MIN_UP_COSINE = 0.5
 """Minimum median cosine of the angle between the vertical and the trunk's up axis. The up axis follows from
 the mount prior. With a smaller cosine, the prior is wrong or the person lies down. Evidence: none."""
 _MIN_WRONG_RATIO = 0.8
-"""Minimum fraction of frames on the wrong side for a camera whose side is swapped. The sides are treated as
-swapped only if all limb cameras reach this fraction. Evidence: docs/decisions/merging.md."""
+"""Minimum fraction of frames on the wrong side for a camera whose side is swapped. Evidence:
+docs/decisions/merging.md."""
 
 
 def swapped_sides(
@@ -31,7 +31,9 @@ def swapped_sides(
 ) -> dict[str, float]:
     """Find limb cameras with swapped sides, such as a left camera on the right side of the body.
 
-    The sides are treated as swapped only if all limb cameras stay on the wrong side.
+    All limb cameras may stay on the wrong side. Otherwise the cameras of one part are swapped if this part
+    has cameras on both sides and all of them stay on the wrong side, for example both palms. A single camera
+    on the wrong side may come from the posture.
 
     Args:
         tracks: Tracks in one map, the track of the trunk's camera first.
@@ -40,9 +42,9 @@ def swapped_sides(
         up: (3,) vertical in the map.
 
     Returns:
-        By camera, the fraction of frames on the wrong side. The result is empty if a limb's camera is on the
-        correct side. It is also empty if the first camera is on a limb or upside down, or if the person lies
-        down, because the first camera then does not show where the body faces.
+        By camera with a swapped side, the fraction of frames on the wrong side. The result is empty if the
+        first camera is on a limb or upside down, or if the person lies down, because the first camera then
+        does not show where the body faces.
     """
     trunk_mount = mounts[tracks[0].camera]
     joint = tracks[0].map_from_cam[:, :3, :3] @ trunk_mount.joint_from_cam[:3, :3].T
@@ -58,4 +60,16 @@ def swapped_sides(
             offset = limb.map_from_cam[:, :3, 3] - trunk[:, :3, 3]
             to_the_right = (offset * np.cross(forward, up)).sum(axis=1)[valid]
             out[limb.camera] = round(float((side * to_the_right < 0.0).mean()), 3)
-    return out if out and min(out.values()) >= _MIN_WRONG_RATIO else {}
+    wrong = {camera: share for camera, share in out.items() if share >= _MIN_WRONG_RATIO}
+    if len(wrong) == len(out):
+        return wrong
+    parts: dict[str, list[str]] = {}
+    for camera in out:
+        parts.setdefault(split_side(mounts[camera].role)[1], []).append(camera)
+    swapped = {
+        camera
+        for cameras in parts.values()
+        if len({mounts[camera].role for camera in cameras}) == len(_SIDES) and wrong.keys() >= {*cameras}
+        for camera in cameras
+    }
+    return {camera: share for camera, share in wrong.items() if camera in swapped}

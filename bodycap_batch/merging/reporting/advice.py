@@ -46,19 +46,20 @@ _MOVEMENTS = {
 }
 
 
-def describe_swapped_sides(swapped: Mapping[str, float]) -> str:
+def describe_swapped_sides(swapped: Mapping[str, float], *, all_limbs: bool) -> str:
     """Describe cameras on the wrong side of the body, and the likely reasons.
 
     Args:
         swapped: By camera, fraction of its frames on the wrong side of the body.
+        all_limbs: True if no other camera is on a limb. The trunk's camera can then be the reason.
 
     Returns:
         A sentence for the report.
     """
+    backward = ", or the camera on the trunk looks backward and its mount is not torso_back"
     return (
         f"{' and '.join(sorted(swapped))} stay on the wrong side of the body: left and right are exchanged "
-        "in the names of the cameras, or the camera on the trunk looks backward and its mount is not "
-        "torso_back"
+        f"in the names of the cameras{backward if all_limbs else ''}"
     )
 
 

@@ -54,6 +54,7 @@ from bodycap_batch.model.merge_report import (
     VerticalReport,
 )
 from bodycap_batch.model.skeleton import Mount
+from bodycap_batch.model.skeleton_presets import split_side
 
 _DOWN_WEIGHTED = 0.25
 """Threshold of the robust weight: a measurement with a smaller weight is down-weighted. Evidence: none.
@@ -173,10 +174,14 @@ def _camera_report(track: CameraTrack, solution: MotionSolution, facts: MotionFa
 def _sides_report(
     priors: Collection[Mount], calibration: BodyCalibration, tracks: Sequence[CameraTrack]
 ) -> SwappedSidesReport | None:
-    """Report swapped sides if all cameras on limbs are on the wrong side of the body, else return None."""
+    """Report the cameras on limbs that stay on the wrong side of the body; return None without any."""
     mounts = {mount.camera: mount for mount in (*priors, calibration.reference_prior)}
     wrong = swapped_sides(tracks, mounts, calibration.vertical.up)
-    return SwappedSidesReport(cameras=wrong, says=describe_swapped_sides(wrong)) if wrong else None
+    if not wrong:
+        return None
+    limbs = {track.camera for track in tracks if split_side(mounts[track.camera].role)[0]}
+    says = describe_swapped_sides(wrong, all_limbs=limbs == wrong.keys())
+    return SwappedSidesReport(cameras=wrong, says=says)
 
 
 def _inverted_cameras_report(

@@ -64,6 +64,18 @@ def test_the_t_pose_comes_from_a_frame_and_faces_the_front(tmp_path: Path) -> No
     assert list(skeleton_warnings(read_rig(tmp_path / "rig.bvh")[0]))
 
 
+@pytest.mark.parametrize("factor", [0.1772, 10.0])
+def test_a_body_in_another_unit_of_length_is_refused(tmp_path: Path, factor: float) -> None:
+    """Recordings of CMU have units of 5.644 cm; other files have millimetres."""
+    motion = reaching(3)
+    body = motion.skeleton
+    small = replace(body, offsets_m=factor * body.offsets_m, end_offsets_m=factor * body.end_offsets_m)
+    write_bvh(tmp_path / "rig.bvh", replace(motion, skeleton=small))
+    with pytest.raises(JobError, match="tall") as raised:
+        read_rig(tmp_path / "rig.bvh")
+    assert raised.value.field == "skeleton"
+
+
 @pytest.mark.parametrize("role", ["LeftForeArm", "RightHand", "LeftLeg", "RightFoot", "Spine1", "Head"])
 def test_limb_axes_are_those_of_the_t_pose(tmp_path: Path, role: str) -> None:
     """The nominal mount on the body does not depend on the zero pose of the skeleton."""

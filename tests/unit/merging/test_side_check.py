@@ -15,7 +15,10 @@ from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.skeleton_presets import load_skeleton
 
-ROLES = {"torso": "Spine1", "left_palm": "LeftHand", "right_palm": "RightHand", "head": "Head"}
+ROLES = {
+    "torso": "Spine1", "left_palm": "LeftHand", "right_palm": "RightHand", "head": "Head",
+    "left_shin": "LeftLeg", "right_shin": "RightLeg",
+}  # fmt: skip
 BODY = load_skeleton("upper_body", 1.75)
 MOUNTS = {camera: nominal_mount(camera, role, BODY) for camera, role in ROLES.items()}
 BACK = replace(nominal_mount("torso_back", "Spine1", BODY), camera="torso")
@@ -52,7 +55,20 @@ def _tracks(*sides: tuple[str, float], down_rad: float = 0.0, count: int = 90) -
 def test_swapped_sides_are_found() -> None:
     wrong = swapped_sides(_tracks(("left_palm", 0.3), ("right_palm", -0.3), ("head", 0.0)), MOUNTS, UP)
     assert wrong == {"left_palm": 1.0, "right_palm": 1.0}
-    assert describe_swapped_sides(wrong).startswith("left_palm and right_palm stay on the wrong side")
+    text = describe_swapped_sides(wrong, all_limbs=True)
+    assert text.startswith("left_palm and right_palm stay on the wrong side")
+    assert "looks backward" in text
+
+
+@pytest.mark.parametrize("shins_m", [0.2, 0.02])
+def test_swapped_palms_are_found_beside_other_limbs_on_their_own_sides(shins_m: float) -> None:
+    palms, shins = (
+        (("left_palm", 0.3), ("right_palm", -0.3)),
+        (("left_shin", -shins_m), ("right_shin", shins_m)),
+    )
+    wrong = swapped_sides(_tracks(*palms, *shins), MOUNTS, UP)
+    assert wrong == {"left_palm": 1.0, "right_palm": 1.0}
+    assert "looks backward" not in describe_swapped_sides(wrong, all_limbs=False)
 
 
 @pytest.mark.parametrize(
@@ -61,12 +77,22 @@ def test_swapped_sides_are_found() -> None:
         _tracks(("left_palm", -0.3), ("right_palm", 0.3)),
         # One arm held across the chest is a posture.
         _tracks(("left_palm", 0.3), ("right_palm", 0.3)),
+        _tracks(("left_palm", 0.3), ("right_palm", 0.3), ("left_shin", -0.3), ("right_shin", 0.3)),
+        _tracks(("left_palm", 0.3), ("left_shin", -0.3), ("right_shin", 0.3)),
         _tracks(("left_palm", 0.0)),
         _tracks(("head", 0.0)),
         # A camera that looks at the feet does not show where the body faces.
         _tracks(("left_palm", 0.3), ("right_palm", -0.3), down_rad=1.3),
     ],
-    ids=["right", "one arm across", "in the middle", "no limb", "looking down"],
+    ids=[
+        "right",
+        "one arm across",
+        "one arm across, legs",
+        "one palm, legs",
+        "in the middle",
+        "no limb",
+        "looking down",
+    ],
 )
 def test_undetermined_sides_are_not_reported(tracks: list[CameraTrack]) -> None:
     assert swapped_sides(tracks, MOUNTS, UP) == {}

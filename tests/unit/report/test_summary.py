@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from bodycap_batch.report.grades import Grade
 from bodycap_batch.report.summary import measured_parts, summarise, summary_of_folder
+from bodycap_batch.report.verdict import judge
 
 LIMBS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
 ROLES = ("Hips", "Spine1", "Head", *(side + limb for side in ("Left", "Right") for limb in LIMBS))
@@ -52,6 +55,28 @@ def test_the_worst_two_criteria_are_named_the_worst_first() -> None:
     ]
     assert summary.lines()[0] == f"verdict: poor. {summary.headline}"
     assert "the motion is poor" in summary.headline
+
+
+@pytest.mark.parametrize(
+    ("frame", "advice", "place"),
+    [
+        ("a1b2", "check that the video is of this recording", "not in the main map: left_palm"),
+        ("main", "clap once", "not part of the body"),
+    ],
+    ids=["another room", "the same room"],
+)
+def test_the_advice_about_an_unknown_clock_depends_on_the_map(frame: str, advice: str, place: str) -> None:
+    """A clap does not help if the video shows another room."""
+    values = metrics(gap_s=0.0, scale=0.01)
+    values["cameras"]["left_palm"] = {**values["cameras"]["torso"], "frame": frame}  # type: ignore[index]
+    values["models"] = [{"frame": "world"}, {"frame": "a1b2"}]
+    values["clocks"] = {"torso": {"source": "common"}, "left_palm": {"source": "none"}}
+    verdict = judge(values, None)
+    assert advice in verdict.headline
+    assert ("clap" in verdict.headline) == (advice == "clap once")
+    (room,) = (item for item in verdict.criteria if item.name == "One room")
+    assert room.grade is Grade.POOR
+    assert place in room.finding
 
 
 def test_a_good_result_names_no_criterion() -> None:

@@ -1,5 +1,7 @@
 """Body, mounts and walk of the synthetic subject."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -153,9 +155,10 @@ def test_a_t_pose_comes_first():
     assert np.linalg.norm(later[0, left, :3, 3] - later[0, right, :3, 3]) < 1.2
 
 
-def _clip_file(path, frames=41):
-    body = load_skeleton("full_body", 1.75)
-    root = np.column_stack([np.linspace(5, 7, frames), np.full(frames, -3.0), np.full(frames, 0.93)])
+def _clip_file(path, frames=41, factor=1.0):
+    usual = load_skeleton("full_body", 1.75)
+    body = replace(usual, offsets_m=factor * usual.offsets_m, end_offsets_m=factor * usual.end_offsets_m)
+    root = factor * np.column_stack([np.linspace(5, 7, frames), np.full(frames, -3.0), np.full(frames, 0.93)])
     local = np.tile(np.eye(3), (frames, len(body.joints), 1, 1))
     write_bvh(
         path,
@@ -181,6 +184,17 @@ def test_a_recorded_motion_is_centred_and_interpolated(tmp_path):
     # The lowest joint (the toes) touches the floor.
     poses = forward_kinematics(clip.skeleton, root, local)
     assert poses[:, :, 2, 3].min() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_recorded_body_in_another_unit_of_length_gets_the_size_of_a_person(tmp_path, caplog):
+    """Read in centimetres, recordings of CMU show a person with a stature of 31 cm."""
+    _clip_file(tmp_path / "small.bvh", factor=0.1772)
+    clip = load_clip(tmp_path / "small.bvh", 0.5, 1.0, 1.6)
+    usual = load_skeleton("full_body", 1.6)
+    assert np.allclose(clip.skeleton.offsets_m[1:], usual.offsets_m[1:], atol=1e-4)
+    root, _ = clip.pose(np.array([0.0, 1.0]))
+    assert root[1, 0] - root[0, 0] == pytest.approx(1.6 / 1.75, abs=1e-4)
+    assert "stature of 0.31 m" in caplog.text
 
 
 def test_a_motion_that_ends_too_early_is_refused(tmp_path):
