@@ -34,7 +34,7 @@ from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.model_files import read_model, registered_ids, write_models
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
-from bodycap_batch.mapping.validation.repair import remove_misregistered, remove_without_adjustment
+from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 from bodycap_batch.model.scene import MapResult
 
 
@@ -98,7 +98,7 @@ def extend_map(
         kept = registered_ids(model) - again
         inside = registered_ids(model) & again
         extended = re_register_images(model, inside, mapping, len(existing) + len(new))
-        model, cut = remove_misregistered(extended, mapping)
+        model, cut, _ = remove_without_adjustment(extended, mapping)
         models.append(model)
         removed += cut
         resected.append(registered_ids(model) - kept if mapping.is_large(len(kept)) else None)

@@ -114,5 +114,5 @@ KEYFRAMES = Stage(
     task=KeyframesTask,
     function=run_keyframes,
     libraries=VISION_LIBRARIES,
-    modules=VISION_MODULES,
+    modules=(*VISION_MODULES, "bodycap_batch.keyframes", "pycolmap"),
 )

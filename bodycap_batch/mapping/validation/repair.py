@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, read_image_ids
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
-from bodycap_batch.mapping.re_registration import adjust_unless_large, re_register_images
+from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model
 from bodycap_batch.mapping.reconstruction.mapper_options import MIN_MODEL_KEYFRAMES
 from bodycap_batch.mapping.reconstruction.model_files import registered_ids
@@ -55,7 +55,8 @@ def repair_model(
     A round is accepted if it increases the number of correctly registered keyframes. If this number stays the
     same, the round is accepted if it decreases the number of misregistered keyframes. At the end, all
     keyframes that are still misregistered are removed, unless a second registration from the points of the
-    other keyframes finds them in the same place.
+    other keyframes finds them in the same place. The model is not adjusted after this removal: the stage
+    adjusts it at its end (`finalise_models`). Evidence: docs/decisions/mapping.md.
 
     Args:
         model: The largest model; not changed.
@@ -112,24 +113,8 @@ def repair_model(
     }
     camera = find_contradicting_camera(pairs, cameras)
     model, removed = _remove_images(model, _without_confirmed(context, model, pairs, wrong))
-    if removed:
-        adjust_unless_large(model, context)
     entries = {"rounds": log, "cut": removed, "contradicted_share": ratio}
     return model, {**entries, "contradicting_camera": camera} if camera else entries
-
-
-def remove_misregistered(model: pycolmap.Reconstruction, context: MappingContext) -> tuple[Any, list[str]]:
-    """Remove misregistered keyframes from a model; adjust the model if any keyframe was removed.
-
-    A large model is not adjusted.
-
-    Returns:
-        The model without misregistered keyframes; the image names of the removed keyframes.
-    """
-    kept, removed, _ = remove_without_adjustment(model, context)
-    if removed:
-        adjust_unless_large(kept, context)
-    return kept, removed
 
 
 def remove_without_adjustment(

@@ -43,7 +43,7 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
     find_misregistered_images,
 )
 from bodycap_batch.mapping.validation.near_points import remove_near_points
-from bodycap_batch.mapping.validation.repair import remove_misregistered, repair_model
+from bodycap_batch.mapping.validation.repair import remove_without_adjustment, repair_model
 from bodycap_batch.mapping.validation.second_registration import confirm_images
 from bodycap_batch.mapping.validation.track_agreement import (
     PairAgreement,
@@ -243,7 +243,7 @@ def test_a_correct_block_with_many_wrong_features_is_kept(
     assert find_misplaced_images(agreement, sequences) == set(block)
     assert confirm_images(mapping.workspace, blurred, block, sequences, 8.0) == set(block)
     assert confirm_images(mapping.workspace, blurred, block[:1], sequences, 8.0) == set()
-    kept, removed = remove_misregistered(blurred, mapping)
+    kept, removed, _ = remove_without_adjustment(blurred, mapping)
     assert removed == []
     assert _rms(kept, poses) < 0.01
 
@@ -354,13 +354,15 @@ def test_keyframes_that_cannot_be_repaired_are_removed(
     # The mapper registers the block with the same wrong poses again.
     module = sys.modules[re_register_images.__module__]
     monkeypatch.setattr(module, "with_new_images", lambda *_, **__: pycolmap.Reconstruction(wrong))
-    monkeypatch.setattr(module, "adjust_and_filter", lambda *_: None)
+    adjusted: list[object] = []
+    monkeypatch.setattr(module, "adjust_and_filter", lambda model, *_: adjusted.append(model))
     refs = sorted(_ids(mapping))
-    alone, names = remove_misregistered(wrong, mapping)
+    alone, names, _ = remove_without_adjustment(wrong, mapping)
     assert names == [f"cam/{frame:07d}" for frame in _MOVED]
     assert alone.num_reg_images() == _KEYFRAMES - len(_MOVED)
-    assert remove_misregistered(model, mapping)[1] == []
+    assert remove_without_adjustment(model, mapping)[1] == []
     cut, log = repair_model(wrong, pairs | {(a, b) for a in refs for b in refs if a < b}, mapping)
+    assert len(adjusted) == len(log["rounds"]), "the stage adjusts the model again at its end"
     assert log["cut"] == [f"cam/{frame:07d}" for frame in _MOVED]
     assert cut.num_reg_images() == _KEYFRAMES - len(_MOVED)
     assert _rms(cut, poses) < 0.01
