@@ -406,6 +406,20 @@ def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
             metric="merge.scale.relative_sigma",
             value=float(scale),
         )
+    if still := merge.get("still_cameras"):
+        yield Criterion(
+            subject="body",
+            name="Cameras that stand still",
+            grade=Grade.POOR,
+            finding="; ".join(
+                f"{name} stands still in the room between {float(part['from_s']):.1f} s and "
+                f"{float(part['to_s']):.1f} s while the person moves: it fell off or was put down, and this "
+                "part is not used"
+                for name, part in sorted(still.items())
+            ),
+            rationale="A camera that is not worn says nothing about its limb. On one walk, a palm's camera "
+            "that lay still for the second half made all sizes wrong by 41 %.",
+        )
     cameras = merge.get("cameras", {})
     yield from _gap_criteria(cameras)
     residuals = [float(camera["residual_m"]["p95"]) for camera in cameras.values()]
@@ -437,20 +451,6 @@ def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
             finding=str(merge["exchanged_sides"]["says"]),
             rationale="If left and right are exchanged, no body fits the cameras: on one such walk, the "
             "metric scale was wrong by 62 %.",
-        )
-    if still := merge.get("still_cameras"):
-        yield Criterion(
-            subject="body",
-            name="Cameras that stand still",
-            grade=Grade.POOR,
-            finding="; ".join(
-                f"{name} stands still in the room between {float(part['from_s']):.1f} s and "
-                f"{float(part['to_s']):.1f} s while the person moves: it fell off or was put down, and this "
-                "part is not used"
-                for name, part in sorted(still.items())
-            ),
-            rationale="A camera that is not worn says nothing about its limb. On one walk, a palm's camera "
-            "that lay still for the second half made all sizes wrong by 41 %.",
         )
     if merge.get("inverted_cameras"):
         yield Criterion(

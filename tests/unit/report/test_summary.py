@@ -79,6 +79,14 @@ def test_the_advice_about_an_unknown_clock_depends_on_the_map(frame: str, advice
     assert place in room.finding
 
 
+def test_a_camera_that_fell_off_is_named_before_the_gap_that_it_leaves() -> None:
+    values = metrics(gap_s=2.5, scale=0.01)
+    values["merge"]["still_cameras"] = {"left_palm": {"from_s": 2.5, "to_s": 5.0}}  # type: ignore[index]
+    summary = summarise(values)
+    assert summary.grade is Grade.POOR
+    assert "left_palm stands still in the room between 2.5 s and 5.0 s" in summary.doubts[0]
+
+
 def test_a_good_result_names_no_criterion() -> None:
     values = metrics(gap_s=0.0, scale=0.01)
     values["merge"]["cameras"]["torso"]["residual_m"]["p95"] = 0.001  # type: ignore[index]
