@@ -425,7 +425,7 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
     if elsewhere := [name for name in unknown if name in own_maps]:
         yield Recommendation(
             action=f"Check that the video of {' and '.join(elsewhere)} is of this recording, and let all "
-            "cameras see the same places.",
+            "cameras see the same places. Clap once while they record with sound.",
             reason=_clock_notes(inputs, elsewhere),
             priority=2.95,
         )

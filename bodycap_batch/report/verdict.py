@@ -173,7 +173,8 @@ def _other_place_sentence(names: Sequence[str]) -> str:
     videos, them = ("the video is", "it") if len(names) == 1 else ("the videos are", "them")
     return (
         f"The map of {' and '.join(names)} has no place in common with the other cameras, and the clock is "
-        f"unknown, so the body is solved without {them}: check that {videos} of this recording. "
+        f"unknown, so the body is solved without {them}: check that {videos} of this recording, let all "
+        "cameras see the same places, and clap once while they record. "
     )
 
 
