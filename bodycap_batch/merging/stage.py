@@ -23,6 +23,7 @@ from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSi
 from bodycap_batch.merging.camera_paths import trajectory_in_world, with_solved_centres
 from bodycap_batch.merging.camera_selection import select_cameras
 from bodycap_batch.merging.cameras.excluded_cameras import MIN_LOCALISED_FRAMES
+from bodycap_batch.merging.cameras.still_parts import still_parts
 from bodycap_batch.merging.cameras.track import CameraTrack, inflate_sigmas, make_track
 from bodycap_batch.merging.cameras.track_outliers import remove_outliers
 from bodycap_batch.merging.graph.adaptive_motion_noise import scale_motion_noise
@@ -64,13 +65,16 @@ from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs, MergeResult, SolvedBody
 from bodycap_batch.model.merge_report import AlignedCameraReport
 from bodycap_batch.model.scene import Trajectory
-from bodycap_batch.model.skeleton import SkeletonModel
+from bodycap_batch.model.skeleton import Mount, SkeletonModel
 
 _EXPECTED_ITERATIONS = 80
 """Expected number of optimiser iterations in the whole stage. Evidence: none.
 
 The progress display starts with this total. The total grows if more iterations are needed.
 """
+
+_T_POSE_MARGIN_S = 1.0
+"""Time (seconds) before and after a T-pose in which the arms rise or fall. Evidence: none."""
 
 
 class _Progress:
@@ -228,12 +232,15 @@ def _solve_body(
                 end_ns=int(tick_times[-1]),
                 dropped=prepared.dropped,
                 floor=placed.floor,
+                still_ns=prepared.still_ns,
                 unused=aligned.unused,
                 aligned={name: AlignedCameraReport(**sigmas) for name, sigmas in aligned.report().items()},
                 joint_sigma_m=sigma_percentiles(inputs.skeleton.roles, covariance, observed),
                 flexion_sigma_deg=flexion_percentiles(inputs.skeleton.roles, flexion_rad, observed),
                 joint_gap_m=joint_gaps(bones, solution.world_from_bone),
-                posture_sigmas=posture_deviations(bones, solution.world_from_bone),
+                postures=posture_deviations(
+                    bones, solution.world_from_bone[_outside_t_pose(tick_times, calibration.t_pose_ns)]
+                ),
                 hinge_off_plane_m=hinge_deviations(inputs.skeleton, bones, solution.world_from_bone),
                 contacts=contact_statistics(contacts, solution.world_from_bone, fps),
                 rule_violation_m={rule.name: rule.violation_m(solution.world_from_bone) for rule in rules},
@@ -242,6 +249,18 @@ def _solve_body(
         joint_covariance_m2=covariance,
         flexion_sigma_rad=flexion_rad,
     )
+
+
+def _outside_t_pose(tick_times: IntArray, t_pose_ns: tuple[int, int] | None) -> BoolArray:
+    """Return (T,) True for ticks (T,) outside the T-pose, which is no everyday posture.
+
+    All ticks count if the T-pose lasts as long as the motion.
+    """
+    if t_pose_ns is None:
+        return np.ones(len(tick_times), dtype=np.bool_)
+    margin_ns = round(1e9 * _T_POSE_MARGIN_S)
+    outside = (tick_times < t_pose_ns[0] - margin_ns) | (tick_times > t_pose_ns[1] + margin_ns)
+    return np.asarray(outside if outside.any() else ~outside, dtype=np.bool_)
 
 
 _MAX_TRIM_NS = 10_000_000_000
@@ -307,27 +326,52 @@ class _PreparedTracks:
         tracks: The cleaned tracks, one per camera. The track of the reference camera is the first.
         provisional: Provisional scale, metres per map unit.
         dropped: By camera, (N,) numbers of the frames with gross errors.
+        still_ns: By camera that stands still in the room for some time while the trunk moves, the first and
+            the last common time of the frames that are not used therefore.
     """
 
     tracks: list[CameraTrack]
     provisional: float
     dropped: dict[str, IntArray]
+    still_ns: dict[str, tuple[int, int]]
 
 
 def _prepare_tracks(
     inputs: MergeInputs, used: Sequence[Trajectory], bones: Sequence[Bone]
 ) -> _PreparedTracks:
-    """Convert the trajectories to common time, remove gross errors, and estimate a provisional scale."""
+    """Convert the trajectories to common time, remove unusable frames, and estimate a provisional scale.
+
+    Frames with gross errors are removed, and frames of cameras that fell off and stand still in the room.
+    """
     index = {bone.role: number for number, bone in enumerate(bones)}
     mounts = inputs.mount_by_camera()
     tracks = [make_track(inputs, each, index[mounts[each.camera].role]) for each in used]
     provisional = provisional_scale(bones, tracks, mounts)
+    still_ns = {}
+    for position, still in _usable_still_parts(tracks, mounts, provisional).items():
+        times_ns = tracks[position].times_ns[still]
+        still_ns[tracks[position].camera] = int(times_ns[0]), int(times_ns[-1])
+        tracks[position] = tracks[position].keep(~still)
+    if still_ns:
+        provisional = provisional_scale(bones, tracks, mounts)
     cleaned, dropped = [], {}
     for track in tracks:
         kept = remove_outliers(track, provisional, inputs.clocks[track.camera].nominal_fps)
         dropped[track.camera] = np.setdiff1d(track.frames, kept.frames)
         cleaned.append(kept)
-    return _PreparedTracks(cleaned, provisional_scale(bones, cleaned, mounts), dropped)
+    return _PreparedTracks(cleaned, provisional_scale(bones, cleaned, mounts), dropped, still_ns)
+
+
+def _usable_still_parts(
+    tracks: Sequence[CameraTrack], mounts: Mapping[str, Mount], scale: float
+) -> dict[int, BoolArray]:
+    """Return the still parts by position of the track, if enough frames remain without them."""
+    found = still_parts(tracks, mounts, scale)
+    return {
+        position: found[track.camera]
+        for position, track in enumerate(tracks)
+        if track.camera in found and int((~found[track.camera]).sum()) >= MIN_LOCALISED_FRAMES
+    }
 
 
 @dataclass(frozen=True, slots=True)

@@ -244,6 +244,19 @@ class CameraReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StillPartReport:
+    """The time in which a camera on a limb stands still in the room while the trunk moves.
+
+    Attributes:
+        from_s: Start of the first such part, seconds from the start of the motion.
+        to_s: End of the last such part, seconds from the start of the motion.
+    """
+
+    from_s: float
+    to_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SwappedSidesReport:
     """The cameras on limbs that were found on the wrong side of the body, as if left and right were swapped.
 
@@ -344,13 +357,16 @@ class MergeReport:
         cameras: By camera name, the measurements of the camera.
         exchanged_sides: Cameras that seem to be on the wrong side of the body; None if there are none.
         inverted_cameras: Cameras that are mounted upside down; None if there are none.
+        still_cameras: By name of a camera on a limb that stands still in the room for some time while the
+            trunk moves, the time in which its frames are not used for the body.
         unused_cameras: By camera name, the reason why the camera's map could not be linked to the body. Only
             cameras with such a map have an entry.
         joined_cameras: By name of a camera in an aligned map, the uncertainty of the map's pose.
         joint_gap_m: By role of a joint, percentiles of its gap: the distance, metres, between the ends of the
             two bones that meet at the joint.
         posture_sigmas: By role of a joint, distance of its rotation from the rest pose, in sigmas of its
-            everyday range (root mean square over ticks and axes).
+            everyday range (root mean square over axes and over ticks outside the T-pose).
+        mean_posture_sigmas: As `posture_sigmas`, for the mean rotation over these ticks.
         joint_sigma_m: By role of a joint, then by ``observed`` or ``filled``, percentiles of the sigma of the
             joint's centre, metres per axis.
         flexion_sigma_deg: By role of the bone below an elbow or a knee, then by ``observed`` or ``filled``,
@@ -372,10 +388,12 @@ class MergeReport:
     cameras: Mapping[str, CameraReport]
     exchanged_sides: SwappedSidesReport | None = field(metadata=_EMPTY_IF_NONE)
     inverted_cameras: InvertedCamerasReport | None = field(default=None, metadata=_OMIT_NONE)
+    still_cameras: Mapping[str, StillPartReport]
     unused_cameras: Mapping[str, str]
     joined_cameras: Mapping[str, AlignedCameraReport]
     joint_gap_m: Mapping[str, Percentiles]
     posture_sigmas: Mapping[str, float]
+    mean_posture_sigmas: Mapping[str, float]
     joint_sigma_m: Mapping[str, Mapping[str, Percentiles]]
     flexion_sigma_deg: Mapping[str, Mapping[str, Percentiles]]
     hinge_off_plane_m: Mapping[str, Percentiles]

@@ -413,12 +413,19 @@ def _about_body(inputs: ReportInputs) -> Iterator[Recommendation]:
             reason=report.exchanged_sides.says,
             priority=2.8,
         )
+    if report.still_cameras:
+        names = " and ".join(sorted(report.still_cameras))
+        yield Recommendation(
+            action=f"Fasten {names} so that it stays on the body until the end.",
+            reason=f"{names} stood still in the room for some time while the person moved",
+            priority=2.7,
+        )
     unknown = sorted(name for name, clock in inputs.clocks.items() if not clock.is_known)
     own_maps = set() if inputs.metrics is None else cameras_in_own_maps(inputs.metrics)
     if elsewhere := [name for name in unknown if name in own_maps]:
         yield Recommendation(
             action=f"Check that the video of {' and '.join(elsewhere)} is of this recording, and let all "
-            "cameras see the same places.",
+            "cameras see the same places. Clap once while they record with sound.",
             reason=_clock_notes(inputs, elsewhere),
             priority=2.95,
         )

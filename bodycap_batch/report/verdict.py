@@ -173,7 +173,8 @@ def _other_place_sentence(names: Sequence[str]) -> str:
     videos, them = ("the video is", "it") if len(names) == 1 else ("the videos are", "them")
     return (
         f"The map of {' and '.join(names)} has no place in common with the other cameras, and the clock is "
-        f"unknown, so the body is solved without {them}: check that {videos} of this recording. "
+        f"unknown, so the body is solved without {them}: check that {videos} of this recording, let all "
+        "cameras see the same places, and clap once while they record. "
     )
 
 
@@ -405,6 +406,20 @@ def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
             "between a short and a tall adult.",
             metric="merge.scale.relative_sigma",
             value=float(scale),
+        )
+    if still := merge.get("still_cameras"):
+        yield Criterion(
+            subject="body",
+            name="Cameras that stand still",
+            grade=Grade.POOR,
+            finding="; ".join(
+                f"{name} stands still in the room between {float(part['from_s']):.1f} s and "
+                f"{float(part['to_s']):.1f} s while the person moves: it fell off or was put down, and this "
+                "part is not used"
+                for name, part in sorted(still.items())
+            ),
+            rationale="A camera that is not worn says nothing about its limb. On one walk, a palm's camera "
+            "that lay still for the second half made all sizes wrong by 41 %.",
         )
     cameras = merge.get("cameras", {})
     yield from _gap_criteria(cameras)

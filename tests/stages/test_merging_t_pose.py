@@ -8,6 +8,8 @@ import pytest
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.merging import merge_trajectories
+from bodycap_batch.report.body_doubts import body_doubt_criteria
+from bodycap_batch.report.grades import Grade
 from bodycap_batch.synthetic import synthesise
 from tests.bench import simulation
 
@@ -60,3 +62,11 @@ def test_every_constant_has_its_sentence_and_its_sources(merged):
         assert report.mounts[camera].roll_deg == 0.0
         assert report.mounts[camera].roll_runner_up.half_squared_sigmas_more > -8.0
     assert "Left elbow not overstretched" in report.activity.rules_active
+
+
+def test_the_t_pose_is_no_rare_posture(merged):
+    """The walker stands with its arms stretched out for a fifth of the time, as the guides ask for."""
+    _, result = merged
+    doubts = body_doubt_criteria(result.report.to_dict())
+    (postures,) = (item for item in doubts if item.name == "Postures")
+    assert postures.grade is Grade.GOOD

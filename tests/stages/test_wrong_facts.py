@@ -148,6 +148,15 @@ def test_a_palm_at_half_speed(walk: Walk, tmp_path) -> None:
     _require_honest_scale(_merged(walk, paths, tmp_path), ("left_palm",), _contradicted_clocks(paths))
 
 
+def test_exchanged_palms_are_named(walk: Walk, tmp_path) -> None:
+    other = {"left_palm": "right_palm", "right_palm": "left_palm"}
+    paths = [replace(path, camera=other.get(path.camera, path.camera)) for path in _recorded(walk)]
+    result = _merged(walk, paths, tmp_path)
+    assert result is not None
+    assert result.report.exchanged_sides is not None
+    assert set(result.report.exchanged_sides.cameras) == set(other)
+
+
 @pytest.mark.parametrize("camera", ["torso", "left_palm"])
 def test_a_video_with_a_second_cut_out(camera: str, walk: Walk, tmp_path) -> None:
     paths = _changed(_recorded(walk), camera, _without_second)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
@@ -385,10 +385,22 @@ def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, 
     return out
 
 
-def posture_deviations(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, float]:
-    """Return by role how far each joint's rotation is from the rest pose, in sigmas of its everyday range.
+class PostureDeviation(NamedTuple):
+    """Deviation of a joint's rotation from the rest pose, in sigmas of its everyday range.
 
-    The value is the root mean square over all ticks and the three axes. It is below 1 for most activities.
+    Both values are the root mean square over the three axes.
+
+    Attributes:
+        rms: Root mean square over the ticks. It is below 1 for most activities.
+        mean: Deviation of the mean rotation. Large swings give a smaller mean than a wrong place of a camera.
+    """
+
+    rms: float
+    mean: float
+
+
+def posture_deviations(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, PostureDeviation]:
+    """Return by role how far each joint's rotation is from the rest pose.
 
     Args:
         bones: Bones of the graph.
@@ -399,8 +411,11 @@ def posture_deviations(bones: Sequence[Bone], world_from_bone: FloatArray) -> di
         if bone.parent >= 0:
             parent = np.swapaxes(world_from_bone[:, bone.parent, :3, :3], 1, 2)
             turn = so3_log(bone.mean_rotation.T @ parent @ world_from_bone[:, index, :3, :3])
-            squares = np.einsum("ti,ij,tj->t", turn, np.linalg.inv(bone.rotation_covariance), turn)
-            out[bone.role] = float(np.sqrt(squares.mean() / 3.0))
+            sigmas = turn @ np.linalg.cholesky(np.linalg.inv(bone.rotation_covariance))
+            out[bone.role] = PostureDeviation(
+                rms=float(np.sqrt(np.square(sigmas).mean())),
+                mean=float(np.sqrt(np.square(sigmas.mean(axis=0)).mean())),
+            )
     return out
 
 

@@ -18,7 +18,7 @@ from bodycap_batch.merging.body_calibration.camera_roll import (
 from bodycap_batch.merging.body_calibration.scale import ScaleSource, chi_square
 from bodycap_batch.merging.cameras.side_check import swapped_sides
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.merging.graph.motion_graph import MotionSolution
+from bodycap_batch.merging.graph.motion_graph import MotionSolution, PostureDeviation
 from bodycap_batch.merging.reporting.advice import (
     describe_hinge,
     describe_inverted_cameras,
@@ -49,6 +49,7 @@ from bodycap_batch.model.merge_report import (
     ScaleReport,
     ScaleSourceReport,
     SolverReport,
+    StillPartReport,
     SwappedSidesReport,
     TPoseReport,
     VerticalReport,
@@ -75,6 +76,8 @@ class MotionFacts:
         end_ns: Common time of the last tick.
         dropped: By camera, (N,) numbers of the frames with gross errors.
         floor: The floor.
+        still_ns: By camera that stands still in the room for some time while the trunk moves, the first and
+            the last common time of the frames that are not used therefore.
         unused: By name of an unused camera, the reason why the camera is not used.
         aligned: By camera, uncertainty of the pose of this camera's map in the main map. The mapping contains
             only cameras whose map was aligned to the main map.
@@ -83,8 +86,7 @@ class MotionFacts:
         flexion_sigma_deg: By role of the bone below a hinge, then by ``observed`` or ``filled`` ticks,
             percentiles of the sigma of the flexion, degrees.
         joint_gap_m: By role of a joint, (T,) distance of the joint from its place on the parent bone, metres.
-        posture_sigmas: By role of a joint, distance of its rotation from the rest pose, in sigmas of its
-            everyday range (root mean square).
+        postures: By role of a joint, deviation of its rotation from the rest pose outside the T-pose.
         hinge_off_plane_m: By role of the joint at the far end of a hinged bone, (T,) distance of this joint
             from the plane of the hinge, metres.
         contacts: By foot, how often the foot stands, and how fast the foot slides while it stands.
@@ -95,12 +97,13 @@ class MotionFacts:
     end_ns: int
     dropped: Mapping[str, IntArray]
     floor: Floor
+    still_ns: Mapping[str, tuple[int, int]]
     unused: Mapping[str, str]
     aligned: Mapping[str, AlignedCameraReport]
     joint_sigma_m: Mapping[str, Mapping[str, Mapping[str, float]]]
     flexion_sigma_deg: Mapping[str, Mapping[str, Mapping[str, float]]]
     joint_gap_m: Mapping[str, FloatArray]
-    posture_sigmas: Mapping[str, float]
+    postures: Mapping[str, PostureDeviation]
     hinge_off_plane_m: Mapping[str, FloatArray]
     contacts: Mapping[str, Mapping[str, float]]
     rule_violation_m: Mapping[str, FloatArray]
@@ -138,10 +141,18 @@ def build_report(
         cameras={track.camera: _camera_report(track, solution, facts) for track in tracks},
         exchanged_sides=_sides_report(inputs.mounts, calibration, main_tracks),
         inverted_cameras=_inverted_cameras_report(inputs.mounts, calibration),
+        still_cameras={
+            camera: StillPartReport(
+                from_s=round(1e-9 * (first_ns - facts.start_ns), 3),
+                to_s=round(1e-9 * (last_ns - facts.start_ns), 3),
+            )
+            for camera, (first_ns, last_ns) in facts.still_ns.items()
+        },
         unused_cameras=dict(facts.unused),
         joined_cameras=dict(facts.aligned),
         joint_gap_m=_percentiles_by_name(facts.joint_gap_m),
-        posture_sigmas={role: round(sigmas, 4) for role, sigmas in facts.posture_sigmas.items()},
+        posture_sigmas={role: round(posture.rms, 4) for role, posture in facts.postures.items()},
+        mean_posture_sigmas={role: round(posture.mean, 4) for role, posture in facts.postures.items()},
         joint_sigma_m=_sigmas_by_role(facts.joint_sigma_m),
         flexion_sigma_deg=_sigmas_by_role(facts.flexion_sigma_deg),
         hinge_off_plane_m=_percentiles_by_name(facts.hinge_off_plane_m),

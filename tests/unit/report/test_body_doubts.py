@@ -28,6 +28,20 @@ def test_rare_postures_lower_the_grade(left: float, grade: Grade) -> None:
     assert found.finding.endswith("left arm") or grade is Grade.GOOD
 
 
+@pytest.mark.parametrize(
+    ("rms", "mean", "grade"),
+    [(0.76, 0.49, Grade.FAIR), (0.69, 0.68, Grade.POOR), (0.92, 0.46, Grade.POOR)],
+    ids=["thrown arms", "an upper arm given as a palm", "thrown arms and wrong clocks"],
+)
+def test_swings_about_the_rest_pose_are_doubted_less_than_a_rare_mean(
+    rms: float, mean: float, grade: Grade
+) -> None:
+    merge = {"posture_sigmas": {"LeftArm": rms}, "mean_posture_sigmas": {"LeftArm": mean}}
+    found = _criterion(merge, "Postures")
+    assert found.grade is grade
+    assert f"{mean:.2f} in the mean" in found.finding
+
+
 @pytest.mark.parametrize(("squares", "grade"), [(3.0, Grade.GOOD), (9.0, Grade.FAIR), (20.0, Grade.POOR)])
 @pytest.mark.parametrize("limbs", [False, True])
 def test_contradictory_scales_lower_the_grade(squares: float, grade: Grade, limbs: bool) -> None:
@@ -72,5 +86,18 @@ def test_the_distance_from_the_rest_pose_is_in_sigmas() -> None:
             turn = half @ np.array([2.0, 0.0, 0.0]) if bone.role == "LeftArm" else np.zeros(3)
             poses[:, index, :3, :3] = poses[0, bone.parent, :3, :3] @ bone.mean_rotation @ so3_exp(turn)
     found = posture_deviations(bones, poses)
-    assert found.pop("LeftArm") == pytest.approx(2.0 / np.sqrt(3.0))
-    assert found == pytest.approx(dict.fromkeys(found, 0.0), abs=1e-6)
+    assert found.pop("LeftArm") == pytest.approx((2.0 / np.sqrt(3.0), 2.0 / np.sqrt(3.0)))
+    assert all(each == pytest.approx((0.0, 0.0), abs=1e-6) for each in found.values())
+
+
+def test_a_swing_about_the_rest_pose_has_no_mean() -> None:
+    bones = kinematic_chain(load_skeleton("upper_body", 1.75), {"Spine1", "LeftHand"})
+    index = next(number for number, bone in enumerate(bones) if bone.role == "LeftArm")
+    bone = bones[index]
+    poses = np.tile(np.eye(4), (2, len(bones), 1, 1))
+    for number, other in enumerate(bones):
+        if other.parent >= 0:
+            poses[:, number, :3, :3] = poses[:, other.parent, :3, :3] @ other.mean_rotation
+    axis = np.linalg.cholesky(bone.rotation_covariance)[:, 0]
+    poses[:, index, :3, :3] = poses[:, index, :3, :3] @ so3_exp(np.stack([axis, -axis]))
+    assert posture_deviations(bones, poses)["LeftArm"] == pytest.approx((1.0 / np.sqrt(3.0), 0.0), abs=1e-6)

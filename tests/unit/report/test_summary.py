@@ -66,17 +66,25 @@ def test_the_worst_two_criteria_are_named_the_worst_first() -> None:
     ids=["another room", "the same room"],
 )
 def test_the_advice_about_an_unknown_clock_depends_on_the_map(frame: str, advice: str, place: str) -> None:
-    """A clap does not help if the video shows another room."""
+    """A clap alone does not help if the video shows another room."""
     values = metrics(gap_s=0.0, scale=0.01)
     values["cameras"]["left_palm"] = {**values["cameras"]["torso"], "frame": frame}  # type: ignore[index]
     values["models"] = [{"frame": "world"}, {"frame": "a1b2"}]
     values["clocks"] = {"torso": {"source": "common"}, "left_palm": {"source": "none"}}
     verdict = judge(values, None)
     assert advice in verdict.headline
-    assert ("clap" in verdict.headline) == (advice == "clap once")
+    assert ("is of this recording" in verdict.headline) == (frame != "main")
     (room,) = (item for item in verdict.criteria if item.name == "One room")
     assert room.grade is Grade.POOR
     assert place in room.finding
+
+
+def test_a_camera_that_fell_off_is_named_before_the_gap_that_it_leaves() -> None:
+    values = metrics(gap_s=2.5, scale=0.01)
+    values["merge"]["still_cameras"] = {"left_palm": {"from_s": 2.5, "to_s": 5.0}}  # type: ignore[index]
+    summary = summarise(values)
+    assert summary.grade is Grade.POOR
+    assert "left_palm stands still in the room between 2.5 s and 5.0 s" in summary.doubts[0]
 
 
 def test_a_good_result_names_no_criterion() -> None:
