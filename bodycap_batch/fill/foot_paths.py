@@ -325,7 +325,11 @@ def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg
     floor = first.place[2] + _smooth(late) * rise - leg.ankle_height_m
     path.pitch_rad[inside] = pitch
     path.toe_rad[inside] = toe
-    path.heading_rad[inside] = first.heading + _smooth(phase) * (second.heading - first.heading)
+    # A person may spin around between two steps. From three quarters of a turn on, the foot leaves out whole
+    # turns.
+    turn = second.heading - first.heading
+    turn -= np.sign(turn) * 2.0 * np.pi * np.floor(abs(turn) / (2.0 * np.pi) + 0.25)
+    path.heading_rad[inside] = first.heading + _smooth(phase) * turn
     path.ankle_m[inside, :2] = travel
     path.ankle_m[inside, 2] = (
         floor + leg.drop_m(pitch, toe) + clearance * np.sin(np.pi * phase**_CLEARANCE_POWER) ** 2

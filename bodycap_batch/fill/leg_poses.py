@@ -52,9 +52,11 @@ def pose_leg(leg: LegGeometry, hip_m: FloatArray, path: FootPath, pelvis: FloatA
     thigh_m, shin_m = float(np.linalg.norm(leg.thigh_m)), float(np.linalg.norm(leg.shin_m))
     reached = soft_length(distance, thigh_m + shin_m)
     along = to_ankle / np.maximum(distance, 1e-9)[:, None]
-    # The knee points where pelvis and foot point in the mean.
+    # The knee points where pelvis and foot point in the mean. Their mean has no direction if the person has
+    # turned by 180° over a standing foot, so the pelvis counts less the more it has turned.
     toes = np.column_stack([np.sin(path.heading_rad), -np.cos(path.heading_rad), np.zeros(len(distance))])
-    ahead = toes - pelvis[:, :, 1]
+    share = 0.5 - 0.5 * (toes * pelvis[:, :, 1]).sum(axis=1, keepdims=True)
+    ahead = toes - share * pelvis[:, :, 1]
     ahead = ahead - (ahead * along).sum(axis=1, keepdims=True) * along
     # A leg that points forward leaves no forward direction: the knee of a sitting person points up.
     ahead = ahead + 1e-3 * (np.array([0.0, 0.0, 1.0]) - along[:, 2:] * along)

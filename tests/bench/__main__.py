@@ -20,6 +20,7 @@ from tests.bench import (
     batch,
     body,
     clocks,
+    elbows,
     field,
     inertial,
     joining,
@@ -50,6 +51,7 @@ _WITH_OPTIONS = {
     "clocks": clocks.main,
     "sync": sync.main,
     "body": body.main,
+    "elbows": elbows.main,
     "bare": bare.main,
     "inertial": inertial.main,
     "shutter": shutter.main,
@@ -73,9 +75,9 @@ def main() -> int:
         "`uncertainty`, `joining` or `solving` (the merge stage on simulated poses), `seeds` (the map "
         "with several seeds), `clocks` (from generated sound and motion), `sync` (ten minutes of sound), "
         "`inertial` (gaps filled from a sensor), `violent` (whole jobs with and without sensors), "
-        "`lenses` (named profiles in the adjustment), `body` (joints without cameras), `bare` (a camera at "
-        "plain surfaces), `shutter` (drawn readout times against global shutters), and `long` (ten minutes "
-        "of three cameras)",
+        "`lenses` (named profiles in the adjustment), `body` (joints without cameras), `elbows` (their "
+        "flexion with a height alone), `bare` (a camera at plain surfaces), `shutter` (drawn readout times "
+        "against global shutters), and `long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)

@@ -795,6 +795,18 @@ def test_known_joint_uncertainty_is_shown(inputs: ReportInputs, tmp_path: Path) 
     assert make_viewer_data(unknown, make_drawn_scene(unknown), PageBudget())["body"]["sigma"] is None
 
 
+def test_the_page_says_how_well_the_elbows_are_known(inputs: ReportInputs, tmp_path: Path) -> None:
+    metrics = json.loads(json.dumps(inputs.metrics))
+    known = {"observed": {"p50": 22.6, "p95": 27.0}, "filled": {"p50": 31.2, "p95": 40.0}}
+    metrics["merge"]["flexion_sigma_deg"] = {"LeftForeArm": known}
+    text = written(replace(inputs, metrics=metrics), tmp_path)
+    assert "bending angle of elbows" in text
+    table = text[text.index("bending angle of elbows") :]
+    assert "left elbow" in table
+    assert "± 23°" in table
+    assert "± 31°" in table
+
+
 def test_the_page_leads_with_the_person_and_links_the_files(inputs: ReportInputs, tmp_path: Path) -> None:
     text = written(replace(inputs, files=("motion.bvh", "metrics.json")), tmp_path)
     places = [text.index(f'id="{name}"') for name in ("person", "verdict", "viewer-title", "motion", "files")]

@@ -12,6 +12,10 @@ from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.model.geometry import interpolate_pose, make_transform
 from bodycap_batch.model.skeleton import SkeletonModel
 
+_MIN_LEVEL_AXIS = 0.3
+"""Minimum horizontal length of the forward axis of a trunk that gives its heading. Unit: 1. Derivation: the
+axis of a trunk that is bent by 73°."""
+
 
 def complete_skeleton(
     skeleton: SkeletonModel, bones: Sequence[Bone], world_from_bone: FloatArray
@@ -72,12 +76,13 @@ def _yaw_only(rotation: FloatArray) -> FloatArray:
 
     The identity has the heading −y.
     """
-    forward, left = -rotation[:, :, 1], rotation[:, :, 0]
-    # If the body bends far forward, its forward axis points down. The left axis then gives the heading.
-    level = forward + 0.0
-    bent = np.hypot(forward[:, 0], forward[:, 1]) < 0.3
-    level[bent] = np.cross(left[bent], [0.0, 0.0, 1.0])
-    yaw = np.arctan2(level[:, 1], level[:, 0]) + 0.5 * np.pi
+    forward = -rotation[:, :, 1]
+    yaw = np.arctan2(forward[:, 1], forward[:, 0]) + 0.5 * np.pi
+    # If the body bends far forward, its forward axis points down, and then backward. The turn about z that is
+    # left without the smallest tilt gives the heading of every body that is not upside down.
+    bent = (np.hypot(forward[:, 0], forward[:, 1]) < _MIN_LEVEL_AXIS) | (rotation[:, 2, 2] < 0.0)
+    twist = np.arctan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1])
+    yaw = np.where(bent, twist, yaw)
     out = np.tile(np.eye(3), (len(rotation), 1, 1))
     out[:, 0, 0] = out[:, 1, 1] = np.cos(yaw)
     out[:, 1, 0] = np.sin(yaw)

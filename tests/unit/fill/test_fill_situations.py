@@ -12,10 +12,12 @@ import pytest
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.fill import fill_motion
+from bodycap_batch.fill.foot_paths import FootPath, foot_path
 from bodycap_batch.fill.leg_geometry import leg_geometry
+from bodycap_batch.fill.leg_poses import pose_leg
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.completion import complete_skeleton
-from bodycap_batch.model.fill_data import FillResult
+from bodycap_batch.model.fill_data import FillResult, Footsteps
 from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp
 from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.model.skeleton_presets import load_skeleton
@@ -334,3 +336,46 @@ def test_planted_feet_stay_where_they_are_in_a_gap_of_the_trunk() -> None:
     result = filled(trunk)
     check_feet(result)
     assert len(result.report.footsteps.side) == 2
+
+
+def test_a_person_who_bows_until_the_head_is_below_the_hips_keeps_the_heading() -> None:
+    """A chest that is bent by more than 90° faces backward; the pelvis and the knees do not turn around."""
+    trunk = still(5.0)
+    trunk.lean_rad[:] = np.radians(125.0) * np.sin(np.pi * smooth((times(trunk) - 1.0) / 3.0)) ** 2
+    result = filled(trunk)
+    rotation = result.motion.world_from_joint()[:, 0, :3, :3]
+    turn = np.degrees(rotation_angle_rad(np.swapaxes(rotation[:-1], -1, -2) @ rotation[1:]))
+    assert turn.max() < 10.0
+    assert rotation[:, 0, 0].min() > 0.9, "the left side of the pelvis stays on the left"
+
+
+def test_knees_do_not_jump_if_the_trunk_turns_around_over_standing_feet() -> None:
+    legs = leg_geometry(load_skeleton("upper_body", 1.75))
+    assert legs is not None
+    leg = legs[0]
+    yaw = np.radians(np.arange(0.0, 361.0, 5.0))
+    zero = 0.0 * yaw
+    pelvis = so3_exp(np.column_stack([zero, zero, yaw]))
+    path = FootPath(
+        ankle_m=np.zeros((len(yaw), 3)), heading_rad=zero, pitch_rad=zero, toe_rad=zero,
+    )  # fmt: skip
+    hip = np.tile([0.05, 0.1, 0.9 * leg.length_m], (len(yaw), 1))
+    thigh = pose_leg(leg, hip, path, pelvis).thigh
+    turn = np.degrees(rotation_angle_rad(np.swapaxes(thigh[:-1], -1, -2) @ thigh[1:]))
+    # The knee does not turn faster than the pelvis, by 5° from tick to tick.
+    assert turn.max() < 5.0
+
+
+def test_a_foot_does_not_spin_with_a_person_who_spins_between_two_steps() -> None:
+    legs = leg_geometry(load_skeleton("upper_body", 1.75))
+    assert legs is not None
+    ankle = legs[0].ankle_height_m
+    steps = Footsteps(
+        side=np.array([0, 0]), start_tick=np.array([0, 20]), end_tick=np.array([10, 30]),
+        ankle_in_world_m=np.array([[0.0, 0.0, ankle], [0.0, -0.4, ankle]]),
+        heading_rad=np.array([0.1, 0.1 + 2.0 * np.pi + 0.5]), is_sure=np.array([False, False]),
+    )  # fmt: skip
+    path = foot_path(steps, 0, legs[0], None, np.zeros((30, 3)), FPS)
+    assert path is not None
+    turned = np.abs(np.angle(np.exp(1j * np.diff(path.heading_rad))))
+    assert turned.sum() == pytest.approx(0.5, abs=0.01)
