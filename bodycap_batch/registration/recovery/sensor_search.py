@@ -31,7 +31,7 @@ _MIN_INLIER_WEIGHT_RATIO = 0.5
 _MAX_DISTANCE = 22.5
 """Maximum squared Mahalanobis distance between the found pose and that of the sensor. Origin: the 99.9 %
 quantile of χ² with six degrees of freedom."""
-_ONLY_GAPS = TelemetryOptions(gravity=False, gaps=True)
+_ONLY_GAPS = TelemetryOptions(gravity=False, smoothing=False)
 
 
 def search_near_sensor(
