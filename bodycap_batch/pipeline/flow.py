@@ -542,7 +542,7 @@ class Flow:
                 continue
             task = self._group_task(own, self._capture.cameras, scene_map, registrations, keyframes)
             if self._job.telemetry.search and own.name in self._with_telemetry:
-                task = replace(task, with_sensor=True, samples=self._samples.get(own.name))
+                task = replace(task, with_sensor=True, samples=self._samples)
             yield make_task(RECOVER, task, camera=own.name)
 
     def _group_task(

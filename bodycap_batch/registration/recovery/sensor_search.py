@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -40,6 +41,7 @@ def search_near_sensor(
     telemetry: CameraTelemetry,
     options: RegistrationOptions,
     context: StageContext,
+    others: Iterable[tuple[Trajectory, CameraTelemetry]] = (),
 ) -> Registration:
     """Search the lost frames of a camera near the poses that its inertial sensor gives.
 
@@ -53,12 +55,13 @@ def search_near_sensor(
         telemetry: The telemetry of the camera.
         options: Minimum number of inliers and maximum relative sigma of a pose.
         context: Progress and cancellation.
+        others: Poses and telemetry of other cameras. They help to find the vertical and the scale of the map.
     """
     path = registration.trajectory
     scene_map = next((scene for scene in inputs.maps if scene.gauge == path.gauge), None)
     if scene_map is None or path.localised.all():
         return registration
-    filled = use_sensor(path, telemetry, _ONLY_GAPS).trajectory
+    filled = use_sensor(path, telemetry, _ONLY_GAPS, others).trajectory
     if (filled.localised == path.localised).all():
         return registration
     camera = inputs.capture.cameras[0]
