@@ -268,6 +268,11 @@ class TelemetryOptions(Options):
         True,
         description="lost frames are searched again near the poses that the inertial sensor gives",
     )
+    smoothing: bool = Field(
+        True,
+        description="the poses of the pictures are solved again together with the inertial samples, and "
+        "poses that contradict them are replaced",
+    )
     gaps: bool = Field(
         True,
         description="frames that are lost for up to a second get poses from the inertial sensor, with the "

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bodycap_batch.config.options import TelemetryOptions
-from bodycap_batch.inertial.alignment import align_sensor
+from bodycap_batch.core.arrays import BoolArray
+from bodycap_batch.inertial.alignment import SensorAlignment, align_sensor
+from bodycap_batch.inertial.clip_solver import ClipSolver
 from bodycap_batch.inertial.force_windows import force_windows
-from bodycap_batch.inertial.gap_filling import FilledGaps, constants_of_clip, fill_gaps
+from bodycap_batch.inertial.gap_filling import constants_of_clip, fill_gaps
+from bodycap_batch.inertial.path_solving import solve_path
 from bodycap_batch.model.earth import GpsFixes
 from bodycap_batch.model.gravity import fit_gravity
-from bodycap_batch.model.inertial_camera import InertialCamera, SensorRelation
+from bodycap_batch.model.inertial_camera import ForceWindows, InertialCamera, SensorRelation
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.telemetry.gyro_fit import GyroFit
 from bodycap_batch.telemetry.streams import CameraTelemetry, GpsTrack
@@ -37,22 +41,64 @@ class UsedSensor:
     trajectory: Trajectory
 
 
-def use_sensor(trajectory: Trajectory, telemetry: CameraTelemetry, options: TelemetryOptions) -> UsedSensor:
+@dataclass(frozen=True, slots=True)
+class _Prepared:
+    """The path of a camera, the relation of its sensor to it, and the means of the specific force."""
+
+    trajectory: Trajectory
+    aligned: SensorAlignment
+    windows: ForceWindows | None
+
+    @staticmethod
+    def of(trajectory: Trajectory, telemetry: CameraTelemetry) -> _Prepared:
+        aligned = align_sensor(trajectory, telemetry)
+        if aligned.fit is None or aligned.samples is None:
+            return _Prepared(trajectory, aligned, None)
+        windows = force_windows(trajectory, aligned.samples, aligned.fit.rotation_sigma_rad)
+        return _Prepared(trajectory, aligned, windows)
+
+    def solver(self, others: Sequence[_Prepared]) -> ClipSolver | None:
+        """Return the solver of the clip; None if vertical and scale are too uncertain.
+
+        Vertical and scale come from the windows of all cameras: a camera with many lost frames may have none.
+        """
+        fit, samples, windows = self.aligned.fit, self.aligned.samples, self.windows
+        if fit is None or samples is None or windows is None:
+            return None
+        gravity = fit_gravity([windows, *(each.windows for each in others if each.windows is not None)])
+        if gravity is None:
+            return None
+        constants = constants_of_clip(fit, gravity, has_windows=bool(len(windows.times_s)))
+        return None if constants is None else ClipSolver(self.trajectory, samples, constants)
+
+
+def use_sensor(
+    trajectory: Trajectory,
+    telemetry: CameraTelemetry,
+    options: TelemetryOptions,
+    others: Iterable[tuple[Trajectory, CameraTelemetry]] = (),
+) -> UsedSensor:
     """Estimate how the sensor of a camera relates to its solved poses, and use what it measures.
 
     Args:
         trajectory: The poses of the camera's frames.
         telemetry: The telemetry of the camera.
         options: Which uses of the telemetry are on.
+        others: Poses and telemetry of other cameras. They help to find the vertical and the scale of the map.
     """
-    aligned = align_sensor(trajectory, telemetry)
-    windows, filled = None, FilledGaps(trajectory=trajectory, filled=0, refused=0)
-    if aligned.fit is not None and aligned.samples is not None:
-        windows = force_windows(trajectory, aligned.samples, aligned.fit.rotation_sigma_rad)
-        gravity = fit_gravity([windows]) if options.gaps else None
-        constants = None if gravity is None else constants_of_clip(aligned.fit, gravity)
-        if constants is not None:
-            filled = fill_gaps(trajectory, aligned.samples, constants)
+    own = _Prepared.of(trajectory, telemetry)
+    aligned, windows = own.aligned, own.windows
+    used = _UsedPath(trajectory)
+    if windows is not None and (options.gaps or options.smoothing):
+        prepared = [_Prepared.of(*other) for other in others if other[0].gauge == trajectory.gauge]
+        solver = own.solver(prepared)
+        if solver is not None:
+            around = [
+                found
+                for index, other in enumerate(prepared)
+                if (found := other.solver([own, *prepared[:index], *prepared[index + 1 :]])) is not None
+            ]
+            used = _used_path(solver, around, options)
     camera = InertialCamera(
         camera=trajectory.camera,
         gauge=trajectory.gauge,
@@ -61,11 +107,68 @@ def use_sensor(trajectory: Trajectory, telemetry: CameraTelemetry, options: Tele
         reason=aligned.comparison.reason,
         relation=None if aligned.fit is None else _relation(aligned.fit),
         windows=windows if options.gravity and windows is not None and len(windows.times_s) else None,
-        filled=filled.filled,
-        refused=filled.refused,
+        filled=used.filled,
+        refused=used.refused,
+        solved=used.solved,
+        replaced=used.replaced,
         gps=_gps_fixes(telemetry.gps) if options.gps and telemetry.gps is not None else None,
     )
-    return UsedSensor(camera=camera, trajectory=filled.trajectory)
+    return UsedSensor(camera=camera, trajectory=used.trajectory)
+
+
+@dataclass(frozen=True, slots=True)
+class _UsedPath:
+    """A trajectory after the sensor was used, and the number of frames as in `InertialCamera`."""
+
+    trajectory: Trajectory
+    filled: int = 0
+    refused: int = 0
+    solved: int = 0
+    replaced: int = 0
+
+
+def _used_path(solver: ClipSolver, others: Sequence[ClipSolver], options: TelemetryOptions) -> _UsedPath:
+    """Return the trajectory with the poses that the sensor improved and added.
+
+    A pose that contradicts the sensor is replaced like that of a lost frame. If that is not possible, it
+    stays.
+    """
+    path = solver.trajectory
+    wrong = np.zeros(len(path.status), dtype=bool)
+    moved, result = wrong, path
+    if options.smoothing:
+        solved = solve_path(solver)
+        moved, wrong, result = solved.moved, solved.wrong, solved.trajectory
+    if not options.gaps:
+        return _UsedPath(result, solved=int(moved.sum()))
+    found = fill_gaps(solver.without(wrong), others)
+    inertial = found.trajectory.localised & ~found.trajectory.registered
+    refused = found.refused - int((wrong & ~inertial).sum())
+    return _UsedPath(
+        _with_frames(result, found.trajectory, inertial),
+        filled=int((inertial & ~wrong).sum()),
+        refused=max(refused, 0),
+        solved=int(moved.sum()),
+        replaced=int((inertial & wrong).sum()),
+    )
+
+
+def _with_frames(path: Trajectory, source: Trajectory, chosen: BoolArray) -> Trajectory:
+    """Return a trajectory in which the chosen frames (N,) are those of another one."""
+    if not chosen.any():
+        return path
+    status = [
+        new if is_chosen else old
+        for old, new, is_chosen in zip(path.status, source.status, chosen.tolist(), strict=True)
+    ]
+    return replace(
+        path,
+        gauge_from_cam=np.where(chosen[:, None, None], source.gauge_from_cam, path.gauge_from_cam),
+        covariance=np.where(chosen[:, None, None], source.covariance, path.covariance),
+        status=tuple(status),
+        inliers=np.where(chosen, source.inliers, path.inliers),
+        error_px=np.where(chosen, source.error_px, path.error_px),
+    )
 
 
 def _gps_fixes(track: GpsTrack) -> GpsFixes | None:

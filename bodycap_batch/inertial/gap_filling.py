@@ -6,12 +6,13 @@ stated sigmas, since neither the noise of a sensor nor the common errors of neig
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
+from bodycap_batch.inertial.clip_solver import MAX_FIX_SIGMAS, ClipSolver
 from bodycap_batch.inertial.gap_solver import (
     CONSTANTS,
     DELAY,
@@ -23,13 +24,9 @@ from bodycap_batch.inertial.gap_solver import (
     TURN,
     Constants,
     SolvedStretch,
-    Stretch,
-    solve_stretch,
 )
-from bodycap_batch.inertial.preintegration import SensorNoise
-from bodycap_batch.inertial.samples import InertialSamples
 from bodycap_batch.model.geometry import so3_log
-from bodycap_batch.model.gravity import GravityFit
+from bodycap_batch.model.gravity import GravityFit, prior_sigmas
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.telemetry.gyro_fit import GyroFit
 
@@ -42,12 +39,6 @@ _MARGIN_S, _LEAST_MARGIN_S, _MIN_FIXES = 0.6, 0.1, 4
 """First: time (seconds) on each side of a gap whose poses are used. Second: minimum of this time. Third:
 minimum number of localised frames in it on each side. They give the velocity at the ends of the gap.
 Evidence: none."""
-_NOISE = SensorNoise(gyro=4e-4, force=1e-2)
-"""Noise densities, rad/s/√Hz and m/s²/√Hz: those of consumer's sensors; that of the force contains errors of
-its scale. Held-out stretches correct the sigmas."""
-_MIN_SIGMA_RAD, _MIN_SIGMA_M = float(np.radians(0.1)), 0.001
-"""Minimum sigmas of a localised pose per axis: the error that neighbouring poses do not share. Evidence:
-none."""
 _BIAS_SIGMA_RAD_S, _DELAY_SIGMA_S = 0.003, 0.0005
 """Minimum sigmas of the remaining bias of the gyroscope and of the remaining delay. Evidence: none."""
 _MAX_SCALE_SIGMA = 0.1
@@ -59,6 +50,8 @@ _LENGTHS_S = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 _QUANTILE, _CHI2_QUANTILE = 0.9, 6.251
 """Quantile of the normalised squared errors that determines the sigmas, and this quantile of χ² with three
 degrees of freedom."""
+_CHI2_MEDIAN = 2.366
+"""Median of the same distribution."""
 _FACTOR_RANGE = (0.01, 100.0)
 """Smallest and largest factor of the variances. Beyond the largest one, the sensor does not describe the
 motion, and nothing is filled."""
@@ -66,9 +59,6 @@ _MAX_SIGMA_M, _MAX_SIGMA_DEG = 0.05, 2.0
 """Maximum sigmas, per axis, of a pose that is used. Evidence: none."""
 _MAX_WRONG = 2
 """Maximum number of wrong poses beside a gap that are left out. Evidence: none."""
-_MAX_WORST_FIX = 8.0
-"""Maximum residual of a localised pose beside a gap, in sigmas of six axes. With a larger one, poses beside
-the gap are wrong. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,37 +87,44 @@ class _Gap:
     end: int
 
 
-def constants_of_clip(fit: GyroFit, gravity: GravityFit) -> Constants | None:
+def constants_of_clip(fit: GyroFit, gravity: GravityFit, *, has_windows: bool = True) -> Constants | None:
     """Return the constants that the whole clip gives; None if they are too uncertain for positions.
 
     Args:
         fit: How the gyroscope relates to the camera.
-        gravity: What the windows of this camera alone determine.
+        gravity: What the windows of all cameras of the map determine. Those of this camera are the first
+            ones.
+        has_windows: False if this camera has no windows. Its own bias, distance and turn then have only
+            their priors.
     """
     if not gravity.scale_sigma < _MAX_SCALE_SIGMA:
         return None
     mean, change = np.zeros(CONSTANTS), np.zeros((CONSTANTS, len(gravity.solution)))
-    places = ((GRAVITY, slice(0, 3), 1.0), (FORCE_BIAS, slice(4, 7), 1.0), (LEVER, slice(7, 10), 1.0))
-    for own, other, sign in (*places, (TURN, slice(10, 13), -1.0)):
+    own_places = ((FORCE_BIAS, slice(4, 7), 1.0), (LEVER, slice(7, 10), 1.0), (TURN, slice(10, 13), -1.0))
+    for own, other, sign in ((GRAVITY, slice(0, 3), 1.0), *(own_places if has_windows else ())):
         mean[own] = sign * gravity.solution[other]
         change[own, other] = sign * np.eye(3)
     mean[LOG_SCALE] = np.log(gravity.metres_per_unit)
     change[LOG_SCALE, 3] = 1.0 / gravity.metres_per_unit
     covariance = change @ gravity.covariance @ change.T
+    if not has_windows:
+        for place, sigma in zip((FORCE_BIAS, LEVER, TURN), prior_sigmas(fit.rotation_sigma_rad), strict=True):
+            covariance[place, place] = np.diag(sigma**2)
     covariance[GYRO_BIAS, GYRO_BIAS] = np.eye(3) * _BIAS_SIGMA_RAD_S**2
     covariance[DELAY, DELAY] = max(fit.delay_sigma_s, _DELAY_SIGMA_S) ** 2
     return Constants(mean=mean, covariance=covariance + 1e-12 * np.eye(CONSTANTS))
 
 
-def fill_gaps(trajectory: Trajectory, samples: InertialSamples, constants: Constants) -> FilledGaps:
+def fill_gaps(solver: ClipSolver, others: Sequence[ClipSolver] = ()) -> FilledGaps:
     """Fill the short gaps of a trajectory.
 
     Args:
-        trajectory: The poses of the camera.
-        samples: The samples of its sensor.
-        constants: What the whole clip gives.
+        solver: The poses of the camera and the samples of its sensor.
+        others: The same of other cameras of the map. Their held-out stretches give the sigmas if those of
+            this camera do not.
     """
-    filler = _Filler(trajectory, samples, constants)
+    trajectory = solver.trajectory
+    filler = _Filler(solver, [_Filler(other) for other in others])
     poses, covariance = trajectory.gauge_from_cam.copy(), trajectory.covariance.copy()
     status = list(trajectory.status)
     filled = refused = 0
@@ -160,24 +157,12 @@ def fill_gaps(trajectory: Trajectory, samples: InertialSamples, constants: Const
 class _Filler:
     """Solves gaps and held-out stretches of one trajectory."""
 
-    def __init__(self, trajectory: Trajectory, samples: InertialSamples, constants: Constants) -> None:
-        self._trajectory, self._constants = trajectory, constants
-        usable = np.isfinite(samples.force_m_s2).all(axis=1)
-        first, last = (int(index) for index in np.flatnonzero(usable)[[0, -1]]) if usable.any() else (0, 0)
-        inside = slice(first, last + 1)
-        self._samples = replace(
-            samples,
-            times_s=samples.times_s[inside],
-            rate_rad_s=samples.rate_rad_s[inside],
-            force_m_s2=samples.force_m_s2[inside],
-        )
-        self._times_s = trajectory.seconds
-        self._known = trajectory.localised & np.asarray(np.diff(self._times_s, prepend=-np.inf) > 0.0)
-        scale = float(np.exp(constants.mean[LOG_SCALE][0]))
-        self._unit = np.repeat([1.0, scale], 3)
-        floor = np.repeat([_MIN_SIGMA_RAD**2, (_MIN_SIGMA_M / scale) ** 2], 3)
-        self._covariance = trajectory.covariance + np.diag(floor)
+    def __init__(self, solver: ClipSolver, others: Sequence[_Filler] = ()) -> None:
+        self._solver, self._others = solver, others
+        self._times_s, self._known = solver.times_s, solver.known
+        self._unit = np.repeat([1.0, solver.metres_per_unit], 3)
         self._factors: dict[float, tuple[float, float] | None] = {}
+        self._errors: dict[float, list[FloatArray]] = {}
 
     def gaps(self) -> Iterator[_Gap]:
         """Yield the short gaps with enough localised frames on both sides."""
@@ -215,7 +200,7 @@ class _Filler:
         known = self._known.copy()
         for _ in range(_MAX_WRONG + 1):
             solved = self._solve(gap, known)
-            if solved is None or solved.worst_fix <= _MAX_WORST_FIX:
+            if solved is None or solved.worst_fix <= MAX_FIX_SIGMAS:
                 return solved
             known[gap.start + solved.worst_frame] = False
             if self._with_margins(gap.first, gap.last, known) is None:
@@ -241,59 +226,69 @@ class _Filler:
             return None
         if (np.diff(times_s[start:end]) <= 0.0).any():
             return None
-        covered = self._samples.covers(times_s[[start]], times_s[[end - 1]])
-        return _Gap(first, last, start, end) if covered[0] else None
+        measured = self._solver.samples.covers(times_s[[first - 1]], times_s[[last]])
+        is_inside = self._solver.has_samples(start, end - 1)
+        return _Gap(first, last, start, end) if is_inside and measured[0] else None
 
     def _solve(self, gap: _Gap, known: BoolArray) -> SolvedStretch | None:
-        stretch = slice(gap.start, gap.end)
-        try:
-            solved = solve_stretch(
-                Stretch(
-                    times_s=self._times_s[stretch],
-                    gauge_from_cam=self._trajectory.gauge_from_cam[stretch],
-                    covariance=self._covariance[stretch],
-                    known=known[stretch],
-                ),
-                self._samples,
-                self._constants,
-                _NOISE,
-            )
-        except np.linalg.LinAlgError:
-            return None
-        is_finite = np.isfinite(solved.gauge_from_cam).all() and np.isfinite(solved.covariance).all()
-        return solved if is_finite else None
+        return self._solver.solve(gap.start, gap.end, known)
 
     def _factors_of(self, length_s: float) -> tuple[float, float] | None:
         """Return the factors of the variances of rotation and position for gaps of a length.
+
+        They come from stretches of this camera. If these are too few, or if wrong poses are among them, they
+        come from the other cameras, unless most stretches of this camera have larger errors.
 
         None if there are too few stretches to hold out, or if the sensor does not describe the motion.
         """
         length_s = next((each for each in _LENGTHS_S if each >= length_s - _ROUNDING_S), _LENGTHS_S[-1])
         if length_s not in self._factors:
-            self._factors[length_s] = self._held_out_factors(length_s)
+            own = self._own_factors(length_s)
+            self._factors[length_s] = self._factors_with_others(length_s) if own is None else own
         return self._factors[length_s]
 
-    def _held_out_factors(self, length_s: float) -> tuple[float, float] | None:
-        worst = []
+    def _own_factors(self, length_s: float) -> tuple[float, float] | None:
+        """Return the factors that the stretches of this camera give."""
+        errors = self._held_out_errors(length_s)
+        if len(errors) < _MIN_HELD_OUT:
+            return None
+        factors = np.quantile(np.concatenate(errors), _QUANTILE, axis=0) / _CHI2_QUANTILE
+        factors = np.maximum(factors, _FACTOR_RANGE[0])
+        return None if (factors > _FACTOR_RANGE[1]).any() else (float(factors[0]), float(factors[1]))
+
+    def _factors_with_others(self, length_s: float) -> tuple[float, float] | None:
+        """Return the largest factors of the other cameras, and at least the typical ones of this camera."""
+        found = [each for each in (other._own_factors(length_s) for other in self._others) if each]
+        if not found:
+            return None
+        errors = self._held_out_errors(length_s)
+        if errors:
+            typical = np.median(np.concatenate(errors), axis=0) / _CHI2_MEDIAN
+            if (typical > _FACTOR_RANGE[1]).any():
+                return None
+            found.append((float(typical[0]), float(typical[1])))
+        return max(each[0] for each in found), max(each[1] for each in found)
+
+    def _held_out_errors(self, length_s: float) -> list[FloatArray]:
+        """Return the normalised squared errors (G,2) of each held-out stretch."""
+        if length_s in self._errors:
+            return self._errors[length_s]
+        errors = self._errors[length_s] = []
         for gap in self._held_out(length_s):
             known = self._known.copy()
             known[gap.first : gap.last] = False
             solved = self._solve(gap, known)
-            if solved is None or solved.worst_fix > _MAX_WORST_FIX:
+            if solved is None or solved.worst_fix > MAX_FIX_SIGMAS:
                 continue  # wrong poses beside it say nothing about the sensor
             inner = slice(gap.first - gap.start, gap.last - gap.start)
-            worst.append(
+            errors.append(
                 self._normalised_errors(
-                    self._trajectory.gauge_from_cam[gap.first : gap.last],
+                    self._solver.trajectory.gauge_from_cam[gap.first : gap.last],
                     solved.gauge_from_cam[inner],
                     solved.covariance[inner],
                 )
             )
-        if len(worst) < _MIN_HELD_OUT:
-            return None
-        squared = np.concatenate(worst)
-        factors = np.maximum(np.quantile(squared, _QUANTILE, axis=0) / _CHI2_QUANTILE, _FACTOR_RANGE[0])
-        return None if (factors > _FACTOR_RANGE[1]).any() else (float(factors[0]), float(factors[1]))
+        return errors
 
     def _held_out(self, length_s: float) -> list[_Gap]:
         """Return stretches of localised frames that are as long as a gap, spread over the clip."""

@@ -37,6 +37,9 @@ _CONVERGED = 1e-5
 """Largest change of the normalised unknowns at which the solution has converged. Evidence: none."""
 _HUBER_SIGMAS = 2.5
 """Residual of a solved pose, in sigmas per axis, above which its weight decreases. Evidence: none."""
+_WITHOUT_SAMPLES = 1e-8
+"""Factor of the weight of an interval without samples, or with a sensor at the end of its range. It only
+keeps the equations regular: a deviation of a metre counts as one of 0.1 mm."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,6 +86,7 @@ class SolvedStretch:
         chi2_per_dof: Weighted sum of squared residuals per degree of freedom; 1 is ideal.
         worst_fix: Largest residual of a solved pose, in sigmas of six axes together.
         worst_frame: Index of the frame with this residual.
+        fix_sigmas: (F,) residuals of all solved poses, in the same unit.
         constants: (17,) the constants of the stretch.
     """
 
@@ -91,6 +95,7 @@ class SolvedStretch:
     chi2_per_dof: float
     worst_fix: float
     worst_frame: int
+    fix_sigmas: FloatArray
     constants: FloatArray
 
 
@@ -155,6 +160,8 @@ class _Problem:
         self._weights = np.linalg.inv(stretch.covariance[self._fixes])
         self._prior_information = np.linalg.inv(constants.covariance)
         self._steps: Steps = steps_between(samples, stretch.times_s)
+        measured = samples.covers(stretch.times_s[:-1], stretch.times_s[1:])
+        self._trust = np.where(measured, 1.0, _WITHOUT_SAMPLES)
         self._rate = np.stack(
             [np.interp(stretch.times_s, samples.times_s, samples.rate_rad_s[:, axis]) for axis in range(3)],
             axis=1,
@@ -190,7 +197,7 @@ class _Problem:
             self._steps, state.constants[GYRO_BIAS], state.constants[FORCE_BIAS], self._noise
         )
         residual, first, second, common = self._span_rows(state, spans)
-        weight = np.linalg.inv(spans.covariance + 1e-14 * np.eye(_NODE))
+        weight = np.linalg.inv(spans.covariance + 1e-14 * np.eye(_NODE)) * self._trust[:, None, None]
         for node in range(self._nodes - 1):
             start = _NODE * node
             jacobian = np.concatenate([first[node], second[node], common[node]], axis=1)
@@ -307,5 +314,6 @@ class _Problem:
             chi2_per_dof=cost / max(rows - size, 1),
             worst_fix=float(sizes.max()),
             worst_frame=int(self._fixes[int(np.argmax(sizes))]),
+            fix_sigmas=sizes,
             constants=state.constants,
         )

@@ -144,9 +144,21 @@ def _prior_information(cameras: Sequence[ForceWindows]) -> FloatArray:
     """Return the information (U,U) of what is known beforehand; the means are zero."""
     parts = [np.full(3, 1e-9), np.array([_PRIOR_SCALE_WEIGHT])]
     for camera in cameras:
-        turn = np.maximum(camera.rotation_sigma_rad, _MIN_ROTATION_SIGMA_RAD)
-        parts += [np.full(3, _BIAS_SIGMA_M_S2**-2), np.full(3, _LEVER_SIGMA_M**-2), turn**-2.0]
+        parts += [sigma**-2.0 for sigma in prior_sigmas(camera.rotation_sigma_rad)]
     return np.diag(np.concatenate(parts))
+
+
+def prior_sigmas(rotation_sigma_rad: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what is known of a sensor beforehand: standard deviations (3,) of bias, distance and turn.
+
+    Args:
+        rotation_sigma_rad: (3,) standard deviations of its rotation against the camera, radians.
+
+    Returns:
+        The standard deviations, m/s², metres and radians. The means are zero.
+    """
+    turn = np.maximum(rotation_sigma_rad, _MIN_ROTATION_SIGMA_RAD)
+    return np.full(3, _BIAS_SIGMA_M_S2), np.full(3, _LEVER_SIGMA_M), turn
 
 
 def _growth(cameras: Sequence[ForceWindows], error: FloatArray, weight: FloatArray) -> float:

@@ -124,6 +124,8 @@ class InertialCamera:
         filled: Number of lost frames that got a pose from the sensor.
         refused: Number of lost frames in short gaps whose poses were too uncertain, or contradicted the poses
             beside them.
+        solved: Number of localised frames whose poses were solved again together with the sensor.
+        replaced: Number of localised frames whose pose contradicted the sensor, and was replaced.
         gps: GPS positions of the camera; None if there are none, or if they are not used.
     """
 
@@ -136,6 +138,8 @@ class InertialCamera:
     windows: ForceWindows | None = None
     filled: int = 0
     refused: int = 0
+    solved: int = 0
+    replaced: int = 0
     gps: GpsFixes | None = None
 
     def figures(self) -> dict[str, Any]:
@@ -148,4 +152,6 @@ class InertialCamera:
             **relation,
             "frames_filled": self.filled,
             "frames_refused": self.refused,
+            "frames_solved_again": self.solved,
+            "frames_replaced": self.replaced,
         }

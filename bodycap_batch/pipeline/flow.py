@@ -304,19 +304,21 @@ class Flow:
         Without telemetry, or if all uses are switched off, the registrations are returned unchanged.
         """
         options = self._job.telemetry
-        if not (options.gravity or options.gaps or options.gps):
+        if not (options.gravity or options.smoothing or options.gaps or options.gps):
             return registrations
+        cameras = [camera for camera in self._capture.cameras if camera.name in self._with_telemetry]
         tasks = []
-        for camera in self._capture.cameras:
-            if camera.name not in self._with_telemetry:
-                continue
+        for own in cameras:
+            ordered = [own, *(camera for camera in cameras if camera.name != own.name)]
+            names = [camera.name for camera in ordered]
             task = InertialTask(
                 options=options,
-                capture=self._footage([camera]),
-                registration=artefact_ref(registrations[camera.name]),
-                samples=self._samples.get(camera.name),
+                cameras=tuple(names),
+                capture=self._footage(ordered),
+                registrations=refs_by_camera({name: registrations[name] for name in names}),
+                samples={name: self._samples[name] for name in names if name in self._samples},
             )
-            tasks.append(make_task(INERTIAL, task, camera=camera.name))
+            tasks.append(make_task(INERTIAL, task, camera=own.name))
         used = self.runner.run_all(tasks)
         for artefact in used.values():
             self.runner.report_notes(artefact, "registration")
@@ -540,7 +542,7 @@ class Flow:
                 continue
             task = self._group_task(own, self._capture.cameras, scene_map, registrations, keyframes)
             if self._job.telemetry.search and own.name in self._with_telemetry:
-                task = replace(task, with_sensor=True, samples=self._samples.get(own.name))
+                task = replace(task, with_sensor=True, samples=self._samples)
             yield make_task(RECOVER, task, camera=own.name)
 
     def _group_task(

@@ -24,8 +24,8 @@ class CameraGroupTask:
         offsets_s: Stated clock offset of each camera that shares a trigger, seconds, by camera name. Empty if
             the cameras share no trigger.
         with_sensor: True to search the lost frames of the first camera near the poses of its inertial sensor.
-        samples: The file with inertial samples beside the video of the first camera; None if the samples are
-            in the video, or if they are not used.
+        samples: The files with inertial samples beside the videos, by camera name. A camera without a file
+            has its samples in the video, or none. Empty if they are not used.
     """
 
     options: RegistrationOptions = field(metadata=NOT_ROUNDS)
@@ -36,4 +36,4 @@ class CameraGroupTask:
     registrations: Mapping[str, ArtefactRef]
     offsets_s: Mapping[str, float]
     with_sensor: bool = False
-    samples: FileRef | None = None
+    samples: Mapping[str, FileRef] = field(default_factory=dict)

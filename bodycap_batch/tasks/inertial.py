@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bodycap_batch.config.options import TelemetryOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, FileRef
 from bodycap_batch.tasks.loading import load_registration
 from bodycap_batch.tasks.registered_cameras import INERTIAL_CAMERA, RIG_POSES
 from bodycap_batch.tasks.registration import save_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
+
+if TYPE_CHECKING:
+    from bodycap_batch.model.scene import Trajectory
+    from bodycap_batch.telemetry.streams import CameraTelemetry
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,15 +27,19 @@ class InertialTask:
 
     Attributes:
         options: Which uses of the telemetry are on.
-        capture: The video of the camera.
-        registration: The registration of the camera.
-        samples: The file with inertial samples beside the video; None if the samples are in the video.
+        cameras: Names of the cameras with telemetry. The first one is the camera whose sensor is used; the
+            others help to find the vertical and the scale of the map.
+        capture: The videos of these cameras, in the same order.
+        registrations: The registration of each camera, by name.
+        samples: The files with inertial samples beside the videos, by name. A camera without a file has its
+            samples in the video.
     """
 
     options: TelemetryOptions
+    cameras: tuple[str, ...]
     capture: CaptureRef
-    registration: ArtefactRef
-    samples: FileRef | None
+    registrations: Mapping[str, ArtefactRef]
+    samples: Mapping[str, FileRef]
 
 
 def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None:
@@ -41,14 +52,22 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
     from bodycap_batch.telemetry.comparison import all_times_ns
 
     context.check_cancelled()
-    camera, config = (
-        open_capture(task.capture.config, context.threads).cameras[0],
-        task.capture.config.cameras[0],
-    )
-    telemetry = read_telemetry(camera.videos, all_times_ns(camera, config), camera.name)
-    before = task.registration.path
+    capture, configs = open_capture(task.capture.config, context.threads), task.capture.config.cameras
+    camera = capture.cameras[0]
+    telemetry = read_telemetry(camera.videos, all_times_ns(camera, configs[0]), camera.name)
+    before = task.registrations[camera.name].path
     registration = load_registration(before)
-    found = use_sensor(registration.trajectory, telemetry, task.options)
+
+    def others() -> Iterator[tuple[Trajectory, CameraTelemetry]]:
+        for other, config in zip(capture.cameras[1:], configs[1:], strict=True):
+            context.check_cancelled()
+            try:
+                read = read_telemetry(other.videos, all_times_ns(other, config), other.name)
+            except CaptureError:  # the task of that camera reports it
+                continue
+            yield load_registration(task.registrations[other.name].path).trajectory, read
+
+    found = use_sensor(registration.trajectory, telemetry, task.options, others())
     notes = [f"{camera.name}: {note}" for note in telemetry.notes]
     if telemetry.gyro is not None and found.camera.relation is None:
         notes.append(f"{camera.name}: the inertial sensor is not used: {found.camera.reason}")

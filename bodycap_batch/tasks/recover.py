@@ -16,6 +16,7 @@ from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, r
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import CaptureCamera
+    from bodycap_batch.config.models import CameraConfig
     from bodycap_batch.telemetry.streams import CameraTelemetry
 
 _MEMORY_MB = 900
@@ -54,8 +55,13 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
     )
     registration = recover_lost_frames(load_registration(paths[0]), inputs, task.options, context)
     if task.with_sensor:
-        telemetry = _telemetry(capture.cameras[0], task)
-        registration = search_near_sensor(registration, inputs, telemetry, task.options, context)
+        configs = task.capture.config.cameras
+        telemetry = _telemetry(capture.cameras[0], configs[0])
+        others = (
+            (load_registration(path).trajectory, _telemetry(camera, config))
+            for camera, config, path in zip(capture.cameras[1:], configs[1:], paths[1:], strict=True)
+        )
+        registration = search_near_sensor(registration, inputs, telemetry, task.options, context, others)
     misplaced = scene.diagnostics.misplaced.get(task.cameras[0], ())
     registration = withdraw_contradicted_poses(registration, scene.maps, misplaced)
     save_registration(registration, capture.cameras[0], files, rolling=read_summary(paths[0])["rolling"])
@@ -63,16 +69,14 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
         write_dataclass(read_dataclass(RigPoses, paths[0], RIG_POSES), files, RIG_POSES)
 
 
-def _telemetry(camera: CaptureCamera, task: CameraGroupTask) -> CameraTelemetry:
-    """Return the telemetry of the first camera; without samples if they cannot be read."""
+def _telemetry(camera: CaptureCamera, config: CameraConfig) -> CameraTelemetry:
+    """Return the telemetry of a camera; without samples if they cannot be read."""
     from bodycap_batch.telemetry import read_telemetry
     from bodycap_batch.telemetry.comparison import all_times_ns
     from bodycap_batch.telemetry.streams import CameraTelemetry
 
     try:
-        return read_telemetry(
-            camera.videos, all_times_ns(camera, task.capture.config.cameras[0]), camera.name
-        )
+        return read_telemetry(camera.videos, all_times_ns(camera, config), camera.name)
     except CaptureError:  # the stage that uses the sensors reports it
         return CameraTelemetry()
 

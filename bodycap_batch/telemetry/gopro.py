@@ -25,6 +25,7 @@ from bodycap_batch.formats.gpmf import (
     gopro_stabilisation,
     read_items,
 )
+from bodycap_batch.telemetry.saturation import saturated_stretches
 from bodycap_batch.telemetry.stream_clock import MAX_SAMPLES, Payload, StreamClock, fit_stream_clock
 from bodycap_batch.telemetry.streams import (
     ACCELEROMETER,
@@ -432,7 +433,7 @@ def _stream(raw: _RawStream, clock: StreamClock, times_s: FloatArray, values: Fl
         times_s=times_s,
         values=values,
         rate_hz=clock.rate_hz,
-        gaps_s=gaps_of(times_s, clock.rate_hz),
+        gaps_s=(*gaps_of(times_s, clock.rate_hz), *saturated_stretches(raw.key, times_s, values)),
     )
 
 

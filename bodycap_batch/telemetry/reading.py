@@ -13,6 +13,7 @@ from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.config.sample_files import samples_beside
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.telemetry.gopro import gaps_of, read_gopro_file
+from bodycap_batch.telemetry.saturation import saturated_stretches
 from bodycap_batch.telemetry.streams import (
     ACCELEROMETER,
     GRAVITY,
@@ -137,12 +138,13 @@ def _joined_stream(parts: Sequence[Stream]) -> Stream:
     times_s = np.concatenate(times)
     counts = np.array([len(part.times_s) for part in parts])
     rate_hz = float(counts.sum() / (counts / np.array([part.rate_hz for part in parts])).sum())
+    joined = np.concatenate(values)
     return replace(
         parts[0],
         times_s=times_s,
-        values=np.concatenate(values),
+        values=joined,
         rate_hz=rate_hz,
-        gaps_s=gaps_of(times_s, rate_hz),
+        gaps_s=(*gaps_of(times_s, rate_hz), *saturated_stretches(parts[0].key, times_s, joined)),
     )
 
 

@@ -36,7 +36,8 @@ class Stream:
         times_s: (N,) time of each sample on the clock of the camera, seconds, increasing.
         values: (N,C) values in the unit.
         rate_hz: Samples per second of the camera's clock, fitted to the recording.
-        gaps_s: Start and end of each stretch without samples, seconds on the clock of the camera.
+        gaps_s: Start and end of each stretch without samples, or in which the sensor was at the end of its
+            range, seconds on the clock of the camera.
     """
 
     key: str

@@ -18,6 +18,7 @@ from bodycap_batch.config.sample_files import GYROFLOW_SUFFIX
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.telemetry.gopro import gaps_of
+from bodycap_batch.telemetry.saturation import saturated_stretches
 from bodycap_batch.telemetry.streams import ACCELEROMETER, GYROSCOPE, CameraTelemetry, Stream
 
 IMU_COLUMNS = ("t_s", "gx", "gy", "gz", "ax", "ay", "az")
@@ -233,6 +234,9 @@ def _telemetry(table: FloatArray, source: str) -> CameraTelemetry:
                 times_s=times_s,
                 values=table[:, start : start + 3],
                 rate_hz=rate_hz,
-                gaps_s=gaps_of(times_s, rate_hz),
+                gaps_s=(
+                    *gaps_of(times_s, rate_hz),
+                    *saturated_stretches(key, times_s, table[:, start : start + 3]),
+                ),
             )
     return CameraTelemetry(source=source, streams=streams)  # type: ignore[arg-type]

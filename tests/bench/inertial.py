@@ -100,7 +100,7 @@ def measure(path: Trajectory, telemetry: CameraTelemetry, gap_s: float) -> dict[
     position, rotation, plain, squared, empty = [], [], [], [], 0
     for phase in range(apart):
         gaps = [(int(first), int(first) + lost) for first in places[phase::apart]]
-        found = use_sensor(lose(path, gaps), telemetry, TelemetryOptions()).trajectory
+        found = use_sensor(lose(path, gaps), telemetry, TelemetryOptions(smoothing=False)).trajectory
         for first, last in gaps:
             truth = path.gauge_from_cam[first:last]
             plain.append(np.linalg.norm(splined(path, first, last) - truth[:, :3, 3], axis=1).max())

@@ -32,13 +32,14 @@ from bodycap_batch.synthetic.imu_options import ImuOptions
 from tests.bench import ours
 from tests.bench.rows import Row
 
-USES = ("gravity", "blur", "tracking", "gps", "search", "gaps")
+USES = ("gravity", "blur", "tracking", "gps", "search", "smoothing", "gaps")
 PLAIN = "without"
 """Name of the job without any use of the telemetry."""
 JOBS = {
     PLAIN: (),
     "tracking": ("gravity", "blur", "tracking", "gps"),
     "search": ("gravity", "blur", "tracking", "gps", "search"),
+    "smoothing": ("gravity", "blur", "tracking", "gps", "search", "smoothing"),
     "with": USES,
 }
 """Uses of the telemetry by name of the job; the middle ones run with ``--separate``."""
@@ -134,9 +135,11 @@ def frames_of(results: Path, truth: Path) -> Frames:
     found, true, error_cm = {}, {}, {}
     for camera in status:
         found[camera] = np.full((len(times_s[camera]), 3), np.nan)
-        if posed[camera].any():
-            table = np.loadtxt(results / "trajectories" / f"{camera}.tum", ndmin=2)
-            found[camera][posed[camera]] = table[:, 1:4]
+        path = results / "trajectories" / f"{camera}.tum"
+        if path.exists():
+            found[camera][posed[camera]] = np.loadtxt(path, ndmin=2)[:, 1:4]
+        else:  # no pose, or poses in another map
+            posed[camera][:] = False
         true[camera] = smooth_path(truth / f"{camera}.tum")[0](times_s[camera])[:, :3, 3]
     known = np.concatenate([posed[camera] for camera in status])
     places, truths = (np.concatenate(list(each.values())) for each in (found, true))

@@ -102,7 +102,7 @@ def summary(options: Json, arguments: Json, files: Path) -> None:
 
 
 def with_sensor(options: Json, arguments: Json, files: Path) -> None:
-    before = Path(arguments["registration"]["path"])
+    before = Path(arguments["registrations"][arguments["cameras"][0]]["path"])
     (files / "summary.json").write_bytes((before / "summary.json").read_bytes())
 
 

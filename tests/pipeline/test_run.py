@@ -363,6 +363,14 @@ def test_sensors_are_used_where_the_video_has_telemetry(bench: Bench) -> None:
     assert "inertial left_palm" in bench.executed()
 
 
+def test_the_sensors_of_all_cameras_help_each_other(bench: Bench) -> None:
+    bench.order(telemetry=["torso", "left_palm"])
+    after = {"telemetry": {"tracking": False, "search": False, "blur": False}}
+    assert {"inertial torso", "inertial left_palm"} <= set(bench.executed(**after))
+    (bench.folder / "torso.imu.csv").write_text("samples")
+    assert {"inertial torso", "inertial left_palm"} <= set(bench.executed(**after))
+
+
 def test_samples_are_an_input_of_the_keyframes_of_their_camera(bench: Bench) -> None:
     bench.run()
     (bench.folder / "torso.imu.csv").write_text("samples")
@@ -377,7 +385,9 @@ def test_telemetry_that_is_switched_off_changes_nothing(bench: Bench) -> None:
     (bench.folder / "torso.imu.csv").write_text("samples")
     assert (
         bench.executed(
-            telemetry=dict.fromkeys(("gravity", "blur", "tracking", "gps", "search", "gaps"), False)
+            telemetry=dict.fromkeys(
+                ("gravity", "blur", "tracking", "gps", "search", "smoothing", "gaps"), False
+            )
         )
         == []
     )

@@ -115,6 +115,24 @@ def test_poses_that_contradict_the_sensor_are_not_accepted(
     assert not path.localised[list(LOST)].any() or np.nanmax(off_m) < 0.05
 
 
+def test_the_sensors_of_other_cameras_help(
+    pictures: list[np.ndarray], context: StageContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Vertical and scale come from all cameras, since a camera with many lost frames has neither."""
+    path, given = _tracked().trajectory, []
+
+    def used(*arguments: Any) -> Any:
+        given.append(list(arguments[3]))
+        return SimpleNamespace(trajectory=path)
+
+    monkeypatch.setattr(sensor_search, "use_sensor", used)
+    inputs: Any = SimpleNamespace(maps=[_map(pictures)])
+    other = (path, CameraTelemetry())
+    options = RegistrationOptions()
+    search_near_sensor(_tracked(), inputs, CameraTelemetry(), options, context, [other])
+    assert given == [[other]]
+
+
 def test_frames_without_texture_stay_lost(
     pictures: list[np.ndarray], context: StageContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:

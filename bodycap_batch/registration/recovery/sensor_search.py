@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +31,7 @@ from bodycap_batch.telemetry.streams import CameraTelemetry
 _MAX_DISTANCE = 22.5
 """Maximum squared Mahalanobis distance between the found pose and that of the sensor. Origin: the 99.9 %
 quantile of χ² with six degrees of freedom."""
-_ONLY_GAPS = TelemetryOptions(gravity=False, gaps=True)
+_ONLY_GAPS = TelemetryOptions(gravity=False, smoothing=False)
 
 
 def search_near_sensor(
@@ -39,6 +40,7 @@ def search_near_sensor(
     telemetry: CameraTelemetry,
     options: RegistrationOptions,
     context: StageContext,
+    others: Iterable[tuple[Trajectory, CameraTelemetry]] = (),
 ) -> Registration:
     """Search the lost frames of a camera near the poses that its inertial sensor gives.
 
@@ -52,12 +54,13 @@ def search_near_sensor(
         telemetry: The telemetry of the camera.
         options: Minimum number of inliers and maximum relative sigma of a pose.
         context: Progress and cancellation.
+        others: Poses and telemetry of other cameras. They help to find the vertical and the scale of the map.
     """
     path = registration.trajectory
     scene_map = next((scene for scene in inputs.maps if scene.gauge == path.gauge), None)
     if scene_map is None or path.localised.all():
         return registration
-    filled = use_sensor(path, telemetry, _ONLY_GAPS).trajectory
+    filled = use_sensor(path, telemetry, _ONLY_GAPS, others).trajectory
     if (filled.localised == path.localised).all():
         return registration
     camera = inputs.capture.cameras[0]

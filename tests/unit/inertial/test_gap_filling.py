@@ -20,6 +20,7 @@ from bodycap_batch.model.scene import FrameStatus
 from tests.inertial import NOISE_M, Hand, Sensor, solved
 
 SECONDS = 12.0
+ONLY_GAPS = TelemetryOptions(smoothing=False)
 GAUGE = Similarity(2.7, so3_exp([0.4, -1.1, 0.3]), np.array([5.0, -3.0, 2.0]))
 EXACT = Sensor(
     turn_rad=(0, 0, 0), late_s=0.0, gyro_bias=(0, 0, 0), force_bias=(0, 0, 0), gyro_noise=0, force_noise=0
@@ -30,7 +31,7 @@ def _lost(gap_frames: int, first: int = 60, every: int = 70) -> list[int]:
     return [frame + start for start in range(first, 330 - gap_frames, every) for frame in range(gap_frames)]
 
 
-def _used(hand, sensor, lost, options=TelemetryOptions(), seed=2):  # noqa: B008 - frozen
+def _used(hand, sensor, lost, options=ONLY_GAPS, seed=2):
     path = solved(hand, SECONDS, lost=lost, gauge_from_world=GAUGE, seed=seed)
     return path, use_sensor(path, sensor.samples(hand, SECONDS, seed), options)
 
@@ -96,7 +97,7 @@ def test_gaps_without_samples_stay_lost():
         streams[key] = replace(
             stream, times_s=stream.times_s[kept], values=stream.values[kept], gaps_s=((2.1, 2.2),)
         )
-    found = use_sensor(path, replace(telemetry, streams=streams), TelemetryOptions()).trajectory
+    found = use_sensor(path, replace(telemetry, streams=streams), ONLY_GAPS).trajectory
     assert {found.status[frame] for frame in lost if frame < 100} == {FrameStatus.BLUR}
     assert {found.status[frame] for frame in lost if frame > 100} == {FrameStatus.INERTIAL}
 
@@ -106,9 +107,7 @@ def test_wrong_poses_beside_a_gap_are_no_base_for_others():
     path = solved(hand, SECONDS, lost=lost)
     poses = path.gauge_from_cam.copy()
     poses[140:146, :3, 3] += 0.3  # the frames after the second gap
-    used = use_sensor(
-        replace(path, gauge_from_cam=poses), Sensor().samples(hand, SECONDS), TelemetryOptions()
-    )
+    used = use_sensor(replace(path, gauge_from_cam=poses), Sensor().samples(hand, SECONDS), ONLY_GAPS)
     assert {used.trajectory.status[frame] for frame in range(130, 140)} == {FrameStatus.BLUR}
     assert used.camera.refused == 10
     # The other gaps are filled: the wrong poses do not count as errors of the sensor.
@@ -122,9 +121,7 @@ def test_an_isolated_wrong_pose_beside_a_gap_is_left_out():
     path = solved(hand, SECONDS, lost=lost)
     poses = path.gauge_from_cam.copy()
     poses[133, :3, 3] += 0.1  # between two gaps
-    used = use_sensor(
-        replace(path, gauge_from_cam=poses), Sensor().samples(hand, SECONDS), TelemetryOptions()
-    )
+    used = use_sensor(replace(path, gauge_from_cam=poses), Sensor().samples(hand, SECONDS), ONLY_GAPS)
     assert used.camera.filled == len(lost)
     shift, _ = _errors(hand, used.trajectory, lost, None)
     assert np.linalg.norm(shift, axis=1).max() < 0.01
@@ -132,17 +129,17 @@ def test_an_isolated_wrong_pose_beside_a_gap_is_left_out():
 
 def test_filling_is_switched_off_and_needs_an_accelerometer_that_agrees():
     hand, lost = Hand(1), _lost(10)
-    path, used = _used(hand, Sensor(), lost, TelemetryOptions(gaps=False))
+    path, used = _used(hand, Sensor(), lost, TelemetryOptions(gaps=False, smoothing=False))
     assert used.trajectory is path
     assert used.camera.windows is not None
-    path, used = _used(hand, Sensor(), lost, TelemetryOptions(gravity=False))
+    path, used = _used(hand, Sensor(), lost, TelemetryOptions(gravity=False, smoothing=False))
     assert used.camera.windows is None
     assert used.camera.filled == len(lost)
     telemetry = Sensor().samples(hand, SECONDS)
     without = replace(telemetry, streams={"GYRO": telemetry.streams["GYRO"]})
-    assert use_sensor(path, without, TelemetryOptions()).trajectory is path
+    assert use_sensor(path, without, ONLY_GAPS).trajectory is path
     noisy = Sensor(force_noise=20.0).samples(hand, SECONDS)
-    refused = use_sensor(path, noisy, TelemetryOptions()).trajectory
+    refused = use_sensor(path, noisy, ONLY_GAPS).trajectory
     assert not refused.localised[lost].any()
 
 

@@ -116,9 +116,10 @@ def tasks(folder: Path) -> dict[str, Any]:
         "recover": CameraGroupTask(**poses),
         "inertial": InertialTask(
             options=TelemetryOptions(gravity=False),
+            cameras=("torso", "head"),
             capture=capture,
-            registration=scene_map,
-            samples=FileRef(path=folder / "torso.imu.csv", digest="of the samples"),
+            registrations=stored,
+            samples={"torso": FileRef(path=folder / "torso.imu.csv", digest="of the samples")},
         ),
         "sound": SoundTask(capture=capture),
         "clocks": ClocksTask(
