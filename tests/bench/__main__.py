@@ -25,6 +25,7 @@ from tests.bench import (
     joining,
     lenses,
     long,
+    mappers,
     ours,
     peers,
     scaling,
@@ -55,6 +56,7 @@ _WITH_OPTIONS = {
     "shutter": shutter.main,
     "lenses": lenses.main,
     "violent": violent.main,
+    "mappers": mappers.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
 
@@ -74,8 +76,8 @@ def main() -> int:
         "with several seeds), `clocks` (from generated sound and motion), `sync` (ten minutes of sound), "
         "`inertial` (gaps filled from a sensor), `violent` (whole jobs with and without sensors), "
         "`lenses` (named profiles in the adjustment), `body` (joints without cameras), `bare` (a camera at "
-        "plain surfaces), `shutter` (drawn readout times against global shutters), and `long` (ten minutes "
-        "of three cameras)",
+        "plain surfaces), `shutter` (drawn readout times against global shutters), `mappers` (the "
+        "incremental and the global mapper), and `long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)
