@@ -26,6 +26,7 @@ from tests.bench import (
     joining,
     lenses,
     long,
+    mappers,
     ours,
     peers,
     scaling,
@@ -57,6 +58,7 @@ _WITH_OPTIONS = {
     "shutter": shutter.main,
     "lenses": lenses.main,
     "violent": violent.main,
+    "mappers": mappers.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
 
@@ -77,7 +79,8 @@ def main() -> int:
         "`inertial` (gaps filled from a sensor), `violent` (whole jobs with and without sensors), "
         "`lenses` (named profiles in the adjustment), `body` (joints without cameras), `elbows` (their "
         "flexion with a height alone), `bare` (a camera at plain surfaces), `shutter` (drawn readout times "
-        "against global shutters), and `long` (ten minutes of three cameras)",
+        "against global shutters), `mappers` (the incremental and the global mapper), and `long` (ten "
+        "minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)
