@@ -23,6 +23,7 @@ from bodycap_batch.mapping.intrinsics.shutters import read_shutters
 from bodycap_batch.mapping.matching.database import read_camera_ids, read_detected_px
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
+from bodycap_batch.mapping.reconstruction.conversion import observed_px
 from bodycap_batch.mapping.reconstruction.model_files import read_model, write_models
 from bodycap_batch.mapping.reconstruction.two_step_adjustment import adjust_in_two_steps
 from bodycap_batch.mapping.results import make_result
@@ -78,7 +79,7 @@ def refine_map(
         for name, entry in previous.log.get("readouts_from_matches", {}).items()
         if (readout := Readout(**entry)).seconds and readout.source != "stated"
     }
-    models, all_readouts = [], []
+    models, all_readouts, adjusted_px = [], [], []
     for number, scene_map in enumerate(previous.maps):
         context.check_cancelled()
         context.progress(number, len(previous.maps), "maps refined")
@@ -94,6 +95,7 @@ def refine_map(
             rolling, cameras, settings, calibrated_ids, scene_map, from_matches
         )
         readout_s = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
+        corrected_px = None
         if readout_s:
             model = rolling.with_exact_rates(readout_s, scene_map.readout_s.keys()).corrected(readout_s)
             if mapping.is_large(model.num_reg_images()):
@@ -101,8 +103,10 @@ def refine_map(
             else:
                 adjust_and_filter(model, settings, calibrated_ids)
                 adjust_robustly(model, settings, calibrated_ids)
+            corrected_px = observed_px(model)
             rolling.move_keypoints(model, {})
         models.append(model)
+        adjusted_px.append(observed_px(model) if corrected_px is None else corrected_px)
         all_readouts.append(readouts)
     write_models(workspace, models)
     log = {
@@ -110,7 +114,7 @@ def refine_map(
             {name: asdict(readout) for name, readout in readouts.items()} for readouts in all_readouts
         ]
     }
-    result = make_result(models, workspace, {**previous.log, **log})
+    result = make_result(models, workspace, {**previous.log, **log}, adjusted_px)
     maps = [
         map_with_readouts(item, readouts) for item, readouts in zip(result.maps, all_readouts, strict=True)
     ]

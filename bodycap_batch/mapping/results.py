@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bodycap_batch.capture import Capture
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.mapping.inputs import frame_times_ns
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import ImageRef
@@ -66,9 +67,24 @@ def misplaced_frames(names: Collection[str], models: Sequence[Any]) -> dict[str,
     return {camera: tuple(ref.frame for ref in refs if ref.camera == camera) for camera in cameras}
 
 
-def make_result(models: Sequence[Any], workspace: Path, log: dict[str, Any]) -> MapResult:
-    """Return the stage's result; add the size and mean reprojection error of each model to the log."""
-    maps = tuple(map_from_reconstruction(model, workspace) for model in models)
+def make_result(
+    models: Sequence[Any],
+    workspace: Path,
+    log: dict[str, Any],
+    adjusted_px: Sequence[Mapping[int, FloatArray]] | None = None,
+) -> MapResult:
+    """Return the stage's result; add the size and mean reprojection error of each model to the log.
+
+    Args:
+        models: Reconstructions, the largest first.
+        workspace: Folder of the database of their keypoints.
+        log: Diagnostics of the stage.
+        adjusted_px: For each model, the positions to which it was adjusted; see `map_from_reconstruction`.
+    """
+    adjusted = [None] * len(models) if adjusted_px is None else adjusted_px
+    maps = tuple(
+        map_from_reconstruction(model, workspace, px) for model, px in zip(models, adjusted, strict=True)
+    )
     log = {
         **log,
         "models": [

@@ -153,6 +153,9 @@ class Map:
             rolling shutter.
         readout_s: By camera name, the readout time, seconds, that the adjustment of the map used. A camera
             without an entry was treated as a camera with a global shutter.
+        keyframe_covariance: (K,6,6) covariance of each keyframe's pose, as in `Trajectory`, relative to the
+            other keyframes: in the gauge in which the mean variance of all keyframes is least. An empty array
+            means that it is unknown.
     """
 
     gauge: str
@@ -168,6 +171,7 @@ class Map:
     obs_feature: IntArray
     obs_px: FloatArray
     readout_s: Mapping[str, float] = field(default_factory=dict)
+    keyframe_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 6, 6)))
 
     def __post_init__(self) -> None:
         keyframes, points, observations = len(self.keyframe_camera), len(self.points), len(self.obs_px)
@@ -180,6 +184,8 @@ class Map:
         set_array(self, "obs_point", (observations,), np.int64)
         set_array(self, "obs_feature", (observations,), np.int64)
         set_array(self, "obs_px", (observations, 2))
+        known = keyframes if len(self.keyframe_covariance) else 0
+        set_array(self, "keyframe_covariance", (known, 6, 6))
 
     def keyframes_of(self, camera: str) -> IntArray:
         """Return the indices of the keyframes of one camera in this map, ordered by frame index."""

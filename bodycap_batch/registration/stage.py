@@ -16,6 +16,7 @@ from bodycap_batch.model.relative_pose import RelativePose
 from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration
 from bodycap_batch.registration.poses.keyframe_requests import request_keyframes
+from bodycap_batch.registration.poses.map_error import with_map_error, without_map_error
 from bodycap_batch.registration.poses.misplaced_keyframes import (
     find_misplaced_keyframes,
     map_without_keyframes,
@@ -86,6 +87,7 @@ def register_frames(
     context.progress(0, 0, "poses")
     poses = solve_camera(camera, scene_map, tracks, criteria, context.threads, rotation)
     trajectory = smooth_if_final(build_trajectory(camera, scene_map.gauge, poses, selection))
+    trajectory = with_map_error(trajectory, maps)
     already_requested = np.zeros(0, np.int64) if previous is None else previous.wanted_keyframes
     requested = request_keyframes(trajectory.localised | selection.frozen, selection.sharpness, offered)
     requested = np.setdiff1d(requested[~selection.frozen[requested]], selection.damaged)
@@ -127,7 +129,8 @@ def register_in_rig(
 
     Source: generalised cameras, Pless, "Using many cameras as one", CVPR 2003.
     """
-    relative_poses = estimate_relative_poses(own, others)
+    own_alone, *others_alone = (_without_map_error(each, maps) for each in (own, *others))
+    relative_poses = estimate_relative_poses(own_alone, others_alone)
     members = rig_members(own, others, relative_poses)
     gauge = own.registration.trajectory.gauge
     scene_map = next((scene for scene in maps if scene.gauge == gauge), None)
@@ -141,7 +144,13 @@ def register_in_rig(
     start = initial_rig_poses(own, others, members)
     poses = solve_rig(members, scene_map, start, criteria, threads)
     trajectory = smooth_if_final(build_trajectory(own.camera, scene_map.gauge, poses, selection))
-    return replace(own.registration, trajectory=trajectory), relative_poses
+    return replace(own.registration, trajectory=with_map_error(trajectory, maps)), relative_poses
+
+
+def _without_map_error(camera: RegisteredCamera, maps: Sequence[Map]) -> RegisteredCamera:
+    """Return a camera whose poses have the covariances that follow from an exact map."""
+    path = without_map_error(camera.registration.trajectory, maps)
+    return replace(camera, registration=replace(camera.registration, trajectory=path))
 
 
 def _track_without_misplaced(

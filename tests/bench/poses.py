@@ -122,7 +122,8 @@ def figures(errors: FloatArray, covariance: FloatArray) -> dict[str, float]:
     Returns:
         For rotation, centre and both: the median squared error over the median of a chi-squared distribution,
         which is 1 if the covariance is correct; and ``<part>_inside``, the fraction of frames in the 95 %
-        region.
+        region. For rotation and centre, ``<part>_sigma`` is the median sigma (root of the summed variances)
+        over the median error; it is 1.13 for normal errors.
     """
     out: dict[str, float] = {"frames": len(errors)}
     for name, part in _PARTS.items():
@@ -130,6 +131,9 @@ def figures(errors: FloatArray, covariance: FloatArray) -> dict[str, float]:
         squared = (error * np.linalg.solve(covariance[:, part, part], error[..., None])[..., 0]).sum(axis=1)
         out[name] = float(np.median(squared) / chi2.median(error.shape[1]))
         out[f"{name}_inside"] = float((squared <= chi2.ppf(_INSIDE, error.shape[1])).mean())
+        if error.shape[1] == 3:
+            variance = np.trace(covariance[:, part, part], axis1=1, axis2=2)
+            out[f"{name}_sigma"] = float(np.sqrt(np.median(variance) / np.median((error**2).sum(axis=1))))
     return out
 
 
@@ -138,4 +142,5 @@ def line_of(scores: dict[str, dict[str, float]]) -> str:
     parts = [
         f"{name} {scores['all'][name]:.2f} ({scores['all'][name + '_inside']:.0%} inside)" for name in _PARTS
     ]
-    return "stated covariance of the poses: normalised error " + ", ".join(parts)
+    ratio = f"; median sigma over median error {scores['all']['centre_sigma']:.2f} (centre)"
+    return "stated covariance of the poses: normalised error " + ", ".join(parts) + ratio

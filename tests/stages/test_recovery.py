@@ -336,12 +336,14 @@ def test_a_rolling_shutter_is_undone(
     monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], context: StageContext
 ) -> None:
     monkeypatch.setitem(globals(), "LOST", range(20, 25))
-    rolled, lost = _rolled(pictures, 0.02), list(LOST)
+    rolled = _rolled(pictures, 0.02)
     off = []
     for readout_s in (0.0, 0.02):
         scene = replace(_map(pictures), readout_s={"torso": readout_s})
         path = _recovered(scene, rolled, context)
-        assert path.localised.all()
+        # Without the correction, the cells of a picture contradict each other, so most frames stay lost.
+        lost = [frame for frame in LOST if path.localised[frame]]
+        assert len(lost) >= (len(LOST) if readout_s else 1)
         turned = path.gauge_from_cam[lost, :3, :3].swapaxes(1, 2) @ PATH[lost, :3, :3]
         centre = np.linalg.norm(path.gauge_from_cam[lost, :3, 3] - PATH[lost, :3, 3], axis=1)
         off.append(np.median(np.linalg.norm(so3_log(turned), axis=1)) + np.median(centre))

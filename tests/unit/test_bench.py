@@ -170,6 +170,7 @@ def test_correct_covariances_of_poses_give_one_in_any_gauge():
         # The median of 400 draws of chi-squared (3) has a sigma of 6 %; three sigmas and a margin.
         assert 0.8 < found[part] < 1.25
         assert found[f"{part}_inside"] > 0.9
+    assert 1.0 < found["centre_sigma"] < 1.26  # the root of 3 over the median of chi-squared (3)
     wide = poses.figures(poses.least_errors(estimates, true, 4.0 * stated), 4.0 * stated)
     assert np.isclose(wide["centre"], found["centre"] / 4.0, rtol=0.02)
     assert wide["centre_inside"] > 0.97

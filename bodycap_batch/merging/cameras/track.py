@@ -14,8 +14,8 @@ from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Mount
 
 MIN_SIGMA_M, MIN_SIGMA_RAD = 0.004, float(np.radians(0.4))
-"""Minimum sigmas of a measured pose per axis (metres, radians). The covariance of PnP contains the image
-noise, but neither the error of the map nor the movement of the strap. Evidence: none."""
+"""Minimum sigmas of a measured pose per axis (metres, radians). The covariance of a pose contains the errors
+of the picture and of the map, but not the movement of the strap. Evidence: none."""
 
 _UNCALIBRATED_SIGMA_RAD, _UNCALIBRATED_SIGMA_M = 0.98 * NOMINAL_ERROR_RAD, 0.98 * NOMINAL_SIGMA_M
 """Minimum sigmas (radians, metres per axis) of a mount that is treated as uncalibrated. The values are

@@ -11,11 +11,14 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp, transform_points
+from bodycap_batch.model.reprojection_derivatives import (
+    common_error_ratio,
+    picture_cells,
+    pose_derivatives,
+    projection_jacobian,
+    weighted_hessians,
+)
 
-_RAY_STEP = 1e-4
-"""Step of the central differences, in units of the ray (x/z, y/z). For a function of unit scale, a step of
-6e-6 has the smallest error: the cube root of the float64 precision. The step used here is 16 times larger.
-Evidence: none."""
 _CHUNK_FRAMES = 48
 """Number of frames solved together. More frames reduce numpy's overhead per frame; fewer frames fit into the
 processor's cache."""
@@ -47,11 +50,11 @@ _TINY = 1e-300
 """Smallest divisor. It prevents a division by zero."""
 _UNUSABLE = 1e5
 """Residual in pixels, or depth, that stands for "no usable value". It exceeds every limit."""
+_MEMBER_SHIFT = 20
+"""Number of bits of the number of a cell of the picture. The number of the camera of a rig is above them."""
 _MIN_OBSERVATIONS = 3
 """Minimum number of observations for a pose. Each observation gives two residuals, and a pose has six
 unknowns."""
-_UPPER_TRIANGLE = tuple((i, j) for i in range(6) for j in range(i, 6))
-"""Index pairs of the upper triangle of a 6×6 matrix."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,6 +124,10 @@ class PoseQuality:
         noise_px: (F,) noise of the observations, pixels. Each residual has an x and a y component. The noise
             is the median of the absolute components, each multiplied by the root of its observation's weight.
             Only inliers with a weight of at least `MIN_COUNTED_WEIGHT` are used.
+        variance_px2: (F,) variance of a residual's component, pixels squared: the reduced chi-squared of the
+            inliers. It contains large errors, which the median in `noise_px` does not.
+        common_px2: (F,) the same variance as it follows from the common errors of neighbouring points; see
+            `common_error_ratio`. NaN if it is unknown.
         depth: (F,) median depth of the inliers, in the unit of the gauge.
         information: (F,6,6) Gauss–Newton information matrix of each pose, for 1 px of noise. It refers to a
             left perturbation of cam_from_gauge.
@@ -130,6 +137,8 @@ class PoseQuality:
     error_px: FloatArray
     inlier_weight_ratio: FloatArray
     noise_px: FloatArray
+    variance_px2: FloatArray
+    common_px2: FloatArray
     depth: FloatArray
     information: FloatArray
 
@@ -156,21 +165,6 @@ def make_observations(
         px_from_ray=projection_jacobian(camera, rays),
         weight=np.ones(len(px)) if weight is None else weight,
     )
-
-
-def projection_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
-    """Return the derivative (N,2,2) of the pixel with respect to the ray (x/z, y/z).
-
-    It is computed from central differences.
-    """
-    out = np.empty((len(rays), 2, 2))
-    for start in range(0, len(rays), _BATCH_ROWS):
-        batch = rays[start : start + _BATCH_ROWS]
-        one = np.ones((len(batch), 1))
-        for axis, step in enumerate(np.eye(2) * _RAY_STEP):
-            ahead, behind = (camera.project(np.hstack([batch + sign * step, one])) for sign in (1.0, -1.0))
-            out[start : start + _BATCH_ROWS, :, axis] = (ahead - behind) / (2.0 * _RAY_STEP)
-    return out
 
 
 def refine_poses(
@@ -215,6 +209,8 @@ def evaluate_poses(
         error_px=np.full(frame_count, np.nan),
         inlier_weight_ratio=np.zeros(frame_count),
         noise_px=np.full(frame_count, np.nan),
+        variance_px2=np.full(frame_count, np.nan),
+        common_px2=np.full(frame_count, np.nan),
         depth=np.full(frame_count, np.nan),
         information=np.zeros((frame_count, 6, 6)),
     )
@@ -237,12 +233,27 @@ def evaluate_poses(
         counted = np.add.reduceat(is_counted, starts, dtype=np.int64)
         quality.noise_px[chosen] = _segment_medians(scaled_px, np.repeat(owner, 2), 2 * starts, 2 * counted)
         quality.depth[chosen] = _segment_medians(np.where(inlier, depth, np.inf), owner, starts, count)
-        quality.information[chosen] = _normal_equations(
-            residual, jacobian, inlier * observations.weight[rows], starts
-        )[0]
+        used = inlier * weight
+        information = weighted_hessians(jacobian, used, starts)
+        quality.information[chosen] = information
+        redundancy = np.maximum(2 * counted - 6, 1)
+        quality.variance_px2[chosen] = np.add.reduceat(used * error_px**2, starts) / redundancy
+        cell = picture_cells(observations.rays[rows])
+        if observations.member is not None:
+            cell = cell + (observations.member[rows] << _MEMBER_SHIFT)
+        quality.common_px2[chosen] = common_error_ratio(
+            residual, jacobian, used, cell, owner, _inverse_or_nan(information)
+        )
 
     _for_each_chunk(observations, evaluate_chunk, threads)
     return quality
+
+
+def _inverse_or_nan(information: FloatArray) -> FloatArray:
+    """Return the inverses of information matrices (F,6,6); NaN for a singular matrix."""
+    solvable = np.linalg.matrix_rank(information) == 6
+    inverse = np.linalg.inv(np.where(solvable[:, None, None], information, np.eye(6)))
+    return np.asarray(np.where(solvable[:, None, None], inverse, np.nan))
 
 
 def find_inliers(
@@ -358,15 +369,7 @@ def linearise(
         Residuals (2,N) in pixels; derivatives (2,6,N), rotation first; depths (N,).
     """
     residual, (a, b, inverse, z), px_from_ray = _residuals(observations, rows, cam_from_gauge)
-    jacobian = np.empty((2, 6, len(a)))
-    for derivative, (by_a, by_b) in zip(jacobian, px_from_ray, strict=True):
-        chain = by_a * a + by_b * b
-        derivative[0] = -(b * chain + by_b)
-        derivative[1] = a * chain + by_a
-        derivative[2] = by_b * a - by_a * b
-        derivative[3] = by_a * inverse
-        derivative[4] = by_b * inverse
-        derivative[5] = -chain * inverse
+    jacobian = pose_derivatives(a, b, inverse, px_from_ray)
     if observations.member is not None and observations.cam_from_rig is not None:
         _camera_to_rig_jacobian(jacobian, observations.member[rows], observations.cam_from_rig)
     return residual, jacobian, z
@@ -414,15 +417,11 @@ def _normal_equations(
     residual: FloatArray, jacobian: FloatArray, weight: FloatArray, starts: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the weighted Hessians (F,6,6) and gradients (F,6) of the frames."""
-    frames = len(starts)
-    hessian, gradient = np.empty((frames, 6, 6)), np.empty((frames, 6))
+    gradient = np.empty((len(starts), 6))
     weighted = jacobian * weight
-    for i, j in _UPPER_TRIANGLE:
-        entry = np.add.reduceat(weighted[0, i] * jacobian[0, j] + weighted[1, i] * jacobian[1, j], starts)
-        hessian[:, i, j] = hessian[:, j, i] = entry
     for i in range(6):
         gradient[:, i] = np.add.reduceat(weighted[0, i] * residual[0] + weighted[1, i] * residual[1], starts)
-    return hessian, gradient
+    return weighted_hessians(jacobian, weight, starts), gradient
 
 
 def _retract(cam_from_gauge: FloatArray, step: FloatArray) -> FloatArray:

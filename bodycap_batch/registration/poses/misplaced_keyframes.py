@@ -202,6 +202,7 @@ def map_without_keyframes(scene_map: Map, rows: IntArray) -> Map:
         ),
         keyframe_frame=scene_map.keyframe_frame[keep],
         map_from_cam=scene_map.map_from_cam[keep],
+        keyframe_covariance=scene_map.keyframe_covariance[keep[: len(scene_map.keyframe_covariance)]],
         obs_keyframe=new_row[scene_map.obs_keyframe[obs_kept]],
         obs_point=scene_map.obs_point[obs_kept],
         obs_feature=scene_map.obs_feature[obs_kept],

@@ -11,9 +11,10 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert
+from bodycap_batch.model.reprojection_derivatives import projection_jacobian
 from bodycap_batch.model.rotation_path import PosePath, RotationPath
 from bodycap_batch.model.scene import Map
-from bodycap_batch.registration.poses.batched_pnp import Observations, make_observations, projection_jacobian
+from bodycap_batch.registration.poses.batched_pnp import Observations, make_observations
 from bodycap_batch.registration.poses.static_points import static_points
 from bodycap_batch.registration.tracking.klt import Tracks
 

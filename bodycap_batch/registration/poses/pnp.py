@@ -25,11 +25,6 @@ observations. Evidence: none."""
 _MIN_NOISE_PX = 0.3
 """Pixels: smallest assumed noise of an observation. It replaces a smaller noise estimate from the residuals.
 Evidence: none."""
-MAP_COVARIANCE_SCALE = 5.0
-"""Factor on the covariance of a pose that is computed from its residuals.
-
-The map points that a frame sees have a common position error. The residuals of one frame cannot show this
-error, so the computed covariance is too small. Evidence: docs/decisions/registration.md."""
 _UNCONSTRAINED_VARIANCE = 1e12
 """Variance assumed for a pose that the observations do not determine. It exceeds every limit."""
 _WEIGHT_RATIO_FLOOR = 1e-3
@@ -69,7 +64,11 @@ class FramePose:
         status: Status of the frame. A frame with the status `REGISTERED`, `KEYFRAME` or `RIG` has a pose. Any
             other status is the reason why the frame has no pose.
         gauge_from_cam: (4,4) pose; None if the frame has no pose.
-        covariance: (6,6) covariance as in `Trajectory`; None if the frame has no pose.
+        covariance: (6,6) covariance as in `Trajectory`, if the map had no error; None if the frame has no
+            pose.
+        scatter: Sigma of the centre (root of the summed variances) from the independent noise of the
+            observations alone, in the unit of the gauge. Neighbouring frames have the rest of the error in
+            common. NaN if the frame has no pose.
         inliers: Number of inliers.
         inlier_weight_ratio: Ratio of the inliers' weight to the weight of all observations.
         error_px: Mean reprojection error of the inliers, pixels.
@@ -78,6 +77,7 @@ class FramePose:
     status: FrameStatus
     gauge_from_cam: FloatArray | None = None
     covariance: FloatArray | None = None
+    scatter: float = float("nan")
     inliers: int = 0
     inlier_weight_ratio: float = 0.0
     error_px: float = float("nan")
@@ -237,7 +237,7 @@ def accept_poses(
         The accepted pose of each frame, or the reason why the pose was rejected.
     """
     quality = evaluate_poses(observations, cam_from_gauge, criteria.max_error_px, threads)
-    covariance = _covariance(quality, criteria.min_noise_px)
+    covariance, independent = _covariances(quality, criteria.min_noise_px)
     sigma = np.sqrt(np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1])
     constrained = sigma < criteria.max_sigma_depth * quality.depth
     gauge_from_cam = invert(cam_from_gauge)
@@ -258,6 +258,7 @@ def accept_poses(
                     status=FrameStatus.REGISTERED if is_constrained else FrameStatus.UNCONSTRAINED,
                     gauge_from_cam=gauge_from_cam[frame] if is_constrained else None,
                     covariance=covariance[frame] if is_constrained else None,
+                    scatter=float(np.sqrt(np.trace(independent[frame, 3:, 3:]))),
                     inliers=inliers,
                     inlier_weight_ratio=float(quality.inlier_weight_ratio[frame]),
                     error_px=float(quality.error_px[frame]),
@@ -266,8 +267,8 @@ def accept_poses(
     return out
 
 
-def _covariance(quality: PoseQuality, min_noise_px: float) -> FloatArray:
-    """Return covariances (F,6,6) from the information and the noise of the inliers.
+def _covariances(quality: PoseQuality, min_noise_px: float) -> tuple[FloatArray, FloatArray]:
+    """Return covariances (F,6,6) from the information and the noise of the inliers, for an exact map.
 
     If the information matrix is singular, the variances are huge. Observations that disagree with a pose make
     this pose less certain. The sigmas therefore grow as the inlier weight ratio falls. Evidence:
@@ -275,9 +276,17 @@ def _covariance(quality: PoseQuality, min_noise_px: float) -> FloatArray:
 
     A left perturbation of cam_from_gauge is a right perturbation of gauge_from_cam with the opposite sign.
     Both perturbations therefore have the same covariance.
+
+    Returns:
+        The covariances from the reduced chi-squared of the inliers, multiplied by the ratio by which common
+        errors of neighbouring points increase the variance; and the covariances from the median noise, as
+        if the errors of all observations were independent.
     """
     noise_px = np.maximum(1.4826 * np.nan_to_num(quality.noise_px), min_noise_px)
     solvable = np.linalg.matrix_rank(quality.information) == 6
     information = np.where(solvable[:, None, None], quality.information, np.eye(6) / _UNCONSTRAINED_VARIANCE)
-    sigma_px = noise_px / np.maximum(quality.inlier_weight_ratio, _WEIGHT_RATIO_FLOOR)
-    return np.asarray(np.linalg.inv(information) * MAP_COVARIANCE_SCALE * sigma_px[:, None, None] ** 2)
+    ratio = np.maximum(quality.inlier_weight_ratio, _WEIGHT_RATIO_FLOOR)
+    inverse = np.linalg.inv(information) / ratio[:, None, None] ** 2
+    common_px2 = np.fmax(np.nan_to_num(quality.variance_px2), quality.common_px2)
+    variance_px2 = np.maximum(common_px2, noise_px**2)
+    return inverse * variance_px2[:, None, None], inverse * noise_px[:, None, None] ** 2

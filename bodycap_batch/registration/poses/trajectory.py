@@ -16,12 +16,7 @@ from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import MUCH_BLUR_PX, FrameStatus, KeyframeSelection, Map, Trajectory
 from bodycap_batch.registration.poses.batched_pnp import find_inliers
 from bodycap_batch.registration.poses.observations import PointReliability, RigMember, RigObservations
-from bodycap_batch.registration.poses.pnp import (
-    MAP_COVARIANCE_SCALE,
-    AcceptanceCriteria,
-    FramePose,
-    solve_poses,
-)
+from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, FramePose, solve_poses
 from bodycap_batch.registration.poses.pose_outliers import (
     ISOLATED_INLIER_FACTOR,
     find_outlier_poses,
@@ -300,11 +295,9 @@ def _reject_outliers(
     centres = np.full((len(poses), 3), np.nan)
     sigma = np.full(len(poses), np.nan)
     for frame, pose in enumerate(poses):
-        if pose.gauge_from_cam is not None and pose.covariance is not None:
+        if pose.gauge_from_cam is not None:
             centres[frame] = pose.gauge_from_cam[:3, 3]
-            # Neighbouring frames share the error of the map. This common error is therefore removed from the
-            # sigma.
-            sigma[frame] = np.sqrt(np.trace(pose.covariance[3:, 3:]) / MAP_COVARIANCE_SCALE)
+            sigma[frame] = pose.scatter
     accepted = _reject(poses, find_outlier_poses(centres, sigma, times_ns), FrameStatus.POSE_JUMP)
     localised = np.array([pose.gauge_from_cam is not None for pose in accepted], dtype=bool)
     inliers = np.array([pose.inliers for pose in accepted], dtype=np.int64)

@@ -14,7 +14,6 @@ from bodycap_batch.model.rotation_path import PosePath
 from bodycap_batch.model.scene import FrameStatus, Map, Trajectory
 from bodycap_batch.registration.poses.batched_pnp import Observations, linearise, make_observations
 from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
-from bodycap_batch.registration.poses.pnp import MAP_COVARIANCE_SCALE
 
 _WELL_SUPPORTED_FACTOR = 4
 """Minimum number of inliers of a pose that is kept next to a lost interval, as a multiple of the minimum
@@ -120,9 +119,7 @@ def refine_points(scene_map: Map, paths: Sequence[Trajectory]) -> Map:
     points, accepted = posed_map.points.copy(), np.zeros(len(px), dtype=bool)
     for chunk in _split_by_point(posed_map.obs_point[order]):
         rows = order[chunk]
-        accepted[rows] = _refine_points_gauss_newton(
-            posed_map, points, rows, px[rows], covariance / MAP_COVARIANCE_SCALE
-        )
+        accepted[rows] = _refine_points_gauss_newton(posed_map, points, rows, px[rows], covariance)
     count = np.bincount(posed_map.obs_point[accepted], minlength=len(points))
     accepted &= count[posed_map.obs_point] >= _MIN_OBSERVATIONS
     return replace(

@@ -15,6 +15,7 @@ from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.rotation_path import RotationPath, TurningShutter
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
+from bodycap_batch.registration.poses.map_error import with_map_error, without_map_error
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
 from bodycap_batch.registration.poses.pose_outliers import ISOLATED_INLIER_FACTOR, isolated_poses
 from bodycap_batch.registration.poses.rig_members import RegisteredCamera
@@ -92,11 +93,12 @@ def recover_lost_frames(
     own_map = next((scene for scene in inputs.maps if scene.gauge == gauge), None)
     if own_map is None:
         return registration
+    registration = replace(registration, trajectory=without_map_error(registration.trajectory, inputs.maps))
     trajectories: list[Trajectory] = []
 
     def cameras() -> Iterable[RegisteredCamera]:
         for camera in inputs.registrations:
-            trajectories.append(camera.registration.trajectory)
+            trajectories.append(without_map_error(camera.registration.trajectory, inputs.maps))
             yield camera
 
     own = with_rotation(inputs.capture.cameras[0], registration, [own_map], inputs.selection)
@@ -105,7 +107,8 @@ def recover_lost_frames(
         scene_map, registration = prepare_recovery(
             own, trajectories[1:], scene_map, inputs.selection, options, context.threads
         )
-    return find_lost_poses(registration, scene_map, inputs.capture, options, context, own.rotation)
+    found = find_lost_poses(registration, scene_map, inputs.capture, options, context, own.rotation)
+    return replace(found, trajectory=with_map_error(found.trajectory, inputs.maps))
 
 
 def find_lost_poses(

@@ -15,6 +15,7 @@ from bodycap_batch.inertial import use_sensor
 from bodycap_batch.model.geometry import invert, so3_log
 from bodycap_batch.model.scene import Registration, Trajectory
 from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
+from bodycap_batch.registration.poses.map_error import with_map_error, without_map_error
 from bodycap_batch.registration.poses.turning_tracks import with_rotation
 from bodycap_batch.registration.recovery.accepted_poses import accepted_pose, with_poses
 from bodycap_batch.registration.recovery.guided_localisation import (
@@ -56,7 +57,7 @@ def search_near_sensor(
         context: Progress and cancellation.
         others: Poses and telemetry of other cameras. They help to find the vertical and the scale of the map.
     """
-    path = registration.trajectory
+    path = without_map_error(registration.trajectory, inputs.maps)
     scene_map = next((scene for scene in inputs.maps if scene.gauge == path.gauge), None)
     if scene_map is None or path.localised.all():
         return registration
@@ -79,7 +80,9 @@ def search_near_sensor(
                 estimate = _pose_near(localiser, search_frame, filled)
                 if estimate is not None:
                     found[frame] = estimate
-    return replace(registration, trajectory=with_poses(path, found)) if found else registration
+    if not found:
+        return registration
+    return replace(registration, trajectory=with_map_error(with_poses(path, found), inputs.maps))
 
 
 def _pose_near(

@@ -217,7 +217,10 @@ def test_both_cameras_of_a_rig_get_poses_that_fit_together() -> None:
     one = _solved(scene_map, first, second).trajectory.gauge_from_cam
     two = _solved(scene_map, second, first).trajectory.gauge_from_cam
     apart = invert(one) @ two
-    assert np.linalg.norm(apart[:, :3, 3] - apart[0, :3, 3], axis=1).max() < 2e-4
+    off_m = np.linalg.norm(apart[:, :3, 3] - apart[0, :3, 3], axis=1)
+    # A weak frame that is smoothed in one camera and not in the other moves by less than its sigma, 1 mm.
+    assert np.median(off_m) < 2e-5
+    assert off_m.max() < 1e-3
     assert np.linalg.norm(apart[0, :3, 3] - FIRST_FROM_SECOND[:3, 3]) < 0.005
 
 
