@@ -50,7 +50,8 @@ _SHOULDER = 0.105
 """Half of the distance of the shoulder joints, as part of the stature. Origin: half of the distance of the
 acromia of both sexes (0.115), less 1.0 % for the joint centre."""
 _SPREAD, _RATIO_SPREAD = 0.03, 0.02
-"""Relative sigma, between people, of the length of the arm, and of each of its two bones against the arm."""
+"""Relative sigma, between people, of the length of the arm, and of each of its two bones against the arm.
+Evidence: none."""
 _HELD_SIGMA_DEG = {"Arm": 20.0, "Out": 15.0, "Spin": 22.5, "Elbow": 20.0}
 """Standard deviations (degrees) of the angles of held arms: half of the everyday ranges of the priors."""
 _HELD_FLEXION_DEG = 20.0
