@@ -99,11 +99,13 @@ def test_a_new_gauge_is_followed_without_a_step_at_keyframes(estimated: Estimate
 
 
 def _transformed(scene_map: Map, world: Similarity) -> Map:
+    unit = np.repeat([1.0, world.scale], 3)
     return replace(
         scene_map,
         gauge="moved",
         points=world.apply(scene_map.points),
         map_from_cam=world.apply_to_poses(scene_map.map_from_cam),
+        keyframe_covariance=scene_map.keyframe_covariance * np.outer(unit, unit),
     )
 
 

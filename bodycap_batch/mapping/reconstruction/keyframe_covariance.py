@@ -146,7 +146,7 @@ def _nearest_chosen(scene_map: Map, chosen: IntArray) -> IntArray:
 
 def _marginal_blocks(system: _Observations, scene_map: Map, chosen: IntArray) -> FloatArray | None:
     """Return the marginal covariances (C,6,6) for 1 px of noise; None if the system is singular."""
-    from scipy.linalg import LinAlgError, cho_factor, cho_solve
+    from scipy.linalg.lapack import dpotrf, dpotri
     from scipy.sparse import csr_array
 
     count, unit = 6 * len(chosen), np.repeat([1.0, 1.0 / system.depth], 3)
@@ -167,7 +167,9 @@ def _marginal_blocks(system: _Observations, scene_map: Map, chosen: IntArray) ->
     coupling = csr_array(
         (mixed.ravel(), (rows.ravel(), columns.ravel())), shape=(count, 3 * system.point_count)
     )
-    reduced = -(coupling @ coupling.T).toarray()
+    reduced = (coupling @ coupling.T).toarray()
+    np.negative(reduced, out=reduced)
+    del mixed, rows, columns, coupling
     for number, hessian in enumerate(hessians):
         block = slice(6 * number, 6 * number + 6)
         reduced[block, block] += hessian
@@ -175,12 +177,18 @@ def _marginal_blocks(system: _Observations, scene_map: Map, chosen: IntArray) ->
     free = np.linalg.qr(gauge)[0]
     size = float(np.trace(reduced)) / count
     reduced += size * (free @ free.T)
-    try:
-        inverse = cho_solve(cho_factor(reduced, overwrite_a=True), np.eye(count))
-    except LinAlgError:
+    # The matrix is symmetric, so its transpose is the same matrix in the order that needs no copy.
+    factor, failed = dpotrf(reduced.T, lower=1, overwrite_a=1)
+    if failed:
         return None
-    inverse -= (free @ free.T) / size
-    blocks = np.array([inverse[each : each + 6, each : each + 6] for each in range(0, count, 6)])
+    inverse, failed = dpotri(factor, lower=1, overwrite_c=1)  # only the lower triangle
+    if failed:
+        return None
+    blocks = np.empty((len(chosen), 6, 6))
+    for number in range(len(chosen)):
+        rows_of = slice(6 * number, 6 * number + 6)
+        lower = np.tril(inverse[rows_of, rows_of])
+        blocks[number] = lower + np.tril(lower, -1).T - free[rows_of] @ free[rows_of].T / size
     return np.asarray(blocks / np.outer(unit, unit))
 
 
