@@ -36,9 +36,12 @@ the square of the time."""
 _ROUNDING_S = 1e-3
 """Rounding of times of frames, seconds."""
 _MARGIN_S, _LEAST_MARGIN_S, _MIN_FIXES = 0.6, 0.1, 4
-"""First: time (seconds) on each side of a gap whose poses are used. Second: minimum of this time. Third:
-minimum number of localised frames in it on each side. They give the velocity at the ends of the gap.
-Evidence: none."""
+"""First: time (seconds) on each side of a gap whose poses are used. Second and third: minimum of this time,
+and of the number of localised frames in it, on one of the sides. They give the velocity at this end of the
+gap. Evidence: none."""
+_MIN_FIXES_OF_ONE_SIDE = 2
+"""Minimum number of localised frames on the other side. Its velocity follows from the sensor. A single pose
+could be wrong without a contradiction."""
 _BIAS_SIGMA_RAD_S, _DELAY_SIGMA_S = 0.003, 0.0005
 """Minimum sigmas of the remaining bias of the gyroscope and of the remaining delay. Evidence: none."""
 _MAX_SCALE_SIGMA = 0.1
@@ -220,9 +223,10 @@ class _Filler:
             return None
         start, end = int(inside[0]), int(inside[-1]) + 1
         sides = (inside[inside < first], inside[inside >= last])
-        if min(len(side) for side in sides) < _MIN_FIXES:
+        counts = sorted(len(side) for side in sides)
+        if counts[0] < _MIN_FIXES_OF_ONE_SIDE or counts[1] < _MIN_FIXES:
             return None
-        if min(times_s[side[-1]] - times_s[side[0]] for side in sides) < _LEAST_MARGIN_S:
+        if max(times_s[side[-1]] - times_s[side[0]] for side in sides) < _LEAST_MARGIN_S:
             return None
         if (np.diff(times_s[start:end]) <= 0.0).any():
             return None

@@ -87,6 +87,16 @@ def test_long_gaps_and_the_ends_stay_lost():
     assert {status[frame] for frame in range(200, 210)} == {FrameStatus.INERTIAL}
 
 
+def test_two_poses_on_one_side_are_enough_but_one_is_not():
+    hand, lost = Hand(1), [*range(340, 350), *range(352, 360)]
+    _, used = _used(hand, Sensor(), lost)
+    assert {used.trajectory.status[frame] for frame in range(340, 350)} == {FrameStatus.INERTIAL}
+    shift, _ = _errors(hand, used.trajectory, list(range(340, 350)))
+    assert np.linalg.norm(shift, axis=1).max() / GAUGE.scale < 0.02
+    _, used = _used(hand, Sensor(), [*lost, 350])
+    assert used.camera.filled == 0
+
+
 def test_gaps_without_samples_stay_lost():
     hand, lost = Hand(1), _lost(10)
     path = solved(hand, SECONDS, lost=lost)
