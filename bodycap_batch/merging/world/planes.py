@@ -12,7 +12,14 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import so3_exp
 
 PLANE_HALF_THICKNESS_M = 0.02
-"""Maximum distance (metres) of a point from its plane. Evidence: none."""
+"""Maximum distance (metres) of a point from its plane; less if the points are more exact. Evidence:
+docs/decisions/merging.md."""
+_MIN_HALF_THICKNESS_M = 0.002
+"""Smallest maximum distance (metres) of a point from its plane: walls are not flatter than that. Evidence:
+none."""
+_THICKNESS_SIGMAS = 1.96
+"""Maximum distance of a point from its plane, in sigmas of the points of the largest plane. Derivation: 95 %
+of the points of a plane are nearer."""
 _MIN_POINTS = 100
 """Minimum number of map points for a search for planes. Evidence: none."""
 _MIN_PLANE_POINTS = 25
@@ -23,6 +30,8 @@ _MAX_PLANES = 10
 """Maximum number of planes that are searched. Evidence: none."""
 _HYPOTHESES = 600
 """Number of RANSAC hypotheses for each plane. Evidence: none."""
+_REFINEMENTS = 5
+"""Number of weighted fits of a plane to the points near it. Evidence: none."""
 _HYPOTHESES_AT_ONCE = 32
 """Number of hypotheses that are compared with all points at the same time. It bounds the memory. Evidence:
 docs/decisions/merging.md."""
@@ -40,10 +49,11 @@ The limit is less than 45 degrees, because a wall could otherwise be mistaken fo
 _AGREEMENT_DEG = 1.0
 """Maximum misalignment (degrees) of a plane that agrees with a vertical. The misalignment is the angle by
 which the plane deviates from horizontal or from vertical, whichever is smaller."""
-_MIN_INFORMATION_SHARE = 0.12
+_MIN_INFORMATION_SHARE = 0.06
 """Minimum information about the vertical, as a fraction of the number of points of all planes. The vertical
 can tilt about two horizontal axes. The information about each of the two tilts must reach this minimum. A
-point of a floor adds one unit to both tilts. A point of a wall adds one unit to one tilt. Evidence: none."""
+point of a floor adds one unit to both tilts. A point of a wall adds one unit to one tilt. Evidence:
+docs/decisions/merging.md."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,27 +94,38 @@ def find_planes(points_m: FloatArray, rng: np.random.Generator) -> list[Plane]:
 
     Source: M. A. Fischler, R. C. Bolles, "Random sample consensus", Communications of the ACM 24, 1981.
     """
-    planes: list[Plane] = []
     if len(points_m) > _MAX_POINTS:
         points_m = points_m[rng.choice(len(points_m), _MAX_POINTS, replace=False)]
-    remaining = points_m
+    if len(points_m) < _MIN_POINTS:
+        return []
     smallest = max(_MIN_PLANE_POINTS, round(_MIN_PLANE_SHARE * len(points_m)))
-    while len(planes) < _MAX_PLANES and len(remaining) >= max(smallest, 4) and len(points_m) >= _MIN_POINTS:
-        plane = _largest_plane(remaining, rng)
+    thickness_m = _thickness(points_m, _largest_plane(points_m, PLANE_HALF_THICKNESS_M, rng))
+    planes: list[Plane] = []
+    remaining = points_m
+    while len(planes) < _MAX_PLANES and len(remaining) >= max(smallest, 4):
+        plane = _largest_plane(remaining, thickness_m, rng)
         if plane is None or plane.count < smallest:
             break
         planes.append(plane)
-        remaining = remaining[
-            np.abs(remaining @ plane.normal - plane.offset_m) > 2.0 * PLANE_HALF_THICKNESS_M
-        ]
+        remaining = remaining[np.abs(remaining @ plane.normal - plane.offset_m) > 2.0 * thickness_m]
     return planes
 
 
-def _largest_plane(points: FloatArray, rng: np.random.Generator) -> Plane | None:
+def _thickness(points: FloatArray, plane: Plane | None) -> float:
+    """Return the maximum distance (metres) of a point (P,3) from its plane, from the largest plane."""
+    if plane is None:
+        return PLANE_HALF_THICKNESS_M
+    distance = np.abs(points @ plane.normal - plane.offset_m)
+    sigma = 1.4826 * float(np.median(distance[distance < PLANE_HALF_THICKNESS_M]))
+    return float(np.clip(_THICKNESS_SIGMAS * sigma, _MIN_HALF_THICKNESS_M, PLANE_HALF_THICKNESS_M))
+
+
+def _largest_plane(points: FloatArray, thickness_m: float, rng: np.random.Generator) -> Plane | None:
     """Find the plane with the most points by RANSAC, and refine it by a fit to these points.
 
     Args:
         points: (P,3) points, metres.
+        thickness_m: Maximum distance of a point from its plane, metres.
         rng: Random generator that draws the hypotheses.
 
     Returns:
@@ -137,21 +158,33 @@ def _largest_plane(points: FloatArray, rng: np.random.Generator) -> Plane | None
     batches = (
         slice(start, start + _HYPOTHESES_AT_ONCE) for start in range(0, len(normals), _HYPOTHESES_AT_ONCE)
     )
-    counts = np.concatenate(
-        [
-            (np.abs(points @ normals[batch].T - offsets[batch]) < PLANE_HALF_THICKNESS_M).sum(axis=0)
-            for batch in batches
-        ]
+    scores = np.concatenate(
+        [_agreement(points @ normals[batch].T - offsets[batch], thickness_m).sum(axis=0) for batch in batches]
     )
-    best = int(np.argmax(counts))
+    best = int(np.argmax(scores))
     normal, offset = normals[best], float(offsets[best])
-    for _ in range(3):
-        inliers = points[np.abs(points @ normal - offset) < PLANE_HALF_THICKNESS_M]
-        if len(inliers) < 4:
+    for _ in range(_REFINEMENTS):
+        weight = _agreement(points @ normal - offset, thickness_m)
+        near = weight > 0.0
+        if near.sum() < 4:
             return None
-        normal = np.linalg.svd(inliers - inliers.mean(axis=0), full_matrices=False)[2][2]
-        offset = float(inliers.mean(axis=0) @ normal)
-    return Plane(normal, offset, int((np.abs(points @ normal - offset) < PLANE_HALF_THICKNESS_M).sum()))
+        centre = np.average(points[near], axis=0, weights=weight[near])
+        root = np.sqrt(weight[near])[:, None]
+        normal = np.linalg.svd(root * (points[near] - centre), full_matrices=False)[2][2]
+        offset = float(centre @ normal)
+    return Plane(normal, offset, int((np.abs(points @ normal - offset) < thickness_m).sum()))
+
+
+def _agreement(distance_m: FloatArray, thickness_m: float) -> FloatArray:
+    """Return how well points agree with a plane: 1 on the plane, 0 at the distance `thickness_m` and farther.
+
+    The number of near points alone would prefer a plane that cuts through two parallel planes, such as a wall
+    and the pictures on it, to either of them.
+
+    Source: P. Torr, A. Zisserman, "MLESAC: a new robust estimator", Computer Vision and Image Understanding
+    78, 2000 (there called MSAC).
+    """
+    return np.asarray(np.maximum(1.0 - (distance_m / thickness_m) ** 2, 0.0))
 
 
 def vertical_from_planes(

@@ -341,6 +341,22 @@ def test_clutter_beside_the_path_is_not_the_floor(floor, clutter, source):
     assert floor_beside_path(points[:0], path, Vertical(UP, source, 0.0, 1.0), 0.0, 1.2) is None
 
 
+@pytest.mark.parametrize("depth_m", [0.08, 0.12, 0.16])
+def test_a_wall_with_a_ledge_does_not_tilt_the_vertical(depth_m):
+    """The upper part of a wall stands back, as behind shelves. A plane through both parts is not a wall."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        side = rng.uniform([3.0, 0.0, 0.0], [3.0, 3.0, 2.5], (600, 3))
+        lower = rng.uniform([0.0, 3.0, 0.5], [3.0, 3.0, 1.2], (230, 3))
+        upper = rng.uniform([0.0, 3.0 + depth_m, 1.2], [3.0, 3.0 + depth_m, 1.9], (230, 3))
+        clutter = rng.uniform([0, 0, 0.1], [3, 3, 2.5], (200, 3))
+        room = np.concatenate([side, lower, upper, clutter])
+        room += rng.normal(scale=0.006, size=room.shape)
+        found = vertical_from_planes(find_planes(room, np.random.default_rng(seed)), UP, TILT_LIMIT_DEG)
+        assert found is not None
+        assert np.degrees(np.arccos(found.up @ UP)) < 1.0
+
+
 def test_one_wall_does_not_determine_the_vertical():
     rng = np.random.default_rng(4)
     wall = rng.uniform([0, 0, 0], [4, 0.005, 2.5], (300, 3))
