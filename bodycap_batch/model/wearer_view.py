@@ -12,6 +12,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.optical_flow import unit_directions
 
 _GRID = (24, 18)
 """Number of columns and rows of viewing rays with which the share of the body in a picture is measured."""
@@ -73,7 +74,7 @@ class WearerView:
         out = np.full(len(rays), np.inf)
         for first in range(0, len(rays), _BLOCK_RAYS):
             part = slice(first, first + _BLOCK_RAYS)
-            directions = _components(_directions(rays[part])[:, None])
+            directions = _components(unit_directions(rays[part])[:, None])
             out[part] = self._depth(directions, self.ends_in_cam_m[frame[part]], self.radius_m[frame[part]])
         return out
 
@@ -101,7 +102,7 @@ class WearerView:
         rays = self.lens.unproject(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
         rays = rays[np.isfinite(rays).all(axis=1)]
         known = np.flatnonzero(self.is_known)
-        directions = _components(_directions(rays)[None, :, None])
+        directions = _components(unit_directions(rays)[None, :, None])
         out = np.full(len(self.radius_m), np.nan)
         step = max(1, _BLOCK_RAYS // max(1, len(rays)))
         for first in range(0, len(known), step):
@@ -109,12 +110,6 @@ class WearerView:
             depth = self._depth(directions, self.ends_in_cam_m[frames, None], self.radius_m[frames, None])
             out[frames] = np.isfinite(depth).mean(axis=1)
         return out
-
-
-def _directions(rays: FloatArray) -> FloatArray:
-    """Return the directions (M,3), of length 1, of viewing rays (M,2): x and y at depth 1."""
-    directions = np.column_stack([rays, np.ones(len(rays))])
-    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
 
 def _components(vectors: FloatArray) -> FloatArray:

@@ -51,7 +51,8 @@ from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_k
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.results import finalise_models
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment, repair_model
-from bodycap_batch.model.geometry import align_points
+from bodycap_batch.model.geometry import align_points, skew
+from bodycap_batch.model.optical_flow import unit_directions
 from tests.bench.bare import MISPLACED_M, robust_alignment
 
 _MIN_MATCHES = 20
@@ -135,7 +136,9 @@ def write_unambiguous_pairs(prepared: Prepared, target: Path) -> tuple[int, int]
         refs = {number: ref for ref, number in read_image_ids(database).items()}
         cameras = {ref.camera: prepared.capture.camera(ref.camera).camera for ref in refs.values()}
         px = {number: np.asarray(database.read_keypoints(number))[:, :2] for number in refs}
-        rays = {number: unit_rays(cameras[ref.camera].unproject(px[number])) for number, ref in refs.items()}
+        rays = {
+            number: unit_directions(cameras[ref.camera].unproject(px[number])) for number, ref in refs.items()
+        }
         pairs = list(zip(*database.read_two_view_geometries(), strict=True))
         database.clear_two_view_geometries()
         with pycolmap.DatabaseTransaction(database):
@@ -159,16 +162,9 @@ def write_unambiguous_pairs(prepared: Prepared, target: Path) -> tuple[int, int]
     return len(pairs), written
 
 
-def unit_rays(tangents: FloatArray) -> FloatArray:
-    """Return unit rays (N,3) for undistorted image points (N,2) at depth 1."""
-    rays = np.column_stack([tangents, np.ones(len(tangents))])
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-
-
 def essential(pose: FloatArray) -> FloatArray:
     """Return the essential matrix (3,3) of a relative pose (3,4)."""
-    x, y, z = pose[:, 3]
-    return np.asarray(np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ pose[:, :3])
+    return np.asarray(skew(pose[:, 3]) @ pose[:, :3])
 
 
 def sampson(pose: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
@@ -309,7 +305,11 @@ def measure(folder: Path, features: int, work: Path) -> None:
     _write_line(f"{name}: {written} of {pairs} pairs have an unambiguous relative pose")
     models = reconstruct_globally(work / "unambiguous.db", work / "global", prepared.options.seed)
     found.append(("global", models, time.process_time() - started))
+    database, before = prepared.context.workspace / DATABASE_NAME, work / "before_repair.db"
+    shutil.copy(database, before)
     for mapper, models, seconds in found:
+        # The repair of a map adds pairs to the database.
+        shutil.copy(before, database)
         if not models:
             _write_line(f"{name}, {mapper}: no model, {seconds:.0f} CPU s")
             continue
