@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -40,6 +41,16 @@ would cost much time for pairs that show different places. Evidence: docs/decisi
 _CONFIDENCE = 0.999
 """Probability at which a robust fit ends early: the probability that at least one sample without a wrong
 match was drawn. OpenCV's default."""
+_MIN_TRIALS = 10
+"""Minimum number of random samples of a robust fit. Evidence: docs/decisions/mapping.md."""
+_TRIALS_SURPLUS = 4
+"""Factor on the number of samples that a pair needs at the least ratio of correct matches. A sample without a
+wrong match can still give an inaccurate geometry, because its matches are noisy. Evidence:
+docs/decisions/mapping.md."""
+_SAMPLE_CALIBRATED = 5
+"""Number of matches in a sample from which an essential matrix is computed."""
+_SAMPLE_UNCALIBRATED = 7
+"""Number of matches in a sample from which a fundamental matrix is computed."""
 _MAX_TANGENT = 2.5
 """Maximum absolute value of x and of y of a ray with z = 1. The value 2.5 corresponds to an angle of 68
 degrees from the optical axis. At larger angles, x and y grow too fast with the angle to measure errors."""
@@ -204,13 +215,15 @@ def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> 
     try:
         if a.calibrated and b.calibrated:
             limit = 0.5 * (a.error + b.error)
-            _, kept = cv2.findEssentialMat(first, second, np.eye(3), method, _CONFIDENCE, limit, _MAX_TRIALS)
+            trials = max_trials(len(matches), _SAMPLE_CALIBRATED)
+            _, kept = cv2.findEssentialMat(first, second, np.eye(3), method, _CONFIDENCE, limit, trials)
         else:
             # If only one camera is calibrated, its rays are converted to undistorted pixels, because the
             # positions in the other keyframe are pixels too.
             first, second = first * (_error_px(a) / a.error), second * (_error_px(b) / b.error)
             limit = 0.5 * (_error_px(a) + _error_px(b))
-            _, kept = cv2.findFundamentalMat(first, second, method, limit, _CONFIDENCE, _MAX_TRIALS)
+            trials = max_trials(len(matches), _SAMPLE_UNCALIBRATED)
+            _, kept = cv2.findFundamentalMat(first, second, method, limit, _CONFIDENCE, trials)
     except cv2.error as error:
         # If no sample gives a two-view geometry, an assertion in OpenCV fails. Then no match is verified.
         # Other errors are raised.
@@ -218,6 +231,22 @@ def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> 
             raise
         return none
     return none if kept is None else matches[kept.ravel().astype(bool)]
+
+
+def max_trials(count: int, sample: int) -> int:
+    """Return the maximum number of random samples of a robust fit, at most `_MAX_TRIALS`.
+
+    A pair is verified only if at least `MIN_INLIERS` of its matches agree. So the ratio of correct matches of
+    a pair with few matches is high, or the pair is rejected. With few samples, a wrong pair is rejected
+    early.
+
+    Args:
+        count: Number of matches, at least `MIN_INLIERS`.
+        sample: Number of matches in a sample.
+    """
+    all_correct = min((MIN_INLIERS / count) ** sample, _CONFIDENCE)
+    needed = math.log(1.0 - _CONFIDENCE) / math.log(1.0 - all_correct)
+    return min(_MAX_TRIALS, max(_MIN_TRIALS, math.ceil(_TRIALS_SURPLUS * needed)))
 
 
 def _error_px(features: KeyframeFeatures) -> float:

@@ -400,7 +400,8 @@ def _render_patches(
     fraction = np.linspace(-0.5, 0.5, samples) if samples > 1 else np.zeros(1)
     centre = scene.obs_px[rows] / step[:, None] - 0.5
     centres = centre[:, None, :] + fraction[None, :, None] * shift[:, None, :]
-    extent = np.abs(offset).max(axis=1)
+    corners = (0, side - 1, side * (side - 1), side * side - 1)
+    extent = np.abs(offset[:, corners]).max(axis=1)  # A warp is linear, so its corners are farthest out.
     low, high = centres.min(axis=1) - extent, centres.max(axis=1) + extent
     is_inside = ((low >= 0.0) & (high <= limit)).all(axis=1)
     images = np.zeros((len(rows), side, side), np.float32)
@@ -408,14 +409,16 @@ def _render_patches(
         own = np.flatnonzero((source_index == number) & is_inside)
         if len(own) == 0:
             continue
-        sample_px = centres[own].astype(np.float32)[:, :, None, :] + offset[own][:, None, :, :]
-        sample_px = sample_px.reshape(-1, side, 2)
-        rendered = cv2.remap(
-            source.levels[level.pyramid_level],
-            np.ascontiguousarray(sample_px[..., 0]),
-            np.ascontiguousarray(sample_px[..., 1]),
-            cv2.INTER_LINEAR,
+        # One array for each axis, as OpenCV needs them.
+        column, row = (
+            (sample[:, :, None] + own_offset[:, None, :]).reshape(-1, side)
+            for sample, own_offset in zip(
+                np.moveaxis(centres[own].astype(np.float32), 2, 0),
+                np.moveaxis(offset[own], 2, 0),
+                strict=True,
+            )
         )
+        rendered = cv2.remap(source.levels[level.pyramid_level], column, row, cv2.INTER_LINEAR)
         images[own] = rendered.reshape(len(own), samples, side, side).mean(axis=1, dtype=np.float32)
     return images, is_inside & (images.std(axis=(1, 2)) >= _MIN_CONTRAST)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -107,3 +109,33 @@ def test_a_fit_that_fails_inside_opencv_verifies_nothing(
     a, b, matches, _ = _two_views(np.random.default_rng(3), calibrated=calibrated)
     monkeypatch.setattr(cv2, "findEssentialMat" if calibrated else "findFundamentalMat", failing)
     assert len(verify_pair(matches, a, b)) == 0
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_few_matches_need_few_samples(calibrated: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "findEssentialMat" if calibrated else "findFundamentalMat"
+    fit = getattr(cv2, name)
+    trials: list[int] = []
+
+    def recording(*arguments: Any) -> Any:
+        trials.append(arguments[-1])
+        return fit(*arguments)
+
+    monkeypatch.setattr(cv2, name, recording)
+    a, b, matches, right = _two_views(np.random.default_rng(5), calibrated=calibrated)
+    wrong = matches[right:]
+    assert len(verify_pair(wrong[:16], a, b)) < 16
+    verify_pair(wrong, a, b)
+    # If 15 of 16 matches are correct, one sample in 1.4 (five matches) or 1.6 (seven) is correct.
+    assert trials[0] <= 40
+    assert trials[1] == 400
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+@pytest.mark.parametrize("wrong", [1, 5, 10])
+def test_a_pair_with_few_correct_matches_is_verified(calibrated: bool, wrong: int) -> None:
+    for seed in range(20):
+        a, b, matches, right = _two_views(np.random.default_rng(100 + seed), calibrated=calibrated)
+        few = np.concatenate([matches[:20], matches[right : right + wrong]])
+        # All of the 20 correct matches are within 8 sigma, and 15 are enough.
+        assert len(verify_pair(few, a, b)) >= 15
