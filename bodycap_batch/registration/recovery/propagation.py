@@ -114,11 +114,14 @@ class Propagation:
     Attributes:
         localiser: Estimates the pose of a frame near an expected pose.
         interval: The lost interval.
+        turns: Rotations (3,3) of the camera from one frame to another that were measured so far, by both
+            frames; None for frames whose rotation cannot be measured. Several propagations share them.
         estimates: Found poses, by direction (1 forward, −1 backward) and frame.
     """
 
     localiser: GuidedLocaliser
     interval: LostInterval
+    turns: dict[tuple[int, int], FloatArray | None] = field(default_factory=dict)
     estimates: dict[tuple[int, int], PoseEstimate] = field(default_factory=dict)
 
     def run(self) -> dict[int, PoseEstimate]:
@@ -258,7 +261,7 @@ class Propagation:
         The first candidate follows from matches between adjacent frames or from the image motion, if one of
         them is known. The last candidate assumes a constant angular velocity.
         """
-        rotation, lens = state.pose[:3, :3], self.localiser.lens
+        rotation = state.pose[:3, :3]
         previous_pyramid, pyramid = self.interval.pyramids.get(state.frame), self.interval.pyramids[frame]
         constant_rotation = [state.rotation_step @ rotation]
         shutter = self.localiser.shutter
@@ -267,20 +270,32 @@ class Propagation:
             return [matched @ rotation, *constant_rotation]
         if previous_pyramid is None:
             return constant_rotation
-        first, second = make_coarse_image(previous_pyramid.levels[0]), make_coarse_image(pyramid.levels[0])
+        frames = state.frame, frame
+        if frames not in self.turns:
+            self.turns[frames] = self._turn_of_pictures(previous_pyramid, pyramid)
+        turn = self.turns[frames]
+        return constant_rotation if turn is None else [turn @ rotation, *constant_rotation]
+
+    def _turn_of_pictures(self, first: Pyramid, second: Pyramid) -> FloatArray | None:
+        """Return the rotation (3,3) of the camera from one frame to another, from the motion of the picture.
+
+        None is returned if the motion is unknown, or if it moves too much of the picture out of sight.
+        """
+        lens = self.localiser.lens
+        before, after = make_coarse_image(first.levels[0]), make_coarse_image(second.levels[0])
         width = lens.width_px
-        corners = detect_corners(first, _MAX_CORNERS, _CORNER_SPACING_PX)
-        motion = estimate_coarse_motion(first, second, corners * np.float32(width / first.shape[1]), width)
+        corners = detect_corners(before, _MAX_CORNERS, _CORNER_SPACING_PX)
+        motion = estimate_coarse_motion(before, after, corners * np.float32(width / before.shape[1]), width)
         if motion is None:
-            return constant_rotation
+            return None
         fractions = np.linspace(0.2, 0.8, _GRID_SIDE)
         grid = np.stack(np.meshgrid(fractions * width, fractions * lens.height_px), axis=-1).reshape(-1, 2)
         arrived = apply_homography(grid.astype(np.float32), motion.homography).astype(np.float64)
         inside = ((arrived > 0.0) & (arrived < (width, lens.height_px))).all(axis=1)
         if inside.sum() < _GRID_SIDE:
-            return constant_rotation
-        before, after = (unit_directions(lens.unproject(px[inside])) for px in (grid, arrived))
-        return [fit_rotation(before, after) @ rotation, *constant_rotation]
+            return None
+        start, end = (unit_directions(lens.unproject(px[inside])) for px in (grid, arrived))
+        return fit_rotation(start, end)
 
 
 def _neighbour_pose(before: FloatArray | None, after: FloatArray | None, pose: FloatArray) -> NeighbourPose:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -216,6 +216,7 @@ class _IntervalSearch:
         statistics: How smoothly the camera moves.
         seed_rows: Row indices in the map by frame, for the lost frames that are keyframes.
         tracked_frames: Indices of the frames with a pose from tracking.
+        turns: Rotations between frames that were measured so far. A further pass does not measure them again.
     """
 
     camera: CaptureCamera
@@ -225,6 +226,7 @@ class _IntervalSearch:
     statistics: MotionStatistics
     seed_rows: Mapping[int, int]
     tracked_frames: Collection[int]
+    turns: dict[tuple[int, int], FloatArray | None] = field(default_factory=dict)
 
     def recover_interval(
         self, start: int, stop: int, poses: Mapping[int, PoseEstimate]
@@ -248,7 +250,7 @@ class _IntervalSearch:
             keyframe_rows=seed_rows,
             statistics=self.statistics,
         )
-        return _accepted_poses(Propagation(self.localiser, interval))
+        return _accepted_poses(Propagation(self.localiser, interval, self.turns))
 
 
 def _extended_intervals(has_pose: BoolArray, before: BoolArray, frozen: BoolArray) -> list[tuple[int, int]]:
