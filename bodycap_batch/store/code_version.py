@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 _PACKAGE = Path(__file__).parent.parent
 _NAMED = re.compile(r"bodycap_batch\.(\w+(?:\.\w+)*)")
@@ -141,9 +141,10 @@ class _ParsedSources:
         known = self._entries.get(name)
         if known is not None and known[0] == content_digest:
             return _Source(known[1], frozenset(known[2]))
-        tree = ast.parse(content, str(path))
-        mentions = frozenset(_mentions(tree)) - _NOT_COMPUTING
-        source = _Source(hashlib.sha256(code_text(tree).encode()).hexdigest(), mentions)
+        reader = _TreeReader()
+        text = reader.text(ast.parse(content, str(path)))
+        mentions = frozenset(reader.mentions) - _NOT_COMPUTING
+        source = _Source(hashlib.sha256(text.encode()).hexdigest(), mentions)
         self._entries[name] = (content_digest, source.digest, sorted(mentions))
         self._is_new = True
         return source
@@ -176,20 +177,6 @@ def _source(path: Path) -> _Source:
     return _parsed_sources(_PACKAGE).find(path, content)
 
 
-def _mentions(tree: ast.AST) -> Iterator[str]:
-    """Yield the modules of this package that a file imports or names in a string."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bodycap_batch."):
-            yield str(node.module).partition(".")[2]
-        elif isinstance(node, ast.ImportFrom) and node.module == "bodycap_batch":
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.Import):
-            named = (_NAMED.fullmatch(alias.name) for alias in node.names)
-            yield from (match[1] for match in named if match)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            yield from _NAMED.findall(node.value) if _NAMED.fullmatch(node.value) else ()
-
-
 def code_text(tree: ast.AST) -> str:
     """Return a syntax tree as text that is equal on all supported versions of Python.
 
@@ -197,32 +184,70 @@ def code_text(tree: ast.AST) -> str:
     versions: Python 3.12 added the field ``type_params``, and Python 3.13 prints trees without empty lists.
     These differences must not change a digest.
     """
-    fields = []
-    for name, value in ast.iter_fields(tree):
-        text = _field_text(value)
-        if text and name not in _IGNORED_FIELDS:
-            fields.append(f"{name}={text}")
-    return f"{type(tree).__name__}({','.join(fields)})"
+    return _TreeReader().text(tree)
 
 
 _IGNORED_FIELDS = frozenset({"ctx", "kind", "type_comment", "type_ignores"})
 """Fields of syntax nodes that do not affect what the code does."""
 
 
-def _field_text(value: object) -> str:
-    """Return a field of a syntax node as text; the text of an empty field is empty."""
-    if isinstance(value, ast.Constant):
-        return f"{type(value.value).__name__}:{value.value!r}"
-    if isinstance(value, ast.JoinedStr):
-        # Python 3.12 adds empty strings to the parts of f-strings; they are ignored.
-        parts = [part for part in value.values if getattr(part, "value", None) != ""]
-        return f"JoinedStr{_field_text(parts)}"
-    if isinstance(value, ast.AST):
-        return code_text(value)
-    if isinstance(value, list):
-        items = [_field_text(item) for item in value if not _is_bare_string(item)]
-        return f"[{','.join(items)}]" if items else ""
-    return "" if value is None else repr(value)
+class _TreeReader:
+    """Reads the text of a syntax tree and the modules that it names, in one walk over the tree.
+
+    Attributes:
+        mentions: Modules of this package that the tree imports or names in a string, outside of bare strings.
+    """
+
+    _FIELDS: ClassVar[dict[type[ast.AST], tuple[str, ...]]] = {}
+    """The fields of each class of nodes that affect what the code does."""
+
+    def __init__(self) -> None:
+        self.mentions = set[str]()
+
+    def text(self, node: ast.AST) -> str:
+        """Return the text of a node; see `code_text`."""
+        kind = node.__class__
+        names = self._FIELDS.get(kind)
+        if names is None:
+            names = self._FIELDS[kind] = tuple(name for name in kind._fields if name not in _IGNORED_FIELDS)
+        if kind is ast.ImportFrom or kind is ast.Import:
+            self.mentions.update(_imported(node))
+        fields = []
+        for name in names:
+            text = self._field_text(getattr(node, name, None))
+            if text:
+                fields.append(f"{name}={text}")
+        return f"{kind.__name__}({','.join(fields)})"
+
+    def _field_text(self, value: object) -> str:
+        """Return a field of a syntax node as text; the text of an empty field is empty."""
+        if value is None:
+            return ""
+        if isinstance(value, ast.Constant):
+            if isinstance(value.value, str) and (named := _NAMED.fullmatch(value.value)):
+                self.mentions.add(named[1])
+            return f"{type(value.value).__name__}:{value.value!r}"
+        if isinstance(value, ast.JoinedStr):
+            # Python 3.12 adds empty strings to the parts of f-strings; they are ignored.
+            parts = [part for part in value.values if getattr(part, "value", None) != ""]
+            return f"JoinedStr{self._field_text(parts)}"
+        if isinstance(value, ast.AST):
+            return self.text(value)
+        if isinstance(value, list):
+            items = [self._field_text(item) for item in value if not _is_bare_string(item)]
+            return f"[{','.join(items)}]" if items else ""
+        return repr(value)
+
+
+def _imported(node: ast.AST) -> Iterator[str]:
+    """Yield the modules of this package that an import statement names."""
+    if isinstance(node, ast.ImportFrom):
+        if node.module == "bodycap_batch":
+            yield from (alias.name for alias in node.names)
+        elif (node.module or "").startswith("bodycap_batch."):
+            yield str(node.module).partition(".")[2]
+    elif isinstance(node, ast.Import):
+        yield from (match[1] for alias in node.names if (match := _NAMED.fullmatch(alias.name)))
 
 
 def _is_bare_string(node: object) -> bool:
