@@ -119,10 +119,11 @@ class LensProfile:
         return 0.5 * (self.params[0] + self.params[1]) * angle_rad * series / self.width
 
     def first_guess(self, size: tuple[int, int]) -> Camera:
-        """Return the lens at an image size, with one focal length and two radial terms.
+        """Return the lens at an image size.
 
-        Mapping refines these three parameters. They are fitted to the radial curve of the profile, as far as
-        the image goes, with a fisheye model or with a perspective model, whichever fits better.
+        Mapping refines its focal length and radial terms. One focal length and two terms are fitted to the
+        radial curve of the profile, as far as the image goes, with a fisheye model or with a perspective
+        model, whichever fits better. If neither fits, the lens has the four terms of the profile.
 
         Args:
             size: Width and height, pixels, of the same shape as the profile.
@@ -139,19 +140,25 @@ class LensProfile:
         for model, base in (("RADIAL_FISHEYE", theta[:end]), ("RADIAL", np.tan(theta[:end]))):
             terms = np.stack([base, base**3, base**5], axis=1)
             found = np.linalg.lstsq(terms, curve[:end], rcond=None)[0]
-            fits.append((float(np.abs(terms @ found - curve[:end]).mean()), model, found.tolist()))
-        _, model, (scale, cubic, fifth) = min(fits)
+            misfit = float(np.sqrt(np.mean((terms @ found - curve[:end]) ** 2)))
+            fits.append((misfit, model, found.tolist()))
+        misfit, model, (scale, cubic, fifth) = min(fits)
         ratio = size[0] / self.width
         centre = [(cx + CV2_PIXEL_OFFSET_PX) * ratio, (cy + CV2_PIXEL_OFFSET_PX) * size[1] / self.height]
-        return Camera(
-            model=model,
-            width_px=size[0],
-            height_px=size[1],
-            params=np.array([focal * scale * ratio, *centre, cubic / scale, fifth / scale]),
-            refine=True,
-        )
+        params = [focal * scale * ratio, *centre, cubic / scale, fifth / scale]
+        has_inverse = bool(curve[end - 1] > _LEAST_REACH * corner)
+        if has_inverse and misfit * focal / max(self.width, self.height) > _MAX_MISFIT:
+            model, params = "OPENCV_FISHEYE", [focal * ratio, focal * ratio, *centre, *radial]
+        return Camera(model=model, width_px=size[0], height_px=size[1], params=np.array(params), refine=True)
 
 
+_MAX_MISFIT = 0.15 / 640
+"""Maximum distance (root mean square) between the curve of a profile and the lens with two terms, as a ratio
+to the longer side of the image. Origin: half of the noise of a keypoint, 0.3 of 640 pixels. A larger one
+shifts the focal length of a map. Evidence: docs/decisions/telemetry.md."""
+_LEAST_REACH = 0.95
+"""Minimum largest value of the curve of a profile whose four terms are used, as a ratio to the distance of
+the corners of the image. Pixels beyond this value have no viewing ray. Evidence: none."""
 _MAX_ANGLE_RAD = 1.5
 """Largest angle (radians) from the optical axis at which the curve of a profile is read."""
 _CURVE_POINTS = 300

@@ -90,8 +90,3 @@ class ClipSolver:
             return None
         is_finite = np.isfinite(solved.gauge_from_cam).all() and np.isfinite(solved.covariance).all()
         return solved if is_finite else None
-
-    def has_samples(self, start: int, last: int) -> bool:
-        """Return True if the samples start before frame `start` and end after frame `last`."""
-        first_s, last_s = self.samples.times_s[[0, -1]]
-        return bool(first_s <= self.times_s[start] and self.times_s[last] <= last_s)

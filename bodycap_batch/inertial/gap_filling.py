@@ -216,8 +216,9 @@ class _Filler:
     def _with_margins(self, first: int, last: int, known: BoolArray) -> _Gap | None:
         """Return a gap with the frames beside it; None if there are too few, or samples are missing."""
         times_s = self._times_s
-        start = int(np.searchsorted(times_s, times_s[first - 1] - _MARGIN_S))
-        end = int(np.searchsorted(times_s, times_s[last] + _MARGIN_S, side="right"))
+        start_s, end_s = self._solver.samples.times_s[[0, -1]]  # frames without samples are of no use
+        start = int(np.searchsorted(times_s, max(times_s[first - 1] - _MARGIN_S, start_s)))
+        end = int(np.searchsorted(times_s, min(times_s[last] + _MARGIN_S, end_s), side="right"))
         inside = np.flatnonzero(known[start:end]) + start
         if not len(inside):
             return None
@@ -231,8 +232,7 @@ class _Filler:
         if (np.diff(times_s[start:end]) <= 0.0).any():
             return None
         measured = self._solver.samples.covers(times_s[[first - 1]], times_s[[last]])
-        is_inside = self._solver.has_samples(start, end - 1)
-        return _Gap(first, last, start, end) if is_inside and measured[0] else None
+        return _Gap(first, last, start, end) if measured[0] else None
 
     def _solve(self, gap: _Gap, known: BoolArray) -> SolvedStretch | None:
         return self._solver.solve(gap.start, gap.end, known)

@@ -61,7 +61,7 @@ def largest_angle(lens: Camera) -> float:
     theta = np.linspace(0.0, 1.5, 600)
     curve = theta * (1.0 + theta**2 * np.polynomial.polynomial.polyval(theta**2, lens.params[4:]))
     corner = 0.5 * float(np.hypot(lens.width_px, lens.height_px)) / lens.focal_px
-    return float(theta[np.argmax((np.diff(curve, append=-1.0) <= 0) | (curve > 1.1 * corner))])
+    return float(theta[np.argmax((np.diff(curve, append=-1.0) <= 0) | (curve > corner))])
 
 
 def drawn_model(start: Camera, truth: Camera, rng: np.random.Generator) -> Any:

@@ -125,6 +125,24 @@ def test_the_first_guess_is_near_the_profile(name, model):
     assert guess.focal_px == pytest.approx(exact.focal_px, rel=0.02)
 
 
+@pytest.mark.parametrize("turning", [False, True])
+def test_a_lens_that_two_terms_do_not_describe_keeps_its_four_terms(turning):
+    """If the curve of a profile turns well before the corner of the image, its terms have no inverse there."""
+    last = -0.45 if turning else 0.12
+    profile = _profile(params=(880.0, 900.0, 950.0, 545.0, 0.04, 0.14, -0.23, last))
+    guess = profile.first_guess((960, 540))
+    if turning:
+        assert guess.model in ("RADIAL", "RADIAL_FISHEYE")
+        return
+    assert guess.model == "OPENCV_FISHEYE"
+    np.testing.assert_allclose(guess.params[:4], [445.0, 445.0, 475.25, 272.75])
+    theta = np.linspace(0.05, 0.9, 30)
+    in_cam = np.column_stack([np.sin(theta), np.zeros(30), np.cos(theta)])
+    radius = guess.project(in_cam)[:, 0] - guess.principal_point_px[0]
+    exact = 960 * np.array([profile.place_of(angle) for angle in theta])
+    np.testing.assert_allclose(radius, exact, atol=1e-6)
+
+
 def _gopro(folder, settings, size=(1920, 1080)):
     frames = [textured_frame(index % 40, *size) for index in range(20)]
     path = write_video(folder / "torso.mp4", frames)
@@ -143,7 +161,7 @@ def test_the_lens_of_a_known_model_is_the_first_guess(tmp_path):
     _gopro(tmp_path, MAX_WIDE)
     capture = open_capture(load_job(tmp_path).capture)
     (camera,) = capture.cameras
-    assert camera.camera.model in ("RADIAL", "RADIAL_FISHEYE")
+    assert camera.camera.model == "OPENCV_FISHEYE"
     assert camera.camera.refine
     assert not camera.calibrated
     (found,) = check_path(tmp_path).cameras

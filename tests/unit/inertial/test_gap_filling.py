@@ -112,6 +112,21 @@ def test_gaps_without_samples_stay_lost():
     assert {found.status[frame] for frame in lost if frame > 100} == {FrameStatus.INERTIAL}
 
 
+def test_gaps_near_the_first_and_the_last_sample_are_filled():
+    """The delay of a sensor leaves the first or the last frames of a clip without samples."""
+    hand, lost = Hand(1), [*range(12, 22), *range(338, 348)]
+    path = solved(hand, SECONDS, lost=lost)
+    telemetry = Sensor().samples(hand, SECONDS)
+    streams = {}
+    for key, stream in telemetry.streams.items():
+        kept = (stream.times_s > 0.05) & (stream.times_s < SECONDS - 0.05)
+        streams[key] = replace(stream, times_s=stream.times_s[kept], values=stream.values[kept])
+    found = use_sensor(path, replace(telemetry, streams=streams), ONLY_GAPS).trajectory
+    assert {found.status[frame] for frame in lost} == {FrameStatus.INERTIAL}
+    shift, _ = _errors(hand, found, lost, None)
+    assert np.linalg.norm(shift, axis=1).max() < 0.01
+
+
 def test_wrong_poses_beside_a_gap_are_no_base_for_others():
     hand, lost = Hand(1), _lost(10)
     path = solved(hand, SECONDS, lost=lost)
