@@ -132,6 +132,20 @@ rise and fall of an ordinary walk. A person who bows or crouches is outside."""
 _MAX_TWIST = 1.2
 """Maximum rate (rad/s) of the trunk's yaw with the stride during a certain step. Derivation: three times
 `_TWIST_SCALE`, rounded up."""
+_MIN_ALTERNATION = 0.8
+"""Minimum share of a signal that alternates with the sides around a certain step, for the best one of sway,
+yaw and arms. Derivation: what does not alternate is less than half of what does. Evidence:
+docs/decisions/filling.md."""
+_MAX_IRREGULAR_TWIST = 0.25
+"""Maximum root mean square (rad/s) of the part of the trunk's yaw rate that does not alternate, around a
+certain step. Derivation: `_TWIST_SCALE` / √2, the root mean square of the part that alternates in an ordinary
+walk. Evidence: docs/decisions/filling.md."""
+_RHYTHM_STEPS = 2
+"""Number of steps before and after a step that decide whether the signals around this step alternate.
+Evidence: none."""
+_SAMPLES_PER_STEP = 12
+"""Number of samples of a signal per step in this comparison. Derivation: the signals have no frequencies
+above 2.5 Hz."""
 _RESTLESS_M_PER_S2 = 0.8
 """Amplitude of the vertical acceleration of the trunk above which a person who does not move away may step in
 place. Derivation: a rise and fall of ± 0.7 cm at 1.7 steps a second; a walking person has ± 1 cm or more."""
@@ -139,6 +153,8 @@ _RESTLESS_HZ = 0.5
 """Cutoff frequency (Hz) of this amplitude. Derivation: less than a third of the frequency of steps."""
 _MIN_STEPS = 2
 """Minimum number of successive steps that can be certain. Evidence: none."""
+_TINY = 1e-9
+"""Smallest power of a signal that is not zero. Origin: against a division by zero."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,7 +222,8 @@ class _StepSignals:
         period_s: (T,) expected time between two steps, seconds.
         speed: (T,) speed of the slow path, m/s.
         sinking: (T,) height of the slow path over its median, metres.
-        twist: (T,) rate of the trunk's yaw without the slow heading, rad/s.
+        sides: (T,3) acceleration of the sway (m/s²), rate of the trunk's yaw without the slow heading
+            (rad/s), and velocity of the left hand relative to the right hand (m/s).
         is_restless: (T,) True if the trunk rises and falls as with steps.
     """
 
@@ -214,7 +231,7 @@ class _StepSignals:
     period_s: FloatArray
     speed: FloatArray
     sinking: FloatArray
-    twist: FloatArray
+    sides: FloatArray
     is_restless: BoolArray
 
 
@@ -245,7 +262,7 @@ def find_contacts(signals: TrunkSignals, standing_m: float | None = None) -> Con
         period_s=period_s,
         speed=signals.speed_m_per_s()[chosen],
         sinking=(height - np.median(height))[chosen],
-        twist=signals.twist_rad_per_s[chosen],
+        sides=np.column_stack([signals.sway_m_per_s2, signals.twist_rad_per_s, signals.arm_m_per_s])[chosen],
         is_restless=(
             oscillation_amplitude(signals.rise_m_per_s2, _RESTLESS_HZ, signals.fps) > _RESTLESS_M_PER_S2
         )[chosen],
@@ -454,8 +471,9 @@ def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> 
     """Return whether the signals determine the state at each tick (T,).
 
     A step is certain if it is one of two or more successive steps of an ordinary walk: evidence for its side
-    without a strong contradiction, an ordinary duration, a trunk that neither sinks nor twists much. Standing
-    is certain if the trunk does not rise and fall as with steps, as it does on a treadmill.
+    without a strong contradiction, an ordinary duration, a trunk that neither sinks nor twists much, and
+    signals that alternate with the sides. Standing is certain if the trunk does not rise and fall as with
+    steps, as it does on a treadmill.
     """
     out = ~((state == STAND) & signals.is_restless)
     bounds = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state)]
@@ -472,6 +490,7 @@ def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> 
         if len(kept) >= _MIN_STEPS:
             support = _mean_of_three(np.array([_support(state, evidence, *each) for each in kept]))
             ordinary = np.array([_is_ordinary(signals, *each) for each in kept])
+            ordinary &= _do_sides_alternate(signals.sides, kept)
             ordinary &= support.sum(axis=1) >= _SURE_NATS
             ordinary &= support.min(axis=1) >= -_MAX_CONTRADICTION_NATS
             padded = np.concatenate([[False], ordinary, [False]])
@@ -513,5 +532,36 @@ def _is_ordinary(signals: _StepSignals, start: int, end: int) -> bool:
         _ORDINARY_DURATION[0] <= duration <= _ORDINARY_DURATION[1]
         and signals.speed[own].mean() >= _SURE_SPEED
         and np.abs(signals.sinking[own]).max() <= _MAX_SINKING_M
-        and np.abs(signals.twist[own]).max() <= _MAX_TWIST
+        and np.abs(signals.sides[own, 1]).max() <= _MAX_TWIST
     )
+
+
+def _do_sides_alternate(sides: FloatArray, steps: list[tuple[int, int]]) -> BoolArray:
+    """Return (N,) True where the signals around each of N successive steps alternate with the sides.
+
+    In a walk, sway, yaw and arms are the mirror image of what they were one step before. In a dance they are
+    not, even if Viterbi's algorithm finds sides that fit the signals. Two steps cannot be compared with
+    others: then only a yaw that varies as little as in a walk is required.
+
+    Args:
+        sides: (T,3) acceleration of the sway, rate of the yaw and velocity of the arms.
+        steps: First tick and end of the N times on one foot of one walk.
+    """
+    middles = np.array([0.5 * (start + end - 1) for start, end in steps])
+    ticks = np.arange(len(sides))
+    out = np.zeros(len(steps), dtype=bool)
+    for index in range(len(steps)):
+        near = middles[max(index - _RHYTHM_STEPS, 0) : index + _RHYTHM_STEPS + 1]
+        if len(near) <= _MIN_STEPS:
+            start, end = steps[index]
+            out[index] = sides[start:end, 1].std() <= _MAX_IRREGULAR_TWIST
+            continue
+        steps_on = np.arange((len(near) - 1) * _SAMPLES_PER_STEP + 1) / _SAMPLES_PER_STEP
+        at = np.interp(steps_on, np.arange(len(near)), near)
+        values = np.column_stack([np.interp(at, ticks, signal) for signal in sides.T])
+        before, after = values[:-_SAMPLES_PER_STEP], values[_SAMPLES_PER_STEP:]
+        power = 0.5 * (before**2 + after**2).mean(axis=0)
+        alternation = -(before * after).mean(axis=0) / np.maximum(power, _TINY)
+        irregular = np.sqrt(0.5 * ((before + after) ** 2).mean(axis=0))
+        out[index] = alternation.max() >= _MIN_ALTERNATION and irregular[1] <= _MAX_IRREGULAR_TWIST
+    return out

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodycap_batch.core.arrays import BoolArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.fill import fill_motion
 from bodycap_batch.fill.leg_geometry import leg_geometry
@@ -106,6 +106,43 @@ def test_steps_of_drawn_walks_with_turns_and_steps_aside_and_back_are_found() ->
         assert each.unsure_share < 0.1
         assert each.true_stance_speed < 0.1
         assert each.knee_correlation > 0.75
+
+
+@pytest.mark.parametrize(("per_stride", "is_sure"), [(1.0, True), (1.55, False)])
+def test_steps_are_certain_only_if_the_yaw_of_the_trunk_alternates_with_them(
+    per_stride: float, is_sure: bool
+) -> None:
+    motion, solved = walking(8.0)
+    time = np.arange(len(motion.local_rotation)) / motion.fps
+    zero = 0.0 * time
+    yaw = 0.09 * np.cos(np.pi * per_stride * time / STEP_S)
+    local = motion.local_rotation.copy()
+    local[:, 0] = so3_exp(np.column_stack([zero, zero, yaw])) @ local[:, 0]
+    report = fill(replace(motion, local_rotation=local), solved).report
+    assert report.is_sure[30:-30].mean() == pytest.approx(float(is_sure), abs=0.15)
+
+
+def test_aimless_movements_of_trunk_and_arms_are_not_taken_for_certain_steps() -> None:
+    """Viterbi's algorithm finds steps in every motion. The signals must also alternate with them."""
+    rng = np.random.default_rng(5)
+    motion, solved = walking(20.0)
+    time = np.arange(len(motion.local_rotation)) / motion.fps
+
+    def aimless(size: float, hertz: tuple[float, float], columns: int) -> FloatArray:
+        rates, starts = rng.uniform(*hertz, (6, columns)), rng.uniform(0.0, 2.0 * np.pi, (6, columns))
+        waves = np.sin(2.0 * np.pi * rates * time[:, None, None] + starts)
+        return np.asarray(size * waves.sum(axis=1) / np.sqrt(3.0))
+
+    path = np.cumsum([0.0, -0.8, 0.0] + aimless(0.3, (0.05, 0.3), 3) * [1.0, 1.0, 0.0], axis=0) / motion.fps
+    height = motion.root_in_world_m[:, 2].mean() * np.array([0.0, 0.0, 1.0])
+    local = motion.local_rotation.copy()
+    local[:, 0] = so3_exp(aimless(0.02, (0.7, 2.0), 3) * [0.0, 0.0, 1.0])
+    for side in ("Left", "Right"):
+        joint = motion.skeleton.roles.index(side + "Arm")
+        local[:, joint] = so3_exp(aimless(0.4, (0.3, 1.5), 3) * [1.0, 0.0, 0.0]) @ local[:, joint]
+    root = path + height + aimless(0.015, (0.7, 2.2), 3)
+    report = fill(replace(motion, root_in_world_m=root, local_rotation=local), solved).report
+    assert report.is_sure.mean() < 0.2
 
 
 def test_the_pelvis_yaws_more_in_a_walk_with_a_wide_arm_swing() -> None:
