@@ -39,7 +39,7 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
         {"intrinsics", "mapping_context"},
         {"re_registration"},
         {"validation", "initial_models"},
-        {"inputs"},
+        {"inputs", "model_joining"},
         {"results"},
         {"build", "extend", "refine"},
     ),

@@ -40,6 +40,7 @@ from bodycap_batch.mapping.matching.database import (
 from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint, exclude_flipped_cameras
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
+from bodycap_batch.mapping.model_joining import join_models
 from bodycap_batch.mapping.reconstruction.model_files import write_models
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
@@ -181,6 +182,7 @@ def build_map_once(
     models, initial_log = reconstruct_with_intrinsics(mapping, options, uncalibrated, len(skeletal.refs))
     log: dict[str, Any] = {"keyframes": len(refs), **match_log, **initial_log, **flips.to_log()}
     if models:
+        models, log["joined"] = join_models(models, mapping)
         models[0], log["repair"] = repair_model(models[0], tried, mapping, skeletal.refs)
         resected: Sequence[set[int] | None] = [None] * len(models)
         if skeletal is not generator:

@@ -29,6 +29,7 @@ from tests.bench import (
     mappers,
     ours,
     peers,
+    scale,
     scaling,
     seeds,
     shutter,
@@ -53,6 +54,7 @@ _WITH_OPTIONS = {
     "sync": sync.main,
     "body": body.main,
     "elbows": elbows.main,
+    "scale": scale.main,
     "bare": bare.main,
     "inertial": inertial.main,
     "shutter": shutter.main,
@@ -78,9 +80,9 @@ def main() -> int:
         "with several seeds), `clocks` (from generated sound and motion), `sync` (ten minutes of sound), "
         "`inertial` (gaps filled from a sensor), `violent` (whole jobs with and without sensors), "
         "`lenses` (named profiles in the adjustment), `body` (joints without cameras), `elbows` (their "
-        "flexion with a height alone), `bare` (a camera at plain surfaces), `shutter` (drawn readout times "
-        "against global shutters), `mappers` (the incremental and the global mapper), and `long` (ten "
-        "minutes of three cameras)",
+        "flexion with a height alone), `scale` (the metric scale with a height alone), `bare` (a camera at "
+        "plain surfaces), `shutter` (drawn readout times against global shutters), `mappers` (the "
+        "incremental and the global mapper), and `long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)

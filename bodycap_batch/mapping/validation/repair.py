@@ -76,7 +76,7 @@ def repair_model(
     if keyframes is not None:
         ids = {ref: ids[ref] for ref in keyframes}
     pairs = evaluate_pairs(context.workspace, model)
-    wrong = _find_wrong_images(context, model, pairs)
+    wrong = find_wrong_images(context, model, pairs)
     for _ in range(_ROUNDS):
         registered = registered_ids(model)
         missing = set(ids.values()) - registered
@@ -100,7 +100,7 @@ def repair_model(
             break
         other = re_register_images(model, wrong, context, len(ids))
         other_pairs = evaluate_pairs(context.workspace, other)
-        still_wrong = _find_wrong_images(context, other, other_pairs)
+        still_wrong = find_wrong_images(context, other, other_pairs)
         sound_before = len(registered - wrong)
         sound_after = len(registered_ids(other) - still_wrong)
         entry |= {"sound_before": sound_before, "sound_after": sound_after}
@@ -127,17 +127,22 @@ def remove_without_adjustment(
         matches in inconsistent pairs before the removal.
     """
     pairs = evaluate_pairs(context.workspace, model)
-    wrong = _find_wrong_images(context, model, pairs)
+    wrong = find_wrong_images(context, model, pairs)
     kept, removed = _remove_images(model, _without_confirmed(context, model, pairs, wrong))
     return kept, removed, round(inconsistent_match_ratio(pairs), 4)
 
 
-def _find_wrong_images(
+def find_wrong_images(
     context: MappingContext, model: pycolmap.Reconstruction, pairs: Sequence[PairConsistency]
 ) -> set[int]:
     """Return the ids of the images whose matches contradict the poses or the points of the model.
 
     If no part of the model agrees with itself, only the images that contradict the poses are returned.
+
+    Args:
+        context: Workspace.
+        model: The model.
+        pairs: The verified pairs of the model (`evaluate_pairs`).
     """
     wrong = find_misregistered_images(pairs)
     misplaced = find_misplaced_images(evaluate_agreement(context.workspace, model), image_sequences(model))

@@ -18,15 +18,36 @@ OUTLIER_LIMIT_M = 0.12
 deviates from the quadratic by a fraction of this distance. A pose at a larger distance is wrong. Evidence:
 none."""
 
+_END_FRAMES = 2
+"""Number of frames at each end of a run that have too few neighbours on one side for a quadratic."""
+_LINE_FRAMES = 3
+"""Number of frames that predict the next frame with constant velocity. Evidence:
+docs/decisions/merging.md."""
+_END_QUANTILE, _END_RATIO = 0.95, 3.0
+"""A frame at an end is wrong if its distance from the prediction exceeds this quantile of the distances
+inside the run by this ratio. Evidence: docs/decisions/merging.md."""
+_MIN_INNER = 10
+"""Minimum number of frames inside a run that show how far frames are from their predictions. Evidence: none.
+"""
+
 
 def remove_outliers(track: CameraTrack, scale: float, fps: float) -> CameraTrack:
-    """Remove frames whose centre jumps away from the robust quadratic through the neighbouring frames.
+    """Remove frames whose centre jumps away from the path through the neighbouring frames.
 
     Args:
         track: The measured path.
         scale: Metres per map unit; a provisional value is accurate enough.
         fps: Nominal frame rate of the camera.
     """
+    # Wrong frames at an end bend the quadratics of their neighbours, and wrong frames elsewhere raise the
+    # limit for the ends. So the ends are tested twice.
+    track = _without_wrong_ends(track, scale, fps)
+    track = track.keep(~_wrong_inside(track, scale, fps))
+    return _without_wrong_ends(track, scale, fps)
+
+
+def _wrong_inside(track: CameraTrack, scale: float, fps: float) -> BoolArray:
+    """Return a mask (N,) of the wrong frames that have neighbours on both sides."""
     count = len(track.times_ns)
     steps = np.array([step for step in range(-OUTLIER_HALF_WINDOW, OUTLIER_HALF_WINDOW + 1) if step])
     index = np.arange(count)[:, None] + steps
@@ -36,11 +57,61 @@ def remove_outliers(track: CameraTrack, scale: float, fps: float) -> CameraTrack
     valid &= np.abs(time) <= OUTLIER_HALF_WINDOW + 0.5
     centre = scale * (track.map_from_cam[index, :3, 3] - track.map_from_cam[:, None, :3, 3])
     predicted = _robust_quadratic(time / OUTLIER_HALF_WINDOW, centre, valid)
-    # A frame with fewer than two neighbours on one side is kept. For such a frame, the quadratic
-    # extrapolates, and a change of direction looks like an error.
+    # For a frame with fewer than two neighbours on one side, the quadratic extrapolates, and a change of
+    # direction looks like an error.
     inner = ((time < 0) & valid).sum(axis=1).clip(max=2) + ((time > 0) & valid).sum(axis=1).clip(max=2) == 4
     bad = (np.linalg.norm(predicted, axis=1) > OUTLIER_LIMIT_M) & inner & (valid.sum(axis=1) >= 6)
-    return track.keep(~_runs_with_jumps(bad, scale * track.map_from_cam[:, :3, 3]))
+    return _runs_with_jumps(bad, scale * track.map_from_cam[:, :3, 3])
+
+
+def _without_wrong_ends(track: CameraTrack, scale: float, fps: float) -> CameraTrack:
+    time = track.times_ns.astype(np.float64) * (1e-9 * fps)
+    return track.keep(~_wrong_ends(time, scale * track.map_from_cam[:, :3, 3]))
+
+
+def _wrong_ends(time: FloatArray, centre_m: FloatArray) -> BoolArray:
+    """Return a mask (N,) of the wrong frames among the first two and the last two frames of each run.
+
+    These frames have too few neighbours on one side for a quadratic. The frames on the other side predict
+    them: in a straight line, with constant velocity. A frame is wrong if it is much farther from the
+    prediction than the frames inside the runs are from theirs, and so are the frames between it and the end.
+
+    Args:
+        time: (N,) times of the frames, in frame intervals.
+        centre_m: (N,3) camera centres, metres.
+    """
+    out = np.zeros(len(time), dtype=bool)
+    first = np.flatnonzero(np.diff(time, prepend=-np.inf) > OUTLIER_HALF_WINDOW + 0.5)
+    for forward in (True, False):
+        order = np.arange(len(time)) if forward else np.arange(len(time))[::-1]
+        off_m = _distance_from_line(time[order], centre_m[order])[order]
+        for start, stop in zip(first, [*first[1:], len(time)], strict=True):
+            inner = off_m[start + _LINE_FRAMES + _END_FRAMES : stop - _LINE_FRAMES - _END_FRAMES]
+            if len(inner) < _MIN_INNER:
+                continue
+            limit_m = max(OUTLIER_LIMIT_M, _END_RATIO * float(np.quantile(inner, _END_QUANTILE)))
+            end = (
+                np.arange(stop - _END_FRAMES, stop)
+                if forward
+                else np.arange(start, start + _END_FRAMES)[::-1]
+            )
+            wrong = np.flatnonzero(off_m[end] > limit_m)
+            out[end[wrong[0] :] if len(wrong) else []] = True
+    return out
+
+
+def _distance_from_line(time: FloatArray, centre_m: FloatArray) -> FloatArray:
+    """Return the distance (N,) of each centre from the straight line through the frames before it, metres."""
+    out = np.zeros(len(time))
+    index = np.arange(_LINE_FRAMES, len(time))
+    before = index[:, None] - np.arange(1, _LINE_FRAMES + 1)
+    past, places = time[before] - time[index, None], centre_m[before]
+    middle = past.mean(axis=1, keepdims=True)
+    spread = (past - middle) / np.maximum(((past - middle) ** 2).sum(axis=1, keepdims=True), 1e-12)
+    velocity = np.einsum("nw,nwk->nk", spread, places)
+    predicted = places.mean(axis=1) - middle * velocity
+    out[index] = np.linalg.norm(predicted - centre_m[index], axis=1)
+    return out
 
 
 def _runs_with_jumps(bad: BoolArray, centre_m: FloatArray) -> BoolArray:

@@ -196,6 +196,18 @@ def test_a_throw_faster_than_a_quadratic_is_kept():
     assert len(remove_outliers(_track(throw), 1.0, 30.0).frames) == len(throw)
 
 
+@pytest.mark.parametrize("wrong", [[89], [88, 89], [0], [0, 1], [44, 45], [46]])
+def test_outliers_at_the_ends_of_a_run_are_removed(wrong):
+    seconds = np.arange(90) / 30.0
+    path = np.stack([0.3 * np.sin(4.0 * np.pi * seconds), seconds, 0.0 * seconds], axis=1)
+    path[wrong] += [0.5, -0.3, 0.4]
+    track = _track(path)
+    # The frames 46 and later follow after a gap of half a second.
+    times_ns = track.times_ns + np.where(np.arange(90) > 45, 500_000_000, 0)
+    kept = remove_outliers(replace(track, times_ns=times_ns), 1.0, 30.0)
+    assert sorted(set(range(90)) - set(kept.frames.tolist())) == wrong
+
+
 def test_poses_in_gaps_and_outside_a_track_are_invalid():
     track = _track(np.stack([np.arange(10.0), np.zeros(10), np.zeros(10)], axis=1))
     with_gap = track.keep(np.array([True] * 3 + [False] * 4 + [True] * 3))
