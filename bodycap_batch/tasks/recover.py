@@ -33,7 +33,6 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
         recover_lost_frames,
         search_near_sensor,
         with_rotation,
-        withdraw_contradicted_poses,
     )
 
     context.check_cancelled()
@@ -52,6 +51,7 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
         maps=scene.maps,
         selection=selections[task.cameras[0]],
         in_rig=in_rig,
+        misplaced=scene.diagnostics.misplaced.get(task.cameras[0], ()),
     )
     registration = recover_lost_frames(load_registration(paths[0]), inputs, task.options, context)
     if task.with_sensor:
@@ -62,8 +62,6 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
             for camera, config, path in zip(capture.cameras[1:], configs[1:], paths[1:], strict=True)
         )
         registration = search_near_sensor(registration, inputs, telemetry, task.options, context, others)
-    misplaced = scene.diagnostics.misplaced.get(task.cameras[0], ())
-    registration = withdraw_contradicted_poses(registration, scene.maps, misplaced)
     save_registration(registration, capture.cameras[0], files, rolling=read_summary(paths[0])["rolling"])
     if in_rig:
         write_dataclass(read_dataclass(RigPoses, paths[0], RIG_POSES), files, RIG_POSES)

@@ -547,3 +547,75 @@ def test_well_supported_ends_leave_map_and_registration_unchanged(pictures: list
     refined_map, left = prepare_recovery(own, [found.trajectory], scene, _selection(), RegistrationOptions())
     assert refined_map is scene
     assert left is found
+
+
+def _map_of_two_cameras(pictures: list[np.ndarray]) -> Map:
+    """Return the map with two keyframes of a second camera: one sees every third point, one every sixth.
+
+    Points that only the first camera sees do not count as static then.
+    """
+    scene = _map(pictures)
+    count = len(scene.keyframe_camera)
+    points, first = np.unique(scene.obs_point, return_index=True)
+    rows = np.concatenate([first[points % 3 == 0], first[points % 6 == 0]])
+    keyframe = np.repeat([count, count + 1], [(points % 3 == 0).sum(), (points % 6 == 0).sum()])
+    return replace(
+        scene,
+        cameras={"torso": CAMERA, "left_palm": CAMERA},
+        keyframe_camera=(*scene.keyframe_camera, "left_palm", "left_palm"),
+        keyframe_frame=np.append(scene.keyframe_frame, [0, 4]),
+        map_from_cam=np.concatenate([scene.map_from_cam, scene.map_from_cam[:2]]),
+        obs_keyframe=np.append(scene.obs_keyframe, keyframe),
+        obs_point=np.append(scene.obs_point, scene.obs_point[rows]),
+        obs_feature=np.append(scene.obs_feature, scene.obs_feature[rows]),
+        obs_px=np.concatenate([scene.obs_px, scene.obs_px[rows]]),
+    )
+
+
+@pytest.mark.parametrize(("doubtful", "step"), [([], 3), ([2], 3), ([20], 6)])
+def test_only_points_of_other_cameras_find_frames_among_misplaced_keyframes(
+    monkeypatch: pytest.MonkeyPatch,
+    pictures: list[np.ndarray],
+    context: StageContext,
+    doubtful: list[int],
+    step: int,
+) -> None:
+    used = []
+
+    def search(propagation: Propagation) -> dict[int, PoseEstimate]:
+        used.append(propagation.localiser.patches.usable)
+        return {}
+
+    monkeypatch.setattr(recover, "_accepted_poses", search)
+    monkeypatch.setattr(recover, "estimate_exposure", lambda *_: 0.0)
+    scene = _map_of_two_cameras(pictures)
+    capture = cast(Capture, _Capture(_Video(pictures)))
+    mask = np.isin(np.arange(COUNT), doubtful)
+    find_lost_poses(_tracked(), scene, capture, RegistrationOptions(), context, None, mask)
+    points = np.unique(scene.obs_point)
+    np.testing.assert_array_equal(np.intersect1d(np.flatnonzero(used[0]), points), points[points % step == 0])
+
+
+def test_poses_from_tracking_among_misplaced_keyframes_are_withdrawn_before_the_search(
+    monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], context: StageContext
+) -> None:
+    video = _SolvedVideo(pictures)
+    scene, tracked = _map(pictures), _tracked()
+    searched = []
+
+    def find(registration: Registration, *rest: object) -> Registration:
+        searched.append((registration.trajectory.status[29], np.flatnonzero(rest[-1])))
+        return registration
+
+    monkeypatch.setattr(recover, "find_lost_poses", find)
+    inputs = recover.RecoveryInputs(
+        capture=Capture(cameras=(cast(CaptureCamera, video),)),
+        registrations=(RegisteredCamera(camera=cast(CaptureCamera, video), registration=tracked),),
+        maps=(scene,),
+        selection=_selection(),
+        in_rig=True,
+        misplaced=(29, 30),
+    )
+    recover.recover_lost_frames(tracked, inputs, RegistrationOptions(), context)
+    assert searched[0][0] is FrameStatus.CONTRADICTED
+    np.testing.assert_array_equal(searched[0][1], [29, 30, 31])

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, IntArray
-from bodycap_batch.model.scene import FrameStatus, Map, Registration
+from bodycap_batch.model.scene import FrameStatus, Map, Registration, Trajectory
 
 _MIN_MISPLACED = 2
 """Minimum number of misplaced keyframes between two keyframes of the map, so that the frames between these
@@ -34,12 +34,7 @@ def withdraw_contradicted_poses(
         The registration. The frames without a pose have the status `CONTRADICTED`.
     """
     path = registration.trajectory
-    scene = next((scene for scene in maps if scene.gauge == path.gauge), None)
-    if scene is None or not misplaced:
-        return registration
-    kept = scene.keyframe_frame[scene.keyframes_of(path.camera)]
-    inside = _frames_in_blocks(len(path.status), np.asarray(kept), np.array(sorted(misplaced)))
-    inside &= path.localised
+    inside = contradicted_frames(path, maps, misplaced) & path.localised
     if not inside.any():
         return registration
     status = [
@@ -52,6 +47,21 @@ def withdraw_contradicted_poses(
         registration,
         trajectory=replace(path, status=tuple(status), gauge_from_cam=poses, covariance=covariance),
     )
+
+
+def contradicted_frames(path: Trajectory, maps: Sequence[Map], misplaced: Collection[int]) -> BoolArray:
+    """Return for each frame (N,) of a camera whether it lies in a block of misplaced keyframes.
+
+    Args:
+        path: The trajectory of the camera.
+        maps: The maps that the camera was registered against.
+        misplaced: Frame indices of the camera's keyframes that contradict the map.
+    """
+    scene = next((scene for scene in maps if scene.gauge == path.gauge), None)
+    if scene is None or not misplaced:
+        return np.zeros(len(path.status), dtype=bool)
+    kept = scene.keyframe_frame[scene.keyframes_of(path.camera)]
+    return _frames_in_blocks(len(path.status), np.asarray(kept), np.array(sorted(misplaced)))
 
 
 def _frames_in_blocks(count: int, kept: IntArray, misplaced: IntArray) -> BoolArray:

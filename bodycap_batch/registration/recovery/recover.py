@@ -14,6 +14,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.rotation_path import RotationPath, TurningShutter
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
+from bodycap_batch.registration.poses.contradicted import contradicted_frames, withdraw_contradicted_poses
 from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
 from bodycap_batch.registration.poses.map_error import with_map_error, without_map_error
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
@@ -44,6 +45,8 @@ from bodycap_batch.registration.recovery.search_images import (
 
 _SMOOTHING_MARGIN = 8
 """Number of frames on either side of an interval that are smoothed together with it. Evidence: none."""
+_MIN_SIGHT_LINES = 2
+"""Minimum number of keyframes of other cameras that determine a point: two lines of sight."""
 _MAX_PASSES = 5
 """Maximum number of passes over the lost intervals. Each pass starts from the poses of the previous pass, and
 reaches frames deeper inside the intervals. Evidence: docs/decisions/registration.md."""
@@ -61,6 +64,7 @@ class RecoveryInputs:
         selection: The keyframes of the camera to recover.
         in_rig: True if the poses were estimated from all cameras of a rig. The preparation is then skipped,
             because it would estimate the poses again from one camera alone.
+        misplaced: Frame indices of the keyframes of the camera to recover that contradict the map.
     """
 
     capture: Capture
@@ -68,6 +72,7 @@ class RecoveryInputs:
     maps: Sequence[Map]
     selection: KeyframeSelection
     in_rig: bool
+    misplaced: Collection[int] = ()
 
 
 def recover_lost_frames(
@@ -107,7 +112,9 @@ def recover_lost_frames(
         scene_map, registration = prepare_recovery(
             own, trajectories[1:], scene_map, inputs.selection, options, context.threads
         )
-    found = find_lost_poses(registration, scene_map, inputs.capture, options, context, own.rotation)
+    registration = withdraw_contradicted_poses(registration, inputs.maps, inputs.misplaced)
+    doubtful = contradicted_frames(registration.trajectory, inputs.maps, inputs.misplaced)
+    found = find_lost_poses(registration, scene_map, inputs.capture, options, context, own.rotation, doubtful)
     return replace(found, trajectory=with_map_error(found.trajectory, inputs.maps))
 
 
@@ -118,6 +125,7 @@ def find_lost_poses(
     options: RegistrationOptions,
     context: StageContext,
     rotation: RotationPath | None = None,
+    doubtful: BoolArray | None = None,
 ) -> Registration:
     """Search the lost frames of a camera, and accept the poses that are well supported.
 
@@ -139,6 +147,8 @@ def find_lost_poses(
         context: Progress and cancellation.
         rotation: The rotation of a camera with a rolling shutter from matches between adjacent frames; None
             if it is unknown.
+        doubtful: (N,) True for frames in blocks of misplaced keyframes; none by default. Lost intervals with
+            such frames are searched with `independent_localiser`.
 
     Returns:
         The registration with more poses and a smoothed trajectory. It contains no observations of the
@@ -155,6 +165,8 @@ def find_lost_poses(
         camera=camera,
         scene_map=scene_map,
         localiser=localiser,
+        independent=independent_localiser(localiser, camera.name),
+        doubtful=np.zeros(len(lost), dtype=bool) if doubtful is None else doubtful,
         times=times,
         statistics=statistics,
         seed_rows=_seed_keyframes(scene_map, camera.name, lost),
@@ -204,6 +216,24 @@ def make_localiser(
     return replace(localiser, exposure_ratio=estimate_exposure(camera, localiser, path))
 
 
+def independent_localiser(localiser: GuidedLocaliser, camera: str) -> GuidedLocaliser:
+    """Return a localiser that uses only the points which other cameras determine.
+
+    It is for frames around keyframes of the camera that contradict the map. Points that only this camera sees
+    may have the same error as these keyframes: they agree with a wrong pose, however many they are. Without
+    other cameras in the map, no such frame is found again. Evidence: docs/decisions/registration.md.
+
+    Args:
+        localiser: The localiser of the camera.
+        camera: Camera name.
+    """
+    patches = localiser.patches
+    scene = patches.scene_map
+    is_other = np.array([name != camera for name in scene.keyframe_camera], dtype=bool)
+    seen = np.bincount(scene.obs_point[is_other[scene.obs_keyframe]], minlength=len(scene.points))
+    return replace(localiser, patches=replace(patches, usable=patches.usable & (seen >= _MIN_SIGHT_LINES)))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _IntervalSearch:
     """The search for the lost frames of one camera.
@@ -212,6 +242,8 @@ class _IntervalSearch:
         camera: The camera.
         scene_map: The map.
         localiser: Estimates the pose of a frame near an expected pose.
+        independent: The same for intervals with doubtful frames; see `independent_localiser`.
+        doubtful: (N,) True for frames in blocks of misplaced keyframes.
         times: (N,) times of the frames, in units of the frame interval.
         statistics: How smoothly the camera moves.
         seed_rows: Row indices in the map by frame, for the lost frames that are keyframes.
@@ -222,6 +254,8 @@ class _IntervalSearch:
     camera: CaptureCamera
     scene_map: Map
     localiser: GuidedLocaliser
+    independent: GuidedLocaliser
+    doubtful: BoolArray
     times: FloatArray
     statistics: MotionStatistics
     seed_rows: Mapping[int, int]
@@ -250,7 +284,8 @@ class _IntervalSearch:
             keyframe_rows=seed_rows,
             statistics=self.statistics,
         )
-        return _accepted_poses(Propagation(self.localiser, interval, self.turns))
+        localiser = self.independent if self.doubtful[start:stop].any() else self.localiser
+        return _accepted_poses(Propagation(localiser, interval, self.turns))
 
 
 def _extended_intervals(has_pose: BoolArray, before: BoolArray, frozen: BoolArray) -> list[tuple[int, int]]:

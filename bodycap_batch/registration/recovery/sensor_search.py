@@ -14,6 +14,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.inertial import use_sensor
 from bodycap_batch.model.geometry import invert, so3_log
 from bodycap_batch.model.scene import Registration, Trajectory
+from bodycap_batch.registration.poses.contradicted import contradicted_frames
 from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
 from bodycap_batch.registration.poses.map_error import with_map_error, without_map_error
 from bodycap_batch.registration.poses.turning_tracks import with_rotation
@@ -25,7 +26,11 @@ from bodycap_batch.registration.recovery.guided_localisation import (
     SearchFrame,
     fuse,
 )
-from bodycap_batch.registration.recovery.recover import RecoveryInputs, make_localiser
+from bodycap_batch.registration.recovery.recover import (
+    RecoveryInputs,
+    independent_localiser,
+    make_localiser,
+)
 from bodycap_batch.registration.recovery.search_images import read_pyramids
 from bodycap_batch.telemetry.streams import CameraTelemetry
 
@@ -67,6 +72,8 @@ def search_near_sensor(
     camera = inputs.capture.cameras[0]
     own = with_rotation(camera, registration, [scene_map], inputs.selection)
     localiser = make_localiser(scene_map, inputs.capture, path, options, context, own.rotation)
+    independent = independent_localiser(localiser, camera.name)
+    doubtful = contradicted_frames(path, inputs.maps, inputs.misplaced)
     rows = scene_map.keyframes_of(camera.name)
     keyframe_rows = dict(zip(scene_map.keyframe_frame[rows].tolist(), rows.tolist(), strict=True))
     found: dict[int, PoseEstimate] = {}
@@ -77,7 +84,8 @@ def search_near_sensor(
         for frame in range(start, stop):
             if frame in pyramids:
                 search_frame = SearchFrame(frame, pyramids[frame], keyframe_rows.get(frame, -1))
-                estimate = _pose_near(localiser, search_frame, filled)
+                used = independent if doubtful[frame] else localiser
+                estimate = _pose_near(used, search_frame, filled)
                 if estimate is not None:
                     found[frame] = estimate
     if not found:
