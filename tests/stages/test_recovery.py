@@ -28,8 +28,18 @@ from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Regis
 from bodycap_batch.registration import RegisteredCamera
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
 from bodycap_batch.registration.recovery import preparation, recover, search_images
-from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser, PoseEstimate
-from bodycap_batch.registration.recovery.patch_search import KeyframePatches, PatchMatches, PredictedView
+from bodycap_batch.registration.recovery.guided_localisation import (
+    GuidedLocaliser,
+    NeighbourPose,
+    PoseEstimate,
+    SearchFrame,
+)
+from bodycap_batch.registration.recovery.patch_search import (
+    KeyframePatches,
+    PatchMatches,
+    PredictedView,
+    Pyramid,
+)
 from bodycap_batch.registration.recovery.preparation import prepare_recovery
 from bodycap_batch.registration.recovery.propagation import Propagation
 from bodycap_batch.registration.recovery.recover import find_lost_poses
@@ -591,7 +601,8 @@ def test_only_points_of_other_cameras_find_frames_among_misplaced_keyframes(
     scene = _map_of_two_cameras(pictures)
     capture = cast(Capture, _Capture(_Video(pictures)))
     mask = np.isin(np.arange(COUNT), doubtful)
-    find_lost_poses(_tracked(), scene, capture, RegistrationOptions(), context, None, mask)
+    known = recover.KnownFrames(doubtful=mask)
+    find_lost_poses(_tracked(), scene, capture, RegistrationOptions(), context, known)
     points = np.unique(scene.obs_point)
     np.testing.assert_array_equal(np.intersect1d(np.flatnonzero(used[0]), points), points[points % step == 0])
 
@@ -604,7 +615,9 @@ def test_poses_from_tracking_among_misplaced_keyframes_are_withdrawn_before_the_
     searched = []
 
     def find(registration: Registration, *rest: object) -> Registration:
-        searched.append((registration.trajectory.status[29], np.flatnonzero(rest[-1])))
+        known = cast(recover.KnownFrames, rest[-1])
+        assert known.doubtful is not None
+        searched.append((registration.trajectory.status[29], np.flatnonzero(known.doubtful)))
         return registration
 
     monkeypatch.setattr(recover, "find_lost_poses", find)
@@ -619,3 +632,51 @@ def test_poses_from_tracking_among_misplaced_keyframes_are_withdrawn_before_the_
     recover.recover_lost_frames(tracked, inputs, RegistrationOptions(), context)
     assert searched[0][0] is FrameStatus.CONTRADICTED
     np.testing.assert_array_equal(searched[0][1], [29, 30, 31])
+
+
+def _searched_frame(
+    pictures: list[np.ndarray], context: StageContext
+) -> tuple[GuidedLocaliser, SearchFrame, PoseEstimate]:
+    """Return a localiser, a lost frame, and the pose that is found in it from its true pose."""
+    path = _tracked().trajectory
+    capture = cast(Capture, _Capture(_Video(pictures)))
+    localiser = recover.make_localiser(
+        _map(pictures), capture, path, RegistrationOptions(), context, rotation=None
+    )
+    frame = SearchFrame(21, Pyramid.build(pictures[21]), -1)
+    found = localiser.relocalise(frame, invert(PATH[21]), NeighbourPose(invert(PATH[20])))
+    assert found is not None
+    return localiser, frame, found
+
+
+def test_a_pose_from_true_matches_does_not_depend_on_its_start(
+    monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], context: StageContext
+) -> None:
+    monkeypatch.setattr(recover, "estimate_exposure", lambda *_: 0.0)
+    localiser, frame, found = _searched_frame(pictures, context)
+    assert localiser.start_dependence(frame, found, NeighbourPose(invert(PATH[20]))) < 0.1
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.9, None])
+def test_the_covariance_contains_the_error_that_a_search_leaves_of_its_start(
+    monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], context: StageContext, share: float | None
+) -> None:
+    monkeypatch.setattr(recover, "estimate_exposure", lambda *_: 0.0)
+    localiser, frame, found = _searched_frame(pictures, context)
+    centre = invert(found.cam_from_map)[:3, 3]
+
+    def search(_localiser: object, _frame: object, pose: np.ndarray, _neighbour: object) -> object:
+        """Find a pose whose centre keeps a share of the start's distance from the first pose."""
+        moved = centre + (share or 0.0) * (invert(pose)[:3, 3] - centre)
+        rotation = pose[:3, :3]
+        return (
+            None
+            if share is None
+            else replace(found, cam_from_map=make_transform(rotation, -rotation @ moved))
+        )
+
+    monkeypatch.setattr(GuidedLocaliser, "relocalise", search)
+    left = localiser.start_dependence(frame, found, NeighbourPose(invert(PATH[20])))
+    assert left == pytest.approx(0.99 if share is None else share, abs=1e-6)
+    grown = found.with_start_error(left)
+    np.testing.assert_allclose(grown.covariance, found.covariance / (1.0 - left) ** 2)

@@ -9,7 +9,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.geometry import invert, make_transform, so3_exp
+from bodycap_batch.model.geometry import invert, make_transform, so3_exp, transform_points
 from bodycap_batch.model.rotation_path import TurningShutter
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.registration.poses.batched_pnp import Observations, make_observations, refine_poses
@@ -52,6 +52,14 @@ _MIN_MATCHES = 8
 _SUFFICIENT_INLIERS, _SUFFICIENT_WEIGHT_RATIO = 25, 0.6
 """Minimum number of inliers and minimum inlier weight ratio of a pose that ends the search in a frame. The
 remaining expected poses are then not tried. Evidence: none."""
+
+_RESTART_PX = 2.5
+"""Pixels at 640 px image width: median movement of the points by which the start of a repeated search is
+displaced. It is less than half of the range of the last search. Evidence: docs/decisions/registration.md."""
+_RESTART_STEP = 1e-3
+"""Step of the difference that gives the movement of the points, in radians and fractions of the depth."""
+_MAX_START_DEPENDENCE = 0.99
+"""Largest used fraction of an error of the start that a search leaves. The covariance is finite then."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,6 +113,17 @@ class PoseEstimate:
     def has_support(self, min_inliers: int, min_inlier_weight_ratio: float) -> bool:
         """Return True if enough matches agree with the pose."""
         return self.inliers >= min_inliers and self.inlier_weight_ratio >= min_inlier_weight_ratio
+
+    def with_start_error(self, dependence: float) -> PoseEstimate:
+        """Return the pose with the covariance that contains the error of the start of its search.
+
+        The pose is the start of its own search. If the search leaves a fraction f of an error of the start,
+        the error of the matches repeats in the start and adds up to 1 / (1 − f) times its size.
+
+        Args:
+            dependence: The fraction, from `GuidedLocaliser.start_dependence`.
+        """
+        return replace(self, covariance=self.covariance / (1.0 - dependence) ** 2)
 
     def conditioned_on_centre(self, position: PositionEstimate) -> tuple[FloatArray, FloatArray]:
         """Return the pose and its covariance after the camera centre is moved to another position.
@@ -242,6 +261,55 @@ class GuidedLocaliser:
             The pose, or None if the search fails.
         """
         return self._search(self._view(search_frame, pose, neighbour), _LEVELS[-1])
+
+    def start_dependence(
+        self, search_frame: SearchFrame, estimate: PoseEstimate, neighbour: NeighbourPose
+    ) -> float:
+        """Return the fraction of an error of the start that remains in a found pose.
+
+        The finest search is repeated from two poses on both sides of the found pose, along the direction that
+        is known least. Matches at true places lead back to one pose. False matches are anywhere in the search
+        range around the start: enough of them agree with the start, wherever it is.
+
+        Args:
+            search_frame: The frame.
+            estimate: The found pose.
+            neighbour: Pose of the frame before or after.
+
+        Returns:
+            Distance between the two centres that were found over the distance of the two starts, at most
+            `_MAX_START_DEPENDENCE`. It is this limit, too, if a search fails.
+        """
+        unit = np.repeat([1.0, estimate.depth], 3)
+        weakest = unit * np.linalg.eigh(estimate.covariance / np.outer(unit, unit))[1][:, -1]
+
+        def displaced(size: float) -> FloatArray:
+            change = size * weakest
+            step = make_transform(np.ravel(so3_exp(change[:3])).reshape(3, 3), change[3:])
+            return np.asarray(step @ estimate.cam_from_map)
+
+        def projected(pose: FloatArray) -> FloatArray:
+            return self.lens.project(transform_points(pose, self.patches.scene_map.points))
+
+        x_in_cam = transform_points(estimate.cam_from_map, self.patches.scene_map.points)
+        px = projected(estimate.cam_from_map)
+        with np.errstate(invalid="ignore"):
+            seen = ((px > 0.0) & (px < (self.lens.width_px, self.lens.height_px))).all(axis=1)
+        seen &= self.patches.usable & (x_in_cam[:, 2] > 0.0)
+        moved_px = np.linalg.norm(projected(displaced(_RESTART_STEP)) - px, axis=1)[seen]
+        moved_px = moved_px[np.isfinite(moved_px)]
+        if len(moved_px) == 0 or np.median(moved_px) == 0.0:
+            return _MAX_START_DEPENDENCE
+        size = _RESTART_STEP * _RESTART_PX * search_frame.pyramid.step_px[0] / float(np.median(moved_px))
+        starts = [displaced(size), displaced(-size)]
+        found = [self.relocalise(search_frame, start, neighbour) for start in starts]
+        if found[0] is None or found[1] is None:
+            return _MAX_START_DEPENDENCE
+        before, after = (
+            np.linalg.norm(np.subtract(*invert(np.array(poses))[:, :3, 3]))
+            for poses in (starts, [found[0].cam_from_map, found[1].cam_from_map])
+        )
+        return min(float(after / max(before, np.finfo(float).tiny)), _MAX_START_DEPENDENCE)
 
     def _view(self, search_frame: SearchFrame, pose: FloatArray, neighbour: NeighbourPose) -> PredictedView:
         """Return the expected view of a frame."""

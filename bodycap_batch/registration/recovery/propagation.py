@@ -203,6 +203,23 @@ class Propagation:
                 accepted[frame] = estimate
         return accepted
 
+    def with_start_errors(self, estimates: Mapping[int, PoseEstimate]) -> dict[int, PoseEstimate]:
+        """Return poses, by frame, with covariances that contain the errors of the starts of their searches.
+
+        See `GuidedLocaliser.start_dependence`.
+        """
+        poses = {
+            frame: estimate.cam_from_map for frame, estimate in {**self.interval.poses, **estimates}.items()
+        }
+        out = {}
+        for frame, estimate in estimates.items():
+            neighbour = _neighbour_pose(poses.get(frame - 1), poses.get(frame + 1), poses[frame])
+            dependence = self.localiser.start_dependence(
+                self.interval.search_frame(frame), estimate, neighbour
+            )
+            out[frame] = estimate.with_start_error(dependence)
+        return out
+
     def _initialised(self, end: int, direction: int) -> _PropagationState:
         """Return the state from which a propagation starts at one end of the interval.
 

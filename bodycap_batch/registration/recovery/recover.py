@@ -53,6 +53,25 @@ reaches frames deeper inside the intervals. Evidence: docs/decisions/registratio
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class KnownFrames:
+    """What is known about the frames of a camera before the lost ones are searched.
+
+    Attributes:
+        rotation: The rotation of a camera with a rolling shutter from matches between adjacent frames; None
+            if it is unknown.
+        doubtful: (N,) True for frames in blocks of misplaced keyframes; None if there are none. Lost
+            intervals with such frames are searched with `independent_localiser`.
+    """
+
+    rotation: RotationPath | None = None
+    doubtful: BoolArray | None = None
+
+
+_NOTHING_KNOWN = KnownFrames()
+"""No rotation, and no misplaced keyframes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RecoveryInputs:
     """The inputs of `recover_lost_frames`, except the registration of the camera to recover.
 
@@ -114,7 +133,8 @@ def recover_lost_frames(
         )
     registration = withdraw_contradicted_poses(registration, inputs.maps, inputs.misplaced)
     doubtful = contradicted_frames(registration.trajectory, inputs.maps, inputs.misplaced)
-    found = find_lost_poses(registration, scene_map, inputs.capture, options, context, own.rotation, doubtful)
+    known = KnownFrames(rotation=own.rotation, doubtful=doubtful)
+    found = find_lost_poses(registration, scene_map, inputs.capture, options, context, known)
     return replace(found, trajectory=with_map_error(found.trajectory, inputs.maps))
 
 
@@ -124,8 +144,7 @@ def find_lost_poses(
     capture: Capture,
     options: RegistrationOptions,
     context: StageContext,
-    rotation: RotationPath | None = None,
-    doubtful: BoolArray | None = None,
+    known: KnownFrames = _NOTHING_KNOWN,
 ) -> Registration:
     """Search the lost frames of a camera, and accept the poses that are well supported.
 
@@ -145,10 +164,7 @@ def find_lost_poses(
         capture: All cameras.
         options: Minimum number of inliers and maximum relative sigma of a pose.
         context: Progress and cancellation.
-        rotation: The rotation of a camera with a rolling shutter from matches between adjacent frames; None
-            if it is unknown.
-        doubtful: (N,) True for frames in blocks of misplaced keyframes; none by default. Lost intervals with
-            such frames are searched with `independent_localiser`.
+        known: What is known about the frames; nothing by default.
 
     Returns:
         The registration with more poses and a smoothed trajectory. It contains no observations of the
@@ -160,13 +176,13 @@ def find_lost_poses(
     if statistics is None:
         return registration
     times = times_in_intervals(path.times_ns)
-    localiser = make_localiser(scene_map, capture, path, options, context, rotation)
+    localiser = make_localiser(scene_map, capture, path, options, context, known.rotation)
     interval_search = _IntervalSearch(
         camera=camera,
         scene_map=scene_map,
         localiser=localiser,
         independent=independent_localiser(localiser, camera.name),
-        doubtful=np.zeros(len(lost), dtype=bool) if doubtful is None else doubtful,
+        doubtful=np.zeros(len(lost), dtype=bool) if known.doubtful is None else known.doubtful,
         times=times,
         statistics=statistics,
         seed_rows=_seed_keyframes(scene_map, camera.name, lost),
@@ -322,6 +338,7 @@ def _accepted_poses(propagation: Propagation) -> dict[int, PoseEstimate]:
     if not estimates:
         return {}
     estimates = propagation.second_pass(estimates, _smooth(estimates, propagation.interval).positions)
+    estimates = propagation.with_start_errors(estimates)
     smoothed = _smooth(estimates, propagation.interval)
     accepted = {}
     for frame, estimate in estimates.items():

@@ -108,7 +108,10 @@ def _pose_near(
     else:
         neighbour = NeighbourPose(prior)
     found = localiser.localise(search_frame, [prior], neighbour, expected.position)
-    if found is None or _distance(found, expected) > _MAX_DISTANCE:
+    if found is None:
+        return None
+    found = found.with_start_error(localiser.start_dependence(search_frame, found, neighbour))
+    if _distance(found, expected) > _MAX_DISTANCE:
         return None
     return accepted_pose(found, fuse(found.position, expected.position)[0], localiser, frame)
 
