@@ -3,6 +3,8 @@
 import av
 import numpy as np
 
+from bodycap_batch.evaluate.association import interpolate_truth
+from bodycap_batch.formats.tum import TimedPoses
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench import bare, bare_draw, long, ours, peers, poses, scaling, seeds, solving, violent
@@ -174,6 +176,34 @@ def test_correct_covariances_of_poses_give_one_in_any_gauge():
     wide = poses.figures(poses.least_errors(estimates, true, 4.0 * stated), 4.0 * stated)
     assert np.isclose(wide["centre"], found["centre"] / 4.0, rtol=0.02)
     assert wide["centre_inside"] > 0.97
+
+
+def test_a_measured_truth_has_errors_of_its_own():
+    """A tracked body carries the camera 2 degrees off, with another clock and with noise in every sample."""
+    rng, sigma = np.random.default_rng(7), np.array([0.001] * 3 + [0.0005] * 3)
+
+    def poses_at(time_s):
+        phase = np.array([0.0, 1.0, 2.0])
+        angle = 0.2 * np.sin(np.outer(time_s, [2.0, 1.7, 1.3]) + phase)
+        return make_transform(so3_exp(angle), 0.3 * np.sin(np.outer(time_s, [1.1, 1.9, 1.5])))
+
+    def noisy(exact, size):
+        noise = rng.normal(0.0, 1.0, (len(exact), 6)) * size
+        return exact @ make_transform(so3_exp(noise[:, :3]), noise[:, 3:])
+
+    sample_s, frame_s = np.arange(0.0, 12.0, 0.01), 1.0 + np.arange(300) / 30.0
+    mount = make_transform(so3_exp(np.radians([2.0, 0.0, -1.0])), np.array([0.02, 0.0, 0.01]))
+    sample_ns = np.round(sample_s * 1e9).astype(np.int64)
+    truth = TimedPoses(times_ns=sample_ns, world_from_cam=noisy(poses_at(sample_s), sigma) @ mount)
+    times_ns = np.round(frame_s * 1e9).astype(np.int64)
+    estimates = noisy(poses_at(frame_s + 0.008), 0.5 * sigma)
+    stated = np.tile(np.diag((0.5 * sigma) ** 2), (300, 1, 1))
+    true, _ = interpolate_truth(truth, times_ns, 0.1)
+    assert poses.figures(poses.least_errors(estimates, true, stated), stated)["pose_inside"] < 0.2
+    measured = poses.MeasuredTruth.create(truth, times_ns)
+    stated = stated + measured.noise
+    found = poses.figures(poses.least_errors(estimates, true, stated, measured.twist), stated)
+    assert 0.9 < found["pose_inside"] < 0.99
 
 
 def test_a_long_capture_is_a_short_one_played_forwards_and_backwards(tmp_path):
