@@ -59,6 +59,10 @@ from bodycap_batch.tasks.wearer import WEARER, WearerTask
 
 _REFINEMENTS = 2
 """Maximum number of passes of the correction of rolling shutters. Evidence: docs/decisions/mapping.md."""
+_MAX_RECOVERY_THREADS = 2
+"""Maximum number of threads of the recovery of one camera. The cameras lose different numbers of frames, so
+one task often runs alone at the end. Much of its work holds the interpreter's lock. Evidence:
+docs/decisions/pipeline.md."""
 ByCamera = Mapping[str, Artefact]
 
 
@@ -543,7 +547,7 @@ class Flow:
             task = self._group_task(own, self._capture.cameras, scene_map, registrations, keyframes)
             if self._job.telemetry.search and own.name in self._with_telemetry:
                 task = replace(task, with_sensor=True, samples=self._samples)
-            yield make_task(RECOVER, task, camera=own.name)
+            yield make_task(RECOVER, task, camera=own.name, threads=min(self._threads, _MAX_RECOVERY_THREADS))
 
     def _group_task(
         self,

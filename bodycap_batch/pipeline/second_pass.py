@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 
 from bodycap_batch.config.lost_frames import LEAST_LOST_SHARE
@@ -15,20 +15,26 @@ from bodycap_batch.tasks.stage import read_summary
 
 
 def repeat_without_wearer(
-    job: Job, flow: Flow, results: StageResults, run_pass: Callable[[StageResults], object]
+    job: Job,
+    flow: Flow,
+    results: StageResults,
+    run_pass: Callable[[StageResults, Callable[[], bool]], object],
 ) -> None:
     """Repeat map, registration and body once without the wearer, and use the results if they are better.
 
     Only cameras are masked in whose pictures the solved body covers much (`find_wearer`). If there are none,
     nothing is repeated. The second pass is better if more cameras are part of the body, or if as many are,
     more frames are localised, and no camera loses a notable part of its frames. Otherwise the results of the
-    first pass stay.
+    first pass stay. If all cameras are part of the body, the second pass ends early when a camera loses a
+    notable part of its frames in the first registration against the map. Evidence:
+    docs/decisions/registration.md.
 
     Args:
         job: The job.
         flow: The stages of the job.
         results: The results of the first pass up to the stage `fill`; changed in place.
-        run_pass: Runs all stages from the map to `fill`, and puts their artefacts into its argument.
+        run_pass: Runs all stages from the map to `fill`, and puts their artefacts into its first argument. It
+            ends early if its second argument, which it calls after the first registration, returns False.
     """
     if job.registration.wearer_mask == "off" or results.filled is None:
         return
@@ -36,16 +42,23 @@ def repeat_without_wearer(
     if wearer is None:
         return
     second, before = StageResults(stage=results.stage, keyframes=results.keyframes), len(flow.runner.records)
+
+    def can_be_better() -> bool:
+        kept = _keeps_frames(_localised(results.tracked), _localised(second.tracked))
+        return kept or _unused_cameras(results) > 0
+
     with flow.without_wearer(wearer):
-        failure = _run(second, run_pass)
-        is_better = not failure and _is_better(second, results)
+        failure = _run(second, lambda: run_pass(second, can_be_better))
+        is_better = second.filled is not None and _is_better(second, results)
         if is_better:
             flow.runner.release_notes()
     seconds = sum(record.seconds for record in flow.runner.records[before:])
     if failure:
         outcome = f"it gave no body ({failure}), so the first results are used"
     elif is_better:
-        before_count, after_count = (sum(_localised(item).values()) for item in (results, second))
+        before_count, after_count = (
+            sum(_localised(item.registrations).values()) for item in (results, second)
+        )
         outcome = f"{after_count} instead of {before_count} frames are localised"
     else:
         outcome = "the first results are better and are used"
@@ -55,16 +68,13 @@ def repeat_without_wearer(
             setattr(results, item.name, getattr(second, item.name))
 
 
-def _run(second: StageResults, run_pass: Callable[[StageResults], object]) -> str:
-    """Run the second pass, and return why it gave no body; "" if it gave one."""
+def _run(second: StageResults, run_pass: Callable[[], object]) -> str:
+    """Run the second pass, and return why it gave no body; "" if it gave one or ended early."""
     try:
-        run_pass(second)
+        run_pass()
     except EstimationError as error:
         return error.message
-    if second.filled is not None:
-        return ""
-    assert second.failure is not None  # The job asks for a body, and this pass gave none.
-    return second.failure.message
+    return "" if second.failure is None else second.failure.message
 
 
 def _describe(wearer: Artefact, seconds: float, outcome: str) -> str:
@@ -88,9 +98,13 @@ def _is_better(second: StageResults, first: StageResults) -> bool:
     unused_second, unused_first = _unused_cameras(second), _unused_cameras(first)
     if unused_second != unused_first:
         return unused_second < unused_first
-    before, after = _localised(first), _localised(second)
-    kept = all(after.get(name, 0) >= (1.0 - LEAST_LOST_SHARE) * number for name, number in before.items())
-    return kept and sum(after.values()) > sum(before.values())
+    before, after = _localised(first.registrations), _localised(second.registrations)
+    return _keeps_frames(before, after) and sum(after.values()) > sum(before.values())
+
+
+def _keeps_frames(before: Mapping[str, int], after: Mapping[str, int]) -> bool:
+    """Return whether no camera loses a notable part of its localised frames, given by camera name."""
+    return all(after.get(name, 0) >= (1.0 - LEAST_LOST_SHARE) * number for name, number in before.items())
 
 
 def _unused_cameras(results: StageResults) -> int:
@@ -99,9 +113,6 @@ def _unused_cameras(results: StageResults) -> int:
     return len(read_summary(results.merged.path)["unused_cameras"])
 
 
-def _localised(results: StageResults) -> dict[str, int]:
+def _localised(registrations: Mapping[str, Artefact]) -> dict[str, int]:
     """Return the number of localised frames of each camera, by camera name."""
-    return {
-        name: int(read_summary(artefact.path)["localised"])
-        for name, artefact in results.registrations.items()
-    }
+    return {name: int(read_summary(artefact.path)["localised"]) for name, artefact in registrations.items()}

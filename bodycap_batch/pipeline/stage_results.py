@@ -31,7 +31,8 @@ class StageResults:
         stage: Name of the running stage, or of the last stage that ran.
         keyframes: The artefact of each camera's keyframes, by camera name.
         map: The artefact of the map.
-        registrations: The registration of each camera, by camera name.
+        tracked: The registration of each camera against the first map, by camera name.
+        registrations: The registration of each camera after all further steps, by camera name.
         job: The job with the places that were found from the motion; None before they are looked for.
         clocks: The artefact of the clocks of all cameras.
         merged: The artefact of the skeleton's motion.
@@ -47,6 +48,7 @@ class StageResults:
     stage: str = "check"
     keyframes: Mapping[str, Artefact] = field(default_factory=dict)
     map: Artefact | None = None
+    tracked: Mapping[str, Artefact] = field(default_factory=dict)
     registrations: Mapping[str, Artefact] = field(default_factory=dict)
     job: Job | None = None
     clocks: Artefact | None = None

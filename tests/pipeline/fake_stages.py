@@ -22,7 +22,8 @@ ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
  "masked": [cameras], "without_wearer": localised frames, of each camera or {camera: frames},
- "rolling": true, "late": number of maps, "telemetry": [cameras], "real": [stages that are no stand-ins]}.
+ "unused": {camera: reason}, "rolling": true, "late": number of maps, "telemetry": [cameras],
+ "real": [stages that are no stand-ins]}.
  "fail" may be a list of stages; "fail_second" is one that fails without the wearer."""
 
 
@@ -155,7 +156,9 @@ def recovered(options: Json, arguments: Json, files: Path) -> None:
 
 
 def merged(options: Json, arguments: Json, files: Path) -> None:
-    (files / "summary.json").write_text(json.dumps({"notes": ["a note"], "unused_cameras": {}}))
+    (files / "summary.json").write_text(
+        json.dumps({"notes": ["a note"], "unused_cameras": orders().get("unused", {})})
+    )
 
 
 def found_wearer(options: Json, arguments: Json, files: Path) -> None:

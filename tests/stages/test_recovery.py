@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -448,6 +449,43 @@ def test_progress_grows_over_the_passes_until_nothing_is_left(
     capture = cast("Capture", _Capture(_Video(pictures)))
     find_lost_poses(_tracked(), _map(pictures), capture, RegistrationOptions(), context)
     assert reported == [18, 22, 22, 23]
+
+
+def test_the_turn_between_two_frames_is_measured_once_for_all_passes(
+    monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], context: StageContext
+) -> None:
+    measured: list[object] = []
+    measure = Propagation._turn_of_pictures
+
+    def counting(self: Propagation, *pyramids: Any) -> Any:
+        measured.append(pyramids)
+        return measure(self, *pyramids)
+
+    monkeypatch.setattr(Propagation, "_turn_of_pictures", counting)
+    rounds = [[(LOST[0], LOST[-1] + 1)], []]
+    monkeypatch.setattr(recover, "_extended_intervals", lambda *_: rounds.pop(0))
+    _recovered(_map(pictures), pictures, context)
+    assert not rounds
+    # Both directions pass each of the lost frames once.
+    assert len(LOST) <= len(measured) <= 2 * len(LOST)
+
+
+def test_intervals_are_searched_side_by_side(
+    monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], tmp_path: Path
+) -> None:
+    both = threading.Barrier(2, timeout=30.0)
+    monkeypatch.setattr(recover, "lost_intervals", lambda _: [(18, 22), (22, 26)])
+    monkeypatch.setattr(recover, "_extended_intervals", lambda *_: [])
+
+    def wait_for_the_other(*_: object) -> dict[int, PoseEstimate]:
+        both.wait()
+        return {}
+
+    monkeypatch.setattr(recover._IntervalSearch, "recover_interval", wait_for_the_other)
+    capture = cast("Capture", _Capture(_Video(pictures)))
+    context = StageContext(work_dir=tmp_path, threads=2)
+    find_lost_poses(_tracked(), _map(pictures), capture, RegistrationOptions(), context)
+    assert not both.broken
 
 
 def _selection() -> KeyframeSelection:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -190,19 +192,31 @@ def find_lost_poses(
     )
     frozen = np.array([status is FrameStatus.FROZEN for status in path.status], dtype=bool)
     intervals, position = lost_intervals(~lost | frozen), 0
-    for _ in range(_MAX_PASSES):
-        if not intervals:
-            break
-        poses: dict[int, PoseEstimate] = {}
-        localised = _localised_poses(path)
-        for start, stop in intervals:
-            context.check_cancelled()
-            position = max(position, start)  # a new pass does not reduce the progress
-            context.progress(position, len(lost), "lost frames searched")
-            poses |= interval_search.recover_interval(start, stop, localised)
-        before, path = path.localised, _merge_into(path, poses, localiser.criteria)
-        intervals = _extended_intervals(path.localised, before, frozen)
+    with ThreadPoolExecutor(context.threads, thread_name_prefix="intervals") as pool:
+        for _ in range(_MAX_PASSES):
+            if not intervals:
+                break
+            poses: dict[int, PoseEstimate] = {}
+            # The intervals of one pass do not depend on each other.
+            search = partial(_recover_unless_cancelled, interval_search, _localised_poses(path), context)
+            for (start, _), found in zip(intervals, pool.map(search, intervals), strict=True):
+                position = max(position, start)  # a new pass does not reduce the progress
+                context.progress(position, len(lost), "lost frames searched")
+                poses |= found
+            before, path = path.localised, _merge_into(path, poses, localiser.criteria)
+            intervals = _extended_intervals(path.localised, before, frozen)
     return replace(registration, trajectory=smooth_weak_centres(path, ~lost))
+
+
+def _recover_unless_cancelled(
+    search: _IntervalSearch,
+    poses: Mapping[int, PoseEstimate],
+    context: StageContext,
+    interval: tuple[int, int],
+) -> dict[int, PoseEstimate]:
+    """Return the accepted poses of one lost interval [start, stop); raise `Cancelled` if the task stops."""
+    context.check_cancelled()
+    return search.recover_interval(*interval, poses)
 
 
 def make_localiser(
@@ -265,6 +279,7 @@ class _IntervalSearch:
         seed_rows: Row indices in the map by frame, for the lost frames that are keyframes.
         tracked_frames: Indices of the frames with a pose from tracking.
         turns: Rotations between frames that were measured so far. A further pass does not measure them again.
+            Several threads may fill it, because each of them measures the same rotation.
     """
 
     camera: CaptureCamera
