@@ -35,6 +35,7 @@ from bodycap_batch.registration.recovery.guided_localisation import (
     PoseEstimate,
     SearchFrame,
 )
+from bodycap_batch.registration.recovery.motion_prior import MotionStatistics
 from bodycap_batch.registration.recovery.patch_search import (
     KeyframePatches,
     PatchMatches,
@@ -42,7 +43,7 @@ from bodycap_batch.registration.recovery.patch_search import (
     Pyramid,
 )
 from bodycap_batch.registration.recovery.preparation import prepare_recovery
-from bodycap_batch.registration.recovery.propagation import Propagation
+from bodycap_batch.registration.recovery.propagation import LostInterval, Propagation
 from bodycap_batch.registration.recovery.recover import find_lost_poses
 from bodycap_batch.registration.recovery.search_images import (
     estimate_exposure,
@@ -718,3 +719,40 @@ def test_the_covariance_contains_the_error_that_a_search_leaves_of_its_start(
     assert left == pytest.approx(0.99 if share is None else share, abs=1e-6)
     grown = found.with_start_error(left)
     np.testing.assert_allclose(grown.covariance, found.covariance / (1.0 - left) ** 2)
+
+
+def test_found_neighbours_do_not_make_a_searched_pose_more_certain() -> None:
+    """Wrong searches continue from frame to frame: only tracked frames and the own picture count."""
+    positions = {
+        frame: PoseEstimate(
+            cam_from_map=invert(PATH[frame]),
+            covariance=np.eye(6) * (0.1 if frame in LOST else 0.001) ** 2,
+            inliers=30,
+            inlier_weight_ratio=0.8,
+            error_px=1.0,
+            depth=2.5,
+        )
+        for frame in range(COUNT)
+    }
+    interval = LostInterval(
+        start=LOST.start,
+        stop=COUNT,
+        times=np.arange(float(COUNT)),
+        pyramids={},
+        poses={frame: positions[frame] for frame in range(LOST.start)},
+        tracked_frames=frozenset(range(LOST.start)),
+        seed_poses={},
+        keyframe_rows={},
+        statistics=MotionStatistics(jerk_sigma=0.01, cubic_residual_sigma=0.01),
+    )
+    found = {frame: positions[frame] for frame in range(LOST.start, LOST.stop)}
+    together = recover._smooth(found, interval).positions
+    predicted = recover._predicted_positions(interval)
+    frame = LOST.stop - 1
+    position = recover._independent_position(found[frame], together[frame], predicted[frame])
+    np.testing.assert_array_equal(position.centre, together[frame].centre)
+    # The motion says nothing eight frames after the last tracked one; eight found poses would seem to.
+    np.testing.assert_allclose(position.covariance, found[frame].position.covariance, rtol=0.05)
+    assert np.trace(together[frame].covariance) < 0.9 * np.trace(position.covariance)
+    near = recover._independent_position(found[LOST.start], together[LOST.start], predicted[LOST.start])
+    assert np.trace(near.covariance) < 0.5 * np.trace(found[LOST.start].position.covariance)

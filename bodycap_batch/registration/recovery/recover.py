@@ -11,7 +11,7 @@ import numpy as np
 
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import RegistrationOptions
-from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.rotation_path import RotationPath, TurningShutter
@@ -24,10 +24,11 @@ from bodycap_batch.registration.poses.pose_outliers import ISOLATED_INLIER_FACTO
 from bodycap_batch.registration.poses.rig_members import RegisteredCamera
 from bodycap_batch.registration.poses.turning_tracks import with_rotation
 from bodycap_batch.registration.recovery.accepted_poses import accepted_pose, with_poses
-from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser, PoseEstimate
+from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser, PoseEstimate, fuse
 from bodycap_batch.registration.recovery.motion_prior import (
     MAX_DISAGREEMENT,
     MotionStatistics,
+    PositionEstimate,
     SmoothedCentres,
     smooth_centres,
     times_in_intervals,
@@ -332,16 +333,54 @@ def _extended_intervals(has_pose: BoolArray, before: BoolArray, frozen: BoolArra
     return [(start, stop) for start, stop in intervals if is_new[start] or is_new[stop + 1]]
 
 
+def _predicted_positions(interval: LostInterval) -> Mapping[int, PositionEstimate]:
+    """Return the positions in an interval, by frame, that follow from the tracked frames around it."""
+    frames = _frames_around(interval)
+    tracked = [frame for frame in frames.tolist() if frame in interval.tracked_frames]
+    positions = {frame: interval.poses[frame].position for frame in tracked if frame in interval.poses}
+    if not positions:
+        return {}
+    smoothed = smooth_centres(
+        frames, interval.times[frames], positions, positions.keys(), interval.statistics
+    )
+    return smoothed.positions
+
+
+def _frames_around(interval: LostInterval) -> IntArray:
+    """Return the frames of an interval and `_SMOOTHING_MARGIN` frames on either side."""
+    first = max(0, interval.start - _SMOOTHING_MARGIN)
+    return np.arange(first, min(len(interval.times), interval.stop + _SMOOTHING_MARGIN))
+
+
 def _smooth(estimates: Mapping[int, PoseEstimate], interval: LostInterval) -> SmoothedCentres:
     """Smooth the centres of an interval together with the centres of the frames around it."""
-    first = max(0, interval.start - _SMOOTHING_MARGIN)
-    frames = np.arange(first, min(len(interval.times), interval.stop + _SMOOTHING_MARGIN))
+    frames = _frames_around(interval)
     neighbours = {
         frame: interval.poses[frame].position for frame in frames.tolist() if frame in interval.poses
     }
     positions = neighbours | {frame: estimate.position for frame, estimate in estimates.items()}
     tracked = neighbours.keys() & interval.tracked_frames
     return smooth_centres(frames, interval.times[frames], positions, tracked, interval.statistics)
+
+
+def _independent_position(
+    estimate: PoseEstimate, smoothed: PositionEstimate, predicted: PositionEstimate | None
+) -> PositionEstimate:
+    """Return a smoothed position with a covariance from independent sources only.
+
+    The sources are the picture of the frame and the motion of the tracked frames. The other found frames of
+    the interval are not independent: each was searched near the pose of the frame beside it, so a wrong
+    search continues in the next frames, and smoothing does not reduce this error. Evidence:
+    docs/decisions/registration.md.
+
+    Args:
+        estimate: The pose from the picture of the frame.
+        smoothed: The position, smoothed together with all found positions.
+        predicted: The position that follows from the tracked frames alone; None if there are none.
+    """
+    own = estimate.position
+    covariance = own.covariance if predicted is None else fuse(own, predicted)[0].covariance
+    return PositionEstimate(smoothed.centre, covariance)
 
 
 def _accepted_poses(propagation: Propagation) -> dict[int, PoseEstimate]:
@@ -355,10 +394,12 @@ def _accepted_poses(propagation: Propagation) -> dict[int, PoseEstimate]:
     estimates = propagation.second_pass(estimates, _smooth(estimates, propagation.interval).positions)
     estimates = propagation.with_start_errors(estimates)
     smoothed = _smooth(estimates, propagation.interval)
+    predicted = _predicted_positions(propagation.interval)
     accepted = {}
     for frame, estimate in estimates.items():
         if smoothed.disagreement[frame] < MAX_DISAGREEMENT:
-            pose = accepted_pose(estimate, smoothed.positions[frame], propagation.localiser, frame)
+            position = _independent_position(estimate, smoothed.positions[frame], predicted.get(frame))
+            pose = accepted_pose(estimate, position, propagation.localiser, frame)
             if pose is not None:
                 accepted[frame] = pose
     return accepted
