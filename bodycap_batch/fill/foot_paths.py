@@ -34,6 +34,9 @@ _HEEL_RISE_S = (0.08, 0.35)
 """Minimum and maximum time (s) of this. Evidence: none."""
 _LANDING_S = 0.09
 """Time (s) from the touch of the heel until the foot is flat. Source: as `_HEEL_RISE_RAD`."""
+_LANDED_SHARE = 0.3
+"""Share of this time that has passed when the foot counts as standing: the heel touches the floor before the
+ankle rests. Evidence: docs/decisions/filling.md."""
 _OVERSHOOT = 1.15
 """Ratio of the largest angle of the foot, shortly after it leaves the floor, to the angle when it leaves the
 floor. Source: as `_HEEL_RISE_RAD`."""
@@ -237,7 +240,7 @@ def _stand(
     before = min(float(np.clip(_HEEL_RISE_SHARE * length, *_HEEL_RISE_S)), 0.6 * length)
     after = min(_LANDING_S, 0.3 * length)
     up = np.clip((seconds - (length - before)) / before, 0.0, 1.0) ** _HEEL_RISE_POWER
-    down = 1.0 - _smooth(seconds / after)
+    down = 1.0 - _smooth(seconds / after + _LANDED_SHARE)
     pitch = rise * _HEEL_RISE_RAD * up - strike * _HEEL_STRIKE_RAD * down
     if hip_m is not None:
         pitch = _reaching_pitch(stance, pitch, leg, hip_m[own])
@@ -301,6 +304,7 @@ def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg
     arriving = -strength * _HEEL_STRIKE_RAD
     if 0 <= second.start < ticks:
         arriving = float(path.pitch_rad[second.start])
+    raised = min(arriving, -strength * _HEEL_STRIKE_RAD)
     rate = 0.0
     if 1 < first.end <= ticks and first.end - 2 >= first.start:
         rate = float(path.pitch_rad[first.end - 1] - path.pitch_rad[first.end - 2])
@@ -308,7 +312,7 @@ def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg
     pitch = _hermite(
         phase,
         np.array([0.0, 0.12, 0.8, 1.0]),
-        np.array([leaving, peak, arriving, arriving]),
+        np.array([leaving, peak, raised, arriving]),
         np.array([rate * count, 0.0, 0.0, 0.0]),
     )
     toe = np.maximum(leaving, 0.0) * (1.0 - _smooth(phase / 0.35))
