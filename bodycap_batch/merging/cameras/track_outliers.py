@@ -81,7 +81,8 @@ def _wrong_ends(time: FloatArray, centre_m: FloatArray) -> BoolArray:
         centre_m: (N,3) camera centres, metres.
     """
     out = np.zeros(len(time), dtype=bool)
-    first = np.flatnonzero(np.diff(time, prepend=-np.inf) > OUTLIER_HALF_WINDOW + 0.5)
+    # Across a longer step, one or both frames on each side lack a second neighbour in the window.
+    first = np.flatnonzero(np.diff(time, prepend=-np.inf) > OUTLIER_HALF_WINDOW - 0.5)
     for forward in (True, False):
         order = np.arange(len(time)) if forward else np.arange(len(time))[::-1]
         off_m = _distance_from_line(time[order], centre_m[order])[order]

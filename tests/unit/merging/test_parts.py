@@ -196,16 +196,19 @@ def test_a_throw_faster_than_a_quadratic_is_kept():
     assert len(remove_outliers(_track(throw), 1.0, 30.0).frames) == len(throw)
 
 
-@pytest.mark.parametrize("wrong", [[89], [88, 89], [0], [0, 1], [44, 45], [46]])
-def test_outliers_at_the_ends_of_a_run_are_removed(wrong):
+@pytest.mark.parametrize("lost", [5, 15])
+@pytest.mark.parametrize("wrong", [[89], [88, 89], [0], [0, 1], [44], [44, 45], [46]])
+def test_outliers_at_the_ends_of_a_run_are_removed(wrong, lost):
     seconds = np.arange(90) / 30.0
     path = np.stack([0.3 * np.sin(4.0 * np.pi * seconds), seconds, 0.0 * seconds], axis=1)
     path[wrong] += [0.5, -0.3, 0.4]
     track = _track(path)
-    # The frames 46 and later follow after a gap of half a second.
-    times_ns = track.times_ns + np.where(np.arange(90) > 45, 500_000_000, 0)
+    # The frames 46 and later follow after a gap.
+    times_ns = track.times_ns + np.where(np.arange(90) > 45, lost * SECOND // 30, 0)
     kept = remove_outliers(replace(track, times_ns=times_ns), 1.0, 30.0)
-    assert sorted(set(range(90)) - set(kept.frames.tolist())) == wrong
+    removed = set(range(90)) - set(kept.frames.tolist())
+    # A right frame between a wrong one and the gap may be lost.
+    assert set(wrong) <= removed <= {*wrong, 45}
 
 
 def test_poses_in_gaps_and_outside_a_track_are_invalid():
