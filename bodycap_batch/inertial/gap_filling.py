@@ -221,7 +221,7 @@ class _Filler:
     def _with_margins(self, first: int, last: int, known: BoolArray) -> _Gap | None:
         """Return a gap with the frames beside it; None if there are too few, or samples are missing."""
         times_s = self._times_s
-        start_s, end_s = self._solver.samples.times_s[[0, -1]]  # frames without samples are of no use
+        start_s, end_s = self._solver.samples.times_s[[0, -1]]  # the other frames have no samples
         start = int(np.searchsorted(times_s, max(times_s[first - 1] - _MARGIN_S, start_s)))
         end = int(np.searchsorted(times_s, min(times_s[last] + _MARGIN_S, end_s), side="right"))
         inside = np.flatnonzero(known[start:end]) + start
