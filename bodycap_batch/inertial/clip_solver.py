@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.inertial.gap_solver import LOG_SCALE, Constants, SolvedStretch, Stretch, solve_stretch
 from bodycap_batch.inertial.preintegration import SensorNoise
 from bodycap_batch.inertial.samples import InertialSamples
@@ -21,6 +21,13 @@ none."""
 MAX_FIX_SIGMAS = 8.0
 """Maximum residual of a localised pose, in sigmas of six axes. A pose with a larger one is wrong. Evidence:
 none."""
+
+_MEDIAN_SIGMAS, _LEAST_RATIO = 2.3, 1.3
+"""First: median length of six independent normally distributed residuals, in sigmas. Second: ratio of the
+median to it above which the covariances of the poses are enlarged. Evidence: none."""
+_GROWTH_ROUNDS, _MAX_GROWTH = 3, 25.0
+"""Maximum number of times that they are enlarged, and maximum factor of the covariances: poses that rest on
+few points were wrong by up to four of their sigmas in common. Evidence: docs/decisions/telemetry.md."""
 
 
 class ClipSolver:
@@ -65,13 +72,14 @@ class ClipSolver:
         path = replace(self.trajectory, gauge_from_cam=poses, covariance=covariance, status=tuple(status))
         return ClipSolver(path, self.samples, self.constants)
 
-    def solve(self, start: int, end: int, known: BoolArray) -> SolvedStretch | None:
+    def solve(self, start: int, end: int, known: BoolArray, growth: float = 1.0) -> SolvedStretch | None:
         """Solve the frames [start, end); None if the equations have no finite solution.
 
         Args:
             start: First frame. It must be known, like the last one.
             end: One past the last frame.
             known: (N,) True for the frames whose pose is used.
+            growth: Factor of the covariances of these poses.
         """
         stretch = slice(start, end)
         try:
@@ -79,7 +87,7 @@ class ClipSolver:
                 Stretch(
                     times_s=self.times_s[stretch],
                     gauge_from_cam=self.trajectory.gauge_from_cam[stretch],
-                    covariance=self._covariance[stretch],
+                    covariance=growth * self._covariance[stretch],
                     known=known[stretch],
                 ),
                 self.samples,
@@ -90,3 +98,29 @@ class ClipSolver:
             return None
         is_finite = np.isfinite(solved.gauge_from_cam).all() and np.isfinite(solved.covariance).all()
         return solved if is_finite else None
+
+    def solve_grown(self, start: int, end: int, known: BoolArray) -> tuple[SolvedStretch, float] | None:
+        """Solve the frames [start, end) with larger covariances of the poses, if most of them need it.
+
+        Args:
+            start: As in `solve`.
+            end: As in `solve`.
+            known: As in `solve`.
+
+        Returns:
+            The solution and the factor of the covariances; None if there is no finite solution.
+        """
+        growth, solved = 1.0, self.solve(start, end, known)
+        for _ in range(_GROWTH_ROUNDS):
+            if solved is None:
+                return None
+            ratio = float(np.median(solved.fix_sigmas)) / _MEDIAN_SIGMAS
+            if ratio < _LEAST_RATIO or growth * ratio**2 > _MAX_GROWTH:
+                break
+            growth *= ratio**2
+            solved = self.solve(start, end, known, growth)
+        return None if solved is None else (solved, growth)
+
+    def pose_covariance(self, frames: slice) -> FloatArray:
+        """Return the covariances (F,6,6) of localised poses, with the error of each single pose."""
+        return self._covariance[frames]

@@ -60,8 +60,9 @@ _FACTOR_RANGE = (0.01, 100.0)
 motion, and nothing is filled."""
 _MAX_SIGMA_M, _MAX_SIGMA_DEG = 0.05, 2.0
 """Maximum sigmas, per axis, of a pose that is used. Evidence: none."""
-_MAX_WRONG = 2
-"""Maximum number of wrong poses beside a gap that are left out. Evidence: none."""
+_MAX_WRONG, _MAX_WRONG_RATIO = 2, 0.25
+"""Maximum number of wrong poses beside a gap that are left out: this number, or this share of the poses if
+that is more. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,9 +183,10 @@ class _Filler:
         factors = self._factors_of(float(self._times_s[gap.last] - self._times_s[gap.first - 1]))
         if factors is None:
             return None
-        solved = self._solve_without_wrong(gap)
-        if solved is None:
+        found = self._solve_without_wrong(gap)
+        if found is None:
             return None
+        gap, solved = found
         lost = slice(gap.first - gap.start, gap.last - gap.start)
         grown = np.repeat(np.sqrt(factors), 3)
         covariance = solved.covariance[lost] * np.outer(grown, grown)
@@ -195,28 +197,31 @@ class _Filler:
             return None
         return solved.gauge_from_cam[lost], covariance
 
-    def _solve_without_wrong(self, gap: _Gap) -> SolvedStretch | None:
-        """Return the solution of a gap; None if poses beside it are wrong.
+    def _solve_without_wrong(self, gap: _Gap) -> tuple[_Gap, SolvedStretch] | None:
+        """Return a gap with its solution; None if too many poses beside it are wrong.
 
-        A few isolated wrong poses are left out. They must not be at the ends of the stretch.
+        Wrong poses are left out. The stretch may become shorter by them.
         """
         known = self._known.copy()
-        for _ in range(_MAX_WRONG + 1):
-            solved = self._solve(gap, known)
-            if solved is None or solved.worst_fix <= MAX_FIX_SIGMAS:
-                return solved
+        most = max(_MAX_WRONG, int(_MAX_WRONG_RATIO * known[gap.start : gap.end].sum()))
+        for _ in range(most + 1):
+            found = self._solver.solve_grown(gap.start, gap.end, known)
+            if found is None:
+                return None
+            solved, _ = found
+            if solved.worst_fix <= MAX_FIX_SIGMAS:
+                return gap, solved
             known[gap.start + solved.worst_frame] = False
-            if self._with_margins(gap.first, gap.last, known) is None:
+            shorter = self._with_margins(gap.first, gap.last, known)
+            if shorter is None:
                 return None
-            inside = np.flatnonzero(known[gap.start : gap.end])
-            if inside[0] != 0 or inside[-1] != gap.end - gap.start - 1:
-                return None
+            gap = shorter
         return None
 
     def _with_margins(self, first: int, last: int, known: BoolArray) -> _Gap | None:
         """Return a gap with the frames beside it; None if there are too few, or samples are missing."""
         times_s = self._times_s
-        start_s, end_s = self._solver.samples.times_s[[0, -1]]  # frames without samples are of no use
+        start_s, end_s = self._solver.samples.times_s[[0, -1]]  # the other frames have no samples
         start = int(np.searchsorted(times_s, max(times_s[first - 1] - _MARGIN_S, start_s)))
         end = int(np.searchsorted(times_s, min(times_s[last] + _MARGIN_S, end_s), side="right"))
         inside = np.flatnonzero(known[start:end]) + start
@@ -233,9 +238,6 @@ class _Filler:
             return None
         measured = self._solver.samples.covers(times_s[[first - 1]], times_s[[last]])
         return _Gap(first, last, start, end) if measured[0] else None
-
-    def _solve(self, gap: _Gap, known: BoolArray) -> SolvedStretch | None:
-        return self._solver.solve(gap.start, gap.end, known)
 
     def _factors_of(self, length_s: float) -> tuple[float, float] | None:
         """Return the factors of the variances of rotation and position for gaps of a length.
@@ -281,15 +283,19 @@ class _Filler:
         for gap in self._held_out(length_s):
             known = self._known.copy()
             known[gap.first : gap.last] = False
-            solved = self._solve(gap, known)
-            if solved is None or solved.worst_fix > MAX_FIX_SIGMAS:
+            solution = self._solver.solve_grown(gap.start, gap.end, known)
+            if solution is None or solution[0].worst_fix > MAX_FIX_SIGMAS:
                 continue  # wrong poses beside it say nothing about the sensor
+            solved, growth = solution
             inner = slice(gap.first - gap.start, gap.last - gap.start)
+            held_out = slice(gap.first, gap.last)
+            # The errors of the held-out poses are as much larger than stated as those beside them.
+            excess = (growth - 1.0) * self._solver.pose_covariance(held_out)
             errors.append(
                 self._normalised_errors(
-                    self._solver.trajectory.gauge_from_cam[gap.first : gap.last],
+                    self._solver.trajectory.gauge_from_cam[held_out],
                     solved.gauge_from_cam[inner],
-                    solved.covariance[inner],
+                    solved.covariance[inner] + excess,
                 )
             )
         return errors

@@ -49,7 +49,8 @@ class SolvedPath:
 def solve_path(solver: ClipSolver) -> SolvedPath:
     """Solve the localised frames of a clip again.
 
-    A window is used if its poses agree with the sensor, except a few wrong ones. The covariances stay those
+    A window is used if its poses agree with the sensor, except a few wrong ones. Where most poses contradict
+    it by more than their covariances, these are enlarged first. The covariances stay those
     of the pictures: errors that all poses of a window have in common are not seen.
 
     Args:
@@ -75,9 +76,10 @@ def solve_path(solver: ClipSolver) -> SolvedPath:
         used = np.isin(np.arange(len(times_s)), inside)
         if (np.diff(times_s[start:end]) <= 0.0).any():
             continue
-        solved = solver.solve(start, end, used)
-        if solved is None or not _describes_motion(solved, solver):
+        found = solver.solve_grown(start, end, used)
+        if found is None or not _describes_motion(found[0], solver):
             continue
+        solved = found[0]
         sigmas = solved.fix_sigmas[np.searchsorted(inside, core)]
         right = core[sigmas <= MAX_FIX_SIGMAS]
         poses[right] = solved.gauge_from_cam[right - start]

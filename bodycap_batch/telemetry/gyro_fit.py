@@ -24,8 +24,9 @@ _MAX_DELAY_S = 0.25
 """Largest delay that is tried, seconds: several frames. Evidence: none."""
 _DELAY_STEP_S = 0.004
 """Step of the delays that are tried, seconds. Rotations of a hand change little in it. Evidence: none."""
-_MIN_PAIRS = 45
-"""Minimum number of pairs of frames for a fit: 1.5 s at 30 frames per second. Evidence: none."""
+_MIN_PAIRS, _MIN_POSE_PAIRS = 45, 20
+"""Minimum number of pairs of frames for a fit: 1.5 s at 30 frames per second, and of pairs of solved poses,
+whose rotations are not biased by the translation. Evidence: none."""
 _TRIMMED_RATIO = 0.1
 """Fraction of the pairs that is left out of a fit: those with the largest residuals, where the flow failed.
 Evidence: none."""
@@ -140,13 +141,13 @@ def fit_gyro(
         picture: The rotations of the pictures.
         gyro: The gyroscope.
         axes_known: Whether the vectors of the gyroscope are nearly in the axes of the camera.
-        focal_known: Whether the focal length behind the rotations is exact, so that the ratio is 1.
+        focal_known: Whether the rotations come from solved poses, so that the ratio is 1.
 
     Returns:
         The fit; None if there are too few pairs of frames with samples.
     """
     inside = _pairs_with_samples(picture, gyro)
-    if inside.sum() < _MIN_PAIRS:
+    if inside.sum() < (_MIN_POSE_PAIRS if focal_known else _MIN_PAIRS):
         return None
     picture = picture.chosen(np.flatnonzero(inside))
     problem = _Problem(picture, _Integral(gyro), axes_known=axes_known, focal_known=focal_known)

@@ -127,7 +127,7 @@ def test_the_first_guess_is_near_the_profile(name, model):
 
 @pytest.mark.parametrize("turning", [False, True])
 def test_a_lens_that_two_terms_do_not_describe_keeps_its_four_terms(turning):
-    """If the curve of a profile turns well before the corner of the image, its terms have no inverse there."""
+    """If the curve of a profile turns well inside the image, its terms have no inverse there."""
     last = -0.45 if turning else 0.12
     profile = _profile(params=(880.0, 900.0, 950.0, 545.0, 0.04, 0.14, -0.23, last))
     guess = profile.first_guess((960, 540))

@@ -80,7 +80,7 @@ def test_without_a_gyroscope_nothing_is_estimated():
 
 
 def test_too_few_poses_give_no_relation():
-    lost = [frame for frame in range(240) if frame > 30]
+    lost = [frame for frame in range(240) if frame > 18]
     aligned = align_sensor(solved(Hand(1), SECONDS, lost=lost), Sensor().samples(Hand(1), SECONDS))
     assert aligned.comparison.verdict == "unknown"
     assert aligned.fit is None

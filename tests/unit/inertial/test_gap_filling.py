@@ -131,7 +131,7 @@ def test_wrong_poses_beside_a_gap_are_no_base_for_others():
     hand, lost = Hand(1), _lost(10)
     path = solved(hand, SECONDS, lost=lost)
     poses = path.gauge_from_cam.copy()
-    poses[140:146, :3, 3] += 0.3  # the frames after the second gap
+    poses[140:152, :3, 3] += 0.3  # most frames after the second gap
     used = use_sensor(replace(path, gauge_from_cam=poses), Sensor().samples(hand, SECONDS), ONLY_GAPS)
     assert {used.trajectory.status[frame] for frame in range(130, 140)} == {FrameStatus.BLUR}
     assert used.camera.refused == 10
@@ -141,11 +141,12 @@ def test_wrong_poses_beside_a_gap_are_no_base_for_others():
     assert np.linalg.norm(shift, axis=1).max() < 0.01
 
 
-def test_an_isolated_wrong_pose_beside_a_gap_is_left_out():
-    hand, lost = Hand(1), [*range(130, 133), 134, *range(200, 210)]
+@pytest.mark.parametrize("wrong", [slice(133, 134), slice(140, 146)])
+def test_a_few_wrong_poses_beside_a_gap_are_left_out(wrong):
+    hand, lost = Hand(1), [*range(130, 133), *range(134, 140), *range(200, 210)]
     path = solved(hand, SECONDS, lost=lost)
     poses = path.gauge_from_cam.copy()
-    poses[133, :3, 3] += 0.1  # between two gaps
+    poses[wrong, :3, 3] += 0.1  # between two gaps, or after both
     used = use_sensor(replace(path, gauge_from_cam=poses), Sensor().samples(hand, SECONDS), ONLY_GAPS)
     assert used.camera.filled == len(lost)
     shift, _ = _errors(hand, used.trajectory, lost, None)
