@@ -11,8 +11,9 @@ import pytest
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.fill import fill_motion
+from bodycap_batch.fill.foot_paths import foot_path
 from bodycap_batch.fill.leg_geometry import leg_geometry
-from bodycap_batch.model.fill_data import FillMode, FillResult
+from bodycap_batch.model.fill_data import FillMode, FillResult, Footsteps
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.model.skeleton_presets import load_skeleton
@@ -171,6 +172,26 @@ def test_feet_stand_still_on_the_floor_and_never_below_it() -> None:
         assert low.min() > -0.005
         assert low[standing].max() < 0.01
         assert 0.5 < standing.mean() < 0.75
+
+
+def test_the_toes_are_lowered_while_the_ankle_comes_to_rest() -> None:
+    """The heel touches the floor first: when the ankle rests, the foot has turned a part of its way."""
+    legs = leg_geometry(load_skeleton("upper_body", 1.75))
+    assert legs is not None
+    steps = Footsteps(
+        side=np.zeros(2, dtype=np.int64),
+        start_tick=np.array([0, 33]),
+        end_tick=np.array([20, 53]),
+        ankle_in_world_m=np.array([[0.1, 0.0, 0.08], [0.1, -1.3, 0.08]]),
+        heading_rad=np.zeros(2),
+        is_sure=np.ones(2, dtype=bool),
+    )
+    path = foot_path(steps, 0, legs[0], None, np.tile([0.0, -SPEED, 0.0], (53, 1)), 30.0)
+    assert path is not None
+    highest = -path.pitch_rad[20:33].min()
+    assert highest > np.radians(5.0)
+    assert 0.4 * highest < -path.pitch_rad[33] < 0.95 * highest
+    assert abs(path.pitch_rad[38]) < np.radians(0.1)
 
 
 def test_every_filled_joint_moves_without_jumps() -> None:
