@@ -244,6 +244,7 @@ def test_a_job_waits_while_the_store_is_cleaned(bench: SpoolFixture) -> None:
     assert bench.lines == ["walk: started", message, f"walk: done -> {bench.spool.done / 'walk'}"]
 
 
+@pytest.mark.slow
 def test_waiting_for_gc_is_reported_once(bench: SpoolFixture) -> None:
     bench.drop("walk")
     watcher = bench.watcher(once=False)

@@ -410,6 +410,7 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.mark.browser
+@pytest.mark.slow
 def test_the_page_shows_the_jobs_and_accepts_videos(
     bench: SpoolFixture, page: LivePage, browser: Any
 ) -> None:

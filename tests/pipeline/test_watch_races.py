@@ -37,6 +37,7 @@ def preceded_by(function: Callable[..., Any], action: Callable[[], None]) -> Cal
     return both
 
 
+@pytest.mark.slow
 def test_finished_stages_of_a_retried_job_are_kept_until_it_has_run_again(bench: SpoolFixture) -> None:
     bench.order(fail="merge")
     bench.drop("walk")
@@ -116,6 +117,7 @@ def test_a_watcher_finishes_a_killed_retry_but_not_a_running_one(
     assert list(bench.spool.failed.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_running_watcher_finishes_a_killed_retry(
     bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -75,6 +75,7 @@ def test_a_camera_of_another_place_or_time_does_not_end_the_job(fault: str, tmp_
     assert abs(scale.metres_per_map_unit - 1.0) < 3.0 * scale.relative_sigma
 
 
+@pytest.mark.slow
 def test_two_cameras_that_do_not_fit_are_refused_as_before(tmp_path: Path) -> None:
     paths, walk = _walk_with({"left_palm": 30.0, "right_palm": 0.01})
     with pytest.raises(ImplausibleBody, match="not possible for a person") as caught:

@@ -127,6 +127,7 @@ def test_gaps_near_the_first_and_the_last_sample_are_filled():
     assert np.linalg.norm(shift, axis=1).max() < 0.01
 
 
+@pytest.mark.slow
 def test_wrong_poses_beside_a_gap_are_no_base_for_others():
     hand, lost = Hand(1), _lost(10)
     path = solved(hand, SECONDS, lost=lost)
@@ -142,6 +143,7 @@ def test_wrong_poses_beside_a_gap_are_no_base_for_others():
 
 
 @pytest.mark.parametrize("wrong", [slice(133, 134), slice(140, 146)])
+@pytest.mark.slow
 def test_a_few_wrong_poses_beside_a_gap_are_left_out(wrong):
     hand, lost = Hand(1), [*range(130, 133), *range(134, 140), *range(200, 210)]
     path = solved(hand, SECONDS, lost=lost)

@@ -63,6 +63,7 @@ def test_poses_with_larger_errors_than_stated_are_solved_and_their_gaps_filled()
     assert errors_m(hand, used.trajectory)[lost].max() < 2.5 * before_m
 
 
+@pytest.mark.slow
 def test_poses_that_contradict_the_sensor_are_replaced() -> None:
     hand, wrong = Hand(1), range(80, 84)
     path = moved(solved(hand, SECONDS, lost=[77, 78, 79], gauge_from_world=GAUGE), wrong, 0.2)
@@ -84,6 +85,7 @@ def test_a_sensor_that_does_not_describe_the_motion_moves_nothing() -> None:
     assert use_sensor(path, good, TelemetryOptions(smoothing=False)).trajectory is path
 
 
+@pytest.mark.slow
 def test_a_camera_with_short_stretches_uses_the_vertical_and_the_scale_of_another() -> None:
     hand, other = Hand(1), Hand(4)
     lost = [frame for start in range(12, 170, 18) for frame in range(start, start + 6)]
@@ -99,6 +101,7 @@ def test_a_camera_with_short_stretches_uses_the_vertical_and_the_scale_of_anothe
     assert use_sensor(path, samples, TelemetryOptions(), [elsewhere]).camera.filled == 0
 
 
+@pytest.mark.slow
 def test_a_sensor_at_the_end_of_its_range_is_not_believed_there() -> None:
     hand = Hand(1, turn_rad=1.6)
     path = solved(hand, SECONDS, gauge_from_world=GAUGE)

@@ -113,6 +113,7 @@ def _stabilised(times, orientation):
     return image, orientation.inv() * image
 
 
+@pytest.mark.slow
 def test_stabilised_pictures_are_named_and_undone(path):
     times, orientation = path
     image, cam_from_image = _stabilised(times, orientation)
@@ -198,6 +199,7 @@ def test_the_command_compares_on_request(tmp_path, capsys):
     assert "delay" in out
 
 
+@pytest.mark.slow
 def test_check_notes_a_stabilised_video(tmp_path, capsys):
     _clip(tmp_path, stabilised=True)
     main(["check", str(tmp_path), "--skeleton", "none"])
