@@ -27,6 +27,7 @@ from bodycap_batch.mapping.reconstruction.conversion import observed_px
 from bodycap_batch.mapping.reconstruction.model_files import read_model, write_models
 from bodycap_batch.mapping.reconstruction.two_step_adjustment import adjust_in_two_steps
 from bodycap_batch.mapping.results import make_result
+from bodycap_batch.mapping.validation.dominant_points import remove_dominant_points
 from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import MapResult, Trajectory
 
@@ -98,6 +99,7 @@ def refine_map(
         corrected_px = None
         if readout_s:
             model = rolling.with_exact_rates(readout_s, scene_map.readout_s.keys()).corrected(readout_s)
+            remove_dominant_points(model)
             if mapping.is_large(model.num_reg_images()):
                 adjust_in_two_steps(model, settings, calibrated_ids)
             else:

@@ -14,6 +14,7 @@ from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robustly
 from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction
 from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, registered_ids
+from bodycap_batch.mapping.validation.dominant_points import remove_dominant_points
 from bodycap_batch.mapping.validation.near_points import remove_near_points
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
 from bodycap_batch.model.scene import MapResult
@@ -22,7 +23,7 @@ from bodycap_batch.model.scene import MapResult
 def finalise_models(
     models: list[Any], context: MappingContext, capture: Capture, resected: Sequence[set[int] | None]
 ) -> int:
-    """Remove transient points and points on the wearer from models, and adjust the models robustly, in place.
+    """Remove transient points, points on the wearer and dominant points, and adjust robustly, in place.
 
     A further model that is left without points is removed from the list: its keyframes saw nothing but
     transient points, or contradict each other. The largest model stays.
@@ -44,6 +45,7 @@ def finalise_models(
         context.stage.progress(number, len(models), "maps adjusted")
         total += remove_near_points(model)
         total += remove_transient_points(model, times_ns)
+        total += remove_dominant_points(model)
         if number and not model.num_points3D():
             empty.add(number)
             continue
