@@ -111,7 +111,9 @@ def _distance_from_line(time: FloatArray, centre_m: FloatArray) -> FloatArray:
     spread = (past - middle) / np.maximum(((past - middle) ** 2).sum(axis=1, keepdims=True), 1e-12)
     velocity = np.einsum("nw,nwk->nk", spread, places)
     predicted = places.mean(axis=1) - middle * velocity
-    out[index] = np.linalg.norm(predicted - centre_m[index], axis=1)
+    # Across lost frames, a constant velocity predicts nothing: an acceleration looks like an error.
+    is_near = np.abs(time[index] - time[index - _LINE_FRAMES]) < _LINE_FRAMES + 0.5
+    out[index] = np.where(is_near, np.linalg.norm(predicted - centre_m[index], axis=1), 0.0)
     return out
 
 

@@ -211,6 +211,15 @@ def test_outliers_at_the_ends_of_a_run_are_removed(wrong, lost):
     assert set(wrong) <= removed <= {*wrong, 45}
 
 
+def test_right_frames_behind_a_short_gap_at_the_end_of_a_run_are_kept():
+    """The frames before the gap predict nothing behind it: the hand turns round in these four frames."""
+    seconds = np.arange(94) / 30.0
+    path = np.stack([0.3 * np.sin(4.0 * np.pi * seconds), seconds, 0.0 * seconds], axis=1)
+    seen = np.delete(np.arange(94), [88, 89, 90, 91])
+    track = _track(path).keep(np.isin(np.arange(94), seen))
+    assert remove_outliers(track, 1.0, 30.0).frames.tolist() == seen.tolist()
+
+
 def test_poses_in_gaps_and_outside_a_track_are_invalid():
     track = _track(np.stack([np.arange(10.0), np.zeros(10), np.zeros(10)], axis=1))
     with_gap = track.keep(np.array([True] * 3 + [False] * 4 + [True] * 3))
