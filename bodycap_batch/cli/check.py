@@ -49,7 +49,8 @@ def check(  # noqa: PLR0913, PLR0917 - the flags a user types
     report = check_path(find_job(job).file, make_overrides(out, skeleton, height, camera, activity, places))
     if report.ready and report.job is not None:
         capture = report.job.capture
-        notes = (*report.notes, *describe_clocks(capture), *telemetry_notes(capture))
+        clocks = describe_clocks(capture, sensors=report.job.telemetry.clocks)
+        notes = (*report.notes, *clocks, *telemetry_notes(capture))
         report = replace(report, notes=notes)
     if as_json:
         print_json(report.to_dict(), indent=1)

@@ -28,11 +28,12 @@ def sync(
         typer.Option(metavar="FILE.svg", help="Draw the correlations and the offsets along time."),
     ] = None,
 ) -> None:
-    """Find the clock offsets of the cameras from their sound.
+    """Find the clock offsets of the cameras from sound or sensors.
 
     Prints the offset and the drift of each camera's clock relative to the torso's camera, and the lines for
-    the job file. Where the sound does not decide, the clocks of the last run of the job are shown; the run
-    estimates them from the motion. Nothing in the job is changed.
+    the job file. Inertial sensors are used where the sound does not decide. Where neither decides, the clocks
+    of the last run of the job are shown; the run estimates them from the motion. Nothing in the job is
+    changed.
 
     \b
     Example:
@@ -52,10 +53,12 @@ def sync(
             path=job,
             hint="give a folder or a job with the videos of all cameras",
         )
-    estimates = with_clocks_of_run(estimate_clocks(capture), results_folder(loaded))
+    estimates = with_clocks_of_run(
+        estimate_clocks(capture, sensors=loaded.telemetry.clocks), results_folder(loaded)
+    )
     if picture is not None:
         write_text(picture, draw_clocks(estimates))
-    _require_common_sound(estimates, job)
+    _require_clocks(estimates, job)
     if as_json:
         print_json(clocks_as_json(estimates), indent=1)
     else:
@@ -67,7 +70,7 @@ def with_clocks_of_run(estimates: ClockEstimates, results: Path) -> ClockEstimat
     """Return the clocks, completed by those that the last run of the job estimated from the motion.
 
     Args:
-        estimates: The clocks that were estimated from the sound.
+        estimates: The clocks that were estimated from sound and sensors.
         results: Folder of the results of the job. It may be missing.
     """
     try:
@@ -113,7 +116,9 @@ def lines_of(estimates: ClockEstimates) -> Iterator[str]:
             for text in texts:
                 mark = f"{kind}: {clock.camera}: "
                 yield from textwrap.wrap(text, 100, initial_indent=mark, subsequent_indent="  ")
-    found = [clock for clock in estimates.cameras if clock.source in ("sound", "motion")]
+    from bodycap_batch.model.camera_clock import ESTIMATED_SOURCES
+
+    found = [clock for clock in estimates.cameras if clock.source in ESTIMATED_SOURCES]
     if found:
         yield "for the cameras in job.yaml:"
         for clock in found:
@@ -129,16 +134,17 @@ def _figures(clock: ClockEstimate) -> str:
     return f"{clock.offset_s:+10.4f} s  {sigma:>9}  {drift:>16}"
 
 
-def _require_common_sound(estimates: ClockEstimates, job: Path) -> None:
-    """Raise an error if the sound gives the clock of no camera."""
+def _require_clocks(estimates: ClockEstimates, job: Path) -> None:
+    """Raise an error if neither sound nor sensors give the clock of a camera."""
     from bodycap_batch.core.errors import EstimationError
+    from bodycap_batch.model.camera_clock import ESTIMATED_SOURCES
 
     others = [clock for clock in estimates.cameras if clock.camera != estimates.reference]
-    if any(clock.source in ("sound", "motion", "common") for clock in others):
+    if any(clock.source in (*ESTIMATED_SOURCES, "common") for clock in others):
         return
     reasons = "; ".join(f"{clock.camera}: {', '.join(clock.reasons)}" for clock in others)
     raise EstimationError(
-        f"the sound of no camera matches that of {estimates.reference} ({reasons})",
+        f"neither sound nor inertial sensors of any camera agree with {estimates.reference} ({reasons})",
         path=job,
         hint="check that all videos are of the same recording and have sound; otherwise clap once in view of "
         "all cameras and state offset_s",

@@ -14,7 +14,7 @@ from bodycap_batch.clocks.estimate import (
 )
 from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.model.camera_clock import CaptureClocks, ClockRelation
+from bodycap_batch.model.camera_clock import ESTIMATED_SOURCES, CaptureClocks, ClockRelation
 
 UNKNOWN_CLOCK_HINT = "clap once, or hop once, while all cameras record, or state offset_s"
 """What a user can do about an unknown clock."""
@@ -67,19 +67,22 @@ def clock_notes(clocks: CaptureClocks) -> list[str]:
     ]
 
 
-def describe_clocks(spec: CaptureConfig, threads: int | None = None) -> list[str]:
-    """Return a sentence for the user about the clock of each camera, from what is stated and from the sound.
+def describe_clocks(spec: CaptureConfig, threads: int | None = None, *, sensors: bool = True) -> list[str]:
+    """Return a sentence for the user about the clock of each camera.
+
+    The clocks are those that are stated, or that the sound or the inertial sensors determine.
 
     Args:
         spec: The capture block of a job, as returned by `load_job`.
         threads: Number of cameras or pairs that are worked on at the same time; None for all processors.
+        sensors: Whether the inertial sensors are used.
 
     Raises:
         CaptureError: A video or its timestamps cannot be used.
     """
     if len(spec.cameras) < 2:
         return []
-    estimates = estimate_clocks(spec, threads)
+    estimates = estimate_clocks(spec, threads, sensors=sensors)
     clocks = decide_clocks(spec, estimates)
     base_s = clocks.cameras[clocks.reference].offset_s
     lines = []
@@ -90,8 +93,8 @@ def describe_clocks(spec: CaptureConfig, threads: int | None = None) -> list[str
         elif not clock.is_known:
             reasons = "; ".join(estimates.camera(name).reasons)
             text = (
-                f"{name}: the sound does not give the clock offset ({reasons}); the run estimates the offset "
-                "from the motion"
+                f"{name}: neither sound nor sensors give the clock offset ({reasons}); the run estimates "
+                "the offset from the motion"
             )
         lines.append("; ".join([text, *(clock.notes if clock.is_known else ())]))
     return lines
@@ -155,8 +158,8 @@ def _clock_of(
 
 
 def _estimated_clock(estimate: ClockEstimate, base_s: float) -> ClockRelation:
-    if estimate.source not in ("sound", "motion") or estimate.offset_s is None:
-        why = "; ".join(estimate.reasons) or "neither the sound nor the motion determines it"
+    if estimate.source not in ESTIMATED_SOURCES or estimate.offset_s is None:
+        why = "; ".join(estimate.reasons) or "neither sound nor sensors nor the motion determine it"
         return ClockRelation(
             drift_sigma_ppm=CRYSTAL_SIGMA_PPM,
             source="none",
@@ -182,7 +185,7 @@ def _with_shared_clock(group: dict[str, ClockRelation]) -> dict[str, ClockRelati
     known = [name for name, clock in group.items() if clock.is_known]
     if not known:
         return group
-    order = ("common", "stated", "sound", "motion")
+    order = ("common", "stated", *ESTIMATED_SOURCES)
     best = group[min(known, key=lambda name: (order.index(group[name].source), group[name].sigma_s))]
     shared = replace(best, source="common", notes=(), is_contradicted=False)
     return {

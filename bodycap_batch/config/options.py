@@ -264,6 +264,10 @@ class TelemetryOptions(Options):
     gps: bool = Field(
         True, description="GPS positions give the place of the world on the Earth; the scale is not changed"
     )
+    clocks: bool = Field(
+        True,
+        description="the inertial sensors give the clocks of cameras whose sound does not",
+    )
     search: bool = Field(
         True,
         description="lost frames are searched again near the poses that the inertial sensor gives",

@@ -38,6 +38,7 @@ from tests.bench import (
     spool,
     sync,
     uncertainty,
+    upright,
     viewer,
     violent,
 )
@@ -46,6 +47,7 @@ from tests.bench.rows import DATA, LAB, Row, row_of, rows_in
 _WITH_OPTIONS = {
     "simulation": simulation.main,
     "uncertainty": uncertainty.main,
+    "upright": upright.main,
     "joining": joining.main,
     "solving": solving.main,
     "seeds": seeds.main,
