@@ -153,6 +153,8 @@ _RESTLESS_HZ = 0.5
 """Cutoff frequency (Hz) of this amplitude. Derivation: less than a third of the frequency of steps."""
 _MIN_STEPS = 2
 """Minimum number of successive steps that can be certain. Evidence: none."""
+_YAW = 1
+"""Column of the yaw rate in the alternating signals."""
 _TINY = 1e-9
 """Smallest power of a signal that is not zero. Origin: against a division by zero."""
 
@@ -222,8 +224,9 @@ class _StepSignals:
         period_s: (T,) expected time between two steps, seconds.
         speed: (T,) speed of the slow path, m/s.
         sinking: (T,) height of the slow path over its median, metres.
-        sides: (T,3) acceleration of the sway (m/s²), rate of the trunk's yaw without the slow heading
-            (rad/s), and velocity of the left hand relative to the right hand (m/s).
+        alternating: (T,3) signals that change their sign from step to step in a walk: acceleration of the
+            sway (m/s²), rate of the trunk's yaw without the slow heading (rad/s), and velocity of the left
+            hand relative to the right hand (m/s).
         is_restless: (T,) True if the trunk rises and falls as with steps.
     """
 
@@ -231,7 +234,7 @@ class _StepSignals:
     period_s: FloatArray
     speed: FloatArray
     sinking: FloatArray
-    sides: FloatArray
+    alternating: FloatArray
     is_restless: BoolArray
 
 
@@ -262,7 +265,9 @@ def find_contacts(signals: TrunkSignals, standing_m: float | None = None) -> Con
         period_s=period_s,
         speed=signals.speed_m_per_s()[chosen],
         sinking=(height - np.median(height))[chosen],
-        sides=np.column_stack([signals.sway_m_per_s2, signals.twist_rad_per_s, signals.arm_m_per_s])[chosen],
+        alternating=np.column_stack([signals.sway_m_per_s2, signals.twist_rad_per_s, signals.arm_m_per_s])[
+            chosen
+        ],
         is_restless=(
             oscillation_amplitude(signals.rise_m_per_s2, _RESTLESS_HZ, signals.fps) > _RESTLESS_M_PER_S2
         )[chosen],
@@ -490,7 +495,7 @@ def _sure_ticks(state: IntArray, evidence: _Evidence, signals: _StepSignals) -> 
         if len(kept) >= _MIN_STEPS:
             support = _mean_of_three(np.array([_support(state, evidence, *each) for each in kept]))
             ordinary = np.array([_is_ordinary(signals, *each) for each in kept])
-            ordinary &= _do_sides_alternate(signals.sides, kept)
+            ordinary &= _do_signals_alternate(signals.alternating, kept)
             ordinary &= support.sum(axis=1) >= _SURE_NATS
             ordinary &= support.min(axis=1) >= -_MAX_CONTRADICTION_NATS
             padded = np.concatenate([[False], ordinary, [False]])
@@ -532,11 +537,11 @@ def _is_ordinary(signals: _StepSignals, start: int, end: int) -> bool:
         _ORDINARY_DURATION[0] <= duration <= _ORDINARY_DURATION[1]
         and signals.speed[own].mean() >= _SURE_SPEED
         and np.abs(signals.sinking[own]).max() <= _MAX_SINKING_M
-        and np.abs(signals.sides[own, 1]).max() <= _MAX_TWIST
+        and np.abs(signals.alternating[own, _YAW]).max() <= _MAX_TWIST
     )
 
 
-def _do_sides_alternate(sides: FloatArray, steps: list[tuple[int, int]]) -> BoolArray:
+def _do_signals_alternate(signals: FloatArray, steps: list[tuple[int, int]]) -> BoolArray:
     """Return (N,) True where the signals around each of N successive steps alternate with the sides.
 
     In a walk, sway, yaw and arms are the mirror image of what they were one step before. In a dance they are
@@ -544,24 +549,24 @@ def _do_sides_alternate(sides: FloatArray, steps: list[tuple[int, int]]) -> Bool
     others: then only a yaw that varies as little as in a walk is required.
 
     Args:
-        sides: (T,3) acceleration of the sway, rate of the yaw and velocity of the arms.
+        signals: (T,3) acceleration of the sway, rate of the yaw and velocity of the arms.
         steps: First tick and end of the N times on one foot of one walk.
     """
     middles = np.array([0.5 * (start + end - 1) for start, end in steps])
-    ticks = np.arange(len(sides))
+    ticks = np.arange(len(signals))
     out = np.zeros(len(steps), dtype=bool)
     for index in range(len(steps)):
         near = middles[max(index - _RHYTHM_STEPS, 0) : index + _RHYTHM_STEPS + 1]
         if len(near) <= _MIN_STEPS:
             start, end = steps[index]
-            out[index] = sides[start:end, 1].std() <= _MAX_IRREGULAR_TWIST
+            out[index] = signals[start:end, _YAW].std() <= _MAX_IRREGULAR_TWIST
             continue
         steps_on = np.arange((len(near) - 1) * _SAMPLES_PER_STEP + 1) / _SAMPLES_PER_STEP
         at = np.interp(steps_on, np.arange(len(near)), near)
-        values = np.column_stack([np.interp(at, ticks, signal) for signal in sides.T])
+        values = np.column_stack([np.interp(at, ticks, signal) for signal in signals.T])
         before, after = values[:-_SAMPLES_PER_STEP], values[_SAMPLES_PER_STEP:]
         power = 0.5 * (before**2 + after**2).mean(axis=0)
         alternation = -(before * after).mean(axis=0) / np.maximum(power, _TINY)
         irregular = np.sqrt(0.5 * ((before + after) ** 2).mean(axis=0))
-        out[index] = alternation.max() >= _MIN_ALTERNATION and irregular[1] <= _MAX_IRREGULAR_TWIST
+        out[index] = alternation.max() >= _MIN_ALTERNATION and irregular[_YAW] <= _MAX_IRREGULAR_TWIST
     return out

@@ -23,8 +23,9 @@ MAX_FIX_SIGMAS = 8.0
 none."""
 
 _MEDIAN_SIGMAS, _LEAST_RATIO = 2.3, 1.3
-"""First: median length of six independent normally distributed residuals, in sigmas. Second: ratio of the
-median to it above which the covariances of the poses are enlarged. Evidence: none."""
+"""First: median length of six independent normally distributed residuals, in sigmas. Derivation: the square
+root of the median of a chi-squared variable with six degrees of freedom, 5.35. Second: ratio of the median to
+it above which the covariances of the poses are enlarged. Evidence: none."""
 _GROWTH_ROUNDS, _MAX_GROWTH = 3, 25.0
 """Maximum number of times that they are enlarged, and maximum factor of the covariances: poses that rest on
 few points were wrong by up to four of their sigmas in common. Evidence: docs/decisions/telemetry.md."""

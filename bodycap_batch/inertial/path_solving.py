@@ -49,15 +49,15 @@ class SolvedPath:
 def solve_path(solver: ClipSolver) -> SolvedPath:
     """Solve the localised frames of a clip again.
 
-    A window is used if its poses agree with the sensor, except a few wrong ones. Where most poses contradict
-    it by more than their covariances, these are enlarged first. The covariances stay those
-    of the pictures: errors that all poses of a window have in common are not seen.
+    A window is used if its poses agree with the sensor, except a few wrong ones. Errors that all poses of a
+    window have in common are not seen, so the covariances stay those of the pictures. Where most poses of a
+    window contradict the sensor by more than these covariances, they are enlarged until the poses agree.
 
     Args:
         solver: The poses and the samples of the clip.
     """
     path, times_s, known = solver.trajectory, solver.times_s, solver.known
-    poses = path.gauge_from_cam.copy()
+    poses, covariance = path.gauge_from_cam.copy(), path.covariance.copy()
     moved, wrong = np.zeros(len(times_s), dtype=bool), np.zeros(len(times_s), dtype=bool)
     frames = np.flatnonzero(known)
     usable = frames[
@@ -79,13 +79,15 @@ def solve_path(solver: ClipSolver) -> SolvedPath:
         found = solver.solve_grown(start, end, used)
         if found is None or not _describes_motion(found[0], solver):
             continue
-        solved = found[0]
+        solved, growth = found
         sigmas = solved.fix_sigmas[np.searchsorted(inside, core)]
         right = core[sigmas <= MAX_FIX_SIGMAS]
         poses[right] = solved.gauge_from_cam[right - start]
+        covariance[right] *= growth
         moved[right] = True
         wrong[core] = sigmas > MAX_FIX_SIGMAS
-    return SolvedPath(trajectory=replace(path, gauge_from_cam=poses), moved=moved, wrong=wrong)
+    solved_path = replace(path, gauge_from_cam=poses, covariance=covariance)
+    return SolvedPath(trajectory=solved_path, moved=moved, wrong=wrong)
 
 
 def _describes_motion(solved: SolvedStretch, solver: ClipSolver) -> bool:

@@ -37,6 +37,15 @@ _MAX_AUTOCORRELATION = 0.95
 """Largest autocorrelation of the residuals of successive windows that is believed. Evidence: none."""
 _PRIOR_SCALE_WEIGHT = 1e-6
 """Weight that keeps the equations regular if nothing moves, so that the scale is unknown."""
+_SENSITIVITY_SIGMA = 0.01
+"""Standard deviation of the sensitivity of an axis of an accelerometer, as a share. The axes of all cameras
+are independent. Origin: as in `_GRAVITY_SIGMA_M_S2`. Evidence: docs/decisions/telemetry.md."""
+_MAX_LEVERAGE = 0.9
+"""Maximum leverage of a window that is believed. Beyond it, the residual says nothing. Evidence: none."""
+_MAX_NOISE_SHARE = 0.5
+"""Largest share of the information about the scale that is believed to be noise. Evidence: none."""
+_SMALLEST = 1e-18
+"""Smallest divisor. It prevents a division by zero."""
 _OWN = 9
 """Number of unknowns of a camera: bias, distance, turn."""
 
@@ -97,12 +106,39 @@ def fit_gravity(cameras: Sequence[ForceWindows]) -> GravityFit | None:
             gravity_row[:3] = solution[:3] / np.linalg.norm(solution[:3]) / _GRAVITY_SIGMA_M_S2
             information += np.outer(gravity_row, gravity_row)
             vector += gravity_row * (GRAVITY_M_S2 / _GRAVITY_SIGMA_M_S2)
+            of_scale = 1.0 / np.linalg.inv(information)[3, 3]
+            of_noise = _path_noise(values - rows @ solution, weight, solution[3]) / noise**2
+            information[3, 3] -= min(of_noise, _MAX_NOISE_SHARE * of_scale)
         solution = np.linalg.solve(information, vector)
         size = np.linalg.norm(values - rows @ solution, axis=1)
+        size /= np.sqrt(1.0 - _leverage(rows, weight / noise**2, information))
         noise = max(1.2 * float(np.median(size)) / np.sqrt(3.0), _MIN_NOISE_M_S2)
         weight = 1.0 / (1.0 + (size / (2.5 * noise)) ** 2) ** 2
     covariance = np.linalg.inv(information) * _growth(cameras, values - rows @ solution, weight)
+    covariance[3, 3] += (_SENSITIVITY_SIGMA * solution[3]) ** 2 / (3.0 * len(cameras))
     return _fit_of(solution, covariance, noise, len(values))
+
+
+def _path_noise(error: FloatArray, weight: FloatArray, scale: float) -> float:
+    """Return by how much the noise of the solved paths raises the weighted sum of squared accelerations.
+
+    The residuals (N,3) of a solution are the noise of the path times its scale, but for the noise that
+    windows with exact poses have. Uncorrected, this sum makes the scale too small.
+
+    Source: Fuller, "Measurement error models", 1987, section 1.2.
+    """
+    squared = (error**2).sum(axis=1) - 3.0 * _MIN_NOISE_M_S2**2
+    return max(float(weight @ squared), 0.0) / max(scale**2, _SMALLEST)
+
+
+def _leverage(rows: FloatArray, weight: FloatArray, information: FloatArray) -> FloatArray:
+    """Return the share (N,) of its own residual that each window takes up by its influence on the solution.
+
+    With few windows for each camera, the residuals are much smaller than the noise.
+    """
+    covariance = np.linalg.inv(information)
+    taken = weight / 3.0 * np.einsum("nki,ij,nkj->n", rows, covariance, rows)
+    return np.asarray(np.clip(taken, 0.0, _MAX_LEVERAGE))
 
 
 def _fit_of(solution: FloatArray, covariance: FloatArray, noise: float, windows: int) -> GravityFit:
@@ -170,5 +206,5 @@ def _growth(cameras: Sequence[ForceWindows], error: FloatArray, weight: FloatArr
         first += len(camera.times_s)
         product += float((own[1:] * own[:-1]).sum())
         energy += float((own**2).sum())
-    correlation = min(max(product / max(energy, 1e-18), 0.0), _MAX_AUTOCORRELATION)
+    correlation = min(max(product / max(energy, _SMALLEST), 0.0), _MAX_AUTOCORRELATION)
     return (1.0 + correlation) / (1.0 - correlation)

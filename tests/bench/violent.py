@@ -71,8 +71,7 @@ def prepare(capture: Path, work: Path, end_s: float | None) -> Path:
     (folder / "gt").mkdir(parents=True)
     for file in (*capture.glob("*.mp4"), *capture.glob("*.imu.csv"), capture / "calib.json"):
         shutil.copy(file, folder)
-    for file in (capture / "gt").iterdir():
-        shutil.copy(file, folder / "gt")
+    shutil.copytree(capture / "gt", folder / "gt", dirs_exist_ok=True)
     for number, video in enumerate(sorted(folder.glob("*.mp4"))):
         if not (folder / f"{video.stem}.imu.csv").exists():
             poses, length_s = smooth_path(folder / "gt" / f"{video.stem}.tum")

@@ -10,11 +10,8 @@ import numpy as np
 from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.body.provisional_scale import distance_constraint, kinematic_neighbours
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.model.camera_clock import CameraClock
+from bodycap_batch.model.camera_clock import ESTIMATED_SOURCES, CameraClock
 from bodycap_batch.model.skeleton import Mount
-
-_ESTIMATED = ("sound", "motion")
-"""Sources of clocks whose uncertainty is propagated. A stated clock is used as it is stated."""
 
 
 def scale_sigma_from_clocks(
@@ -26,8 +23,8 @@ def scale_sigma_from_clocks(
     """Return the sigma of the logarithm of the metric scale that the sigmas of the clocks cause.
 
     A wrong clock changes the distances between the cameras of neighbouring bones. The scale is inversely
-    proportional to these distances. The change is computed for a shift of each clock by one sigma, to earlier
-    and to later times.
+    proportional to these distances. A stated clock is used as it is stated. The change is computed for a
+    shift of each clock by one sigma, to earlier and to later times.
 
     Args:
         bones: The graph's bones.
@@ -37,7 +34,7 @@ def scale_sigma_from_clocks(
     """
     variance = 0.0
     for camera, clock in clocks.items():
-        if clock.source not in _ESTIMATED or not clock.sigma_s:
+        if clock.source not in ESTIMATED_SOURCES or not clock.sigma_s:
             continue
         logs = [
             _log_distance(bones, _with_shift(tracks, camera, side * clock.sigma_s), mounts)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.inertial import align_sensor, force_windows
-from bodycap_batch.model.geometry import Similarity, so3_exp
+from bodycap_batch.model.geometry import Similarity, skew, so3_exp
 from bodycap_batch.model.gravity import fit_gravity
 from bodycap_batch.model.inertial_camera import ForceWindows
 from tests.inertial import Hand, Sensor, solved
@@ -102,3 +102,54 @@ def test_too_few_windows_give_nothing():
     assert 0 < len(windows.times_s) < 5
     assert fit_gravity([windows]) is None
     assert fit_gravity([]) is None
+
+
+def _drawn_windows(
+    rng: np.random.Generator, count: int, path_noise: float, force_noise: float = 0.005
+) -> ForceWindows:
+    """Return windows of a sensor with a bias alone, in a gauge of metres, with accelerations of 1 m/s²."""
+    turn = so3_exp(rng.normal(0.0, 0.7, (count, 3)))
+    acceleration, up = rng.normal(0.0, 1.0, (count, 3)), np.array([0.0, 0.0, 9.81])
+    bias = rng.normal(0.0, 0.1, 3)
+    force = acceleration + up + turn @ bias + rng.normal(0.0, force_noise, (count, 3))
+    return ForceWindows(
+        times_s=0.4 * np.arange(count),
+        force=force,
+        rotation=turn,
+        turned_force=turn @ skew(np.einsum("nji,nj->ni", turn, force)),
+        acceleration=acceleration + rng.normal(0.0, path_noise, (count, 3)),
+        lever=rng.normal(0.0, 3.0, (count, 3, 3)),
+        rotation_sigma_rad=np.full(3, 0.005),
+    )
+
+
+def test_the_noise_of_the_path_does_not_make_the_scale_too_small():
+    """The squared noise adds to the squared accelerations: uncorrected, the scale would be 14 % too small."""
+    rng = np.random.default_rng(5)
+    found = fit_gravity([_drawn_windows(rng, 300, path_noise=0.4)])
+    assert found is not None
+    # 300 windows with three axes: 0.4 / sqrt(900) is 1.3 %.
+    assert abs(np.log(found.metres_per_unit)) < 3.0 * 0.013
+    assert abs(np.log(found.metres_per_unit)) < 3.0 * found.scale_sigma
+
+
+def test_the_sigma_of_the_scale_holds_with_few_windows_for_each_camera():
+    """Eleven windows with 31 unknowns: their residuals are much smaller than the noise."""
+    errors = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        found = fit_gravity([_drawn_windows(rng, count, path_noise=0.1) for count in (5, 1, 5)])
+        assert found is not None
+        errors.append(np.log(found.metres_per_unit) / found.scale_sigma)
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.4
+    assert np.mean(np.abs(errors) < 2.0) > 0.88
+
+
+def test_the_sigma_of_the_scale_contains_the_sensitivity_of_the_accelerometer():
+    windows = [_drawn_windows(np.random.default_rng(seed), 200, path_noise=0.0) for seed in range(3)]
+    one, three = fit_gravity(windows[:1]), fit_gravity(windows)
+    assert one is not None
+    assert three is not None
+    # 1 % for each axis; the three axes of each camera are independent.
+    assert one.scale_sigma == pytest.approx(0.01 / np.sqrt(3.0), rel=0.1)
+    assert three.scale_sigma == pytest.approx(0.01 / 3.0, rel=0.1)

@@ -57,6 +57,8 @@ def test_poses_with_larger_errors_than_stated_are_solved_and_their_gaps_filled()
         np.sqrt(np.mean(errors_m(hand, each)[localised] ** 2)) for each in (path, used.trajectory)
     )
     assert used.camera.solved == localised.sum()
+    variance = [np.trace(each.covariance[:, 3:, 3:], axis1=1, axis2=2) for each in (path, used.trajectory)]
+    assert np.median(variance[1][localised] / variance[0][localised]) > 1.5
     # 48 poses of a window determine nine unknowns; the vertical and the scale have errors, too.
     assert after_m < 0.6 * before_m
     assert used.camera.filled == len(lost)
