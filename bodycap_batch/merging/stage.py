@@ -60,7 +60,7 @@ from bodycap_batch.merging.world.floor import (
     standing_height,
 )
 from bodycap_batch.merging.world.world_frame import initial_heading, rotation_to_z_up, world_from_solved_frame
-from bodycap_batch.model.camera_clock import CameraClock
+from bodycap_batch.model.camera_clock import ESTIMATED_SOURCES, CameraClock
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs, MergeResult, SolvedBody
 from bodycap_batch.model.merge_report import AlignedCameraReport
@@ -292,7 +292,7 @@ def timeline(
     """
     times = [clocks[each.camera].common_times_ns(each.times_ns) for each in used]
     start, end = min(int(each.min()) for each in times), max(int(each.max()) for each in times)
-    if any(clocks[each.camera].source in ("sound", "motion") for each in used):
+    if any(clocks[each.camera].source in ESTIMATED_SOURCES for each in used):
         late, early = max(int(each.min()) for each in times), min(int(each.max()) for each in times)
         late = late if late - start <= _MAX_TRIM_NS else start
         early = early if end - early <= _MAX_TRIM_NS else end

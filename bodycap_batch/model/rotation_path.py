@@ -43,9 +43,15 @@ _END_RATE_SIGMA = 0.2
 docs/decisions/registration.md."""
 _END_RATE_SIGMA_RATIO = 0.4
 """The same error as a ratio of this velocity. Both are added. Evidence: docs/decisions/registration.md."""
-_MIN_END_POINTS = 60
-"""Minimum number of observations of a frame at the end of a run of poses for the larger expected error.
-Evidence: none."""
+_MIN_LOOSE_POINTS = 60
+"""Minimum number of observations of a frame for the larger expected error, at the end of a run of poses and
+where the velocity deviates from its neighbours. Evidence: none."""
+_RATE_DEVIATION_RATIO = 0.3
+"""Expected error of the angular velocity of a frame, as a ratio of its deviation from both neighbours.
+Evidence: docs/decisions/registration.md."""
+_ACCELERATION_DEVIATION_RATIO = 1.0
+"""Expected change of the angular velocity in one frame interval that the cubic does not contain, as a ratio
+of the same deviation. Evidence: docs/decisions/registration.md."""
 _SPEED_PERCENTILE = 90.0
 """Percentile of the speeds of a camera from which its largest plausible speed is computed. Evidence: none."""
 _MAX_SPEED_RATIO = 2.0
@@ -78,6 +84,8 @@ class RotationPath:
         rate: (N,3) angular velocity at the time of each frame, in the camera frame, rad/s.
         gyro: What the gyroscope of the camera measured; None if there is none. Near a frame time that its
             samples cover, it replaces the cubic.
+        acceleration: (N,3) angular acceleration around the time of each frame that is not contained in the
+            cubic, in the camera frame, rad/s²; None if there is none.
     """
 
     times_ns: IntArray
@@ -85,6 +93,7 @@ class RotationPath:
     segment: IntArray
     rate: FloatArray
     gyro: GyroRates | None = None
+    acceleration: FloatArray | None = None
 
     @staticmethod
     def from_steps(
@@ -235,6 +244,18 @@ class RotationPath:
         span_s = np.where(inside, (self.times_ns[other] - self.times_ns[frame]) * 1e-9, np.inf)
         return np.asarray(delay_s * (1.0 - delay_s / span_s) ** 2)
 
+    def rate_deviations(self) -> FloatArray:
+        """Return how far (N,) the angular velocity of each frame is from the mean of both neighbours, rad/s.
+
+        At an end of a segment, it is the distance from the only neighbour; 0 without a neighbour.
+        """
+        known = (np.diff(self.segment) == 0)[:, None]
+        step = np.where(known, np.diff(self.rate, axis=0), 0.0)
+        nothing = np.zeros((1, 3))
+        before, after = np.concatenate([nothing, step]), np.concatenate([step, nothing])
+        sides = np.concatenate([[[False]], known]).astype(int) + np.concatenate([known, [[False]]])
+        return np.asarray(np.linalg.norm((before - after) / np.maximum(sides, 1), axis=1))
+
     def rotvec_to_instant(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
         """Return the rotation vectors (M,3) of `frame_from_instant`, rad.
 
@@ -269,6 +290,8 @@ class RotationPath:
             + u**2 * (3.0 - 2.0 * u) * end[position]
             + u**2 * (u - 1.0) * span * end_rate
         )
+        if self.acceleration is not None:
+            turn += self.acceleration[frame] * (0.5 * delay_s * self.rate_leverage_s(frame, delay_s))[:, None]
         return turn
 
 
@@ -458,12 +481,15 @@ class PosePath:
         rotation: The orientation over time.
         velocity: (N,3) velocity of the camera at each frame time, map units per second.
         acceleration: (N,3) acceleration of the camera at each frame time, map units per second squared.
+        rate_sigma: (N,) standard deviation of the angular velocity of each frame about an axis, rad/s, before
+            the observations of the frame are used; None if it is unknown.
     """
 
     map_from_cam: FloatArray
     rotation: RotationPath
     velocity: FloatArray
     acceleration: FloatArray
+    rate_sigma: FloatArray | None = None
 
     @staticmethod
     def create(
@@ -544,13 +570,14 @@ class PosePath:
     def with_fitted_rates(
         self, camera: Camera, frame: IntArray, points: FloatArray, px: FloatArray, readout_s: float
     ) -> PosePath:
-        """Return the path with angular velocities that fit the observations of each frame.
+        """Return the path with angular velocities and accelerations that fit the observations of each frame.
 
         A hand shakes faster than its video can tell from frame to frame. But the rows of a frame are exposed
-        one after another, so the observations of a frame tell its angular velocity. A correction of the
-        velocity is fitted together with a correction of the pose, and only the velocity is used. The usual
-        size of the corrections of a camera is the prior of each of them. An angular velocity that a gyroscope
-        measured is kept.
+        one after another, so the observations of a frame tell its angular velocity, and how this changes
+        during the readout. A correction of both is fitted together with a correction of the pose, which is
+        not used. The prior of a velocity is the usual size of the corrections of a camera, or a part of the
+        deviation of the velocity from its neighbours if this is more. The prior of an acceleration is a part
+        of this deviation, too. What a gyroscope measured is kept.
 
         Args:
             camera: The camera model.
@@ -563,7 +590,7 @@ class PosePath:
             of a frame with an angular velocity.
         """
         if self.rotation.measured().all():
-            return self
+            return replace(self, rate_sigma=np.zeros(len(self.rotation.rate)))
         moved = camera.unproject(self.px_at_mid_row(camera, frame, points, px, readout_s))
         pose = self.map_from_cam[frame]
         x_in_cam = np.einsum("mji,mj->mi", pose[:, :3, :3], points - pose[:, :3, 3])
@@ -583,13 +610,34 @@ class PosePath:
         move[:, :, 2] = -moved[rows]
         # A translation is measured in units of the depth of the points: the parts have similar sizes then.
         move *= (np.median(x_in_cam[rows, 2]) if len(rows) else 1.0) / x_in_cam[rows, 2][:, None, None]
-        jacobian = np.concatenate([turn, move, leverage_s[:, None, None] * turn], axis=2)
+        # The unknown of the acceleration is the change of the velocity in a frame interval.
+        intervals_ns = np.diff(self.rotation.times_ns)
+        interval_s = 1e-9 * float(np.median(intervals_ns)) if len(intervals_ns) else 1.0
+        gain = np.column_stack([leverage_s, 0.5 * delay_s * leverage_s / interval_s])
+        jacobian = np.concatenate([turn, move, *(gain.T[:, :, None, None] * turn)], axis=2)
         noise = _RATE_NOISE_PX * pixel_scale(camera.width_px, camera.height_px) / camera.focal_px
         end = _END_RATE_SIGMA + _END_RATE_SIGMA_RATIO * np.linalg.norm(self.rotation.rate, axis=1)
         end[~self.rotation.is_end()] = 0.0
-        change = _fit_frames(frame[rows], residual[rows], jacobian, noise, end)
+        deviation = self.rotation.rate_deviations()
+        change, sigma = _fit_frames(frame[rows], residual[rows], jacobian, noise, end, deviation)
         change[self.rotation.measured()] = 0.0
-        return replace(self, rotation=replace(self.rotation, rate=self.rotation.rate + change))
+        sigma[self.rotation.measured()] = 0.0
+        rate, acceleration = self.rotation.rate + change[:, :3], change[:, 3:] / interval_s
+        rotation = replace(self.rotation, rate=rate, acceleration=acceleration)
+        return replace(self, rotation=rotation, rate_sigma=sigma)
+
+    def rate_leverage_s(
+        self, camera: Camera, frame: IntArray, px: FloatArray, readout_s: float
+    ) -> FloatArray:
+        """Return the seconds (M,) by which the angular velocity of a frame turns the rays of its pixels.
+
+        Args:
+            camera: The camera model.
+            frame: (M,) frame index of each observation.
+            px: (M,2) observed pixels.
+            readout_s: Readout time, seconds.
+        """
+        return self.rotation.rate_leverage_s(frame, row_delay(camera, px) * readout_s)
 
     def _shift_in_cam(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
         """Return how far (M,3) the camera moves from frame times to instants, in its frame of the frame time.
@@ -623,34 +671,46 @@ def _turn_jacobian(ray: FloatArray) -> FloatArray:
 
 
 def _fit_frames(
-    frame: IntArray, residual: FloatArray, jacobian: FloatArray, noise: float, end_sigma: FloatArray
-) -> FloatArray:
-    """Fit corrections of poses and angular velocities to residuals, frame by frame, robustly.
+    frame: IntArray,
+    residual: FloatArray,
+    jacobian: FloatArray,
+    noise: float,
+    end_sigma: FloatArray,
+    deviation: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Fit corrections of poses, angular velocities and accelerations to residuals of frames, robustly.
 
     Args:
         frame: (M,) frame index of each residual, not decreasing.
         residual: (M,2) residuals.
-        jacobian: (M,2,9) derivatives of the residuals with respect to turn, shift and angular velocity.
+        jacobian: (M,2,12) derivatives of the residuals with respect to turn, shift, angular velocity and
+            its change in a frame interval.
         noise: Standard deviation of a residual.
         end_sigma: (N,) least expected error of the angular velocity of each frame, rad/s.
+        deviation: (N,) deviation of the angular velocity of each frame from its neighbours, rad/s.
 
     Returns:
-        The corrections (N,3) of the angular velocities, rad/s; 0 for a frame with too few residuals.
+        The corrections (N,6) of the angular velocities and of their changes, rad/s; 0 for a frame with too
+        few residuals. And the expected size (N,) of a correction of the angular velocity, rad/s.
     """
-    out = np.zeros((len(end_sigma), 3))
+    out = np.zeros((len(end_sigma), 6))
+    expected = np.maximum(end_sigma, _RATE_DEVIATION_RATIO * deviation)
     frames, starts, sizes = np.unique(frame, return_index=True, return_counts=True)
     enough = sizes >= _MIN_RATE_POINTS
     if not enough.any():
-        return out
+        return out, np.maximum(_RATE_SIGMA, expected)
     sigma = _RATE_SIGMA
-    loose = np.where(sizes >= _MIN_END_POINTS, end_sigma[frames], 0.0)
-    solution: FloatArray = np.zeros((len(frames), 9))
+    deviation = np.where(sizes >= _MIN_LOOSE_POINTS, deviation[frames], 0.0)
+    loose = np.where(sizes >= _MIN_LOOSE_POINTS, expected[frames], 0.0)
+    bent = np.maximum(_ACCELERATION_DEVIATION_RATIO * deviation, _MIN_RATE_SIGMA)
+    unknowns = np.arange(jacobian.shape[2])
+    solution: FloatArray = np.zeros((len(frames), len(unknowns)))
     position = np.repeat(np.arange(len(frames)), sizes)
     for _ in range(_RATE_FITS):
         left = residual + np.einsum("mij,mj->mi", jacobian, solution[position])
         weight = 1.0 / (noise**2 + np.einsum("mi,mi->m", left, left))
-        normal = np.empty((len(frames), 9, 9))
-        right = np.empty((len(frames), 9))
+        normal = np.empty((len(frames), len(unknowns), len(unknowns)))
+        right = np.empty((len(frames), len(unknowns)))
         for start in range(0, len(frames), _RATE_BATCH_FRAMES):
             part = slice(start, start + _RATE_BATCH_FRAMES)
             first, stop = int(starts[part][0]), int(starts[part][-1] + sizes[part][-1])
@@ -660,14 +720,15 @@ def _fit_frames(
             right[part] = np.add.reduceat(
                 np.einsum("mia,mi->ma", weighted, residual[first:stop]), inner, axis=0
             )
-        prior = np.full((len(frames), 9), 1e-6 / noise**2)
-        prior[:, 6:] = 1.0 / np.maximum(sigma, loose)[:, None] ** 2
-        normal[:, np.arange(9), np.arange(9)] += prior
+        prior = np.full((len(frames), len(unknowns)), 1e-6 / noise**2)
+        prior[:, 6:9] = 1.0 / np.maximum(sigma, loose)[:, None] ** 2
+        prior[:, 9:] = 1.0 / bent[:, None] ** 2
+        normal[:, unknowns, unknowns] += prior
         solution = np.asarray(-np.linalg.solve(normal, right[:, :, None])[:, :, 0], dtype=np.float64)
-        size = np.linalg.norm(solution[enough, 6:], axis=1)
+        size = np.linalg.norm(solution[enough, 6:9], axis=1)
         sigma = float(np.clip(np.median(size), _MIN_RATE_SIGMA, _RATE_SIGMA))
     out[frames[enough]] = solution[enough, 6:]
-    return out
+    return out, np.maximum(sigma, expected)
 
 
 def _projected_or(camera: Camera, x_in_cam: FloatArray, px: FloatArray) -> FloatArray:

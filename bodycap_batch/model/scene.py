@@ -153,6 +153,8 @@ class Map:
             rolling shutter.
         readout_s: By camera name, the readout time, seconds, that the adjustment of the map used. A camera
             without an entry was treated as a camera with a global shutter.
+        readout_sigma_s: By camera name, the standard deviation of an estimated readout time, seconds. A
+            readout time without an entry is exact.
         keyframe_covariance: (K,6,6) covariance of each keyframe's pose, as in `Trajectory`, relative to the
             other keyframes: in the gauge in which the mean variance of all keyframes is least. An empty array
             means that it is unknown.
@@ -171,6 +173,7 @@ class Map:
     obs_feature: IntArray
     obs_px: FloatArray
     readout_s: Mapping[str, float] = field(default_factory=dict)
+    readout_sigma_s: Mapping[str, float] = field(default_factory=dict)
     keyframe_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 6, 6)))
 
     def __post_init__(self) -> None:

@@ -38,6 +38,7 @@ from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, triangles_f
 from bodycap_batch.synthetic.truth import (
     MARKER,
     common_ticks_ns,
+    mean_poses,
     seconds_from_ns,
     write_calibration,
     write_path,
@@ -159,6 +160,14 @@ def _write_camera_truth(
     clock = true_clocks(options)[camera]
     poses = camera_poses_at(subject.motion, mount, clock.common_s(seconds_from_ns(times_ns)))
     write_path(folder / "gt" / f"{camera}.tum", times_ns, poses, "world_from_camera, the camera's own clock")
+    if options.exposure_s:
+
+        def pose_at(camera_s: FloatArray) -> FloatArray:
+            return camera_poses_at(subject.motion, mount, clock.common_s(camera_s))
+
+        mean = mean_poses(pose_at, seconds_from_ns(times_ns), options.exposure_s)
+        note = "world_from_camera, mean over the exposure, the camera's own clock"
+        write_path(folder / "gt" / "exposure" / f"{camera}.tum", times_ns, mean, note)
     if not kept.all():
         write_timestamps(folder / f"{camera}.timestamps.txt", times_ns)
     if options.poses_only:

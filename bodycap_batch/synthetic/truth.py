@@ -6,6 +6,7 @@ The ground truth consists of camera paths, joint positions, body proportions, mo
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 from bodycap_batch.formats.bvh import write_bvh
 from bodycap_batch.formats.tum import TimedPoses, seconds_text, write_tum
-from bodycap_batch.model.geometry import quat_xyzw_from_rotation
+from bodycap_batch.model.geometry import invert, make_transform, quat_xyzw_from_rotation, so3_exp, so3_log
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 from bodycap_batch.synthetic.camera_renderer import MovingBody, joint_poses_at
 from bodycap_batch.synthetic.clocks import has_own_clocks, reference_name, true_clocks
@@ -36,6 +37,8 @@ _README = """Ground truth of a synthetic capture. Metres, Z up, floor at z = 0.
                Timestamps are the camera's own; common time = camera time + offsets_s of calib.json.
                With a rolling shutter, it is the pose at the exposure of the middle row of the image. With
                motion blur, it is the pose at the middle of the exposure.
+exposure/<camera>.tum  with motion blur, the mean pose over the exposure, which the picture shows. A recorded
+               motion shakes within an exposure, so it differs from the pose at the middle.
 joints.npz     names (J,), t (T,) s on the common clock, world (T,J,3) m: joint centres.
 motion.bvh     the motion on the common clock, at the cameras' rate; frame 0 is the earliest frame.
 mounts.json    joint_from_cam of each camera: the true mount, which differs from the nominal mount.
@@ -59,6 +62,9 @@ contacts.json  stances of each foot (left, right) in ascending order. strike_s: 
 """
 _CLOCK_OPTIONS = {"clocks", "drifts_ppm", "sound", "sound_ratio_db", "sound_skews_s", "sound_skew_range_s"}
 """Options that are left out of the truth if no camera has its own clock or sound."""
+_EXPOSURE_STEPS = 24
+"""Number of instants whose mean is the pose over an exposure. Origin: 0.4 ms of an exposure of 10 ms, a
+twentieth of the interval of a recorded motion."""
 MARKER = Path("gt", "synth.json")
 """Path of the file that marks a folder as a complete synthetic capture, relative to the folder."""
 
@@ -145,6 +151,25 @@ def common_ticks_ns(options: SynthOptions) -> IntArray:
     lasts_s -= min(offsets)
     ticks = np.arange(int(np.floor(lasts_s * options.fps + 1e-6)) + 1)
     return np.asarray(np.round(min(offsets) * 1e9 + ticks * (1e9 / options.fps)), dtype=np.int64)
+
+
+def mean_poses(
+    world_from_cam_at: Callable[[FloatArray], FloatArray], times_s: FloatArray, exposure_s: float
+) -> FloatArray:
+    """Return the mean poses (T,4,4) of a camera over exposures.
+
+    Args:
+        world_from_cam_at: Function that returns the poses (N,4,4) of the camera at times (N,), seconds.
+        times_s: (T,) middle of each exposure, seconds.
+        exposure_s: Length of an exposure, seconds.
+    """
+    middle = world_from_cam_at(times_s)
+    turn, shift = np.zeros((len(times_s), 3)), np.zeros((len(times_s), 3))
+    for step in (np.arange(_EXPOSURE_STEPS) + 0.5) / _EXPOSURE_STEPS - 0.5:
+        moved = invert(middle) @ world_from_cam_at(times_s + step * exposure_s)
+        turn += so3_log(moved[:, :3, :3]) / _EXPOSURE_STEPS
+        shift += moved[:, :3, 3] / _EXPOSURE_STEPS
+    return np.asarray(middle @ make_transform(so3_exp(turn), shift))
 
 
 def write_path(path: Path, times_ns: IntArray, world_from_cam: FloatArray, note: str) -> None:

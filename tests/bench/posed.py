@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -51,14 +51,21 @@ class Posed:
         return joint_poses_at(self.motion, seconds_from_ns(common_ticks_ns(self.options)))
 
 
-def posed(options: SynthOptions, maps: Mapping[str, str] | None = None) -> Posed:
+def posed(
+    options: SynthOptions,
+    maps: Mapping[str, str] | None = None,
+    move: Callable[[MovingBody], MovingBody] | None = None,
+) -> Posed:
     """Simulate the output of registration.
 
     Args:
         options: Cameras, noise and gaps; the seed determines the mounts and the walk.
         maps: Gauge per camera; cameras without an entry share one gauge.
+        move: Returns another motion of the same body; None for the walk itself.
     """
     subject = draw_subject(options)
+    if move is not None:
+        subject = replace(subject, motion=move(subject.motion))
     rng = np.random.default_rng([options.seed, 77])
     names = sorted({(maps or {}).get(camera, GAUGE) for camera in options.cameras})
     gauges = {name: _draw_gauge(rng) for name in names}

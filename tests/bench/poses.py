@@ -64,8 +64,10 @@ def consistency(results: Path, store: Path, truth: Path) -> dict[str, dict[str, 
         results: A job's results.
         store: The store in which it ran.
         truth: Folder with ``<camera>.tum``, or the file of the only camera. A file was measured, so it has
-            errors of its own: see `MeasuredTruth`.
+            errors of its own: see `MeasuredTruth`. If the folder holds ``exposure/<camera>.tum``, the mean
+            poses over the exposures, these are the truth: a picture with motion blur shows them.
     """
+    truth = shown_truth(truth)
     paths, true = _with_truth(last_poses(results, store), truth)
     if sum(map(len, true)) < _LEAST_POSES:
         return {}
@@ -82,6 +84,11 @@ def consistency(results: Path, store: Path, truth: Path) -> dict[str, dict[str, 
     names = np.concatenate([np.full(scored.sum(), path.camera) for path, scored in paths])
     out = {name: figures(errors[names == name], stated[names == name]) for name in np.unique(names).tolist()}
     return {**out, "all": figures(errors, stated)}
+
+
+def shown_truth(truth: Path) -> Path:
+    """Return the folder with the poses that the pictures of a capture show, or the file of the truth."""
+    return truth / "exposure" if (truth / "exposure").is_dir() else truth
 
 
 def _with_truth(

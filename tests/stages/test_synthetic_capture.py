@@ -320,6 +320,12 @@ def test_blur_rolling_shutter_body_and_fisheye_together(tmp_path):
         0.015,
         "OPENCV_FISHEYE",
     )
+    middle, mean = (read_tum(folder / "gt" / part / "right_palm.tum") for part in ("", "exposure"))
+    assert (middle.times_ns == mean.times_ns).all()
+    off_m = np.linalg.norm(middle.world_from_cam[:, :3, 3] - mean.world_from_cam[:, :3, 3], axis=1)
+    # Accelerations of a walk up to 40 m/s²: a · T² / 24.
+    assert (off_m > 0.0).all()
+    assert (off_m < 40.0 * 0.015**2 / 24.0).all()
 
 
 def test_progress_counts_every_frame(tmp_path):

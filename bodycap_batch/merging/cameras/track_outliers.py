@@ -18,6 +18,14 @@ OUTLIER_LIMIT_M = 0.12
 deviates from the quadratic by a fraction of this distance. A pose at a larger distance is wrong. Evidence:
 none."""
 
+_JUMP_RATIO = 2.0
+"""Ratio of a third difference of the path to the displacement of the frames that cause it. Origin: the third
+differences of a step are 1, -2 and 1 times its height. Evidence: docs/decisions/merging.md."""
+_DIFFERENCE_FRAMES = 4
+"""Number of successive frames that a third difference compares."""
+_NEXT_FRAME = 1.5
+"""Maximum step between successive frames without a lost frame between them, in frame intervals. Derivation:
+the middle between one and two intervals."""
 _END_FRAMES = 2
 """Number of frames at each end of a run that have too few neighbours on one side for a quadratic."""
 _LINE_FRAMES = 3
@@ -61,7 +69,8 @@ def _wrong_inside(track: CameraTrack, scale: float, fps: float) -> BoolArray:
     # direction looks like an error.
     inner = ((time < 0) & valid).sum(axis=1).clip(max=2) + ((time > 0) & valid).sum(axis=1).clip(max=2) == 4
     bad = (np.linalg.norm(predicted, axis=1) > OUTLIER_LIMIT_M) & inner & (valid.sum(axis=1) >= 6)
-    return _runs_with_jumps(bad, scale * track.map_from_cam[:, :3, 3])
+    frame_time = track.times_ns.astype(np.float64) * (1e-9 * fps)
+    return _runs_with_jumps(bad, frame_time, scale * track.map_from_cam[:, :3, 3])
 
 
 def _without_wrong_ends(track: CameraTrack, scale: float, fps: float) -> CameraTrack:
@@ -117,13 +126,31 @@ def _distance_from_line(time: FloatArray, centre_m: FloatArray) -> FloatArray:
     return out
 
 
-def _runs_with_jumps(bad: BoolArray, centre_m: FloatArray) -> BoolArray:
+def _runs_with_jumps(bad: BoolArray, time: FloatArray, centre_m: FloatArray) -> BoolArray:
     """Return a mask (N,) of the runs of bad frames in which the path jumps.
 
-    The path of a very fast arm deviates from any quadratic, but this path does not jump.
+    The path of a very fast arm deviates from any quadratic, but its acceleration hardly changes from one
+    frame to the next. A frame that is displaced changes a third difference by three times its displacement,
+    and the first frame of a displaced block by twice the displacement. Across lost frames, the third
+    derivative is compared in the same unit. A few frames between lost frames have no third difference of
+    their own. For them, the path jumps if a second difference is larger than the limit.
+
+    Args:
+        bad: (N,) True for a bad frame.
+        time: (N,) times of the frames, in frame intervals.
+        centre_m: (N,3) camera centres, metres.
     """
     jump = np.zeros(len(bad), dtype=bool)
-    jump[1:-1] = np.linalg.norm(np.diff(centre_m, n=2, axis=0), axis=1) > OUTLIER_LIMIT_M
+    divided = centre_m
+    for order in (1, 2, 3):
+        divided = order * np.diff(divided, axis=0) / (time[order:] - time[:-order])[:, None]
+    steep = np.linalg.norm(divided, axis=1) > _JUMP_RATIO * OUTLIER_LIMIT_M
+    jump[1:-2] |= steep
+    jump[2:-1] |= steep
+    block = np.cumsum(np.diff(time, prepend=time[:1]) > _NEXT_FRAME)
+    few = np.bincount(block, minlength=1)[block] < _DIFFERENCE_FRAMES
+    bent = np.linalg.norm(np.diff(centre_m, n=2, axis=0), axis=1) > OUTLIER_LIMIT_M
+    jump[1:-1] |= bent & few[1:-1]
     out = np.zeros(len(bad), dtype=bool)
     for start, stop in runs(bad):
         out[start:stop] = jump[max(start - 1, 0) : stop + 1].any()

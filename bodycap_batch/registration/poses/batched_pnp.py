@@ -48,6 +48,10 @@ _DAMPING = 1e-10
 """Damping, as a fraction of the trace of the normal equations. It only prevents a singular matrix."""
 _TINY = 1e-300
 """Smallest divisor. It prevents a division by zero."""
+_SMALLEST_VARIANCE = 1e-12
+"""Smallest variance of an angular velocity, rad²/s². It prevents a division by zero."""
+_SMALLEST_NOISE_PX2 = 1e-12
+"""Smallest variance of an observation, px². It prevents singular equations for a frame without inliers."""
 _UNUSABLE = 1e5
 """Residual in pixels, or depth, that stands for "no usable value". It exceeds every limit."""
 _MEMBER_SHIFT = 20
@@ -55,6 +59,22 @@ _MEMBER_SHIFT = 20
 _MIN_OBSERVATIONS = 3
 """Minimum number of observations for a pose. Each observation gives two residuals, and a pose has six
 unknowns."""
+
+
+@dataclass(frozen=True, slots=True)
+class RateErrors:
+    """The unknown angular velocities of the frames of a rolling shutter.
+
+    The observations are moved to the instant of the middle row with an angular velocity that has an error.
+
+    Attributes:
+        leverage_s: (M,) seconds by which the angular velocity turns the ray of each observation.
+        sigma: (M,) standard deviation of the angular velocity about an axis before the observations are
+            used, rad/s, for the frame of each observation.
+    """
+
+    leverage_s: FloatArray
+    sigma: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,6 +91,8 @@ class Observations:
         member: (M,) index of the observing camera of a rig; None for a single camera.
         cam_from_rig: (C,4,4) poses of the cameras in the rig; None for a single camera. If they are given,
             the estimated poses are the poses of the rig.
+        rates: How the angular velocities of a rolling shutter's frames move the observations; None if all
+            observations are from one instant.
     """
 
     bounds: IntArray
@@ -80,6 +102,7 @@ class Observations:
     weight: FloatArray
     member: IntArray | None = None
     cam_from_rig: FloatArray | None = None
+    rates: RateErrors | None = None
 
     def rows(self, frame: int) -> slice:
         """Return the range of rows of one frame."""
@@ -96,6 +119,9 @@ class Observations:
             weight=self.weight[rows],
             member=None if self.member is None else self.member[rows],
             cam_from_rig=self.cam_from_rig,
+            rates=None
+            if self.rates is None
+            else RateErrors(self.rates.leverage_s[rows], self.rates.sigma[rows]),
         )
 
     def camera_poses(self, rows: IntArray, poses: FloatArray) -> FloatArray:
@@ -235,7 +261,6 @@ def evaluate_poses(
         quality.depth[chosen] = _segment_medians(np.where(inlier, depth, np.inf), owner, starts, count)
         used = inlier * weight
         information = weighted_hessians(jacobian, used, starts)
-        quality.information[chosen] = information
         redundancy = np.maximum(2 * counted - 6, 1)
         quality.variance_px2[chosen] = np.add.reduceat(used * error_px**2, starts) / redundancy
         cell = picture_cells(observations.rays[rows])
@@ -244,9 +269,54 @@ def evaluate_poses(
         quality.common_px2[chosen] = common_error_ratio(
             residual, jacobian, used, cell, owner, _inverse_or_nan(information)
         )
+        if observations.rates is not None:
+            noise_px2 = np.fmax(quality.variance_px2[chosen], np.nan_to_num(quality.common_px2[chosen]))
+            taken = _information_of_rates(observations.rates, rows, jacobian, used, starts, noise_px2)
+            information = information - taken
+        quality.information[chosen] = information
 
     _for_each_chunk(observations, evaluate_chunk, threads)
     return quality
+
+
+def _information_of_rates(
+    rates: RateErrors,
+    rows: IntArray,
+    jacobian: FloatArray,
+    weight: FloatArray,
+    starts: IntArray,
+    noise_px2: FloatArray,
+) -> FloatArray:
+    """Return the information (F,6,6) about poses that the unknown angular velocities take away.
+
+    The observations of a frame determine its pose and its angular velocity together, with the sigma of the
+    angular velocity as prior. What is left belongs to the pose alone.
+
+    Args:
+        rates: The angular velocities.
+        rows: (N,) row indices of the observations.
+        jacobian: (2,6,N) derivatives with respect to the pose, rotation first.
+        weight: (N,) weights.
+        starts: (F,) first row of each frame.
+        noise_px2: (F,) variance of an observation with the weight 1, pixels squared.
+
+    Source: the Schur complement, as in Triggs et al., "Bundle adjustment: a modern synthesis", 2000,
+        section 6.
+    """
+    lag = rates.leverage_s[rows]
+    weighted = jacobian * (weight * lag)
+    cross = np.empty((len(starts), 6, 3))
+    own = np.empty((len(starts), 3, 3))
+    for j in range(3):
+        for i in range(6):
+            entry = weighted[0, i] * jacobian[0, j] + weighted[1, i] * jacobian[1, j]
+            cross[:, i, j] = np.add.reduceat(entry, starts)
+            if i < 3:
+                own[:, i, j] = np.add.reduceat(entry * lag, starts)
+    variance = np.maximum.reduceat(rates.sigma[rows], starts) ** 2
+    prior = np.maximum(noise_px2, _SMALLEST_NOISE_PX2) / np.maximum(variance, _SMALLEST_VARIANCE)
+    own += prior[:, None, None] * np.eye(3)
+    return np.asarray(cross @ np.linalg.solve(own, np.swapaxes(cross, 1, 2)))
 
 
 def _inverse_or_nan(information: FloatArray) -> FloatArray:

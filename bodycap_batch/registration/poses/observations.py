@@ -14,7 +14,7 @@ from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.reprojection_derivatives import projection_jacobian
 from bodycap_batch.model.rotation_path import PosePath, RotationPath
 from bodycap_batch.model.scene import Map
-from bodycap_batch.registration.poses.batched_pnp import Observations, make_observations
+from bodycap_batch.registration.poses.batched_pnp import Observations, RateErrors, make_observations
 from bodycap_batch.registration.poses.static_points import static_points
 from bodycap_batch.registration.tracking.klt import Tracks
 
@@ -188,7 +188,12 @@ class FrameBlock:
     member: IntArray
     _observations: Observations | None = field(default=None, init=False, repr=False)
 
-    def observations(self, px: FloatArray | None, reliability: PointReliability | None) -> Observations:
+    def observations(
+        self,
+        px: FloatArray | None,
+        reliability: PointReliability | None,
+        rates: RateErrors | None = None,
+    ) -> Observations:
         """Return the weighted observations.
 
         Args:
@@ -196,9 +201,10 @@ class FrameBlock:
                 undistorted once and cached.
             reliability: Reliability of the points according to an earlier solution; None if there is no
                 earlier solution.
+            rates: How the angular velocities move the corrected pixels; None if they are not corrected.
         """
         if px is not None:
-            observations = self._make_observations(px)
+            observations = replace(self._make_observations(px), rates=rates)
         elif self._observations is not None:
             observations = self._observations
         else:
@@ -242,14 +248,15 @@ class FrameBlock:
         """(M,) combined index of camera and point for each observation, as used in `PointReliability`."""
         return self.member * len(self.rig.scene_map.points) + self.point
 
-    def px_at_mid_row(self, path: FloatArray) -> FloatArray:
-        """Return the pixels (M,2) moved to the instant of the middle row.
+    def px_at_mid_row(self, path: FloatArray) -> tuple[FloatArray, RateErrors]:
+        """Return the pixels (M,2) moved to the instant of the middle row, and the errors of this movement.
 
         Args:
             path: (F,4,4) poses map_from_rig of all frames; NaN for a frame without a pose. Without poses,
                 only the rotation between adjacent frames is corrected, if it is known.
         """
         out = self.px.copy()
+        rates = RateErrors(np.zeros(len(out)), np.zeros(len(out)))
         scene_map, times_ns = self.rig.scene_map, self.rig.members[0].camera.times_ns
         for number, (member, lens) in enumerate(zip(self.rig.members, self.rig.lenses, strict=True)):
             readout_s = scene_map.readout_s.get(member.camera.name, 0.0)
@@ -258,8 +265,15 @@ class FrameBlock:
                 own_poses, points = path @ invert(member.cam_from_rig), scene_map.points[self.point[rows]]
                 poses = PosePath.create(own_poses, times_ns, member.rotation)
                 seen = lens, self.frame[rows], points, out[rows], readout_s
-                out[rows] = poses.with_fitted_rates(*seen).px_at_mid_row(*seen)
-        return out
+                fitted = poses.with_fitted_rates(*seen)
+                rates.leverage_s[rows] = fitted.rate_leverage_s(lens, seen[1], seen[3], readout_s)
+                if fitted.rate_sigma is not None:
+                    # A wrong readout time turns the rays of the rows like a wrong angular velocity.
+                    off = scene_map.readout_sigma_s.get(member.camera.name, 0.0) / readout_s
+                    wrong = off * np.linalg.norm(fitted.rotation.rate, axis=1) / np.sqrt(3.0)
+                    rates.sigma[rows] = np.hypot(fitted.rate_sigma, wrong)[seen[1]]
+                out[rows] = fitted.px_at_mid_row(*seen)
+        return out, rates
 
     def count_by_frame(self, selected: BoolArray) -> IntArray:
         """Return the number (F,) of selected observations in each frame of the block.

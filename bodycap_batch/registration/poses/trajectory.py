@@ -168,8 +168,8 @@ def _solve(
         [], PointReliability.zero(rig.static.size), np.zeros(count, np.int64), np.zeros(count, np.int64)
     )
     for block in rig.blocks():
-        px = None if path is None else block.px_at_mid_row(path)
-        observations, frames = block.observations(px, reliability), block.frames
+        px, rates = (None, None) if path is None else block.px_at_mid_row(path)
+        observations, frames = block.observations(px, reliability, rates), block.frames
         observed_px = block.px if px is None else px
         poses = solve_poses(rig.lenses, observations, observed_px, start[frames], criteria, threads)
         solved = pose_array(poses)

@@ -297,11 +297,13 @@ def match_patches(
     expected_px = view.px_in_picture(points, px)
     found_px, score = np.full((len(rows), 2), np.nan), np.zeros(len(rows))
     target = view.pyramid.levels[level.pyramid_level].astype(np.float32)
-    for number in np.flatnonzero(is_inside).tolist():
-        match = _best_match(target, images[number], expected_px[number] / step - 0.5, level.search_radius)
+    searched = np.flatnonzero(is_inside)
+    centres = np.round(expected_px[searched] / step - 0.5).astype(np.int64).tolist()
+    for number, (column, row) in zip(searched.tolist(), centres, strict=True):
+        match = _best_match(target, images[number], column, row, level.search_radius)
         if match is not None:
-            found_px[number] = (np.array(match[:2]) + 0.5) * step
-            score[number] = match[2]
+            found_px[number], score[number] = match[:2], match[2]
+    found_px = (found_px + 0.5) * step
     accepted = (score > level.min_score) & np.isfinite(found_px).all(axis=1)
     mid_row_px = view.px_at_mid_row(points, px, found_px)
     return PatchMatches(
@@ -409,14 +411,10 @@ def _render_patches(
         own = np.flatnonzero((source_index == number) & is_inside)
         if len(own) == 0:
             continue
+        sample, own_offset = centres[own].astype(np.float32), offset[own]
         # One array for each axis, as OpenCV needs them.
         column, row = (
-            (sample[:, :, None] + own_offset[:, None, :]).reshape(-1, side)
-            for sample, own_offset in zip(
-                np.moveaxis(centres[own].astype(np.float32), 2, 0),
-                np.moveaxis(offset[own], 2, 0),
-                strict=True,
-            )
+            (sample[:, :, None, axis] + own_offset[:, None, :, axis]).reshape(-1, side) for axis in (0, 1)
         )
         rendered = cv2.remap(source.levels[level.pyramid_level], column, row, cv2.INTER_LINEAR)
         images[own] = rendered.reshape(len(own), samples, side, side).mean(axis=1, dtype=np.float32)
@@ -424,7 +422,7 @@ def _render_patches(
 
 
 def _best_match(
-    target: Patches, patch: Patches, expected: FloatArray, radius: int
+    target: Patches, patch: Patches, column: int, row: int, radius: int
 ) -> tuple[float, float, float] | None:
     """Return column, row and correlation of the best match near an expected pixel.
 
@@ -433,13 +431,13 @@ def _best_match(
     Args:
         target: (H,W) image of the frame.
         patch: (side,side) patch to search.
-        expected: (2,) expected column and row of the patch's centre.
+        column: Expected column of the patch's centre.
+        row: Expected row of the patch's centre.
         radius: Maximum distance from the expected pixel along each axis.
     """
     import cv2
 
     half = patch.shape[0] // 2
-    column, row = (round(float(value)) for value in expected)
     height, width = target.shape
     left, top = max(column - half - radius, 0), max(row - half - radius, 0)
     right, bottom = min(column + half + radius + 1, width), min(row + half + radius + 1, height)

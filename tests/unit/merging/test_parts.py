@@ -196,6 +196,33 @@ def test_a_throw_faster_than_a_quadratic_is_kept():
     assert len(remove_outliers(_track(throw), 1.0, 30.0).frames) == len(throw)
 
 
+def test_a_fast_swing_around_the_shoulder_is_kept():
+    # A stretched arm starts a swing of 180 degrees and stops: 10 m/s, and 13 cm of acceleration in a frame.
+    angle = np.pi / (1.0 + np.exp(-(np.arange(60) - 30) / 1.5))
+    swing = 0.65 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    assert np.linalg.norm(np.diff(swing, n=2, axis=0), axis=1).max() > 0.13
+    assert len(remove_outliers(_track(swing), 1.0, 30.0).frames) == len(swing)
+    some = np.delete(np.arange(60), [27, 28])
+    lost = _track(swing).keep(np.isin(np.arange(60), some))
+    assert remove_outliers(lost, 1.0, 30.0).frames.tolist() == some.tolist()
+    wrong = swing.copy()
+    wrong[[29, 30]] += [0.1, 0.1, 0.15]
+    kept = remove_outliers(_track(wrong), 1.0, 30.0).frames.tolist()
+    assert not {29, 30} & set(kept)
+
+
+@pytest.mark.parametrize("lost", [0, 1, 2, 3])
+@pytest.mark.parametrize("off_m", [0.2, 0.5])
+def test_wrong_frames_between_lost_frames_are_removed(lost, off_m):
+    seconds = np.arange(60) / 30.0
+    path = np.stack([seconds, 0.0 * seconds, 0.0 * seconds], axis=1)
+    path[[30, 31], 1] += off_m
+    gaps = [*range(30 - lost, 30), *range(32, 32 + lost)]
+    some = np.isin(np.arange(60), gaps, invert=True)
+    kept = remove_outliers(_track(path).keep(some), 1.0, 30.0).frames.tolist()
+    assert kept == [number for number in np.flatnonzero(some).tolist() if number not in {30, 31}]
+
+
 @pytest.mark.parametrize("lost", [5, 15])
 @pytest.mark.parametrize("wrong", [[89], [88, 89], [0], [0, 1], [44], [44, 45], [46]])
 def test_outliers_at_the_ends_of_a_run_are_removed(wrong, lost):

@@ -191,6 +191,15 @@ def test_the_direction_of_a_turned_sensor_is_estimated(readout_s: float, sideway
     assert readout_s == 0.0 or misfit_px(model.corrected({}), film) > 1.5
 
 
+def test_the_displacements_by_a_shutter_grow_with_its_readout_time() -> None:
+    rolling = rolling_model(Film(0.02))
+    once, twice = (rolling.displacement_px("head", readout_s) for readout_s in (0.01, 0.02))
+    # The hand turns by 2 rad/s at most, so an edge row of 480 rows moves by 400 px · 2/s · 10 ms.
+    assert 1.0 < once < 8.0
+    assert twice == pytest.approx(2.0 * once, rel=0.1)
+    assert rolling.displacement_px("head", 0.0) == rolling.displacement_px("no camera", 0.02) == 0.0
+
+
 def test_a_stated_readout_runs_the_way_the_video_is_turned() -> None:
     film = Film(0.02, sideways=True)
     _, reported = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))

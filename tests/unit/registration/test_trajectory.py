@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -119,3 +120,16 @@ def test_blocks_of_frames_give_the_same_poses(monkeypatch: pytest.MonkeyPatch) -
     whole = trajectory.pose_array(_solve(scene_map, tracks))
     monkeypatch.setattr(observations, "BLOCK_FRAMES", 7)
     np.testing.assert_allclose(trajectory.pose_array(_solve(scene_map, tracks)), whole, atol=1e-12)
+
+
+def test_an_uncertain_readout_time_makes_the_poses_uncertain() -> None:
+    scene_map, tracks = _capture(0, np.random.default_rng(3))
+    exact = replace(scene_map, readout_s={"torso": 0.002})
+    estimated = replace(exact, readout_sigma_s={"torso": 0.02})
+    known, unknown = (
+        np.array([pose.covariance for pose in _solve(each, tracks)]) for each in (exact, estimated)
+    )
+    # The frame turns by 0.26 rad/s; a readout that is 20 ms longer would turn the edges by 1.1 px.
+    ratio = np.trace(unknown[:, :3, :3], axis1=1, axis2=2) / np.trace(known[:, :3, :3], axis1=1, axis2=2)
+    assert (ratio > 1.01).all()
+    assert np.median(ratio) > 1.05
