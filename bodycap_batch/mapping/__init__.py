@@ -1,7 +1,7 @@
 """Stage 2: build one sparse map from the keyframes of all cameras."""
 
-from bodycap_batch.mapping.build import build_map
+from bodycap_batch.mapping.build import build_map, earlier_results
 from bodycap_batch.mapping.extend import extend_map
 from bodycap_batch.mapping.refine import refine_map
 
-__all__ = ["build_map", "extend_map", "refine_map"]
+__all__ = ["build_map", "earlier_results", "extend_map", "refine_map"]

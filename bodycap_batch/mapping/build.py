@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,10 +22,11 @@ from bodycap_batch.mapping.inputs import (
 )
 from bodycap_batch.mapping.intrinsics.intrinsics_check import find_misfit_intrinsics
 from bodycap_batch.mapping.intrinsics.readout_profile import estimate_from_matches
-from bodycap_batch.mapping.intrinsics.readout_time import map_with_readouts
+from bodycap_batch.mapping.intrinsics.readout_time import Readout, map_with_readouts
 from bodycap_batch.mapping.intrinsics.recalibration import recalibrate_if_misfit
 from bodycap_batch.mapping.intrinsics.shutters import (
     known_readouts,
+    readouts_of_maps,
     turning_shutters,
     with_gyroscopes,
     write_shutters,
@@ -49,9 +51,49 @@ from bodycap_batch.mapping.validation.repair import remove_without_adjustment, r
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.scene import KeyframeSelection, MapResult
 
+WORKSPACE = "workspace"
+"""Name of the folder of a map's database, in the work folder."""
 _MIN_MOTION_PX = 2.0
 """Minimum motion of the picture of a camera that moves, px of an image with a long side of 640 px. Evidence:
 docs/decisions/mapping.md."""
+
+
+@dataclass(frozen=True, slots=True)
+class EarlierResults:
+    """What earlier maps of the same capture give for a new one.
+
+    Attributes:
+        features: By camera name, the workspace of a map that holds the features of the camera's keyframes.
+        readouts: By camera name, the readout time for which the keypoints are corrected.
+    """
+
+    features: Mapping[str, Path] = field(default_factory=dict)
+    readouts: Mapping[str, Readout] = field(default_factory=dict)
+
+
+NOTHING_EARLIER = EarlierResults()
+"""There is no earlier map."""
+
+
+def earlier_results(
+    capture: Capture, refined: MapResult | None, unmasked: MapResult | None
+) -> EarlierResults:
+    """Return what earlier maps of a capture give for a new one.
+
+    Args:
+        capture: All cameras.
+        refined: A map of the same pictures, in which rolling shutters were found. The keypoints are corrected
+            for its readout times, and all features are taken from it.
+        unmasked: A map for which no wearer was known. The features of the cameras without a known wearer are
+            taken from it, if there is no refined map.
+    """
+    if refined is not None:
+        names = [camera.name for camera in capture.cameras]
+        return EarlierResults(dict.fromkeys(names, refined.workspace), readouts_of_maps(refined.maps))
+    if unmasked is not None:
+        names = [camera.name for camera in capture.cameras if camera.wearer is None]
+        return EarlierResults(dict.fromkeys(names, unmasked.workspace))
+    return NOTHING_EARLIER
 
 
 def build_map(
@@ -61,6 +103,7 @@ def build_map(
     context: StageContext,
     *,
     skeletal_above: int = SKELETAL_ABOVE,
+    earlier: EarlierResults = NOTHING_EARLIER,
 ) -> MapResult:
     """Reconstruct the room and the keyframe poses by incremental structure from motion.
 
@@ -75,6 +118,7 @@ def build_map(
         skeletal_above: Maximum number of keyframes of a map that is built from all keyframes at once. A
             larger map is built from skeletal keyframes (the reduced set of keyframes, Snavely's skeletal
             set), and the other keyframes are resected.
+        earlier: What earlier maps of the same capture give.
 
     Returns:
         The models, largest first, each in a separate gauge.
@@ -86,11 +130,13 @@ def build_map(
     Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016 (COLMAP).
     """
     _require_motion(selections)
-    result, refused = build_map_once(capture, selections, options, context, skeletal_above)
+    result, refused = build_map_once(capture, selections, options, context, skeletal_above, earlier)
+    # A map that is built again has the same features.
+    used = replace(earlier, features={item.camera: context.work_dir / WORKSPACE for item in selections})
     second_context = replace(context, work_dir=context.work_dir / "freed")
 
     def build_again(other: Capture) -> MapResult:
-        again, unusable = build_map_once(other, selections, options, second_context, skeletal_above)
+        again, unusable = build_map_once(other, selections, options, second_context, skeletal_above, used)
         if unusable is not None:
             raise unusable
         return again
@@ -107,6 +153,7 @@ def build_map(
             _without_initial_pair_of(camera, options),
             replace(context, work_dir=context.work_dir / "without"),
             skeletal_above,
+            used,
         )
         if unusable is not None:
             raise
@@ -137,10 +184,11 @@ def build_map_once(
     options: MapOptions,
     context: StageContext,
     skeletal_above: int,
+    earlier: EarlierResults = NOTHING_EARLIER,
 ) -> tuple[MapResult, EstimationError | None]:
     """Build a map with the capture's intrinsics: calibrated intrinsics stay constant, others are refined.
 
-    The arguments are the same as in `build_map`.
+    The arguments are the same as in `build_map`; `earlier` is what earlier maps give.
 
     Returns:
         The map; an error with the reason why the map is unusable (too few keyframes, or matches that
@@ -152,13 +200,14 @@ def build_map_once(
     """
     import pycolmap
 
-    workspace = context.work_dir / "workspace"
+    workspace = context.work_dir / WORKSPACE
     workspace.mkdir(parents=True, exist_ok=True)
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         ids = {item.camera: add_camera(database, capture.camera(item.camera)) for item in selections}
     estimated = with_gyroscopes(estimate_from_matches(capture, selections), selections)
     readouts = {**known_readouts(capture), **estimated}
-    shutters = turning_shutters(capture, selections, readouts)
+    used = {**readouts, **earlier.readouts}
+    shutters = turning_shutters(capture, selections, used)
     write_shutters(workspace, shutters)
     keyframes = [
         CameraKeyframes(
@@ -166,6 +215,7 @@ def build_map_once(
             ids[item.camera],
             np.asarray(item.frames),
             shutters.get(item.camera),
+            earlier.features.get(item.camera),
         )
         for item in selections
     ]
@@ -200,9 +250,17 @@ def build_map_once(
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
     if readouts:
         log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
-    log = MapDiagnostics(misfit_factors=misfits, misplaced=misplaced, details=log).to_log()
+    unknown = tuple(
+        item.camera
+        for item in selections
+        if not capture.camera(item.camera).rolling_shutter_known
+        and not (item.camera in readouts and readouts[item.camera].determined)
+    )
+    log = MapDiagnostics(
+        misfit_factors=misfits, misplaced=misplaced, unknown_shutters=unknown, details=log
+    ).to_log()
     result = make_result(models, workspace, log)
-    corrected = {name: readouts[name] for name in shutters}
+    corrected = {name: used[name] for name in shutters}
     result = replace(result, maps=tuple(map_with_readouts(item, corrected) for item in result.maps))
     ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
     refused = refused or add_flip_hint(check_consistency(max(ratios)), flips)

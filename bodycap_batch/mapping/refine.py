@@ -31,6 +31,11 @@ from bodycap_batch.mapping.validation.dominant_points import remove_dominant_poi
 from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import MapResult, Trajectory
 
+_MAX_DISPLACEMENT_PX = 4.0
+"""Maximum displacement of the keypoints of a camera by its rolling shutter in a map that was built without a
+correction, px of an image with a long side of 640 px. If it is larger, right matches contradict the geometry
+of their pairs. Origin: COLMAP's limit of the deviation of a match. Evidence: docs/decisions/mapping.md."""
+
 
 def refine_map(
     capture: Capture,
@@ -47,7 +52,8 @@ def refine_map(
     keypoint in the image is computed from the poses of neighbouring frames. With this velocity, the keypoint
     is moved to its position at the instant of the image's middle row. Then each model is adjusted. In the
     result, the observations are at their detected positions again. `Map.readout_s` holds the readout times
-    with which the correction can be repeated.
+    with which the correction can be repeated. The entry `distorted_cameras` of the log names the cameras
+    whose shutter displaces keypoints so far that the map should be built again from corrected keypoints.
 
     Args:
         capture: All cameras.
@@ -81,6 +87,8 @@ def refine_map(
         if (readout := Readout(**entry)).seconds and readout.source != "stated"
     }
     models, all_readouts, adjusted_px = [], [], []
+    removed = 0
+    distorted: set[str] = set()
     for number, scene_map in enumerate(previous.maps):
         context.check_cancelled()
         context.progress(number, len(previous.maps), "maps refined")
@@ -97,9 +105,14 @@ def refine_map(
         )
         readout_s = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         corrected_px = None
+        distorted |= {
+            name
+            for name in readout_s.keys() - scene_map.readout_s.keys()
+            if rolling.displacement_px(name, readout_s[name]) > _MAX_DISPLACEMENT_PX
+        }
         if readout_s:
             model = rolling.with_exact_rates(readout_s, scene_map.readout_s.keys()).corrected(readout_s)
-            remove_dominant_points(model)
+            removed += remove_dominant_points(model)
             if mapping.is_large(model.num_reg_images()):
                 adjust_in_two_steps(model, settings, calibrated_ids)
             else:
@@ -112,9 +125,11 @@ def refine_map(
         all_readouts.append(readouts)
     write_models(workspace, models)
     log = {
+        "dominant_points": removed,
+        "distorted_cameras": sorted(distorted),
         "rolling_shutter": [
             {name: asdict(readout) for name, readout in readouts.items()} for readouts in all_readouts
-        ]
+        ],
     }
     result = make_result(models, workspace, {**previous.log, **log}, adjusted_px)
     maps = [

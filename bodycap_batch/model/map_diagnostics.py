@@ -17,6 +17,7 @@ _REFINED_INTRINSICS = "found_lenses"
 _EXTENSIONS = "growth"
 _REACH = "reach"
 _MISPLACED = "misplaced_keyframes"
+_UNKNOWN_SHUTTERS = "unknown_shutters"
 
 CameraGroups = tuple[tuple[str, ...], tuple[str, ...]]
 """Two groups of cameras, by name."""
@@ -57,6 +58,8 @@ class MapDiagnostics:
             as entries of the log. None if the distances were not checked.
         misplaced: By camera name, the frame indices of the keyframes that contradicted the map. They are not
             in the map.
+        unknown_shutters: Names of the cameras whose readout time neither the job nor the matches of adjacent
+            frames determine.
         details: All entries of the log in the order of the log, including the entries of the other fields.
     """
 
@@ -70,6 +73,7 @@ class MapDiagnostics:
     extensions: tuple[Mapping[str, Any], ...] = ()
     reach: Mapping[str, Any] | None = None
     misplaced: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    unknown_shutters: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
@@ -93,6 +97,7 @@ class MapDiagnostics:
             extensions=tuple(log.get(_EXTENSIONS, ())),
             reach=log.get(_REACH),
             misplaced={name: tuple(frames) for name, frames in log.get(_MISPLACED, {}).items()},
+            unknown_shutters=tuple(log.get(_UNKNOWN_SHUTTERS, ())),
             details=log,
         )
 
@@ -129,6 +134,8 @@ class MapDiagnostics:
             log[_REACH] = dict(self.reach)
         if self.misplaced or _MISPLACED in log:
             log[_MISPLACED] = {name: list(frames) for name, frames in self.misplaced.items()}
+        if self.unknown_shutters:
+            log[_UNKNOWN_SHUTTERS] = list(self.unknown_shutters)
         return log
 
 

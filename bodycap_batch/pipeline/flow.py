@@ -85,6 +85,7 @@ class Flow:
         self._cameras: dict[str, str] = {}
         self._map_round = 0
         self._wearer: Artefact | None = None
+        self._first_map: Artefact | None = None
         self._with_telemetry = frozenset[str]()
         self._with_gyro = frozenset[str]()
         self._with_blur = frozenset[str]()
@@ -158,22 +159,28 @@ class Flow:
 
     def map(self, keyframes: ByCamera) -> Artefact:
         """Build the map of all keyframes and return its artefact."""
+        artefact = self._build(keyframes)
+        if self._sound is not None:
+            self._sound.result()  # The sound is compared in much less time, so this does not wait.
+        self.runner.report_notes(artefact, "map")
+        return artefact
+
+    def _build(self, keyframes: ByCamera, refined: Artefact | None = None) -> Artefact:
+        """Build a map; `refined` is an earlier map in which rolling shutters were found."""
         task = MapTask(
             options=self._job.map,
             capture=self._footage(),
             keyframes=refs_by_camera(keyframes),
+            refined=optional_ref(refined),
+            unmasked=optional_ref(self._first_map),
         )
         body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
         later: list[Stage[Any]] = [REGISTRATION, *body, EXPORT, REPORT]
         # Mapping keeps one core busy. Meanwhile, another core loads the libraries of later stages.
         preload = [[module for stage in later for module in stage.modules]] if self._threads > 1 else []
-        artefact = self.runner.run(
+        return self.runner.run(
             make_task(MAP, task, map_round=self._map_round, threads=self._threads), preload
         )
-        if self._sound is not None:
-            self._sound.result()  # The sound is compared in much less time, so this does not wait.
-        self.runner.report_notes(artefact, "map")
-        return artefact
 
     def register(
         self, scene_map: Artefact, keyframes: ByCamera, previous: ByCamera | None = None
@@ -236,13 +243,15 @@ class Flow:
     ) -> tuple[Artefact, ByCamera]:
         """Remove the deformation of the map that rolling shutters cause, and solve all poses again.
 
-        If no camera has a rolling shutter, the map and the registrations are returned unchanged. If the map
+        If no camera has a rolling shutter, the map and the registrations are returned unchanged. If readout
+        times are unknown, and the poses show no rolling shutter, the registrations are unchanged. If the map
         was built from keypoints that were not corrected, the first pass starts from wrong poses. Then there
-        is a second pass.
+        is a second pass. If the shutters displace keypoints far, the map is built again before it, from
+        corrected keypoints.
         """
         if not any(read_summary(artefact.path)["rolling"] for artefact in registrations.values()):
             return scene_map, registrations
-        for _ in range(_REFINEMENTS):
+        for number in range(_REFINEMENTS):
             task = RefineTask(
                 options=self._job.map,
                 capture=self._footage(),
@@ -250,11 +259,38 @@ class Flow:
                 registrations=refs_by_camera(registrations),
             )
             scene_map = self.runner.run(make_task(REFINE, task, threads=self._threads))
+            summary = read_summary(scene_map.path)
+            if not summary.get("corrected", True) and not summary.get("corrected_before"):
+                break
             self._map_round += 1
-            registrations = self.register(scene_map, keyframes, registrations)
-            if not read_summary(scene_map.path).get("late"):
+            again = None
+            if summary.get("distorted") and number + 1 < _REFINEMENTS:
+                again = self._rebuilt(scene_map, registrations, keyframes)
+            if again is None:
+                again = scene_map, self.register(scene_map, keyframes, registrations)
+            scene_map, registrations = again
+            if not summary.get("late"):
                 break
         return scene_map, registrations
+
+    def _rebuilt(
+        self, refined: Artefact, registrations: ByCamera, keyframes: ByCamera
+    ) -> tuple[Artefact, ByCamera] | None:
+        """Build the map again from keypoints that are corrected for the shutters of a refined map.
+
+        Where a camera turns fast, the first map lacks right matches and has wrong ones.
+
+        Returns:
+            The map and the registrations against it; None if there is no such map, or if fewer frames are
+            localised than before.
+        """
+        try:
+            rebuilt = self._build(keyframes, refined)
+        except EstimationError:
+            return None
+        again = self.register(rebuilt, keyframes, registrations)
+        rebuilt, again = self.extend_map(rebuilt, again, keyframes)
+        return (rebuilt, again) if _posed_frames(again) >= _posed_frames(registrations) else None
 
     def solve_rigs(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
         """Solve the poses of each synchronised rig again, from the observations of all cameras of the rig."""
@@ -383,18 +419,22 @@ class Flow:
         return artefact if lossy.intersection(read_summary(artefact.path)["masked"]) else None
 
     @contextmanager
-    def without_wearer(self, wearer: Artefact) -> Iterator[None]:
+    def without_wearer(self, wearer: Artefact, scene_map: Artefact | None) -> Iterator[None]:
         """Leave out the wearer's body, as `find_wearer` found it, in all tasks that run in this context.
 
         The notes of these tasks are held back until `runner.release_notes`.
+
+        Args:
+            wearer: The wearer's body in the pictures.
+            scene_map: The map of the first pass. Its features are used again where they stay the same.
         """
-        self._wearer = wearer
+        self._wearer, self._first_map = wearer, scene_map
         self._map_round += 1
         with self.runner.held_notes():
             try:
                 yield
             finally:
-                self._wearer = None
+                self._wearer = self._first_map = None
 
     def export(self, results: StageResults) -> Artefact:
         """Write the result files and return their artefact.
@@ -465,8 +505,10 @@ class Flow:
         return replace(capture_ref(self._capture, self._cameras, cameras), wearer=optional_ref(self._wearer))
 
     def _start_sound(self) -> Future[Artefact]:
-        """Compare the sound of the cameras, beside the keyframes if there are threads for both."""
-        task = make_task(SOUND, SoundTask(capture=self._footage()))
+        """Compare sound and sensors of the cameras, beside the keyframes if there are threads for both."""
+        sensors = self._job.telemetry.clocks and len(self._with_telemetry) > 1
+        samples = self._samples if sensors else {}
+        task = make_task(SOUND, SoundTask(capture=self._footage(), sensors=sensors, samples=samples))
         if self._threads > 1:
             return self.runner.start(task)
         done = Future[Artefact]()
@@ -474,7 +516,7 @@ class Flow:
         return done
 
     def _apply_sound_offsets(self) -> None:
-        """Select the frames between start_s and end_s with the clocks that the sound determines.
+        """Select the frames between start_s and end_s with the clocks that are known before the map.
 
         All frames of a camera with an unknown clock are used. A note says so.
         """
@@ -483,8 +525,8 @@ class Flow:
         for camera in self._capture.cameras:
             if camera.offset_s is None:
                 note = (
-                    f"{camera.name}: neither the job nor the sound gives its clock, so start_s and end_s do "
-                    "not apply to it and all its frames are used; state offset_s to use a part of its video"
+                    f"{camera.name}: neither the job nor sound or sensors give its clock, so start_s and "
+                    "end_s do not apply to it and all its frames are used; state offset_s to use a part of it"
                 )
                 self._settings.listener(Event(kind="note", stage="clocks", what=f"note: {note}"))
         self._cameras = camera_digests(

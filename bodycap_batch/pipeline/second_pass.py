@@ -47,7 +47,7 @@ def repeat_without_wearer(
         kept = _keeps_frames(_localised(results.tracked), _localised(second.tracked))
         return kept or _unused_cameras(results) > 0
 
-    with flow.without_wearer(wearer):
+    with flow.without_wearer(wearer, results.map):
         failure = _run(second, lambda: run_pass(second, can_be_better))
         is_better = second.filled is not None and _is_better(second, results)
         if is_better:

@@ -132,6 +132,7 @@ def _frames_table(metrics: Mapping[str, Any]) -> Table:
 
 _CLOCK_SOURCES = {
     "sound": "sound",
+    "sensors": "inertial sensors",
     "motion": "motion",
     "stated": "stated in the job or the calibration",
     "common": "common clock",

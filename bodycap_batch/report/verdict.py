@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bodycap_batch.core.percent import format_percent
+from bodycap_batch.model.camera_clock import ESTIMATED_SOURCES
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.report.body_doubts import body_doubt_criteria
 from bodycap_batch.report.camera_pairs import distance_criteria, shared_segment_criteria
@@ -514,7 +515,7 @@ def _clock_criteria(metrics: Mapping[str, Any]) -> Iterator[Criterion]:
             rationale=rationale,
         )
         return
-    estimated = {name: clock for name, clock in clocks.items() if clock["source"] in ("sound", "motion")}
+    estimated = {name: clock for name, clock in clocks.items() if clock["source"] in ESTIMATED_SOURCES}
     name, worst = max(estimated.items(), key=lambda item: item[1]["sigma_s"], default=("", None))
     if worst is not None:
         sigma_s = float(worst["sigma_s"])

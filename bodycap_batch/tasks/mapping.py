@@ -27,11 +27,18 @@ class MapTask:
         options: The stage's options.
         capture: The videos of all cameras.
         keyframes: The selected keyframes of each camera, by camera name.
+        refined: An earlier map of the same pictures, in which rolling shutters were found. The new map is
+            built from its features, with keypoints that are corrected for the shutters. None in the first
+            round.
+        unmasked: A map of the same keyframes from the pass in which no wearer was known. The features of the
+            cameras that are not masked are taken from it. None in the first pass.
     """
 
     options: MapOptions
     capture: CaptureRef
     keyframes: Mapping[str, ArtefactRef]
+    refined: ArtefactRef | None = None
+    unmasked: ArtefactRef | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,11 +79,14 @@ class RefineTask:
 
 def run_map(task: MapTask, context: StageContext, files: Path) -> None:
     """Build the map and store it."""
-    from bodycap_batch.mapping import build_map
+    from bodycap_batch.mapping import build_map, earlier_results
 
     selections = [load_keyframes(artefact.path) for artefact in task.keyframes.values()]
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
-    result = build_map(capture, selections, task.options, context)
+    refined = None if task.refined is None else load_map(task.refined.path)
+    unmasked = None if task.unmasked is None else load_map(task.unmasked.path)
+    earlier = earlier_results(capture, refined, unmasked)
+    result = build_map(capture, selections, task.options, context, earlier=earlier)
     _save_map(result, files)
 
 
@@ -100,7 +110,15 @@ def run_refine(task: RefineTask, context: StageContext, files: Path) -> None:
     previous = load_map(task.map.path)
     capture = load_capture(task.capture, threads=context.threads)
     result = refine_map(capture, previous, paths, task.options, context)
-    _save_map(result, files, late=sorted(_rolling_cameras(result) - _rolling_cameras(previous)))
+    rolling, before = _rolling_cameras(result), _rolling_cameras(previous)
+    _save_map(
+        result,
+        files,
+        late=sorted(rolling - before),
+        corrected=sorted(rolling),
+        corrected_before=sorted(before),
+        distorted=result.log["distorted_cameras"],
+    )
 
 
 def _rolling_cameras(result: MapResult) -> set[str]:
@@ -108,13 +126,24 @@ def _rolling_cameras(result: MapResult) -> set[str]:
     return {name for scene_map in result.maps for name in scene_map.readout_s}
 
 
-def _save_map(result: MapResult, files: Path, *, late: Sequence[str] = ()) -> None:
+def _save_map(
+    result: MapResult,
+    files: Path,
+    *,
+    late: Sequence[str] = (),
+    corrected: Sequence[str] = (),
+    corrected_before: Sequence[str] = (),
+    distorted: Sequence[str] = (),
+) -> None:
     """Store a map with its workspace. Extending the map later needs the workspace.
 
     Args:
         result: The map.
         files: Folder of the artefact.
         late: Names of the cameras whose rolling shutters are corrected for the first time.
+        corrected: Names of the cameras whose rolling shutters are corrected.
+        corrected_before: Names of the cameras whose rolling shutters were corrected in the map before it.
+        distorted: Names of the cameras for whose rolling shutters the map should be built again.
     """
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.intrinsics.intrinsics_check import misfit_note
@@ -131,6 +160,9 @@ def _save_map(result: MapResult, files: Path, *, late: Sequence[str] = ()) -> No
         keyframes=len(largest.keyframe_camera),
         points=len(largest.points),
         late=list(late),
+        corrected=list(corrected),
+        corrected_before=list(corrected_before),
+        distorted=list(distorted),
         notes=[
             *flip_notes(diagnostics),
             *map(contradicting_camera_note, diagnostics.contradicting_cameras),

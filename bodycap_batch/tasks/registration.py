@@ -16,7 +16,7 @@ from bodycap_batch.tasks.typed_json import omitted_from_key
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import CaptureCamera
-    from bodycap_batch.model.scene import Registration
+    from bodycap_batch.model.scene import MapResult, Registration
 
 NOT_ROUNDS = omitted_from_key("rounds", "wearer_mask")
 """Metadata of a dataclass field; it omits the options `rounds` and `wearer_mask` from the artefact's key.
@@ -45,7 +45,6 @@ class RegistrationTask:
 
 def run_registration(task: RegistrationTask, context: StageContext, files: Path) -> None:
     """Register the camera's frames and store their poses."""
-    from bodycap_batch.model.rolling_shutter import has_visible_rolling_shutter
     from bodycap_batch.registration import register_frames, withdraw_contradicted_poses
 
     camera = load_capture(task.capture, task.keyframes, threads=context.threads).cameras[0]
@@ -55,15 +54,30 @@ def run_registration(task: RegistrationTask, context: StageContext, files: Path)
     maps = scene.maps
     found = register_frames(camera, maps, selection, task.options, context, previous)
     found = withdraw_contradicted_poses(found, maps, scene.diagnostics.misplaced.get(camera.name, ()))
-    known = camera.rolling_shutter_known
-    rolling = (
-        bool(camera.rolling_shutter_s)
-        if known
-        else True
-        if any(camera.name in scene.readout_s for scene in maps)
-        else has_visible_rolling_shutter(found, maps, allow_sideways=camera.may_be_sideways)
-    )
-    save_registration(found, camera, files, rolling=rolling)
+    save_registration(found, camera, files, rolling=may_have_rolling_shutter(found, camera, scene))
+
+
+def may_have_rolling_shutter(found: Registration, camera: CaptureCamera, scene: MapResult) -> bool:
+    """Return whether the map is corrected for the camera's shutter, or whether its readout time is unknown.
+
+    The residuals are a weak evidence against a rolling shutter, because the map absorbs most of the
+    displacements. They decide only if the matches of adjacent frames found none. Evidence:
+    docs/decisions/mapping.md.
+
+    Args:
+        found: Poses and observations of the camera.
+        camera: The camera.
+        scene: The map to which the poses refer.
+    """
+    from bodycap_batch.model.rolling_shutter import has_visible_rolling_shutter
+
+    if camera.rolling_shutter_known:
+        return bool(camera.rolling_shutter_s)
+    if camera.name in scene.diagnostics.unknown_shutters:
+        return True
+    if any(camera.name in item.readout_s for item in scene.maps):
+        return True
+    return has_visible_rolling_shutter(found, scene.maps, allow_sideways=camera.may_be_sideways)
 
 
 def save_registration(

@@ -22,7 +22,9 @@ ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
  "masked": [cameras], "without_wearer": localised frames, of each camera or {camera: frames},
- "unused": {camera: reason}, "rolling": true, "late": number of maps, "telemetry": [cameras],
+ "unused": {camera: reason}, "rolling": true, "late": number of maps,
+ "corrected" | "corrected_before" | "distorted": [cameras] in refined maps,
+ "fail_rebuilt": true, "telemetry": [cameras],
  "real": [stages that are no stand-ins]}.
  "fail" may be a list of stages; "fail_second" is one that fails without the wearer."""
 
@@ -68,6 +70,8 @@ def stage(name: str) -> Any:
                 time.sleep(0.05)
         if name in as_list(orders().get("fail")) and meant:
             raise EstimationError(f"{name} does not work out", hint="film more")
+        if name == "map" and arguments.get("refined") and orders().get("fail_rebuilt"):
+            raise EstimationError("no map from corrected keypoints", hint="film more")
         repeats = re.search(r'"wearer\\*": \\*"', json.dumps(made_of(arguments))) is not None
         if repeats and orders().get("fail_second") == name:
             raise EstimationError(f"{name} does not work out without the wearer", hint="film more")
@@ -147,7 +151,19 @@ def refined(options: Json, arguments: Json, files: Path) -> None:
     before = Path(arguments["map"]["path"]) / "summary.json"
     passes = json.loads(before.read_text()).get("passes", 0) + 1 if before.exists() else 1
     late = ["torso"] if passes <= orders().get("late", 0) else []
-    (files / "summary.json").write_text(json.dumps({"notes": [], "passes": passes, "late": late}))
+    corrected, distorted = orders().get("corrected", ["torso"]), orders().get("distorted", late)
+    (files / "summary.json").write_text(
+        json.dumps(
+            {
+                "notes": [],
+                "passes": passes,
+                "late": late,
+                "corrected": corrected,
+                "distorted": distorted,
+                "corrected_before": orders().get("corrected_before", []),
+            }
+        )
+    )
 
 
 def recovered(options: Json, arguments: Json, files: Path) -> None:

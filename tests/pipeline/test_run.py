@@ -386,7 +386,7 @@ def test_telemetry_that_is_switched_off_changes_nothing(bench: Bench) -> None:
     assert (
         bench.executed(
             telemetry=dict.fromkeys(
-                ("gravity", "blur", "tracking", "gps", "search", "smoothing", "gaps"), False
+                ("gravity", "blur", "tracking", "gps", "search", "smoothing", "gaps", "clocks"), False
             )
         )
         == []
@@ -434,15 +434,49 @@ def test_a_rolling_shutter_refines_the_map_and_solves_every_frame_again(bench: B
     assert bench.executed() == []
 
 
+def test_poses_are_kept_if_no_rolling_shutter_is_found(bench: Bench) -> None:
+    bench.order(rolling=True, corrected=[])
+    executed = bench.executed()
+    assert executed.count("refine") == 1
+    assert executed.count("registration torso") == 1
+    assert json.loads((bench.out / "result.ply").read_text())["registrations"]["torso"]
+    assert bench.executed() == []
+
+
+def test_poses_that_were_solved_with_readouts_are_solved_again_without_them(bench: Bench) -> None:
+    bench.order(rolling=True, corrected=[], corrected_before=["torso"])
+    assert bench.executed().count("registration torso") == 2
+
+
 @pytest.mark.parametrize(("late", "passes"), [(0, 1), (1, 2), (9, 2)])
-def test_a_readout_that_is_found_late_is_followed_by_a_second_pass(
+def test_a_readout_that_is_found_late_is_followed_by_a_new_map_and_a_second_pass(
     bench: Bench, late: int, passes: int
 ) -> None:
     bench.order(rolling=True, late=late)
     executed = bench.executed()
-    assert executed.count("refine") == passes
+    assert executed.count("refine") == executed.count("map") == passes
     assert executed.count("registration torso") == 1 + passes
+    used = json.loads(json.loads((bench.out / "result.ply").read_text())["registrations"]["torso"])
+    built = json.loads(json.loads(json.loads(used[2]["map"])[2]["map"])[2]["refined"] or "[0]")
+    assert built[0] == ("refine" if passes == 2 else 0), "the new map uses the readout times of the first"
     assert bench.executed() == []
+
+
+def test_a_map_that_the_shutter_distorts_little_is_not_built_again(bench: Bench) -> None:
+    bench.order(rolling=True, late=1, distorted=[])
+    executed = bench.executed()
+    assert (executed.count("map"), executed.count("refine")) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    "order", [{"localised": [40, 30, 40]}, {"fail_rebuilt": True}], ids=["fewer frames", "no map"]
+)
+def test_a_worse_map_from_corrected_keypoints_is_not_used(bench: Bench, order: dict[str, Any]) -> None:
+    bench.order(rolling=True, late=1, **order)
+    executed = bench.executed()
+    assert executed.count("refine") == 2
+    used = json.loads(json.loads((bench.out / "result.ply").read_text())["registrations"]["torso"])
+    assert json.loads(json.loads(used[2]["map"])[2]["map"])[0] == "refine"
 
 
 def pictures_used(bench: Bench) -> bool:
@@ -465,6 +499,9 @@ def test_map_and_registration_are_repeated_without_the_wearer_and_used_if_better
     assert [executed.count(name) for name in repeated] == [2] * len(repeated)
     assert [executed.count(name) for name in ("wearer", "keyframes torso", "export", "report")] == [1] * 4
     assert pictures_used(bench) == is_used
+    scene_map = json.loads(json.loads((bench.out / "result.ply").read_text())["map"])
+    # The second map takes the features of unmasked cameras from the first map.
+    assert (scene_map[2]["unmasked"] is not None) == is_used
     (note,) = {event.what for event in bench.events if "wearer covers" in event.what}
     assert "40% of torso" in note
     assert (f"{2 * localised} instead of 60 frames" in note) == is_used

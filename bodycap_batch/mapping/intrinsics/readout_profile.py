@@ -13,7 +13,12 @@ import numpy as np
 
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.mapping.intrinsics.readout_time import Readout, groups_of_equal_cameras
+from bodycap_batch.mapping.intrinsics.readout_time import (
+    Readout,
+    few_blocks_factor,
+    groups_of_equal_cameras,
+    judged_readout,
+)
 from bodycap_batch.model.frame_matches import FrameMatches
 from bodycap_batch.model.optical_flow import pixel_scale
 from bodycap_batch.model.rotation_fit import MatchedRays, fit_to_rays
@@ -45,17 +50,12 @@ _BLOCK_FRAMES = 15
 standard deviation is estimated. Evidence: none."""
 _MIN_BLOCKS = 4
 """Minimum number of blocks for a standard deviation. Evidence: none."""
-_MIN_READOUT_S = 0.001
-"""Minimum estimated readout time (seconds) of a rolling shutter. A shorter one moves no pixel by much.
+_MAX_SIGMAS = 3.0
+"""Maximum deviation of the readout time of a camera from that of equal cameras, in its standard deviations.
 Evidence: none."""
-_MAX_GLOBAL_S = 0.002
-"""A shutter is treated as global if its readout time is shorter than this value (seconds) with 95 %
-probability. Evidence: none."""
-_MIN_SIGMAS = 3.0
-"""Minimum ratio of a readout time to its standard deviation. Origin: the correction then removes at least two
-thirds of the displacements."""
 _MAX_SIGMA_S = 0.004
-"""Maximum standard deviation of a determined readout time, seconds. Evidence: none."""
+"""Maximum standard deviation (seconds) of the readout time of a camera that is compared with that of equal
+cameras. Evidence: none."""
 _FLOOR_SIGMA_S = 0.0002
 """Standard deviation that is added to each estimate, seconds, because the model has no translation. Evidence:
 none."""
@@ -183,7 +183,8 @@ def estimate_from_matches(capture: Capture, selections: Sequence[KeyframeSelecti
         if joint is not None and not _agree(list(single.values()), joint):
             joint = None
         for name in names:
-            out[name] = _readout(joint or single[name], sideways=sideways[name])
+            estimate = joint or single[name]
+            out[name] = judged_readout(estimate.seconds, estimate.sigma_s, sideways=sideways[name])
     return out
 
 
@@ -206,7 +207,7 @@ def _agree(single: Sequence[_Estimate], joint: _Estimate) -> bool:
     Cameras whose data determine no readout time are not asked.
     """
     determined = [each for each in single if each.sigma_s <= _MAX_SIGMA_S]
-    return all(abs(each.seconds - joint.seconds) <= _MIN_SIGMAS * each.sigma_s for each in determined)
+    return all(abs(each.seconds - joint.seconds) <= _MAX_SIGMAS * each.sigma_s for each in determined)
 
 
 def _estimate(profiles: Sequence[_Profile]) -> _Estimate:
@@ -269,8 +270,6 @@ def _standard_deviation(costs: Sequence[FloatArray], speeds: Sequence[FloatArray
         speeds: (P,) speed of the picture in each pair of frames of each camera.
         step_s: The step, seconds.
     """
-    from scipy.special import ndtri, stdtrit  # scipy.stats takes a second to import.
-
     total = np.sum([each.sum(axis=1) for each in costs], axis=0)
     blocks = [
         each[:, start : start + _BLOCK_FRAMES].sum(axis=1)
@@ -280,8 +279,7 @@ def _standard_deviation(costs: Sequence[FloatArray], speeds: Sequence[FloatArray
     if len(blocks) < _MIN_BLOCKS or total[0] - 2.0 * total[1] + total[2] <= 0.0:
         return float("inf")
     without = np.array([_newton_step(total - block) for block in blocks])
-    # Few blocks often have similar estimates by chance.
-    few = stdtrit(len(blocks) - 1, 0.975) / ndtri(0.975)
+    few = few_blocks_factor(len(blocks))
     variance = few**2 * (len(blocks) - 1) / len(blocks) * ((without - without.mean()) ** 2).sum()
     variance += 2.0 * _PARALLAX_COST_RATIO * total[1] / (total[0] - 2.0 * total[1] + total[2])
     every, speed = np.concatenate(list(costs), axis=1), np.concatenate(list(speeds))
@@ -307,13 +305,3 @@ def _half(costs: FloatArray) -> tuple[float, float]:
     without = np.array([_newton_step(total - part) for part in parts])
     sigma = np.sqrt((_MIN_BLOCKS - 1) / _MIN_BLOCKS * ((without - without.mean()) ** 2).sum())
     return _newton_step(total), float(sigma)
-
-
-def _readout(estimate: _Estimate, *, sideways: bool) -> Readout:
-    """Return the readout time, or 0 with the reason why it is not used."""
-    best_s, sigma_s = estimate.seconds, estimate.sigma_s
-    if sigma_s <= _MAX_SIGMA_S and abs(best_s) >= max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s):
-        return Readout(best_s, sigma_s, "estimated", best_s, sideways)
-    if abs(best_s) + 2.0 * sigma_s < _MAX_GLOBAL_S:
-        return Readout(0.0, sigma_s, "none found", best_s)
-    return Readout(0.0, sigma_s, "not determined: the camera turns too evenly, or too little", best_s)

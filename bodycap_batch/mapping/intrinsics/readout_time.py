@@ -16,6 +16,7 @@ from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust, sub_model
 from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
 from bodycap_batch.mapping.reconstruction.reprojection import image_residuals_px
+from bodycap_batch.model.optical_flow import pixel_scale
 from bodycap_batch.model.rotation_path import PosePath, RotationPath, near_in_time
 from bodycap_batch.model.scene import Map, Trajectory
 
@@ -40,12 +41,17 @@ is smaller. Evidence: none."""
 _MAX_READOUT_FRAMES = 1.1
 """Maximum estimated readout time, in frame intervals. The physical limit is one frame interval. The value is
 a little larger, because the estimate is uncertain."""
-_MIN_READOUT_S = 0.002
-"""Minimum readout time (seconds) of a rolling shutter. A shutter with a smaller estimate is treated as
-global. Evidence: none."""
-_MIN_SIGMAS = 5.0
-"""Minimum ratio of an estimated readout time to its standard deviation. With a smaller ratio, the estimate is
-not significant and the shutter is treated as global. Evidence: none."""
+_MIN_READOUT_S = 0.001
+"""Minimum estimated readout time (seconds) of a rolling shutter. A shorter one moves no pixel by much.
+Evidence: none."""
+_MAX_GLOBAL_S = 0.002
+"""A shutter is treated as global if its readout time is shorter than this value (seconds) with 95 %
+probability. Evidence: none."""
+_MIN_SIGMAS = 3.0
+"""Minimum ratio of a readout time to its standard deviation. Origin: the correction then removes at least two
+thirds of the displacements."""
+_MAX_SIGMA_S = 0.004
+"""Maximum standard deviation of a determined readout time, seconds. Evidence: none."""
 _MAX_DIFFERENCE_S = 0.003
 """Maximum difference of the readout times from residuals and from matches, seconds. With a larger difference,
 the residuals are not used. Evidence: none."""
@@ -55,11 +61,15 @@ than the spline through the poses of the frames follows. Evidence: docs/decision
 _MAX_POOLED_SIGMAS = 3.0
 """Maximum deviation of the readout time of a camera from the mean of equal cameras, in its standard
 deviations. With a larger deviation, the cameras do not share the mean. Evidence: none."""
+_UNDETERMINED = "not determined: "
+"""First words of `Readout.source` of a camera whose readout time is unknown; the reason follows."""
 _BLOCKS = 8
 """Number of blocks of successive keyframes from which a standard deviation is estimated. Evidence: none."""
 _FLOOR_SIGMA_S = 0.0002
 """Standard deviation that is added to each estimate and to each mean of equal cameras, seconds, because the
 path between frames is a spline. Evidence: docs/decisions/mapping.md."""
+_DISPLACED_PERCENT = 95.0
+"""Percentile of the displacements of keypoints that is compared with a limit. Evidence: none."""
 _LOSS_PX = 1.0
 """Width (px) of the robust weight function of a residual. Evidence: none."""
 _MAX_RESIDUAL_PX = 8.0
@@ -100,7 +110,7 @@ class Readout:
             return self
         best_s = mean[0]
         sigma_s = float(np.linalg.norm([mean[1], _FLOOR_SIGMA_S, _MODEL_SIGMA_RATIO * best_s]))
-        return replace(self, seconds=best_s, best_s=best_s, sigma_s=sigma_s, source="estimated")
+        return judged_readout(best_s, sigma_s, sideways=self.sideways)
 
     def with_other_estimate(self, other: Readout) -> Readout:
         """Return the mean of the readout time from the residuals of a map and that from matches.
@@ -124,13 +134,45 @@ class Readout:
         return replace(self, seconds=best_s, best_s=best_s, sigma_s=sigma_s, source="estimated")
 
     @property
+    def determined(self) -> bool:
+        """True if the readout time is known, or known to be short; False if the data do not tell it."""
+        return not self.source.startswith(_UNDETERMINED)
+
+    @property
+    def scatter_s(self) -> float:
+        """Standard deviation (seconds) without the part that all estimates have in common.
+
+        The common part is the error of the splines, a ratio of the readout time. A mean does not reduce it,
+        so it is added to the mean, once.
+        """
+        variance = self.sigma_s**2 - (_MODEL_SIGMA_RATIO * self.best_s) ** 2
+        return float(np.sqrt(max(variance, _FLOOR_SIGMA_S**2)))
+
+    @property
     def significance(self) -> float:
         """Ratio of the readout time to its standard deviation; 0 if no readout time was found."""
         return abs(self.seconds) / self.sigma_s if self.sigma_s else 0.0
 
 
+def judged_readout(best_s: float, sigma_s: float, *, sideways: bool = False) -> Readout:
+    """Return the readout time, or 0 with the reason why it is not used.
+
+    Args:
+        best_s: The most likely readout time, seconds.
+        sigma_s: Its standard deviation, seconds; infinity if it is unknown.
+        sideways: True if the sensor's rows are columns of the image.
+    """
+    if sigma_s <= _MAX_SIGMA_S and abs(best_s) >= max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s):
+        return Readout(best_s, sigma_s, "estimated", best_s, sideways)
+    if abs(best_s) + 2.0 * sigma_s < _MAX_GLOBAL_S:
+        return Readout(0.0, sigma_s, "none found", best_s, sideways)
+    return Readout(
+        0.0, sigma_s, f"{_UNDETERMINED}the camera turns too evenly, or too little", best_s, sideways
+    )
+
+
 def _weighted_mean(readouts: Sequence[Readout], max_sigmas: float) -> tuple[float, float] | None:
-    """Return the weighted mean of readout times and its standard deviation, seconds.
+    """Return the weighted mean of readout times and its standard deviation without the common part, seconds.
 
     Args:
         readouts: The readout times.
@@ -140,8 +182,8 @@ def _weighted_mean(readouts: Sequence[Readout], max_sigmas: float) -> tuple[floa
         Mean and standard deviation; None if a standard deviation is unknown, or if a value deviates more.
     """
     value = np.array([item.best_s for item in readouts])
-    sigma = np.array([item.sigma_s for item in readouts])
-    if len(readouts) == 0 or not np.isfinite(sigma).all() or not sigma.all():
+    sigma = np.array([item.scatter_s for item in readouts])
+    if len(readouts) == 0 or not np.isfinite(sigma).all() or not all(item.sigma_s for item in readouts):
         return None
     weight = 1.0 / sigma**2
     mean = float((weight * value).sum() / weight.sum())
@@ -150,6 +192,16 @@ def _weighted_mean(readouts: Sequence[Readout], max_sigmas: float) -> tuple[floa
         return None
     scatter = max(1.0, float((deviation**2).sum()) / max(1, len(readouts) - 1))
     return mean, float(np.sqrt(scatter / weight.sum()))
+
+
+def few_blocks_factor(blocks: int) -> float:
+    """Return the factor of a standard deviation that was estimated from a few independent blocks.
+
+    Few blocks often have similar estimates by chance. The factor is that of a 95 % interval.
+    """
+    from scipy.special import ndtri, stdtrit  # scipy.stats takes a second to import.
+
+    return float(stdtrit(blocks - 1, 0.975) / ndtri(0.975))
 
 
 def groups_of_equal_cameras(cameras: Iterable[CaptureCamera]) -> list[list[str]]:
@@ -285,6 +337,24 @@ class RollingShutterModel:
             for feature, xy in zip(item.feature.tolist(), px, strict=True):
                 points[feature].xy = xy
 
+    def displacement_px(self, name: str, readout_s: float) -> float:
+        """Return how far the rolling shutter displaces the keypoints of a camera.
+
+        Args:
+            name: Name of the camera.
+            readout_s: Readout time of the camera, seconds.
+
+        Returns:
+            The 95th percentile, px of an image with a long side of 640 px; 0 if there are no keypoints.
+        """
+        lens = self._intrinsics.get(name)
+        own = [item for item in self._keypoints if item.camera == name and len(item.px)]
+        if lens is None or not own:
+            return 0.0
+        moved = [np.linalg.norm(self._px_at_mid_row(item, readout_s) - item.px, axis=1) for item in own]
+        scale = pixel_scale(lens.width_px, lens.height_px)
+        return float(np.percentile(np.concatenate(moved), _DISPLACED_PERCENT)) / scale
+
     def _px_at_mid_row(self, item: _Keypoints, readout_s: float) -> FloatArray:
         """Return the positions (N,2) of keypoints at the instant of the middle row, for a readout time."""
         path = self._paths.get(item.camera)
@@ -393,11 +463,10 @@ class RollingShutterModel:
         def contradicted(name: str) -> bool:
             return name in others and abs(out[name].best_s - others[name].best_s) > _MAX_DIFFERENCE_S
 
-        found = {name for name in unknown if out[name].seconds or name in others}
         pooled = dict(out)
         for names in groups_of_equal_cameras(self._cameras[name] for name in unknown):
-            equal = [name for name in names if name in found and not contradicted(name)]
-            for name in found.intersection(names):
+            equal = [name for name in names if np.isfinite(out[name].sigma_s) and not contradicted(name)]
+            for name in names:
                 pooled[name] = out[name].pooled([out[other] for other in equal])
         return pooled | {
             name: pooled[name].with_other_estimate(other) for name, other in others.items() if name in unknown
@@ -418,7 +487,7 @@ class RollingShutterModel:
             if camera.rolling_shutter_known:
                 out[name] = stated_readout(camera.rolling_shutter_s)
             else:
-                out[name] = Readout(0.0, 0.0, f"not determined: {reason}", 0.0)
+                out[name] = Readout(0.0, 0.0, f"{_UNDETERMINED}{reason}", 0.0)
         return out
 
     def _keypoints_of(self, image_id: int) -> _Keypoints:
@@ -516,21 +585,22 @@ class _ResidualSlope:
         )
         without = other_correlation / np.maximum(other_information, 1e-12 * information)
         variance = (_BLOCKS - 1) / _BLOCKS * ((without - without.mean()) ** 2).sum()
-        return _ResidualSlope(correlation, information, float(np.hypot(np.sqrt(variance), _FLOOR_SIGMA_S)))
+        sigma_s = few_blocks_factor(_BLOCKS) * float(np.sqrt(variance))
+        return _ResidualSlope(correlation, information, float(np.hypot(sigma_s, _FLOOR_SIGMA_S)))
 
     def readout(self, at_s: float, frame_s: float) -> Readout:
-        """Return the readout time with the smallest residuals, or 0 if that time is not significant.
+        """Return the readout time with the smallest residuals, or 0 with the reason why it is not used.
 
         Args:
             at_s: Readout time of the adjustment at which the slope was computed, seconds.
             frame_s: Frame interval, seconds.
         """
         if self.information <= 0.0:
-            return Readout(0.0, float("inf"), "none found", at_s)
+            return judged_readout(at_s, float("inf"))
         best_s = at_s - self.correlation / self.information
-        found = max(_MIN_READOUT_S, _MIN_SIGMAS * self.sigma_s) < abs(best_s) < _MAX_READOUT_FRAMES * frame_s
-        sigma_s = float(np.hypot(self.sigma_s, _MODEL_SIGMA_RATIO * best_s))
-        return Readout(best_s if found else 0.0, sigma_s, "estimated" if found else "none found", best_s)
+        if abs(best_s) > _MAX_READOUT_FRAMES * frame_s:
+            return judged_readout(best_s, float("inf"))
+        return judged_readout(best_s, float(np.hypot(self.sigma_s, _MODEL_SIGMA_RATIO * best_s)))
 
 
 def estimate_readouts(
@@ -592,7 +662,10 @@ def map_with_readouts(scene: Map, readouts: Mapping[str, Readout]) -> Map:
         for name, camera in scene.cameras.items()
     }
     return replace(
-        scene, cameras=cameras, readout_s={name: readout.seconds for name, readout in nonzero.items()}
+        scene,
+        cameras=cameras,
+        readout_s={name: readout.seconds for name, readout in nonzero.items()},
+        readout_sigma_s={name: readout.sigma_s for name, readout in nonzero.items() if readout.sigma_s},
     )
 
 

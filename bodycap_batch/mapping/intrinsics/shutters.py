@@ -11,15 +11,12 @@ import numpy as np
 from bodycap_batch.capture import Capture
 from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
 from bodycap_batch.inertial import camera_rotation
-from bodycap_batch.mapping.intrinsics.readout_time import Readout, stated_readout
+from bodycap_batch.mapping.intrinsics.readout_time import Readout, judged_readout, stated_readout
 from bodycap_batch.model.rotation_path import TurningShutter
 from bodycap_batch.model.scene import KeyframeSelection, Map
 
 _MAX_SIGMAS = 3.0
 """Maximum difference of two readout times that agree, in its standard deviations. Evidence: none."""
-_MIN_READOUT_S, _MIN_SIGMAS = 0.002, 5.0
-"""Minimum readout time (seconds) of a rolling shutter, and its minimum in standard deviations: the same as
-for readout times from the map."""
 _FOLDER = "shutters"
 """Name of the folder with the shutters, in the workspace folder. Each camera with a rolling shutter has a
 file."""
@@ -57,14 +54,7 @@ def with_gyroscopes(
         if abs(value[0] - value[1]) > _MAX_SIGMAS * float(np.hypot(*sigma)):
             weight = np.where(sigma == sigma.min(), weight, 0.0)
         best_s, sigma_s = float(weight @ value / weight.sum()), float(weight.sum() ** -0.5)
-        is_rolling = abs(best_s) > max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s)
-        out[selection.camera] = replace(
-            own,
-            seconds=best_s if is_rolling else 0.0,
-            sigma_s=sigma_s,
-            source="estimated" if is_rolling else "none found",
-            best_s=best_s,
-        )
+        out[selection.camera] = judged_readout(best_s, sigma_s, sideways=own.sideways)
     return out
 
 
@@ -74,7 +64,8 @@ def readouts_of_maps(maps: Sequence[Map]) -> dict[str, Readout]:
     for scene_map in maps:
         for name, seconds in scene_map.readout_s.items():
             sideways = name in scene_map.cameras and scene_map.cameras[name].sideways
-            out.setdefault(name, Readout(seconds, 0.0, "of the map", seconds, sideways))
+            sigma_s = scene_map.readout_sigma_s.get(name, 0.0)
+            out.setdefault(name, Readout(seconds, sigma_s, "of the map", seconds, sideways))
     return out
 
 

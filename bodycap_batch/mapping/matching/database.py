@@ -5,7 +5,9 @@ Cameras and images are written in a fixed order, so the same input always gives 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import shutil
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +19,7 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping.matching.sift import extract_features
+from bodycap_batch.mapping.matching.sift import SiftFeatures, extract_features
 from bodycap_batch.model.rotation_path import TurningShutter
 
 if TYPE_CHECKING:
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
 
 DATABASE_NAME = "database.db"
 """File name of the database in the workspace folder."""
+_COPY_NAME = "earlier.db"
+"""Name of the copy of an earlier map's database, in the work folder."""
 _COLOURS_FOLDER = "colours"
 """Name of the folder with the colours of the keypoints, in the workspace folder. Each image has one file."""
 _DETECTED_FOLDER = "detected"
@@ -64,12 +68,16 @@ class CameraKeyframes:
         camera_id: Database id of the camera. The camera's rig has the same id.
         frames: (K,) frame indices, increasing.
         shutter: Moves the keypoints to the instant of the middle row; None for a global shutter.
+        earlier: Workspace of an earlier map that was made from the same pictures of the camera, with the same
+            mask and the same maximum number of features. The features that it holds are copied. None: all
+            features are extracted.
     """
 
     camera: CaptureCamera
     camera_id: int
     frames: IntArray
     shutter: TurningShutter | None = None
+    earlier: Path | None = None
 
 
 def read_image_ids(database: pycolmap.Database) -> dict[ImageRef, int]:
@@ -125,7 +133,7 @@ def add_keyframes(
 ) -> None:
     """Extract the SIFT features of keyframes, and write the keyframes and their features to the database.
 
-    The cameras are processed one after the other.
+    The cameras are processed one after the other. Features that an earlier map holds are copied.
 
     Args:
         workspace: Folder of the database.
@@ -148,7 +156,7 @@ def add_keyframes(
         pycolmap.DatabaseTransaction(database),
     ):
         for item in keyframes:
-            for index, features in extract_features(item.camera, item.frames, options.features, context):
+            for index, features in _features_of(item, options.features, context):
                 image_id = write_image(database, ImageRef(item.camera.name, index), item.camera_id)
                 keypoints = features.keypoints
                 if item.shutter is not None:
@@ -161,6 +169,64 @@ def add_keyframes(
                 done += 1
                 context.progress(done, total, "features")
     context.progress(0, 0, "choosing pairs")
+
+
+def _features_of(
+    keyframes: CameraKeyframes, count: int, context: StageContext
+) -> Iterator[tuple[int, SiftFeatures]]:
+    """Yield the index and the features of each keyframe, in frame order.
+
+    Args:
+        keyframes: The keyframes of one camera.
+        count: Maximum number of features of a keyframe.
+        context: Work folder, threads and cancellation.
+    """
+    if keyframes.earlier is None:
+        yield from extract_features(keyframes.camera, keyframes.frames, count, context)
+        return
+    with _opened_copy(keyframes.earlier, context) as database:
+        ids = {ref.frame: number for ref, number in _images_of(database, keyframes.camera.name).items()}
+        missing = np.array([frame for frame in keyframes.frames if int(frame) not in ids], dtype=np.int64)
+        extracted = extract_features(keyframes.camera, missing, count, context)
+        for frame in map(int, keyframes.frames):
+            context.check_cancelled()
+            if frame in ids:
+                yield frame, _read_features(keyframes.earlier, database, ids[frame])
+            else:
+                yield next(extracted)
+
+
+@contextmanager
+def _opened_copy(workspace: Path, context: StageContext) -> Iterator[pycolmap.Database]:
+    """Give a copy of the database of an earlier map.
+
+    COLMAP writes to each database that it opens. The earlier map may be a stored result, which never changes.
+    """
+    import pycolmap
+
+    copied = context.work_dir / _COPY_NAME
+    shutil.copyfile(workspace / DATABASE_NAME, copied)
+    with pycolmap.Database.open(str(copied)) as database:
+        yield database
+    copied.unlink()
+
+
+def _images_of(database: pycolmap.Database, camera: str) -> dict[ImageRef, int]:
+    """Return the image id of every keyframe of one camera in the database."""
+    return {ref: number for ref, number in read_image_ids(database).items() if ref.camera == camera}
+
+
+def _read_features(workspace: Path, database: pycolmap.Database, image_id: int) -> SiftFeatures:
+    """Return the features of an image as they were extracted, with the detected positions."""
+    keypoints = np.asarray(database.read_keypoints(image_id), dtype=np.float32)[:, :4].copy()
+    detected = workspace / _DETECTED_FOLDER / f"{image_id}.npy"
+    if detected.exists():
+        keypoints[:, :2] = np.load(detected)
+    return SiftFeatures(
+        keypoints=keypoints,
+        descriptors=np.asarray(database.read_descriptors(image_id).data, dtype=np.uint8),
+        rgb=read_keypoint_colours(workspace, image_id),
+    )
 
 
 def _at_mid_row(

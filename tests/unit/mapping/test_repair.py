@@ -396,10 +396,12 @@ def _two_models(
     return parts[0], parts[1]
 
 
+@pytest.mark.parametrize("is_large", [False, True])
 def test_models_with_common_keyframes_become_one(
-    built: tuple[Any, FloatArray, MappingContext, set[Any]],
+    built: tuple[Any, FloatArray, MappingContext, set[Any]], is_large: bool
 ) -> None:
     model, poses, mapping, _ = built
+    mapping = replace(mapping, skeletal_above=1 if is_large else 100)
     main, further = _two_models(built, range(10), range(7, _KEYFRAMES))
     models, log = join_models([main, further], mapping)
     assert [each.num_reg_images() for each in models] == [_KEYFRAMES]

@@ -6,6 +6,7 @@ import errno
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import CaptureError, DiskAway, JobError
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.nominal_mounts import (
     NOMINAL_SIGMA_RAD,
     STATED_SIGMA_M,
@@ -27,6 +29,7 @@ from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.pipeline.inputs import body_input, camera_digest
 from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.body import mount_prior
+from bodycap_batch.tasks.registration import may_have_rolling_shutter
 
 QUARTER_TURN = {"translation_m": [0.1, 0.2, 0.3], "quat_xyzw": [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]}
 
@@ -165,3 +168,17 @@ def test_a_disk_that_fails_while_footage_is_read_is_reported_instead_of_the_file
     with pytest.raises(DiskAway, match=os.strerror(number)) as caught:
         camera_digest(job.capture, job.capture.cameras[0], FileDigests(tmp_path / "digests"))
     assert caught.value.path == str(job.capture.cameras[0].video[0])
+
+
+def test_a_map_is_corrected_again_if_matches_do_not_determine_a_readout(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The poses show no rolling shutter: the map has absorbed most of its displacements.
+    monkeypatch.setattr(
+        "bodycap_batch.model.rolling_shutter.has_visible_rolling_shutter", lambda *_, **__: False
+    )
+    camera: Any = SimpleNamespace(name="torso", rolling_shutter_known=False, may_be_sideways=False)
+    for names, expected in (((), False), (("torso",), True), (("palm",), False)):
+        log = MapDiagnostics(unknown_shutters=names).to_log()
+        scene: Any = SimpleNamespace(maps=(), diagnostics=MapDiagnostics.from_log(log))
+        assert may_have_rolling_shutter(SimpleNamespace(), camera, scene) is expected  # type: ignore[arg-type]

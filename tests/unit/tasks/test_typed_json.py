@@ -121,7 +121,11 @@ def tasks(folder: Path) -> dict[str, Any]:
             registrations=stored,
             samples={"torso": FileRef(path=folder / "torso.imu.csv", digest="of the samples")},
         ),
-        "sound": SoundTask(capture=capture),
+        "sound": SoundTask(
+            capture=capture,
+            sensors=True,
+            samples={"torso": FileRef(path=folder / "torso.imu.csv", digest="of the samples")},
+        ),
         "clocks": ClocksTask(
             capture=capture,
             stated=clocks,
