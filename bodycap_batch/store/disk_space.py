@@ -50,7 +50,7 @@ def require_room(folder: Path, frames: int, large: int = 0) -> list[str]:
         raise StoreError(
             f"the disk has {free / 1e6:.0f} MB of free space, but the job needs about {need / 1e6:.0f} MB",
             path=folder,
-            hint="free some space, or choose another disk with --out",
+            hint="free some space, or choose another disk with --out and --store",
         )
     if free < _HARD_CAPTURE_FACTOR * need:
         return [
