@@ -289,3 +289,9 @@ def test_frames_of_a_violent_capture_are_compared_with_the_truth_and_with_the_jo
     assert (used["posed"], used["inertial"], used["short"], used["off"]) == (10, 1, 0, 1)
     assert (used["short_without"], used["of_them_posed"], used["gained"], used["common"]) == (1, 1, 1, 9)
     assert used["gained_rmse"] == used["max"] > 10.0
+
+
+def test_poses_are_compared_with_the_mean_over_the_exposure_where_it_is_known(tmp_path):
+    assert poses.shown_truth(tmp_path) == tmp_path
+    (tmp_path / "exposure").mkdir()
+    assert poses.shown_truth(tmp_path) == tmp_path / "exposure"
