@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM
 from bodycap_batch.clocks.estimate import (
     STATED_SIGMA_S,
     ClockEstimate,
@@ -12,7 +13,6 @@ from bodycap_batch.clocks.estimate import (
     estimate_clocks,
     triggered_groups,
 )
-from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.model.camera_clock import ESTIMATED_SOURCES, CaptureClocks, ClockRelation
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.capture.timeline import join_chapters
+from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM, ClockPair
 from bodycap_batch.clocks.container_times import (
     ContainerTime,
     ExpectedOffset,
@@ -23,13 +24,12 @@ from bodycap_batch.clocks.container_times import (
 from bodycap_batch.clocks.joint_offsets import (
     UNLIKE_SIGMA_S,
     WAY_SIGMA_S,
-    ClockPair,
     JointClock,
     camera_pairs,
     connected_cameras,
     solve_clocks,
 )
-from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM, MAX_DRIFT_PPM, PairOffset, measure_pair
+from bodycap_batch.clocks.pair_offsets import MAX_DRIFT_PPM, PairOffset, measure_pair
 from bodycap_batch.clocks.phase_correlation import PEAK_WIDTH_S
 from bodycap_batch.clocks.recorders import Recorder
 from bodycap_batch.clocks.sensor_offsets import SensorOffset, measure_sensor_offset

@@ -10,11 +10,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
-from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM
+from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM, ClockPair
 from bodycap_batch.core.arrays import FloatArray
 
 WAY_SIGMA_S = 0.0015
@@ -27,55 +27,6 @@ _MIN_SIGMA_S = 1e-4
 """Least standard deviation of the offset of a pair, seconds, so that no pair has an infinite weight."""
 _MAX_CLOSURE_SIGMAS = 4.0
 """Maximum residual of a pair in a loop, in its standard deviations. Evidence: none."""
-
-
-class ClockPair(Protocol):
-    """What two cameras say about their clocks: the attributes of `PairOffset` that are solved together."""
-
-    @property
-    def first(self) -> str:
-        """Name of the first camera."""
-        ...
-
-    @property
-    def second(self) -> str:
-        """Name of the second camera."""
-        ...
-
-    @property
-    def pivot_s(self) -> float:
-        """Time on the second camera's clock, seconds."""
-        ...
-
-    @property
-    def offset_s(self) -> float:
-        """Difference of the clocks at the pivot, seconds."""
-        ...
-
-    @property
-    def sigma_s(self) -> float:
-        """Standard deviation of the offset, seconds."""
-        ...
-
-    @property
-    def drift_ppm(self) -> float:
-        """Drift, parts per million."""
-        ...
-
-    @property
-    def drift_sigma_ppm(self) -> float:
-        """Standard deviation of the drift."""
-        ...
-
-    @property
-    def drift_measured(self) -> bool:
-        """True if the drift was measured."""
-        ...
-
-    @property
-    def evidence(self) -> float:
-        """How clear the offset is."""
-        ...
 
 
 Pair = TypeVar("Pair", bound=ClockPair)

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM
 from bodycap_batch.clocks.estimate import ClockEstimate, ClockEstimates, Recording, SoundEvidence
 from bodycap_batch.clocks.joint_offsets import WAY_SIGMA_S, JointClock, connected_cameras
 from bodycap_batch.clocks.motion_offsets import MotionClocks
-from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM, PairOffset
+from bodycap_batch.clocks.pair_offsets import PairOffset
 
 _GIVEN_BY: Mapping[str, str] = {"sound": "sound gives", "sensors": "inertial sensors give"}
 """Beginning of a sentence about an offset, by its source."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM, ClockPair
 from bodycap_batch.clocks.joint_offsets import JointClock, JointClocks, solve_clocks
 from bodycap_batch.clocks.motion_score import (
     LIMB_WEIGHTS_HZ,
@@ -21,7 +22,6 @@ from bodycap_batch.clocks.motion_score import (
     motion_score,
 )
 from bodycap_batch.clocks.motion_signals import STEP_S, CameraPath, MotionSignals, motion_signals
-from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM
 from bodycap_batch.core.arrays import FloatArray
 
 MIN_COMMON_S = 2.0
@@ -70,23 +70,12 @@ information within `_NEAR_S`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MotionOffset:
+class MotionOffset(ClockPair):
     """What the motion of two cameras says about their clocks.
 
-    Time of the first camera = time of the second camera + offset_s at the time `pivot_s` of the second
-    camera. From there the difference changes by `drift_ppm`.
+    `sigma_s` contains that of a limb which lags behind the trunk.
 
     Attributes:
-        first: Name of the first camera.
-        second: Name of the second camera.
-        accepted: True if the offset is determined.
-        reason: Why the pair was not accepted; empty if it was.
-        pivot_s: Time on the second camera's clock, seconds, at which offset and drift are not correlated.
-        offset_s: Difference of the clocks at the pivot, seconds.
-        sigma_s: Standard deviation of the offset, seconds, with that of a limb which lags behind the trunk.
-        drift_ppm: Drift, parts per million; 0 if it was not measured.
-        drift_sigma_ppm: Standard deviation of the drift.
-        drift_measured: True if the common time is long enough to measure the drift.
         evidence: Score of the offset: logarithm of its likelihood relative to a typical offset.
         log_odds: Logarithm of the likelihood of this peak over that of all other offsets.
         common_s: Time in which both cameras were localised, seconds.
@@ -94,17 +83,6 @@ class MotionOffset:
         curve: (L,) score of each offset.
     """
 
-    first: str
-    second: str
-    accepted: bool = False
-    reason: str = ""
-    pivot_s: float = 0.0
-    offset_s: float = 0.0
-    sigma_s: float = float("inf")
-    drift_ppm: float = 0.0
-    drift_sigma_ppm: float = CRYSTAL_SIGMA_PPM
-    drift_measured: bool = False
-    evidence: float = 0.0
     log_odds: float = 0.0
     common_s: float = 0.0
     curve_lags_s: FloatArray | None = field(default=None, repr=False)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM, ClockPair
 from bodycap_batch.clocks.phase_correlation import (
     PEAK_WIDTH_S,
     Peak,
@@ -27,9 +28,6 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray
 MIN_DRIFT_SPAN_S = 40.0
 """Least time, seconds, between the first and the last window from which the drift is measured. Origin: about
 a minute of sound; the way of sound changes by 1 ms, which is 20 ppm of this time."""
-CRYSTAL_SIGMA_PPM = 40.0
-"""Standard deviation of the drift between two clocks, ppm, if it was not measured. Origin: crystals have a
-tolerance of ±50 ppm, about 29 ppm of standard deviation each."""
 _WINDOW_S = 6.0
 """Duration of a window, seconds. Origin: at 50 ppm two clocks move by 0.3 ms in it, which is less than
 `SMOOTHING_S`. Evidence: docs/decisions/clocks.md."""
@@ -97,23 +95,10 @@ class ChunkOffset:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PairOffset:
-    """What the sound of two cameras says about their clocks.
-
-    Time of the first camera = time of the second camera · (1 + drift_ppm · 1e-6) + constant, where the
-    constant is such that the difference is `offset_s` at the time `pivot_s` of the second camera.
+class PairOffset(ClockPair):
+    """What the sound of two cameras says about their clocks; `sigma_s` is without the way of sound.
 
     Attributes:
-        first: Name of the first camera.
-        second: Name of the second camera.
-        accepted: True if both heard the same.
-        reason: Why the pair was not accepted; empty if it was.
-        pivot_s: Time on the second camera's clock, seconds, at which offset and drift are not correlated.
-        offset_s: Difference of the clocks at the pivot, seconds.
-        sigma_s: Standard deviation of the offset without the way of sound, seconds.
-        drift_ppm: Drift, parts per million; 0 if it was not measured.
-        drift_sigma_ppm: Standard deviation of the drift.
-        drift_measured: True if the common time is long enough to measure the drift.
         evidence: Summed heights of the windows that agree, σ.
         rival_ratio: `evidence` over that of the best other lag.
         log_chance: Logarithm of the probability that unrelated sounds give this result.
@@ -122,17 +107,6 @@ class PairOffset:
         curve: (N,) mean energy of the correlations of the windows, relative to its mean.
     """
 
-    first: str
-    second: str
-    accepted: bool = False
-    reason: str = ""
-    pivot_s: float = 0.0
-    offset_s: float = 0.0
-    sigma_s: float = float("inf")
-    drift_ppm: float = 0.0
-    drift_sigma_ppm: float = CRYSTAL_SIGMA_PPM
-    drift_measured: bool = False
-    evidence: float = 0.0
     rival_ratio: float = 0.0
     log_chance: float = 0.0
     chunks: tuple[ChunkOffset, ...] = ()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM
+from bodycap_batch.clocks.clock_pair import ClockPair
 from bodycap_batch.clocks.sensor_signals import RATE_HZ, SensorTrack
 from bodycap_batch.core.arrays import FloatArray, IntArray
 
@@ -54,37 +54,16 @@ relative to the picture is some 10 ms and differs between models."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SensorOffset:
+class SensorOffset(ClockPair):
     """What the inertial sensors of two cameras say about their clocks.
 
-    Time of the first camera = time of the second camera + `offset_s`, at the time `pivot_s` of the second.
+    `pivot_s` is the middle of the common time. The drift is not measured.
 
     Attributes:
-        first: Name of the first camera.
-        second: Name of the second camera.
-        accepted: True if both measured the same body.
-        reason: Why the pair was not accepted; empty if it was.
-        pivot_s: Middle of the common time on the second camera's clock, seconds.
-        offset_s: Difference of the clocks, seconds.
-        sigma_s: Standard deviation of the offset, seconds.
-        drift_ppm: 0: the drift is not measured.
-        drift_sigma_ppm: Standard deviation of the drift, parts per million.
-        drift_measured: False.
         evidence: Logarithm of the likelihood over that of unrelated recordings.
         log_odds: Logarithm of the likelihood over that of the best other offset.
     """
 
-    first: str
-    second: str
-    accepted: bool = False
-    reason: str = ""
-    pivot_s: float = 0.0
-    offset_s: float = 0.0
-    sigma_s: float = float("inf")
-    drift_ppm: float = 0.0
-    drift_sigma_ppm: float = CRYSTAL_SIGMA_PPM
-    drift_measured: bool = False
-    evidence: float = 0.0
     log_odds: float = 0.0
 
 

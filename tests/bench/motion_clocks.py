@@ -59,11 +59,11 @@ def run(data: Path, share: float, seed: int, stored: Sequence[Path]) -> tuple[li
     lines, wrong = [], 0
     outcomes: list[Outcome] = []
     for kind in ("walk", "posture", "spot", *motions):
-        length_s = _length_s(motions[kind]) if kind in motions else 20.0
-        if length_s < 5.0:
+        most_s = length_s(motions[kind]) if kind in motions else 20.0
+        if most_s < 5.0:
             continue
         for index in range(max(1, round(40 * share))):
-            paths, starts = trial(kind, seed + index, length_s, motions)
+            paths, starts = trial(kind, seed + index, most_s, motions)
             outcomes += solved(kind, paths, starts)
     for folder in stored:
         paths = stored_paths(folder)
@@ -74,7 +74,7 @@ def run(data: Path, share: float, seed: int, stored: Sequence[Path]) -> tuple[li
         note = "" if kind is None or kind not in DEVELOPED_ON else " (developed on)"
         lines.append(f"{'all' if kind is None else kind:10} {_row(some)}{note}")
     wrong = sum(each.accepted and abs(each.error_s) > WRONG_S for each in outcomes)
-    names = [name for name in motions if _length_s(motions[name]) > 5.0]
+    names = [name for name in motions if length_s(motions[name]) > 5.0]
     found = [
         measure_motion_offset(
             trial(one, seed + 500 + index, 6.0, motions)[0][0],
@@ -116,7 +116,7 @@ def trial(
     seconds = float(rng.uniform(5.0, longest_s))
     options: dict[str, object] = {"seed": seed, "seconds": seconds, "cameras": CAMERAS[seed % len(CAMERAS)]}
     if kind in motions:
-        start_s = float(rng.uniform(0.0, _length_s(motions[kind]) - seconds))
+        start_s = float(rng.uniform(0.0, length_s(motions[kind]) - seconds))
         options |= {"motion": motions[kind], "motion_start_s": start_s}
     options |= {"on_the_spot": True} if kind == "spot" else {}
     options |= {"posture_spread": 1.0} if kind == "posture" else {}
@@ -187,7 +187,8 @@ def _path(camera: str, times_ns: FloatArray, poses: FloatArray) -> CameraPath:
     )
 
 
-def _length_s(path: Path) -> float:
+def length_s(path: Path) -> float:
+    """Return the duration of a recorded motion, seconds; 0 without motion."""
     motion = read_bvh(path)[1]
     return 0.0 if motion is None else (len(motion.root_in_world_m) - 2) / motion.fps
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +16,16 @@ import numpy as np
 from bodycap_batch.clocks.sensor_offsets import measure_sensor_offset
 from bodycap_batch.clocks.sensor_signals import SensorTrack, sensor_track
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.synthetic.camera_renderer import camera_poses_at
 from bodycap_batch.synthetic.imu import write_imu
 from bodycap_batch.synthetic.imu_options import ImuOptions
 from bodycap_batch.synthetic.making import Subject, draw_subject
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.telemetry.text_files import read_imu_file
+from tests.bench.motion_clocks import LONG_S, Outcome, length_s
 
 CAMERAS = ("torso", "left_palm", "right_palm", "head", "left_upper_arm", "right_thigh")
 WRONG_S, FAR_S = 0.020, 0.050
-LONG_S = 6.0
 START_S = 0.1
 """Start of the used part of a recorded motion: its first frame may be a pose without motion."""
 WALKS: Mapping[str, Mapping[str, object]] = {
@@ -38,18 +36,6 @@ WALKS: Mapping[str, Mapping[str, object]] = {
 }
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What was found for a pair; the error is estimate − truth."""
-
-    kind: str
-    camera: str
-    common_s: float
-    accepted: bool
-    error_s: float
-    sigma_s: float
-
-
 def run(data: Path, share: float, seed: int) -> tuple[list[str], int]:
     """Run all trials.
 
@@ -57,7 +43,7 @@ def run(data: Path, share: float, seed: int) -> tuple[list[str], int]:
         The lines of the table, and the number of offsets that are far off or of unrelated recordings.
     """
     motions = {path.stem: path for path in sorted((data / "motions").glob("*.bvh"))}
-    lengths_s = {kind: _length_s(path) - START_S for kind, path in motions.items()}
+    lengths_s = {kind: length_s(path) - START_S for kind, path in motions.items()}
     kinds = [*WALKS, *(kind for kind, length_s in lengths_s.items() if length_s >= 5.0)]
     outcomes: list[Outcome] = []
     tracks: list[tuple[str, int, Mapping[str, SensorTrack]]] = []
@@ -160,11 +146,6 @@ def _part(track: SensorTrack, begin: int, end: int) -> SensorTrack:
 
 def _belongs(kind: str, group: str, motions: Mapping[str, Path]) -> bool:
     return group in ("all", kind) or (group == "recorded" and kind in motions)
-
-
-def _length_s(path: Path) -> float:
-    motion = read_bvh(path)[1]
-    return 0.0 if motion is None else (len(motion.root_in_world_m) - 2) / motion.fps
 
 
 def _row(some: Sequence[Outcome]) -> str:

@@ -7,8 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
+from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM
 from bodycap_batch.clocks.joint_offsets import UNLIKE_SIGMA_S, WAY_SIGMA_S, connected_cameras, solve_clocks
-from bodycap_batch.clocks.pair_offsets import CRYSTAL_SIGMA_PPM, PairOffset
+from bodycap_batch.clocks.pair_offsets import PairOffset
 
 OFFSETS = {"torso": 0.0, "head": 0.4, "left": -1.2, "right": 7.0}
 DRIFTS = {"torso": 0.0, "head": 30.0, "left": -45.0, "right": 10.0}
