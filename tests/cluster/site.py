@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.pipeline.fake_stages import ORDERS
+from tests.pipeline.fake_stages import ORDERS, give_orders
 from tests.processes import END_WITH_PARENT
 from tests.results import results_of
 
@@ -59,8 +59,7 @@ class Site:
                 (self.folder / name / f"{camera}.mp4").write_text(f"frames of {camera} on {name}")
 
     def order(self, **orders: Any) -> None:
-        started = str(self.folder / "started")
-        (self.folder / "orders.json").write_text(json.dumps({"started": started, **orders}))
+        give_orders(self.folder, **orders)
 
     def spawn(self, name: str, module: str, *arguments: str) -> None:
         with (self.folder / f"{name}.log").open("ab") as log:

@@ -14,7 +14,7 @@ from typing import Any
 
 from bodycap_batch.watch import JobPermissions, Spool, Watcher, WatchOptions
 from bodycap_batch.watch.spool import JobDir
-from tests.pipeline.fake_stages import ORDERS
+from tests.pipeline.fake_stages import ORDERS, give_orders
 
 ROOT = Path(__file__).parents[2]
 CHILD = (sys.executable, str(Path(__file__).with_name("fake_stages.py")))
@@ -35,8 +35,7 @@ class SpoolFixture:
         self.order()
 
     def order(self, **orders: Any) -> None:
-        started = str(self.folder / "started")
-        self.orders.write_text(json.dumps({"started": started, **orders}))
+        give_orders(self.folder, **orders)
 
     def drop(self, name: str, job: str | None = None, *, ready: bool = True) -> Path:
         """Drop a folder of two videos, with a job file if a text is given."""

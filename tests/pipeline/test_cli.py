@@ -20,7 +20,7 @@ import yaml
 import bodycap_batch
 from bodycap_batch.cli import main
 from tests.pipeline.fake_bodycap import run_here
-from tests.pipeline.fake_stages import ORDERS
+from tests.pipeline.fake_stages import ORDERS, give_orders
 from tests.processes import gone
 from tests.results import results_of
 
@@ -42,8 +42,7 @@ class Bench:
         self.order()
 
     def order(self, **orders: Any) -> None:
-        started = str(self.folder / "started")
-        (self.folder / "orders.json").write_text(json.dumps({"started": started, **orders}))
+        give_orders(self.folder, **orders)
 
     def start(self, *arguments: str, **options: Any) -> subprocess.Popen[str]:
         return subprocess.Popen(

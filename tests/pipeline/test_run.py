@@ -20,7 +20,7 @@ from bodycap_batch.core.errors import BodycapError, Cancelled, CaptureError, Est
 from bodycap_batch.core.progress import Event
 from bodycap_batch.pipeline import RunSummary, Settings, run_job
 from bodycap_batch.store.artefacts import Store
-from tests.pipeline.fake_stages import ORDERS
+from tests.pipeline.fake_stages import ORDERS, give_orders
 from tests.pipeline.spools import wait_for
 from tests.results import results_of
 
@@ -38,12 +38,11 @@ class Bench:
         self.events: list[Event] = []
         for name in CAMERAS:
             (folder / f"{name}.mp4").write_text(f"frames of {name}")
-        self._orders = folder / "orders.json"
-        monkeypatch.setenv(ORDERS, str(self._orders))
+        monkeypatch.setenv(ORDERS, str(folder / "orders.json"))
         self.order()
 
     def order(self, **orders: Any) -> None:
-        self._orders.write_text(json.dumps({"started": str(self.folder / "started"), **orders}))
+        give_orders(self.folder, **orders)
 
     def job(self, **changes: Any) -> Job:
         cameras = [
