@@ -31,10 +31,12 @@ from bodycap_batch.mapping.intrinsics.shutters import (
     with_gyroscopes,
     write_shutters,
 )
+from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     CameraKeyframes,
     ImageRef,
+    Pair,
     add_camera,
     add_keyframes,
     read_camera_ids,
@@ -48,6 +50,7 @@ from bodycap_batch.mapping.results import finalise_models, make_result, misplace
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment, repair_model
+from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.scene import KeyframeSelection, MapResult
 
@@ -232,13 +235,11 @@ def build_map_once(
     models, initial_log = reconstruct_with_intrinsics(mapping, options, uncalibrated, len(skeletal.refs))
     log: dict[str, Any] = {"keyframes": len(refs), **match_log, **initial_log, **flips.to_log()}
     if models:
-        models, log["joined"] = join_models(models, mapping)
-        models[0], log["repair"] = repair_model(models[0], tried, mapping, skeletal.refs)
-        resected: Sequence[set[int] | None] = [None] * len(models)
-        if skeletal is not generator:
-            resected, log["placed"] = resect_remaining(models, generator, tried, mapping)
+        models, resected = _validated(models, generator, skeletal, tried, mapping, log)
         log["unconfirmed_points"] = finalise_models(models, mapping, capture, resected)
         models[0], log["contradicting"], _ = remove_without_adjustment(models[0], mapping)
+        # A removed keyframe may have connected others with the room.
+        log["unconfirmed_points"] += sum(map(remove_points_on_wearer, models))
     attempts = log.get("initial_candidates", log["initial_pair_ladder"])
     refused = add_flip_hint(check_coverage(models, len(refs), attempts, options), flips)
     if refused is not None and not models:
@@ -265,3 +266,32 @@ def build_map_once(
     ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
     refused = refused or add_flip_hint(check_consistency(max(ratios)), flips)
     return result, refused
+
+
+def _validated(
+    models: list[Any],
+    generator: PairGenerator,
+    skeletal: PairGenerator,
+    tried: set[Pair],
+    mapping: MappingContext,
+    log: dict[str, Any],
+) -> tuple[list[Any], Sequence[set[int] | None]]:
+    """Join the models, repair the largest one, and place the keyframes of a large map that were left out.
+
+    Args:
+        models: Reconstructions, the largest first.
+        generator: Pairs of all keyframes.
+        skeletal: Pairs of the keyframes that the mapper used.
+        tried: The pairs that were matched.
+        mapping: Workspace, mapper options.
+        log: Diagnostics of the stage. Entries are added.
+
+    Returns:
+        The models, and for each the ids of the images that are adjusted at the end (`finalise_models`).
+    """
+    models, log["joined"] = join_models(models, mapping)
+    models[0], log["repair"] = repair_model(models[0], tried, mapping, skeletal.refs)
+    if skeletal is generator:
+        return models, [None] * len(models)
+    resected, log["placed"] = resect_remaining(models, generator, tried, mapping)
+    return models, resected

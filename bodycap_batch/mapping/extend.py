@@ -35,6 +35,7 @@ from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.model_files import read_model, registered_ids, write_models
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment
+from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.scene import MapResult
 
 
@@ -106,6 +107,8 @@ def extend_map(
     for number, model in enumerate(models):
         models[number], names, _ = remove_without_adjustment(model, mapping)
         removed += names
+        # A removed keyframe may have connected others with the room.
+        transient += remove_points_on_wearer(models[number])
     write_models(workspace, models)
     entry = {
         "new_keyframes": len(new),

@@ -15,8 +15,8 @@ from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robust
 from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction
 from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, registered_ids
 from bodycap_batch.mapping.validation.dominant_points import remove_dominant_points
-from bodycap_batch.mapping.validation.near_points import remove_near_points
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
+from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.scene import MapResult
 
 
@@ -43,7 +43,7 @@ def finalise_models(
     empty = set[int]()
     for number, (model, image_ids) in enumerate(zip(models, resected, strict=True)):
         context.stage.progress(number, len(models), "maps adjusted")
-        total += remove_near_points(model)
+        total += remove_points_on_wearer(model)
         total += remove_transient_points(model, times_ns)
         total += remove_dominant_points(model)
         if number and not model.num_points3D():

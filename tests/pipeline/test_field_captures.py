@@ -73,9 +73,10 @@ def test_a_palm_at_the_chest_is_refused_and_comes_back(tmp_path: Path) -> None:
     assert report.total.ate_m.rmse < MAX_ATE_M
 
 
-def test_a_palm_on_patterned_clothes_is_never_registered(tmp_path: Path) -> None:
+@pytest.mark.parametrize("seed", [301, 304])
+def test_a_palm_on_patterned_clothes_is_never_registered(seed: int, tmp_path: Path) -> None:
     # The pattern can be tracked, and the hand does not move relative to it: it looks like a near wall.
-    options = {"seconds": 3.5, "seed": 301, "body_in_view": True, "clothes": "patterned"}
+    options = {"seconds": 3.5, "seed": seed, "body_in_view": True, "clothes": "patterned"}
     capture = render(tmp_path, **options, pressed_s={"left_palm": (1.0, 2.6)})
     assert run(capture) == 0
     pressed = [
@@ -83,10 +84,14 @@ def test_a_palm_on_patterned_clothes_is_never_registered(tmp_path: Path) -> None
     ]
     assert len(pressed) == 49
     assert {row["status"] for row in pressed} == {"LOST"}
-    # The wrong poses of the palm had pulled the map: the torso was 15 cm off.
-    torso = score(capture).cameras["torso"]
+    # The wrong poses of the palm had pulled the map: the torso was 15 cm off. When the hand left the chest,
+    # the pattern gave it the place where it had touched the chest: the palm was 1.5 m off.
+    report = score(capture)
+    torso = report.cameras["torso"]
     assert torso.ate_m is not None
     assert torso.ate_m.rmse < MAX_ATE_M
+    assert report.total.ate_m is not None
+    assert report.total.ate_m.max < 0.10
 
 
 def test_a_room_of_repeated_posters_is_right_or_refused(tmp_path: Path) -> None:

@@ -47,7 +47,6 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
     evaluate_pairs,
     find_misregistered_images,
 )
-from bodycap_batch.mapping.validation.near_points import remove_near_points
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment, repair_model
 from bodycap_batch.mapping.validation.second_registration import confirm_images
 from bodycap_batch.mapping.validation.track_agreement import (
@@ -57,6 +56,7 @@ from bodycap_batch.mapping.validation.track_agreement import (
     image_sequences,
 )
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
+from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, align_points, invert, make_transform, so3_exp
 from tests.misplaced import misplace
@@ -499,10 +499,13 @@ def test_transient_points_are_removed_if_enough_others_remain(
     assert remove_transient_points(pycolmap.Reconstruction(model), {"cam": seen_ns // 100}) == 0
 
 
-def _two_cameras(near_images: int) -> pycolmap.Reconstruction:
-    """Return a model of 40 shared points at a depth of 4, and of 20 points 0.2 before one of the cameras.
+def _two_cameras(palm: str, depth: float = 0.6) -> pycolmap.Reconstruction:
+    """Return a model of 40 points of a room at a depth of 4, and of 60 near points of one of two cameras.
 
-    The near points are seen by the last `near_images` of the four palm's images, which see nothing else.
+    Args:
+        palm: A letter for each image of the palm: it sees the `r`oom, `n`ear points, or `b`oth. The two
+            images of the torso see the room.
+        depth: Depth of the near points. A tenth of the depth of the room is 0.4, a fifth is 0.8.
     """
     rng = np.random.default_rng(3)
     model = pycolmap.Reconstruction()
@@ -510,48 +513,63 @@ def _two_cameras(near_images: int) -> pycolmap.Reconstruction:
         model.add_camera_with_trivial_rig(
             pycolmap.Camera(model="PINHOLE", width=640, height=480, params=_CAMERA.params, camera_id=number)
         )
-    far = rng.uniform((-1, -1, 3.8), (1, 1, 4.2), (40, 3))
-    near = rng.uniform((-0.1, -0.1, 0.19), (0.1, 0.1, 0.21), (20, 3))
-    names = [("torso", 0), ("torso", 1), *(("palm", frame) for frame in range(4))]
-    tracks: dict[tuple[str, int], pycolmap.Track] = {}
-    for number, (camera, frame) in enumerate(names, start=1):
-        is_near = camera == "palm" and frame >= 4 - near_images
-        seen = near if is_near else far
+    room = rng.uniform((-1, -1, 3.8), (1, 1, 4.2), (40, 3))
+    near = rng.uniform((-0.1, -0.1, 1.0), (0.1, 0.1, 1.1), (60, 3)) * depth
+    points = np.concatenate([room, near])
+    seen_by = {"r": range(40), "n": range(40, 100), "b": range(70)}
+    names = [("torso", 0, "r"), ("torso", 1, "r"), *(("palm", *item) for item in enumerate(palm))]
+    tracks = [pycolmap.Track() for _ in points]
+    for number, (camera, frame, sees) in enumerate(names, start=1):
+        seen = list(seen_by[sees])
         shift = np.array([0.02 * number, 0.0, 0.0])
         image = pycolmap.Image(
             name=ImageRef(camera, frame).name,
-            keypoints=_CAMERA.project(seen - shift),
+            keypoints=_CAMERA.project(points[seen] - shift),
             camera_id=1 + (camera == "palm"),
             image_id=number,
         )
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), -shift))
-        for index in range(len(seen)):
-            track = tracks.setdefault(("near" if is_near else "far", index), pycolmap.Track())
-            track.add_element(number, index)
-    for (kind, index), track in tracks.items():
-        model.add_point3D((near if kind == "near" else far)[index], track, np.zeros(3, np.uint8))
+        for keypoint, index in enumerate(seen):
+            tracks[index].add_element(number, keypoint)
+    for track, point in zip(tracks, points, strict=True):
+        if track.length():
+            model.add_point3D(point, track, np.zeros(3, np.uint8))
     return model
 
 
-def test_near_points_that_only_one_camera_sees_are_removed_with_their_keyframes() -> None:
-    model = _two_cameras(near_images=2)
-    assert (model.num_points3D(), model.num_reg_images()) == (60, 6)
-    assert remove_near_points(model) == 20
-    assert model.num_points3D() == 40
-    left = [ImageRef.parse(model.image(number).name) for number in model.reg_image_ids()]
-    assert sorted((ref.camera, ref.frame) for ref in left) == [
-        ("palm", 0),
-        ("palm", 1),
-        ("torso", 0),
-        ("torso", 1),
-    ]
-    assert remove_near_points(model) == 0
+@pytest.mark.parametrize(
+    ("palm", "depth", "left", "points"),
+    [
+        ("rrnn", 0.6, [0, 1], 40),  # the hand stays at the chest until the end
+        ("rbnnr", 0.6, [0, 1, 4], 40),  # when it leaves the chest, nothing connects the keyframes
+        (
+            "rbnnbr",
+            0.6,
+            [0, 1, 2, 3, 4, 5],
+            100,
+        ),  # a table, which is seen together with the room before and after
+        ("rbnnbr", 0.3, [0, 1, 4, 5], 40),  # the hand touches something that no other camera sees
+        ("rbnnr", 0.9, [0, 1, 2, 3, 4], 100),  # out of reach
+        ("rrrr", 0.6, [0, 1, 2, 3], 40),
+    ],
+)
+def test_keyframes_of_near_points_are_kept_only_between_keyframes_of_the_room(
+    palm: str, depth: float, left: list[int], points: int
+) -> None:
+    model = _two_cameras(palm, depth)
+    before = model.num_points3D()
+    assert remove_points_on_wearer(model) == before - points
+    assert model.num_points3D() == points
+    refs = sorted(ImageRef.parse(model.image(number).name) for number in model.reg_image_ids())
+    assert [ref.frame for ref in refs if ref.camera == "palm"] == left
+    assert [ref.frame for ref in refs if ref.camera == "torso"] == [0, 1]
+    assert remove_points_on_wearer(model) == 0
 
 
 def test_a_camera_that_shares_no_points_keeps_its_near_points() -> None:
     # Its usual depth is unknown: the near points may be a desk.
-    model = _two_cameras(near_images=4)
-    assert remove_near_points(model) == 0
+    model = _two_cameras("nnnn")
+    assert remove_points_on_wearer(model) == 0
     assert model.num_reg_images() == 6
 
 
