@@ -18,6 +18,7 @@ _EXTENSIONS = "growth"
 _REACH = "reach"
 _MISPLACED = "misplaced_keyframes"
 _UNKNOWN_SHUTTERS = "unknown_shutters"
+_DISTORTED_CAMERAS = "distorted_cameras"
 
 CameraGroups = tuple[tuple[str, ...], tuple[str, ...]]
 """Two groups of cameras, by name."""
@@ -60,6 +61,8 @@ class MapDiagnostics:
             in the map.
         unknown_shutters: Names of the cameras whose readout time neither the job nor the matches of adjacent
             frames determine.
+        distorted_cameras: Names of the cameras whose rolling shutter displaces keypoints so far that the map
+            should be built again from corrected keypoints.
         details: All entries of the log in the order of the log, including the entries of the other fields.
     """
 
@@ -74,6 +77,7 @@ class MapDiagnostics:
     reach: Mapping[str, Any] | None = None
     misplaced: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     unknown_shutters: tuple[str, ...] = ()
+    distorted_cameras: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
@@ -98,6 +102,7 @@ class MapDiagnostics:
             reach=log.get(_REACH),
             misplaced={name: tuple(frames) for name, frames in log.get(_MISPLACED, {}).items()},
             unknown_shutters=tuple(log.get(_UNKNOWN_SHUTTERS, ())),
+            distorted_cameras=tuple(log.get(_DISTORTED_CAMERAS, ())),
             details=log,
         )
 
@@ -136,6 +141,8 @@ class MapDiagnostics:
             log[_MISPLACED] = {name: list(frames) for name, frames in self.misplaced.items()}
         if self.unknown_shutters:
             log[_UNKNOWN_SHUTTERS] = list(self.unknown_shutters)
+        if self.distorted_cameras or _DISTORTED_CAMERAS in log:
+            log[_DISTORTED_CAMERAS] = list(self.distorted_cameras)
         return log
 
 
