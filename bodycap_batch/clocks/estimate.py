@@ -334,6 +334,10 @@ def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstim
         {name: _floor_s(recordings[reference], recordings[name]) for name in starts_s},
     )
     sensed = _clocks_with_sensors(reference, evidence, joint.clocks)
+    found: dict[str, tuple[JointClock, ClockSource]] = {
+        **{name: (clock, "sound") for name, clock in joint.clocks.items()},
+        **{name: (clock, "sensors") for name, clock in sensed.items()},
+    }
     stated = stated_offsets(spec, reference)
     triggered = _triggered_with(spec, reference)
     clocks = []
@@ -354,17 +358,14 @@ def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstim
             )  # fmt: skip
             continue
         reasons = recording.notes
-        best: tuple[JointClock, ClockSource] | None = None
+        best = found.get(name)
+        if best is not None:
+            contradictions += _stated_contradictions(stated.get(name), best)
         if name in joint.clocks:
-            best = joint.clocks[name], "sound"
-            dates = _date_contradictions(name, accepted, expected)
-            contradictions += _stated_contradictions(stated.get(name), *best) + dates
+            contradictions += _date_contradictions(name, accepted, expected)
         else:
             silent = _why_none(name, reference, recordings, pairs, expected)
             reasons = (*silent, *_why_unsensed(name, reference, evidence, sensed), *reasons)
-            if name in sensed:
-                best = sensed[name], "sensors"
-                contradictions += _stated_contradictions(stated.get(name), *best)
         clocks.append(_camera_clock(name, best, stated.get(name), name in triggered, reasons, contradictions))
     return ClockEstimates(reference=reference, cameras=tuple(clocks), pairs=pairs)
 
@@ -505,10 +506,11 @@ def describe_contradiction(
     return text
 
 
-def _stated_contradictions(stated_s: float | None, clock: JointClock, source: ClockSource) -> list[str]:
-    """Return how a clock contradicts the stated offset, if there is one."""
+def _stated_contradictions(stated_s: float | None, found: tuple[JointClock, ClockSource]) -> list[str]:
+    """Return how a clock from a source contradicts the stated offset, if there is one."""
     if stated_s is None:
         return []
+    clock, source = found
     text = describe_contradiction(stated_s, source, clock.offset_s, clock.sigma_s)
     return [text] if text else []
 
