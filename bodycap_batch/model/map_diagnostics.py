@@ -115,10 +115,14 @@ class MapDiagnostics:
         log = dict(self.details)
         if self.undecided_groups:
             log[_UNDECIDED_GROUPS] = [[list(one), list(other)] for one, other in self.undecided_groups]
-        if self.flipped_cameras:
-            log[_FLIPPED_CAMERAS] = list(self.flipped_cameras)
-        if self.contradicting_cameras:
-            log[_CONTRADICTING_CAMERAS] = list(self.contradicting_cameras)
+        for key, names in (
+            (_FLIPPED_CAMERAS, self.flipped_cameras),
+            (_CONTRADICTING_CAMERAS, self.contradicting_cameras),
+            (_RECALIBRATED, self.recalibrated),
+            (_UNKNOWN_SHUTTERS, self.unknown_shutters),
+        ):
+            if names:
+                log[key] = list(names)
         if self.excluded_from_pair:
             log[_INITIAL_PAIR] = {
                 "failed": "a mirrored camera was left out",
@@ -126,8 +130,6 @@ class MapDiagnostics:
             }
         if self.misfit_factors is not None:
             log[_MISFIT_FACTORS] = dict(self.misfit_factors)
-        if self.recalibrated:
-            log[_RECALIBRATED] = list(self.recalibrated)
         if self.refined_intrinsics:
             log[_REFINED_INTRINSICS] = {
                 name: {"model": item.model, "params": list(item.params)}
@@ -139,8 +141,6 @@ class MapDiagnostics:
             log[_REACH] = dict(self.reach)
         if self.misplaced or _MISPLACED in log:
             log[_MISPLACED] = {name: list(frames) for name, frames in self.misplaced.items()}
-        if self.unknown_shutters:
-            log[_UNKNOWN_SHUTTERS] = list(self.unknown_shutters)
         if self.distorted_cameras or _DISTORTED_CAMERAS in log:
             log[_DISTORTED_CAMERAS] = list(self.distorted_cameras)
         return log
