@@ -49,6 +49,7 @@ from bodycap_batch.mapping.validation.epipolar_consistency import check_consiste
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment, repair_model
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
+from bodycap_batch.model.rotation_path import TurningShutter
 from bodycap_batch.model.scene import KeyframeSelection, MapResult
 
 WORKSPACE = "workspace"
@@ -198,27 +199,14 @@ def build_map_once(
     Raises:
         EstimationError: No model was reconstructed.
     """
-    import pycolmap
-
     workspace = context.work_dir / WORKSPACE
     workspace.mkdir(parents=True, exist_ok=True)
-    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        ids = {item.camera: add_camera(database, capture.camera(item.camera)) for item in selections}
     estimated = with_gyroscopes(estimate_from_matches(capture, selections), selections)
     readouts = {**known_readouts(capture), **estimated}
     used = {**readouts, **earlier.readouts}
     shutters = turning_shutters(capture, selections, used)
     write_shutters(workspace, shutters)
-    keyframes = [
-        CameraKeyframes(
-            capture.camera(item.camera),
-            ids[item.camera],
-            np.asarray(item.frames),
-            shutters.get(item.camera),
-            earlier.features.get(item.camera),
-        )
-        for item in selections
-    ]
+    keyframes = _keyframes_of(workspace, capture, selections, shutters, earlier)
     add_keyframes(workspace, keyframes, options, context)
     selections, options, flips = exclude_flipped_cameras(workspace, selections, options)
     ids = read_camera_ids(workspace)
@@ -250,12 +238,7 @@ def build_map_once(
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
     if readouts:
         log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
-    unknown = tuple(
-        item.camera
-        for item in selections
-        if not capture.camera(item.camera).rolling_shutter_known
-        and not (item.camera in readouts and readouts[item.camera].determined)
-    )
+    unknown = _unknown_shutters(capture, selections, readouts)
     log = MapDiagnostics(
         misfit_factors=misfits, misplaced=misplaced, unknown_shutters=unknown, details=log
     ).to_log()
@@ -265,3 +248,47 @@ def build_map_once(
     ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
     refused = refused or add_flip_hint(check_consistency(max(ratios)), flips)
     return result, refused
+
+
+def _keyframes_of(
+    workspace: Path,
+    capture: Capture,
+    selections: Sequence[KeyframeSelection],
+    shutters: Mapping[str, TurningShutter],
+    earlier: EarlierResults,
+) -> list[CameraKeyframes]:
+    """Write the cameras to a new database, and return the keyframes that are added to it.
+
+    Args:
+        workspace: Folder of the database.
+        capture: All cameras.
+        selections: Keyframes of each camera.
+        shutters: By camera name, what corrects the keypoints for a rolling shutter.
+        earlier: What earlier maps give.
+    """
+    import pycolmap
+
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        ids = {item.camera: add_camera(database, capture.camera(item.camera)) for item in selections}
+    return [
+        CameraKeyframes(
+            capture.camera(item.camera),
+            ids[item.camera],
+            np.asarray(item.frames),
+            shutters.get(item.camera),
+            earlier.features.get(item.camera),
+        )
+        for item in selections
+    ]
+
+
+def _unknown_shutters(
+    capture: Capture, selections: Sequence[KeyframeSelection], readouts: Mapping[str, Readout]
+) -> tuple[str, ...]:
+    """Return the names of the cameras whose readout time is neither stated nor determined by matches."""
+    return tuple(
+        item.camera
+        for item in selections
+        if not capture.camera(item.camera).rolling_shutter_known
+        and not (item.camera in readouts and readouts[item.camera].determined)
+    )
