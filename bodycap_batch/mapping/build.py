@@ -28,6 +28,7 @@ from bodycap_batch.mapping.intrinsics.shutters import (
     known_readouts,
     readouts_of_maps,
     turning_shutters,
+    unknown_shutters,
     with_gyroscopes,
     write_shutters,
 )
@@ -238,7 +239,7 @@ def build_map_once(
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
     if readouts:
         log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
-    unknown = _unknown_shutters(capture, selections, readouts)
+    unknown = unknown_shutters(capture, selections, readouts)
     log = MapDiagnostics(
         misfit_factors=misfits, misplaced=misplaced, unknown_shutters=unknown, details=log
     ).to_log()
@@ -280,15 +281,3 @@ def _keyframes_of(
         )
         for item in selections
     ]
-
-
-def _unknown_shutters(
-    capture: Capture, selections: Sequence[KeyframeSelection], readouts: Mapping[str, Readout]
-) -> tuple[str, ...]:
-    """Return the names of the cameras whose readout time is neither stated nor determined by matches."""
-    return tuple(
-        item.camera
-        for item in selections
-        if not capture.camera(item.camera).rolling_shutter_known
-        and not (item.camera in readouts and readouts[item.camera].determined)
-    )
