@@ -399,6 +399,7 @@ def _at_least(clock: JointClock, sigma_s: float) -> JointClock:
     """Return a clock whose offset has at least a standard deviation, seconds.
 
     A limb that follows the trunk is late in all pairs of its camera, so the mean of several pairs is as late.
+    Evidence: docs/decisions/clocks.md.
     """
     missing_s2 = max(0.0, sigma_s**2 - clock.sigma_s**2)
     return replace(clock, covariance=clock.covariance + np.diag([missing_s2, 0.0]))
