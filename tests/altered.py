@@ -136,9 +136,9 @@ def alter(source: Path, target: Path, recordings: Mapping[str, Recording]) -> Pa
         target: A new folder.
         recordings: Per camera; the other cameras are copied.
     """
-    (target / "gt").mkdir(parents=True)
-    for path in [*source.glob("*.json"), *(source / "gt").iterdir()]:
-        shutil.copy(path, target / path.relative_to(source))
+    shutil.copytree(source / "gt", target / "gt")
+    for path in source.glob("*.json"):
+        shutil.copy(path, target)
     for video in sorted(source.glob("*.mp4")):
         if video.stem in recordings:
             _record(video, target, recordings[video.stem])
@@ -160,9 +160,9 @@ def _record(video: Path, target: Path, recording: Recording) -> None:
         for row in np.flatnonzero(kept)
     ]
     _encode(target / video.name, pictures, recording)
-    path = target / "gt" / f"{video.stem}.tum"
-    truth = read_tum(path)
-    write_tum(path, TimedPoses(times_ns=truth.times_ns[kept], world_from_cam=truth.world_from_cam[kept]))
+    for path in (target / "gt").rglob(f"{video.stem}.tum"):
+        truth = read_tum(path)
+        write_tum(path, TimedPoses(times_ns=truth.times_ns[kept], world_from_cam=truth.world_from_cam[kept]))
 
 
 def _encode(path: Path, pictures: list[tuple[float, Image]], recording: Recording) -> None:

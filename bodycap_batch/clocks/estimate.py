@@ -223,15 +223,7 @@ def _with_sensors(
         heard: Cameras whose clocks the sound relates to that of the reference camera.
     """
     by_camera = {track.camera: track for track in tracks}
-    recordings = tuple(
-        replace(
-            recording,
-            sensor_start_s=None if track.problem else track.start_s,
-            sensor_problem=track.problem,
-        )
-        for recording in found.recordings
-        if (track := by_camera[recording.camera])
-    )
+    recordings = tuple(_with_sensor(each, by_camera[each.camera]) for each in found.recordings)
     usable = [name for name, track in by_camera.items() if not track.problem]
     pairs = tuple(
         measure_sensor_offset(by_camera[first], by_camera[second])
@@ -241,7 +233,14 @@ def _with_sensors(
     return replace(found, recordings=recordings, sensor_pairs=pairs)
 
 
+def _with_sensor(recording: Recording, track: SensorTrack) -> Recording:
+    """Return a recording with the start of the signals of its sensor, or why these cannot be used."""
+    start_s = None if track.problem else track.start_s
+    return replace(recording, sensor_start_s=start_s, sensor_problem=track.problem)
+
+
 def _read_sensor(config: CameraConfig) -> SensorTrack:
+    """Return the signals of the inertial sensor of a camera; a problem if its samples cannot be read."""
     videos = tuple(index_video(path, 1) for path in config.video)
     times_ns = join_chapters(videos, config.timestamps).times_ns
     try:
@@ -335,6 +334,10 @@ def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstim
         {name: _floor_s(recordings[reference], recordings[name]) for name in starts_s},
     )
     sensed = _clocks_with_sensors(reference, evidence, joint.clocks)
+    found: dict[str, tuple[JointClock, ClockSource]] = {
+        **{name: (clock, "sound") for name, clock in joint.clocks.items()},
+        **{name: (clock, "sensors") for name, clock in sensed.items()},
+    }
     stated = stated_offsets(spec, reference)
     triggered = _triggered_with(spec, reference)
     clocks = []
@@ -345,7 +348,6 @@ def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstim
             for pair, residual in joint.dropped
             if name in (pair.first, pair.second)
         ]
-        clock = joint.clocks.get(name)
         if name == reference:
             clocks.append(
                 ClockEstimate(
@@ -355,16 +357,15 @@ def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstim
                 )
             )  # fmt: skip
             continue
-        dates = _date_contradictions(name, accepted, expected)
-        if clock is not None:
-            contradictions += _stated_contradictions(stated.get(name), clock) + dates
         reasons = recording.notes
-        if clock is None:
+        best = found.get(name)
+        if best is not None:
+            contradictions += _stated_contradictions(stated.get(name), best)
+        if name in joint.clocks:
+            contradictions += _date_contradictions(name, accepted, expected)
+        else:
             silent = _why_none(name, reference, recordings, pairs, expected)
             reasons = (*silent, *_why_unsensed(name, reference, evidence, sensed), *reasons)
-        best: tuple[JointClock, ClockSource] | None = None if clock is None else (clock, "sound")
-        if clock is None and name in sensed:
-            best = sensed[name], "sensors"
         clocks.append(_camera_clock(name, best, stated.get(name), name in triggered, reasons, contradictions))
     return ClockEstimates(reference=reference, cameras=tuple(clocks), pairs=pairs)
 
@@ -390,7 +391,18 @@ def _clocks_with_sensors(
         if start_s is not None
     }
     clocks = solve_clocks(reference, pairs, starts_s).clocks
-    return {name: clock for name, clock in clocks.items() if name not in heard}
+    least_s = min(pair.sigma_s for pair in sensed)
+    return {name: _at_least(clock, least_s) for name, clock in clocks.items() if name not in heard}
+
+
+def _at_least(clock: JointClock, sigma_s: float) -> JointClock:
+    """Return a clock whose offset has at least a standard deviation, seconds.
+
+    A limb that follows the trunk is late in all pairs of its camera, so the mean of several pairs is as late.
+    Evidence: docs/decisions/clocks.md.
+    """
+    missing_s2 = max(0.0, sigma_s**2 - clock.sigma_s**2)
+    return replace(clock, covariance=clock.covariance + np.diag([missing_s2, 0.0]))
 
 
 def _why_unsensed(
@@ -495,10 +507,12 @@ def describe_contradiction(
     return text
 
 
-def _stated_contradictions(stated_s: float | None, clock: JointClock) -> list[str]:
+def _stated_contradictions(stated_s: float | None, found: tuple[JointClock, ClockSource]) -> list[str]:
+    """Return how a clock from a source contradicts the stated offset, if there is one."""
     if stated_s is None:
         return []
-    text = describe_contradiction(stated_s, "sound", clock.offset_s, clock.sigma_s)
+    clock, source = found
+    text = describe_contradiction(stated_s, source, clock.offset_s, clock.sigma_s)
     return [text] if text else []
 
 

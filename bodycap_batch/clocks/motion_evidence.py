@@ -105,6 +105,9 @@ def _compared(estimate: ClockEstimate, clock: JointClock | None) -> ClockEstimat
         return estimate
     weight = estimate.sigma_s**2 / (estimate.sigma_s**2 + clock.sigma_s**2)
     mean_sigma_s = estimate.sigma_s * clock.sigma_s / sigma_s
+    if estimate.source == "sensors":
+        # Both are late where a limb follows the trunk, so their mean is not more exact than the better one.
+        mean_sigma_s = min(estimate.sigma_s, clock.sigma_s)
     return replace(
         estimate,
         offset_s=estimate.offset_s + weight * difference_s,

@@ -50,11 +50,6 @@ class SensorTrack:
     model: str = ""
     problem: str = ""
 
-    @property
-    def end_s(self) -> float:
-        """Time of the last sample on the clock of the camera, seconds."""
-        return self.start_s + (len(self.vertical) - 1) / RATE_HZ
-
 
 def sensor_track(camera: str, telemetry: CameraTelemetry) -> SensorTrack:
     """Return the signals of the inertial sensor of a camera.

@@ -28,15 +28,14 @@ from bodycap_batch.mapping.intrinsics.shutters import (
     known_readouts,
     readouts_of_maps,
     turning_shutters,
+    unknown_shutters,
     with_gyroscopes,
     write_shutters,
 )
-from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     CameraKeyframes,
     ImageRef,
-    Pair,
     add_camera,
     add_keyframes,
     read_camera_ids,
@@ -52,6 +51,7 @@ from bodycap_batch.mapping.validation.remaining_keyframes import resect_remainin
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment, repair_model
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
+from bodycap_batch.model.rotation_path import TurningShutter
 from bodycap_batch.model.scene import KeyframeSelection, MapResult
 
 WORKSPACE = "workspace"
@@ -201,27 +201,14 @@ def build_map_once(
     Raises:
         EstimationError: No model was reconstructed.
     """
-    import pycolmap
-
     workspace = context.work_dir / WORKSPACE
     workspace.mkdir(parents=True, exist_ok=True)
-    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-        ids = {item.camera: add_camera(database, capture.camera(item.camera)) for item in selections}
     estimated = with_gyroscopes(estimate_from_matches(capture, selections), selections)
     readouts = {**known_readouts(capture), **estimated}
     used = {**readouts, **earlier.readouts}
     shutters = turning_shutters(capture, selections, used)
     write_shutters(workspace, shutters)
-    keyframes = [
-        CameraKeyframes(
-            capture.camera(item.camera),
-            ids[item.camera],
-            np.asarray(item.frames),
-            shutters.get(item.camera),
-            earlier.features.get(item.camera),
-        )
-        for item in selections
-    ]
+    keyframes = _keyframes_of(workspace, capture, selections, shutters, earlier)
     add_keyframes(workspace, keyframes, options, context)
     selections, options, flips = exclude_flipped_cameras(workspace, selections, options)
     ids = read_camera_ids(workspace)
@@ -235,7 +222,11 @@ def build_map_once(
     models, initial_log = reconstruct_with_intrinsics(mapping, options, uncalibrated, len(skeletal.refs))
     log: dict[str, Any] = {"keyframes": len(refs), **match_log, **initial_log, **flips.to_log()}
     if models:
-        models, resected = _validated(models, generator, skeletal, tried, mapping, log)
+        models, log["joined"] = join_models(models, mapping)
+        models[0], log["repair"] = repair_model(models[0], tried, mapping, skeletal.refs)
+        resected: Sequence[set[int] | None] = [None] * len(models)
+        if skeletal is not generator:
+            resected, log["placed"] = resect_remaining(models, generator, tried, mapping)
         log["unconfirmed_points"] = finalise_models(models, mapping, capture, resected)
         models[0], log["contradicting"], _ = remove_without_adjustment(models[0], mapping)
         # A removed keyframe may have connected others with the room.
@@ -251,12 +242,7 @@ def build_map_once(
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
     if readouts:
         log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
-    unknown = tuple(
-        item.camera
-        for item in selections
-        if not capture.camera(item.camera).rolling_shutter_known
-        and not (item.camera in readouts and readouts[item.camera].determined)
-    )
+    unknown = unknown_shutters(capture, selections, readouts)
     log = MapDiagnostics(
         misfit_factors=misfits, misplaced=misplaced, unknown_shutters=unknown, details=log
     ).to_log()
@@ -268,30 +254,33 @@ def build_map_once(
     return result, refused
 
 
-def _validated(
-    models: list[Any],
-    generator: PairGenerator,
-    skeletal: PairGenerator,
-    tried: set[Pair],
-    mapping: MappingContext,
-    log: dict[str, Any],
-) -> tuple[list[Any], Sequence[set[int] | None]]:
-    """Join the models, repair the largest one, and place the keyframes of a large map that were left out.
+def _keyframes_of(
+    workspace: Path,
+    capture: Capture,
+    selections: Sequence[KeyframeSelection],
+    shutters: Mapping[str, TurningShutter],
+    earlier: EarlierResults,
+) -> list[CameraKeyframes]:
+    """Write the cameras to a new database, and return the keyframes that are added to it.
 
     Args:
-        models: Reconstructions, the largest first.
-        generator: Pairs of all keyframes.
-        skeletal: Pairs of the keyframes that the mapper used.
-        tried: The pairs that were matched.
-        mapping: Workspace, mapper options.
-        log: Diagnostics of the stage. Entries are added.
-
-    Returns:
-        The models, and for each the ids of the images that are adjusted at the end (`finalise_models`).
+        workspace: Folder of the database.
+        capture: All cameras.
+        selections: Keyframes of each camera.
+        shutters: By camera name, what corrects the keypoints for a rolling shutter.
+        earlier: What earlier maps give.
     """
-    models, log["joined"] = join_models(models, mapping)
-    models[0], log["repair"] = repair_model(models[0], tried, mapping, skeletal.refs)
-    if skeletal is generator:
-        return models, [None] * len(models)
-    resected, log["placed"] = resect_remaining(models, generator, tried, mapping)
-    return models, resected
+    import pycolmap
+
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        ids = {item.camera: add_camera(database, capture.camera(item.camera)) for item in selections}
+    return [
+        CameraKeyframes(
+            capture.camera(item.camera),
+            ids[item.camera],
+            np.asarray(item.frames),
+            shutters.get(item.camera),
+            earlier.features.get(item.camera),
+        )
+        for item in selections
+    ]

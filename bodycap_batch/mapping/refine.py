@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -52,8 +52,8 @@ def refine_map(
     keypoint in the image is computed from the poses of neighbouring frames. With this velocity, the keypoint
     is moved to its position at the instant of the image's middle row. Then each model is adjusted. In the
     result, the observations are at their detected positions again. `Map.readout_s` holds the readout times
-    with which the correction can be repeated. The entry `distorted_cameras` of the log names the cameras
-    whose shutter displaces keypoints so far that the map should be built again from corrected keypoints.
+    with which the correction can be repeated. `MapDiagnostics.distorted_cameras` names the cameras for which
+    the map should be built again from corrected keypoints.
 
     Args:
         capture: All cameras.
@@ -105,11 +105,7 @@ def refine_map(
         )
         readout_s = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         corrected_px = None
-        distorted |= {
-            name
-            for name in readout_s.keys() - scene_map.readout_s.keys()
-            if rolling.displacement_px(name, readout_s[name]) > _MAX_DISPLACEMENT_PX
-        }
+        distorted |= distorted_cameras(rolling, readout_s, scene_map.readout_s.keys())
         if readout_s:
             model = rolling.with_exact_rates(readout_s, scene_map.readout_s.keys()).corrected(readout_s)
             removed += remove_dominant_points(model)
@@ -126,16 +122,37 @@ def refine_map(
     write_models(workspace, models)
     log = {
         "dominant_points": removed,
-        "distorted_cameras": sorted(distorted),
         "rolling_shutter": [
             {name: asdict(readout) for name, readout in readouts.items()} for readouts in all_readouts
         ],
     }
-    result = make_result(models, workspace, {**previous.log, **log}, adjusted_px)
+    diagnostics = replace(
+        previous.diagnostics,
+        distorted_cameras=tuple(sorted(distorted)),
+        details={**previous.log, **log},
+    )
+    result = make_result(models, workspace, diagnostics.to_log(), adjusted_px)
     maps = [
         map_with_readouts(item, readouts) for item, readouts in zip(result.maps, all_readouts, strict=True)
     ]
     return replace(result, maps=tuple(maps))
+
+
+def distorted_cameras(
+    rolling: RollingShutterModel, readout_s: Mapping[str, float], corrected: Collection[str]
+) -> set[str]:
+    """Return the names of the cameras for which a map should be built again from corrected keypoints.
+
+    Args:
+        rolling: The model.
+        readout_s: Readout time (seconds) of each camera with a rolling shutter, by camera name.
+        corrected: Names of the cameras whose keypoints were corrected before the model was built.
+    """
+    return {
+        name
+        for name in readout_s.keys() - set(corrected)
+        if rolling.displacement_px(name, readout_s[name]) > _MAX_DISPLACEMENT_PX
+    }
 
 
 def _rotations(workspace: Path, paths: Mapping[str, Trajectory]) -> dict[str, RotationPath]:

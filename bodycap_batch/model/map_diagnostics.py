@@ -18,6 +18,7 @@ _EXTENSIONS = "growth"
 _REACH = "reach"
 _MISPLACED = "misplaced_keyframes"
 _UNKNOWN_SHUTTERS = "unknown_shutters"
+_DISTORTED_CAMERAS = "distorted_cameras"
 
 CameraGroups = tuple[tuple[str, ...], tuple[str, ...]]
 """Two groups of cameras, by name."""
@@ -60,6 +61,8 @@ class MapDiagnostics:
             in the map.
         unknown_shutters: Names of the cameras whose readout time neither the job nor the matches of adjacent
             frames determine.
+        distorted_cameras: Names of the cameras whose rolling shutter displaces keypoints so far that the map
+            should be built again from corrected keypoints.
         details: All entries of the log in the order of the log, including the entries of the other fields.
     """
 
@@ -74,6 +77,7 @@ class MapDiagnostics:
     reach: Mapping[str, Any] | None = None
     misplaced: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     unknown_shutters: tuple[str, ...] = ()
+    distorted_cameras: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
@@ -98,6 +102,7 @@ class MapDiagnostics:
             reach=log.get(_REACH),
             misplaced={name: tuple(frames) for name, frames in log.get(_MISPLACED, {}).items()},
             unknown_shutters=tuple(log.get(_UNKNOWN_SHUTTERS, ())),
+            distorted_cameras=tuple(log.get(_DISTORTED_CAMERAS, ())),
             details=log,
         )
 
@@ -110,10 +115,14 @@ class MapDiagnostics:
         log = dict(self.details)
         if self.undecided_groups:
             log[_UNDECIDED_GROUPS] = [[list(one), list(other)] for one, other in self.undecided_groups]
-        if self.flipped_cameras:
-            log[_FLIPPED_CAMERAS] = list(self.flipped_cameras)
-        if self.contradicting_cameras:
-            log[_CONTRADICTING_CAMERAS] = list(self.contradicting_cameras)
+        for key, names in (
+            (_FLIPPED_CAMERAS, self.flipped_cameras),
+            (_CONTRADICTING_CAMERAS, self.contradicting_cameras),
+            (_RECALIBRATED, self.recalibrated),
+            (_UNKNOWN_SHUTTERS, self.unknown_shutters),
+        ):
+            if names:
+                log[key] = list(names)
         if self.excluded_from_pair:
             log[_INITIAL_PAIR] = {
                 "failed": "a mirrored camera was left out",
@@ -121,8 +130,6 @@ class MapDiagnostics:
             }
         if self.misfit_factors is not None:
             log[_MISFIT_FACTORS] = dict(self.misfit_factors)
-        if self.recalibrated:
-            log[_RECALIBRATED] = list(self.recalibrated)
         if self.refined_intrinsics:
             log[_REFINED_INTRINSICS] = {
                 name: {"model": item.model, "params": list(item.params)}
@@ -134,8 +141,8 @@ class MapDiagnostics:
             log[_REACH] = dict(self.reach)
         if self.misplaced or _MISPLACED in log:
             log[_MISPLACED] = {name: list(frames) for name, frames in self.misplaced.items()}
-        if self.unknown_shutters:
-            log[_UNKNOWN_SHUTTERS] = list(self.unknown_shutters)
+        if self.distorted_cameras or _DISTORTED_CAMERAS in log:
+            log[_DISTORTED_CAMERAS] = list(self.distorted_cameras)
         return log
 
 

@@ -260,16 +260,16 @@ class Flow:
             )
             scene_map = self.runner.run(make_task(REFINE, task, threads=self._threads))
             summary = read_summary(scene_map.path)
-            if not summary.get("corrected", True) and not summary.get("corrected_before"):
+            if not summary["corrected"] and not summary["corrected_before"]:
                 break
             self._map_round += 1
             again = None
-            if summary.get("distorted") and number + 1 < _REFINEMENTS:
+            if summary["distorted"] and number + 1 < _REFINEMENTS:
                 again = self._rebuilt(scene_map, registrations, keyframes)
             if again is None:
                 again = scene_map, self.register(scene_map, keyframes, registrations)
             scene_map, registrations = again
-            if not summary.get("late"):
+            if not summary["late"]:
                 break
         return scene_map, registrations
 

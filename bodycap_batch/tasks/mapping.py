@@ -117,7 +117,7 @@ def run_refine(task: RefineTask, context: StageContext, files: Path) -> None:
         late=sorted(rolling - before),
         corrected=sorted(rolling),
         corrected_before=sorted(before),
-        distorted=result.log["distorted_cameras"],
+        distorted=result.diagnostics.distorted_cameras,
     )
 
 

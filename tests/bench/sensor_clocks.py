@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.clocks.sensor_offsets import measure_sensor_offset
-from bodycap_batch.clocks.sensor_signals import SensorTrack, sensor_track
+from bodycap_batch.clocks.sensor_signals import RATE_HZ, SensorTrack, sensor_track
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.synthetic.camera_renderer import camera_poses_at
 from bodycap_batch.synthetic.imu import write_imu
@@ -114,7 +114,8 @@ def measured(kind: str, tracks: Mapping[str, SensorTrack], starts_s: Mapping[str
             continue
         found = measure_sensor_offset(first, second)
         true_s = starts_s[camera] - starts_s[CAMERAS[0]]
-        common_s = min(first.end_s, second.end_s + true_s) - max(first.start_s, second.start_s + true_s)
+        ends_s = _end_s(first), _end_s(second) + true_s
+        common_s = min(ends_s) - max(first.start_s, second.start_s + true_s)
         error_s = found.offset_s - true_s
         out.append(Outcome(kind, camera, common_s, found.accepted, error_s, found.sigma_s))
     return out
@@ -138,6 +139,11 @@ def unrelated(tracks: Sequence[tuple[str, int, Mapping[str, SensorTrack]]]) -> d
             early, late = _part(first, 0, half - 50), _part(second, half + 50, len(second.vertical))
             out["two parts of one motion"].append(measure_sensor_offset(early, late).accepted)
     return out
+
+
+def _end_s(track: SensorTrack) -> float:
+    """Return the time of the last sample on the clock of the camera, seconds."""
+    return track.start_s + (len(track.vertical) - 1) / RATE_HZ
 
 
 def _part(track: SensorTrack, begin: int, end: int) -> SensorTrack:

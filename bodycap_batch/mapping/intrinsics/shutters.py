@@ -31,6 +31,21 @@ def known_readouts(capture: Capture) -> dict[str, Readout]:
     }
 
 
+def unknown_shutters(
+    capture: Capture, selections: Sequence[KeyframeSelection], readouts: Mapping[str, Readout]
+) -> tuple[str, ...]:
+    """Return the names of the cameras whose readout time is neither stated nor determined by matches.
+
+    Args:
+        capture: All cameras.
+        selections: Keyframes of the cameras that are asked for.
+        readouts: Readout times from matches between adjacent frames, by camera name. A camera without such
+            matches has none.
+    """
+    names = [item.camera for item in selections if not capture.camera(item.camera).rolling_shutter_known]
+    return tuple(name for name in names if name not in readouts or not readouts[name].determined)
+
+
 def with_gyroscopes(
     readouts: Mapping[str, Readout], selections: Sequence[KeyframeSelection]
 ) -> dict[str, Readout]:

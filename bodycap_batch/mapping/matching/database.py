@@ -206,9 +206,11 @@ def _opened_copy(workspace: Path, context: StageContext) -> Iterator[pycolmap.Da
 
     copied = context.work_dir / _COPY_NAME
     shutil.copyfile(workspace / DATABASE_NAME, copied)
-    with pycolmap.Database.open(str(copied)) as database:
-        yield database
-    copied.unlink()
+    try:
+        with pycolmap.Database.open(str(copied)) as database:
+            yield database
+    finally:
+        copied.unlink()
 
 
 def _images_of(database: pycolmap.Database, camera: str) -> dict[ImageRef, int]:

@@ -256,24 +256,24 @@ class FrameBlock:
                 only the rotation between adjacent frames is corrected, if it is known.
         """
         out = self.px.copy()
-        rates = RateErrors(np.zeros(len(out)), np.zeros(len(out)))
+        leverage_s, sigma = np.zeros(len(out)), np.zeros(len(out))
         scene_map, times_ns = self.rig.scene_map, self.rig.members[0].camera.times_ns
         for number, (member, lens) in enumerate(zip(self.rig.members, self.rig.lenses, strict=True)):
-            readout_s = scene_map.readout_s.get(member.camera.name, 0.0)
+            name = member.camera.name
+            readout_s = scene_map.readout_s.get(name, 0.0)
             if readout_s:
                 rows = self.member == number
-                own_poses, points = path @ invert(member.cam_from_rig), scene_map.points[self.point[rows]]
-                poses = PosePath.create(own_poses, times_ns, member.rotation)
-                seen = lens, self.frame[rows], points, out[rows], readout_s
-                fitted = poses.with_fitted_rates(*seen)
-                rates.leverage_s[rows] = fitted.rate_leverage_s(lens, seen[1], seen[3], readout_s)
-                if fitted.rate_sigma is not None:
-                    # A wrong readout time turns the rays of the rows like a wrong angular velocity.
-                    off = scene_map.readout_sigma_s.get(member.camera.name, 0.0) / readout_s
-                    wrong = off * np.linalg.norm(fitted.rotation.rate, axis=1) / np.sqrt(3.0)
-                    rates.sigma[rows] = np.hypot(fitted.rate_sigma, wrong)[seen[1]]
-                out[rows] = fitted.px_at_mid_row(*seen)
-        return out, rates
+                frame, points, px = self.frame[rows], scene_map.points[self.point[rows]], self.px[rows]
+                poses = PosePath.create(path @ invert(member.cam_from_rig), times_ns, member.rotation)
+                fitted = poses.with_fitted_rates(lens, frame, points, px, readout_s)
+                assert fitted.rate_sigma is not None
+                # A wrong readout time turns the rays of the rows like a wrong angular velocity.
+                off = scene_map.readout_sigma_s.get(name, 0.0) / readout_s
+                wrong = off * np.linalg.norm(fitted.rotation.rate, axis=1) / np.sqrt(3.0)
+                leverage_s[rows] = fitted.rate_leverage_s(lens, frame, px, readout_s)
+                sigma[rows] = np.hypot(fitted.rate_sigma, wrong)[frame]
+                out[rows] = fitted.px_at_mid_row(lens, frame, points, px, readout_s)
+        return out, RateErrors(leverage_s, sigma)
 
     def count_by_frame(self, selected: BoolArray) -> IntArray:
         """Return the number (F,) of selected observations in each frame of the block.

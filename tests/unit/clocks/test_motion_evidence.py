@@ -49,7 +49,10 @@ def added(estimate: ClockEstimate, motion: MotionClocks, evidence: SoundEvidence
 def test_sensors_and_motion_give_a_mean():
     found = added(replace(sound(1.0, 0.025), source="sensors"), moved(1.02, 0.025))
     assert (found.source, found.offset_s) == ("sensors", pytest.approx(1.01))
-    assert found.sigma_s == pytest.approx(0.025 / np.sqrt(2.0))
+    # The lag of a limb is in both.
+    assert found.sigma_s == pytest.approx(0.025)
+    assert found.covariance is not None
+    assert np.sqrt(found.covariance[0, 0]) == pytest.approx(0.025)
 
 
 def test_sensors_and_motion_that_contradict_each_other_give_no_clock():

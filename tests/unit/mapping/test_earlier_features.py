@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import cv2
@@ -13,6 +14,7 @@ import pytest
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.mapping import earlier_results
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     CameraKeyframes,
@@ -106,3 +108,21 @@ def test_only_pictures_that_the_earlier_map_lacks_are_read(tmp_path: Path) -> No
     assert camera.read_frames == [2, 5]
     _workspace(tmp_path / "alone", FRAMES)
     assert _content(tmp_path / "second") == _content(tmp_path / "alone")
+
+
+def test_features_are_taken_from_a_map_of_the_same_pictures() -> None:
+    capture: Any = SimpleNamespace(
+        cameras=[SimpleNamespace(name="torso", wearer="mask"), SimpleNamespace(name="palm", wearer=None)]
+    )
+    scene = SimpleNamespace(readout_s={"palm": 0.02}, readout_sigma_s={"palm": 0.001}, cameras={})
+    refined: Any = SimpleNamespace(workspace=Path("refined"), maps=[scene])
+    unmasked: Any = SimpleNamespace(workspace=Path("unmasked"), maps=[scene])
+    nothing = earlier_results(capture, None, None)
+    assert (nothing.features, nothing.readouts) == ({}, {})
+    first = earlier_results(capture, None, unmasked)
+    assert (first.features, first.readouts) == ({"palm": Path("unmasked")}, {}), "the torso has another mask"
+    for found in (earlier_results(capture, refined, None), earlier_results(capture, refined, unmasked)):
+        assert found.features == {"torso": Path("refined"), "palm": Path("refined")}
+        assert {name: (each.seconds, each.sigma_s) for name, each in found.readouts.items()} == {
+            "palm": (0.02, 0.001)
+        }

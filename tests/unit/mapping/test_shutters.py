@@ -14,12 +14,13 @@ import pytest
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping.intrinsics.readout_time import Readout
+from bodycap_batch.mapping.intrinsics.readout_time import Readout, judged_readout
 from bodycap_batch.mapping.intrinsics.shutters import (
     known_readouts,
     read_shutters,
     readouts_of_maps,
     turning_shutters,
+    unknown_shutters,
     write_shutters,
 )
 from bodycap_batch.mapping.matching.database import (
@@ -184,6 +185,18 @@ def test_only_cameras_with_a_rolling_shutter_get_one() -> None:
     ]
     readouts["torso"] = Readout(0.0, 0.01, "none found", 0.0)
     assert list(turning_shutters(capture, selections, readouts)) == ["head"]
+
+
+def test_a_shutter_is_unknown_if_neither_the_job_nor_matches_determine_it() -> None:
+    stated = {"head": True, "hips": False, "torso": False, "left_palm": False, "right_palm": False}
+    capture: Any = SimpleNamespace(camera=lambda name: SimpleNamespace(rolling_shutter_known=stated[name]))
+    selections: Any = [SimpleNamespace(camera=name) for name in stated]
+    readouts = {
+        "hips": judged_readout(0.0, 0.0005),
+        "torso": judged_readout(0.01, 0.0005),
+        "left_palm": judged_readout(0.003, 0.0027),
+    }
+    assert unknown_shutters(capture, selections, readouts) == ("left_palm", "right_palm")
 
 
 def test_the_readouts_of_corrected_maps_are_used_for_their_extension() -> None:

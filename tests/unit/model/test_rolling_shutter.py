@@ -21,6 +21,7 @@ from bodycap_batch.mapping.intrinsics.readout_time import (
     map_with_readouts,
 )
 from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
+from bodycap_batch.mapping.refine import distorted_cameras
 from bodycap_batch.model import rolling_shutter
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
@@ -198,6 +199,15 @@ def test_the_displacements_by_a_shutter_grow_with_its_readout_time() -> None:
     assert 1.0 < once < 8.0
     assert twice == pytest.approx(2.0 * once, rel=0.1)
     assert rolling.displacement_px("head", 0.0) == rolling.displacement_px("no camera", 0.02) == 0.0
+
+
+def test_a_map_is_built_again_only_if_a_shutter_found_late_displaces_keypoints_far() -> None:
+    # In pictures of 640 px, the keypoints of the hand above move by 4 px between 10 and 40 ms.
+    rolling = rolling_model(Film(0.02))
+    assert rolling.displacement_px("head", 0.01) < 4.0 < rolling.displacement_px("head", 0.04)
+    assert distorted_cameras(rolling, {"head": 0.01}, ()) == set()
+    assert distorted_cameras(rolling, {"head": 0.04}, ()) == {"head"}
+    assert distorted_cameras(rolling, {"head": 0.04}, ("head",)) == set()
 
 
 def test_a_stated_readout_runs_the_way_the_video_is_turned() -> None:
