@@ -286,7 +286,11 @@ class Flow:
         """
         try:
             rebuilt = self._build(keyframes, refined)
-        except EstimationError:
+        except EstimationError as error:
+            note = (
+                f"no map from keypoints corrected for the shutters, the earlier map is kept: {error.message}"
+            )
+            self.runner.note(note, "map")
             return None
         again = self.register(rebuilt, keyframes, registrations)
         rebuilt, again = self.extend_map(rebuilt, again, keyframes)

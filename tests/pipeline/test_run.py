@@ -479,11 +479,17 @@ def test_a_map_that_the_shutter_distorts_little_is_not_built_again(bench: Bench)
 
 
 @pytest.mark.parametrize(
-    "order", [{"localised": [40, 30, 40]}, {"fail_rebuilt": True}], ids=["fewer frames", "no map"]
+    ("order", "is_noted"),
+    [({"localised": [40, 30, 40]}, False), ({"fail_rebuilt": True}, True)],
+    ids=["fewer frames", "no map"],
 )
-def test_a_worse_map_from_corrected_keypoints_is_not_used(bench: Bench, order: dict[str, Any]) -> None:
+def test_a_worse_map_from_corrected_keypoints_is_not_used(
+    bench: Bench, order: dict[str, Any], is_noted: bool
+) -> None:
     bench.order(rolling=True, late=1, **order)
     executed = bench.executed()
+    notes = [event.what for event in bench.events if event.kind == "note"]
+    assert any("the earlier map is kept" in note for note in notes) == is_noted
     assert executed.count("refine") == 2
     used = json.loads(json.loads((bench.out / "result.ply").read_text())["registrations"]["torso"])
     assert json.loads(json.loads(used[2]["map"])[2]["map"])[0] == "refine"
