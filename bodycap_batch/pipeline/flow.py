@@ -14,7 +14,7 @@ from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_LOST_SHARE, LEAST
 from bodycap_batch.config.models import CameraConfig, Job
 from bodycap_batch.config.mounts import MOTION_PLACES, mount_of
 from bodycap_batch.core.errors import BodycapError, CaptureError, EstimationError, JobError
-from bodycap_batch.core.progress import Event
+from bodycap_batch.core.progress import RECONSTRUCTION, Event
 from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.pipeline.inputs import (
     artefact_ref,
@@ -31,6 +31,7 @@ from bodycap_batch.pipeline.stage_results import StageResults, preview_task, rep
 from bodycap_batch.pipeline.stage_runner import StageRunner
 from bodycap_batch.pipeline.task_keys import make_task
 from bodycap_batch.runner import Task
+from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, Preload
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.tasks.body import camera_distances
 from bodycap_batch.tasks.camera_group import CameraGroupTask
@@ -109,7 +110,8 @@ class Flow:
         except (CaptureError, JobError):
             self._settings.listener(Event(kind="failed", stage="check"))
             raise
-        artefact = self.runner.run(task, [KEYFRAMES.modules] * (self.runner.parallel_tasks - 1))
+        preload = Preload(modules=[KEYFRAMES.modules] * (self.runner.parallel_tasks - 1))
+        artefact = self.runner.run(task, preload)
         summary = read_summary(artefact.path)
         self.runner.expect_frames(int(summary["frames"]), int(summary.get("large_frames", 0)))
         found = {
@@ -176,11 +178,17 @@ class Flow:
         )
         body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
         later: list[Stage[Any]] = [REGISTRATION, *body, EXPORT, REPORT]
-        # Mapping keeps one core busy. Meanwhile, another core loads the libraries of later stages.
-        preload = [[module for stage in later for module in stage.modules]] if self._threads > 1 else []
+        # Features and matches keep all cores busy. After them, mapping keeps one core busy. Only then does
+        # another core load the libraries of later stages. Evidence: docs/decisions/pipeline.md.
+        modules = [module for stage in later for module in stage.modules]
+        preload = self._preload([modules], step=RECONSTRUCTION)
         return self.runner.run(
             make_task(MAP, task, map_round=self._map_round, threads=self._threads), preload
         )
+
+    def _preload(self, modules: Sequence[Sequence[str]], step: str = "") -> Preload:
+        """Return the modules that idle children load while a task runs: none if there is only one thread."""
+        return Preload(modules=modules, step=step) if self._threads > 1 else NOTHING_TO_LOAD
 
     def register(
         self, scene_map: Artefact, keyframes: ByCamera, previous: ByCamera | None = None
@@ -382,7 +390,7 @@ class Flow:
             body=self._body,
             footage=None if self._job.merge.marker_board is None else footage,
         )
-        preload = [PREVIEW.modules] if self._job.export.preview and self._threads > 1 else []
+        preload = self._preload([PREVIEW.modules] if self._job.export.preview else [])
         artefact = self.runner.run(make_task(MERGE, task, threads=self._threads), preload)
         self.runner.report_notes(artefact, "merge")
         return artefact

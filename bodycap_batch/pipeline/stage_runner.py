@@ -13,6 +13,7 @@ from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.core.progress import Event
 from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.runner import NotStored, Task
+from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, Preload
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.store.disk_space import require_room
 from bodycap_batch.store.references import References, in_use
@@ -87,13 +88,12 @@ class StageRunner:
         """
         self._frame_counts = (frames, large_frames)
 
-    def run(self, task: Task, preload: Sequence[Sequence[str]] = ()) -> Artefact:
+    def run(self, task: Task, preload: Preload = NOTHING_TO_LOAD) -> Artefact:
         """Return a task's artefact: from the store, or computed now if it is not stored.
 
         Args:
             task: The task.
-            preload: Modules that idle child processes load while this task is computed: one list of module
-                names for each child process.
+            preload: Modules that idle child processes load while this task is computed.
 
         Raises:
             BodycapError: The task failed. `NotStored`: the artefact is missing and nothing may be computed.

@@ -49,10 +49,13 @@ class Watched(Children):
     def __init__(self) -> None:
         super().__init__(CHILD)
         self.preload: dict[str, set[str]] = {}
+        self.steps: dict[str, str] = {}
         self.arguments: dict[str, Mapping[str, Any]] = {}
 
     def execute(self, task: Task, environment: TaskEnvironment) -> None:
-        self.preload[task.key.stage] = {name for modules in environment.preload for name in modules}
+        preload = environment.preload
+        self.preload[task.key.stage] = {name for modules in preload.modules for name in modules}
+        self.steps[task.key.stage] = preload.step
         self.arguments[task.key.stage] = task.arguments
         super().execute(task, environment)
 
@@ -71,6 +74,7 @@ def test_modules_of_later_stages_load_while_a_core_is_idle(bench: Bench, threads
     later = {"registration", "export", "report"} | ({"merge", "fill"} if skeleton != "none" else set())
     wanted = {name for stage in later for name in STAGES[stage].modules}
     assert children.preload["map"] == (wanted if threads > 1 else set())
+    assert children.steps["map"] == ("reconstruction" if threads > 1 else ""), "before it, no core is idle"
     if skeleton != "none":
         assert children.preload["merge"] == (set(STAGES["preview"].modules) if threads > 1 else set())
 
