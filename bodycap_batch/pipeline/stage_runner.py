@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -118,6 +118,10 @@ class StageRunner:
     def start(self, task: Task) -> Future[Artefact]:
         """Start a task in another thread, and return the future of its artefact."""
         return self._pool.submit(self.run, task)
+
+    def start_beside(self, function: Callable[[], object]) -> None:
+        """Call a function of this process in another thread. Its errors are ignored: it only saves time."""
+        self._pool.submit(function)
 
     def run_all(self, tasks: Iterable[Task]) -> dict[str, Artefact]:
         """Run one task per camera at the same time, and return the artefacts by camera name.

@@ -24,6 +24,10 @@ CHILDREN_LOG = "children.log"
 STOPPED = "the job stopped on request; the results of finished stages stay in the store"
 
 
+def do_nothing() -> None:
+    """Do nothing when children begin to load modules."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Preload:
     """Modules that idle children load while a task runs.
@@ -32,10 +36,12 @@ class Preload:
         modules: One list of module names for each child.
         step: Name of the step of the task at which the children begin to load: the unit of its progress
             reports. "" to begin with the task.
+        then: Called in this process when the children begin to load.
     """
 
     modules: Sequence[Sequence[str]] = ()
     step: str = ""
+    then: Callable[[], object] = do_nothing
 
 
 NOTHING_TO_LOAD = Preload()
@@ -173,13 +179,13 @@ class Children:
 
         If an idle child has died before it receives the task, another child runs the task.
         """
-        preload = environment.preload
-        waiting = list(preload.modules)
+        due = [environment.preload]
 
         def load_ahead(step: str) -> None:
-            if waiting and step == preload.step:
-                self.prepare(environment.logs, waiting)
-                waiting.clear()
+            if due and step == due[0].step:
+                preload = due.pop()
+                self.prepare(environment.logs, preload.modules)
+                preload.then()
 
         while True:
             child, is_new = self._take(task.modules, environment.logs)

@@ -190,8 +190,10 @@ def test_libraries_load_ahead_in_the_child_that_will_need_them(bench: Bench) -> 
 
 @pytest.mark.parametrize(("step", "children"), [("", 2), ("steps", 2), ("no such step", 1)])
 def test_idle_children_begin_to_load_at_a_step_of_the_task(bench: Bench, step: str, children: int) -> None:
-    bench.runner.run(a_task("work"), Preload(modules=[["wave"]], step=step))
+    calls: list[str] = []
+    bench.runner.run(a_task("work"), Preload(modules=[["wave"]], step=step, then=lambda: calls.append(step)))
     assert len(bench.children._idle) == children
+    assert calls == [step][: children - 1], "the step has several reports"
     made, _ = bench.runner.run(replace(a_task("work", 2), modules=("wave",)))
     assert (made.path / "process.txt").read_text().split()[3:] == ["wave"][: children - 1]
 
