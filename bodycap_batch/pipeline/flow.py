@@ -178,7 +178,7 @@ class Flow:
             unmasked=optional_ref(self._first_map),
         )
         body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
-        later: list[Stage[Any]] = [REGISTRATION, *body, EXPORT, REPORT]
+        later: list[Stage[Any]] = [REGISTRATION, CLOCKS, *body, EXPORT, REPORT]
         # Features and matches keep all cores busy. After them, mapping keeps one core busy. Only then does
         # another core load the libraries of later stages. Evidence: docs/decisions/pipeline.md.
         modules = [module for stage in later for module in stage.modules]

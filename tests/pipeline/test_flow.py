@@ -77,7 +77,9 @@ def test_modules_of_later_stages_load_while_a_core_is_idle(bench: Bench, threads
         executor=children,
     )
     run_job(bench.job(skeleton=skeleton), out_dir=bench.out, settings=settings)
-    later = {"registration", "export", "report"} | ({"merge", "fill"} if skeleton != "none" else set())
+    later = {"registration", "clocks", "export", "report"} | (
+        {"merge", "fill"} if skeleton != "none" else set()
+    )
     wanted = {name for stage in later for name in STAGES[stage].modules}
     assert children.preload["map"] == (wanted if threads > 1 else set())
     assert children.steps["map"] == ("reconstruction" if threads > 1 else ""), "before it, no core is idle"
