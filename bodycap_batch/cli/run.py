@@ -82,10 +82,10 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap run my_walk/ --from merge
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.body_height import describe_height
-    from bodycap_batch.config.folder import job_file_in
+    from bodycap_batch.config.folder import RUN_FILE, job_file_in
     from bodycap_batch.config.job import load_job_with_origins
-    from bodycap_batch.pipeline import Settings, prepare_capture, run_job
-    from bodycap_batch.store.artefacts import Store
+    from bodycap_batch.runner import Children
+    from bodycap_batch.tasks.check import CHECK
 
     if force and from_ is not None:
         raise JobError(
@@ -100,11 +100,16 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         make_progress_display(as_json=json_progress) as display,
         _report_errors_as_json(display),
     ):
+        children = Children()
 
         def settings(out_dir: Path) -> Settings:
+            from bodycap_batch.pipeline import Settings
+            from bodycap_batch.store.artefacts import Store
+
             return Settings(
                 store=Store(store or find_store(out_dir)),
                 threads=threads or cores(),
+                children=children,
                 listener=display,
                 cancelled=stop.is_set,
                 redo=redo,
@@ -123,6 +128,8 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
             )
 
         def prepare(options: Mapping[str, Any], folder: Path, out_dir: Path) -> None:
+            from bodycap_batch.pipeline import prepare_capture
+
             prepare_capture(options, folder, settings(out_dir))
 
         place = find_job(job)
@@ -138,6 +145,11 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
             display(Event(kind="note", stage="", what=text))
         resolved = loaded.job
         out_dir = results_folder(resolved)
+        if not (out_dir / RUN_FILE).exists():  # With results, all stages may be stored, which needs no child.
+            children.start_ahead(CHECK.modules)
+        # This import takes long. Meanwhile, the child loads the libraries of the first stage.
+        from bodycap_batch.pipeline import run_job
+
         summary = run_job(resolved, out_dir=out_dir, settings=settings(out_dir))
     _print_summary(summary, resolved, display, verbose=verbose)
 

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 Kind = Literal["started", "progress", "finished", "reused", "failed", "stopped", "note"]
+RECONSTRUCTION = "reconstruction"
+"""Name of the step of a map that begins when all pairs are matched. From there on, a map uses one core."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

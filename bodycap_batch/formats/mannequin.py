@@ -431,12 +431,11 @@ def _surface(distance: Field, box: FloatArray, spacing: float) -> tuple[FloatArr
         return i, j, k
 
     for a, b in edges:
-        crossed = inside[at(a)] != inside[at(b)]
-        first, last = values[at(a)], values[at(b)]
-        share = np.where(crossed, first / np.where(crossed, first - last, 1.0), 0.0)
-        place = np.array(a) + share[..., None] * (np.array(b) - np.array(a))
-        total += np.where(crossed[..., None], place, 0.0)
-        count += crossed
+        crossed = np.nonzero(inside[at(a)] != inside[at(b)])
+        first, last = values[at(a)][crossed], values[at(b)][crossed]
+        share = first / (first - last)
+        total[crossed] += np.array(a) + share[:, None] * (np.array(b) - np.array(a))
+        count[crossed] += 1.0
     used = count > 0
     number = np.full(cells, -1)
     number[used] = np.arange(int(used.sum()))

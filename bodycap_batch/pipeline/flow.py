@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_LOST_SHARE, LEAST
 from bodycap_batch.config.models import CameraConfig, Job
 from bodycap_batch.config.mounts import MOTION_PLACES, mount_of
 from bodycap_batch.core.errors import BodycapError, CaptureError, EstimationError, JobError
-from bodycap_batch.core.progress import Event
+from bodycap_batch.core.progress import RECONSTRUCTION, Event
 from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.pipeline.inputs import (
     artefact_ref,
@@ -29,8 +30,9 @@ from bodycap_batch.pipeline.inputs import (
 from bodycap_batch.pipeline.settings import Settings
 from bodycap_batch.pipeline.stage_results import StageResults, preview_task, report_task
 from bodycap_batch.pipeline.stage_runner import StageRunner
-from bodycap_batch.pipeline.task_keys import make_task
+from bodycap_batch.pipeline.task_keys import make_task, program_of
 from bodycap_batch.runner import Task
+from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, Preload
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.tasks.body import camera_distances
 from bodycap_batch.tasks.camera_group import CameraGroupTask
@@ -109,7 +111,8 @@ class Flow:
         except (CaptureError, JobError):
             self._settings.listener(Event(kind="failed", stage="check"))
             raise
-        artefact = self.runner.run(task, [KEYFRAMES.modules] * (self.runner.parallel_tasks - 1))
+        preload = Preload(modules=[KEYFRAMES.modules] * (self.runner.parallel_tasks - 1))
+        artefact = self.runner.run(task, preload)
         summary = read_summary(artefact.path)
         self.runner.expect_frames(int(summary["frames"]), int(summary.get("large_frames", 0)))
         found = {
@@ -175,12 +178,29 @@ class Flow:
             unmasked=optional_ref(self._first_map),
         )
         body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
-        later: list[Stage[Any]] = [REGISTRATION, *body, EXPORT, REPORT]
-        # Mapping keeps one core busy. Meanwhile, another core loads the libraries of later stages.
-        preload = [[module for stage in later for module in stage.modules]] if self._threads > 1 else []
+        later: list[Stage[Any]] = [REGISTRATION, CLOCKS, *body, EXPORT, REPORT]
+        # Features and matches keep all cores busy. After them, mapping keeps one core busy. Only then does
+        # another core load the libraries of later stages. Evidence: docs/decisions/pipeline.md.
+        modules = [module for stage in later for module in stage.modules]
+        preload = self._preload([modules], [REGISTRATION, CLOCKS, *body[:1]], step=RECONSTRUCTION)
         return self.runner.run(
             make_task(MAP, task, map_round=self._map_round, threads=self._threads), preload
         )
+
+    def _preload(
+        self, modules: Sequence[Sequence[str]], next_stages: Sequence[Stage[Any]], step: str = ""
+    ) -> Preload:
+        """Return what an idle core does while a task runs: nothing if there is only one thread.
+
+        Args:
+            modules: Modules that idle children load: one list of module names for each child.
+            next_stages: Stages whose code this process reads.
+            step: Name of the step of the task at which this begins; "" to begin with the task.
+        """
+        if self._threads == 1:
+            return NOTHING_TO_LOAD
+        read_ahead = partial(self.runner.start_beside, partial(_read_ahead, next_stages))
+        return Preload(modules=modules, step=step, then=read_ahead)
 
     def register(
         self, scene_map: Artefact, keyframes: ByCamera, previous: ByCamera | None = None
@@ -386,7 +406,8 @@ class Flow:
             body=self._body,
             footage=None if self._job.merge.marker_board is None else footage,
         )
-        preload = [PREVIEW.modules] if self._job.export.preview and self._threads > 1 else []
+        modules = [PREVIEW.modules] if self._job.export.preview else []
+        preload = self._preload(modules, [FILL, EXPORT, REPORT, PREVIEW])
         artefact = self.runner.run(make_task(MERGE, task, threads=self._threads), preload)
         self.runner.report_notes(artefact, "merge")
         return artefact
@@ -615,6 +636,13 @@ class Flow:
             registrations=refs_by_camera({name: registrations[name] for name in names}),
             offsets_s={},
         )
+
+
+def _read_ahead(stages: Sequence[Stage[Any]]) -> None:
+    """Read what this process needs later: the code of stages, and a library that judges the results."""
+    for stage in stages:
+        program_of(stage).versions()
+    importlib.import_module("scipy.special")
 
 
 def _unknown_places(cameras: Sequence[str], reason: str) -> EstimationError:

@@ -38,6 +38,8 @@ class Settings:
         command: Command line of the child processes.
         executor: Runs the tasks of several jobs, on this machine or on other machines. None starts child
             processes for this job only.
+        children: Child processes that were started ahead for this job; None to start them with its tasks. Not
+            used with an `executor`.
         compute: If False, only stored artefacts are used; `NotStored` is raised for a missing artefact.
         redo: Names of the stages that are computed again even if their artefacts are stored.
         until: Name of the last stage to run; "" runs all stages. Results are published only if the last stage
@@ -58,6 +60,7 @@ class Settings:
     may_commit: Callable[[], bool] = always
     command: Sequence[str] = CHILD_COMMAND
     executor: Executor | None = None
+    children: Children | None = None
     compute: bool = True
     redo: frozenset[str] = frozenset()
     until: str = ""
@@ -77,7 +80,7 @@ class Settings:
             stop_also: Function that returns True if the runner must stop for another reason.
             before: Called before a task runs; may raise an error to forbid the task.
         """
-        executor = self.executor or Children(self.command)
+        executor = self.executor or self.children or Children(self.command)
         return Runner(
             self.store,
             executor if self.turns is None else TurnTakingExecutor(executor, self.turns),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -13,6 +13,7 @@ from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.core.progress import Event
 from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.runner import NotStored, Task
+from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, Preload
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.store.disk_space import require_room
 from bodycap_batch.store.references import References, in_use
@@ -87,13 +88,12 @@ class StageRunner:
         """
         self._frame_counts = (frames, large_frames)
 
-    def run(self, task: Task, preload: Sequence[Sequence[str]] = ()) -> Artefact:
+    def run(self, task: Task, preload: Preload = NOTHING_TO_LOAD) -> Artefact:
         """Return a task's artefact: from the store, or computed now if it is not stored.
 
         Args:
             task: The task.
-            preload: Modules that idle child processes load while this task is computed: one list of module
-                names for each child process.
+            preload: Modules that idle child processes load while this task is computed.
 
         Raises:
             BodycapError: The task failed. `NotStored`: the artefact is missing and nothing may be computed.
@@ -118,6 +118,10 @@ class StageRunner:
     def start(self, task: Task) -> Future[Artefact]:
         """Start a task in another thread, and return the future of its artefact."""
         return self._pool.submit(self.run, task)
+
+    def start_beside(self, function: Callable[[], object]) -> None:
+        """Call a function of this process in another thread. Its errors are ignored: it only saves time."""
+        self._pool.submit(function)
 
     def run_all(self, tasks: Iterable[Task]) -> dict[str, Artefact]:
         """Run one task per camera at the same time, and return the artefacts by camera name.

@@ -24,7 +24,7 @@ def make_task(
     return Task(
         key=artefact_key(stage, task),
         arguments=to_json(task),
-        program=_program(stage),
+        program=program_of(stage),
         camera=camera,
         round=map_round,
         threads=threads,
@@ -35,7 +35,7 @@ def make_task(
 
 def artefact_key(stage: Stage[TaskT], task: TaskT) -> ArtefactKey:
     """Return the key under which the store holds the result of a typed task."""
-    algorithm, libraries = _program(stage).versions()
+    algorithm, libraries = program_of(stage).versions()
     return ArtefactKey(
         stage=stage.name,
         algorithm=algorithm,
@@ -45,5 +45,6 @@ def artefact_key(stage: Stage[TaskT], task: TaskT) -> ArtefactKey:
     )
 
 
-def _program(stage: Stage[TaskT]) -> Program:
+def program_of(stage: Stage[TaskT]) -> Program:
+    """Return the code that computes the results of a stage."""
     return Program(stage.module, stage.libraries)

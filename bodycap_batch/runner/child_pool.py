@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
@@ -23,6 +24,30 @@ CHILDREN_LOG = "children.log"
 STOPPED = "the job stopped on request; the results of finished stages stay in the store"
 
 
+def do_nothing() -> None:
+    """Do nothing when children begin to load modules."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Preload:
+    """Modules that idle children load while a task runs.
+
+    Attributes:
+        modules: One list of module names for each child.
+        step: Name of the step of the task at which the children begin to load: the unit of its progress
+            reports. "" to begin with the task.
+        then: Called in this process when the children begin to load.
+    """
+
+    modules: Sequence[Sequence[str]] = ()
+    step: str = ""
+    then: Callable[[], object] = do_nothing
+
+
+NOTHING_TO_LOAD = Preload()
+"""No child loads modules."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskEnvironment:
     """The environment in which a task runs. It does not change the result of the task.
@@ -33,7 +58,7 @@ class TaskEnvironment:
         progress: Called as ``progress(done, total, what)``.
         cancelled: Called several times a second; True stops the task.
         may_commit: Called before the artefact is committed; False stops the task.
-        preload: Modules that idle children load while the task runs: one list of module names for each child.
+        preload: Modules that idle children load while the task runs.
         memory_mb: Memory limit (MB) of the task; None for four fifths of the machine's memory.
     """
 
@@ -42,7 +67,7 @@ class TaskEnvironment:
     progress: Callable[[int, int, str], None]
     cancelled: Callable[[], bool]
     may_commit: Callable[[], bool]
-    preload: Sequence[Sequence[str]] = ()
+    preload: Preload = NOTHING_TO_LOAD
     memory_mb: int | None = None
 
     @property
@@ -86,6 +111,22 @@ class Children:
         with contextlib.suppress(FileNotFoundError):  # another run of the same job may have removed it
             if log.stat().st_size == 0:
                 log.unlink()
+
+    def start_ahead(self, modules: Sequence[str]) -> None:
+        """Start one child before the job has a task, and let it load modules.
+
+        What the child prints before its first task is not kept. If the child dies before its first task,
+        another child runs the task.
+
+        Args:
+            modules: The modules to load.
+        """
+        with Path(os.devnull).open("wb") as nothing:
+            child = Child(self._command, nothing)
+        child.order({"import": list(modules)})
+        child.loaded |= set(modules)
+        with self._lock:
+            self._idle.append(child)
 
     def prepare(self, logs: Path, work: Sequence[Sequence[str]]) -> None:
         """Let idle children load modules: one child per list. If too few children are idle, start new ones.
@@ -138,7 +179,14 @@ class Children:
 
         If an idle child has died before it receives the task, another child runs the task.
         """
-        preload = environment.preload
+        due = [environment.preload]
+
+        def load_ahead(step: str) -> None:
+            if due and step == due[0].step:
+                preload = due.pop()
+                self.prepare(environment.logs, preload.modules)
+                preload.then()
+
         while True:
             child, is_new = self._take(task.modules, environment.logs)
             child.loaded |= set(task.modules)
@@ -146,13 +194,15 @@ class Children:
 
             def receive(message: dict[str, Any], child: Child = child, events: list[str] = events) -> None:
                 events.append(message["event"])
+                if message["event"] == "progress":
+                    load_ahead(message.get("what", ""))
                 _answer(child, message, environment)
 
             # End the child if the listener of the progress raises an error, for example because its pipe is
             # closed.
             with ExitStack() as on_error:
                 on_error.callback(child.end, at_once=True)
-                self.prepare(environment.logs, preload)
+                load_ahead("")
                 memory_mb = environment.memory_limit_mb
                 limit_yourself = child.limit_memory(memory_mb)
                 child.order({**order, "memory_mb": memory_mb, "limit_yourself": limit_yourself})
@@ -161,7 +211,6 @@ class Children:
             if is_new or events or last is not None or environment.cancelled():
                 return child, last
             child.end(at_once=False)
-            preload = ()
 
     def _take(self, modules: Collection[str], logs: Path) -> tuple[Child, bool]:
         """Return a child for a task that needs `modules`, and whether the child is new.

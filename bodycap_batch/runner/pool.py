@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bodycap_batch.core.errors import Cancelled
-from bodycap_batch.runner.child_pool import STOPPED, Children, TaskEnvironment
+from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, STOPPED, Children, TaskEnvironment
 from bodycap_batch.runner.child_process import CHILD_COMMAND
 from bodycap_batch.runner.memory_limit import default_limit_mb
 from bodycap_batch.runner.task import Task
@@ -103,7 +103,7 @@ class LocalPool:
                 return
             with self.slots.taken(task, environment.cancelled):
                 self._logs.add(environment.logs)
-                self._children.execute(task, replace(environment, preload=()))
+                self._children.execute(task, replace(environment, preload=NOTHING_TO_LOAD))
 
     def close(self, logs: Path) -> None:
         """Do nothing: the child processes are kept for other jobs."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from bodycap_batch.core.errors import BodycapError, Cancelled, StoreError
 from bodycap_batch.core.progress import Event, Listener
-from bodycap_batch.runner.child_pool import Executor, TaskEnvironment
+from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, Executor, Preload, TaskEnvironment
 from bodycap_batch.runner.task import Task
 from bodycap_batch.store.artefacts import Artefact, Store
 
@@ -92,12 +92,12 @@ class Runner:
         """Release what the executor holds for this job."""
         self._executor.close(self._logs)
 
-    def run(self, task: Task, preload: Sequence[Sequence[str]] = ()) -> tuple[Artefact, bool]:
+    def run(self, task: Task, preload: Preload = NOTHING_TO_LOAD) -> tuple[Artefact, bool]:
         """Return the task's artefact, and True if it was computed now or False if it was stored.
 
         Args:
             task: The task.
-            preload: Modules that idle children load while the task runs (see `TaskEnvironment`).
+            preload: Modules that idle children load while the task runs.
 
         Raises:
             BodycapError: The error of the task; `StoreError` if the disk fails; `Cancelled` if the task is
@@ -120,7 +120,7 @@ class Runner:
         self._notify(task, "finished", seconds=float(artefact.made["seconds"]))
         return artefact, True
 
-    def _compute(self, task: Task, preload: Sequence[Sequence[str]]) -> Artefact:
+    def _compute(self, task: Task, preload: Preload) -> Artefact:
         environment = TaskEnvironment(
             store=self.store,
             logs=self._logs,

@@ -58,5 +58,9 @@ def run_check(task: CheckTask, context: StageContext, files: Path) -> None:
 
 
 CHECK = Stage(
-    name="check", task=CheckTask, function=run_check, libraries=VISION_LIBRARIES, modules=VISION_MODULES
+    name="check",
+    task=CheckTask,
+    function=run_check,
+    libraries=VISION_LIBRARIES,
+    modules=(*VISION_MODULES, "bodycap_batch.check", "bodycap_batch.telemetry.gopro"),
 )

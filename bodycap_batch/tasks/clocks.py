@@ -95,5 +95,5 @@ CLOCKS = Stage(
     task=ClocksTask,
     function=run_clocks,
     libraries=("numpy", "scipy"),
-    modules=("bodycap_batch.clocks",),
+    modules=("bodycap_batch.clocks", "bodycap_batch.mapping.validation.camera_distance_check"),
 )

@@ -175,7 +175,7 @@ def _save_map(
 
 
 _LIBRARIES = (*VISION_LIBRARIES, "pycolmap")
-_MODULES = (*VISION_MODULES, "pycolmap")
+_MODULES = (*VISION_MODULES, "pycolmap", "bodycap_batch.mapping")
 _MEMORY_MB = 1500
 """Memory to reserve (MB) for a task that builds, extends or refines a map.
 Evidence: docs/decisions/pipeline.md."""

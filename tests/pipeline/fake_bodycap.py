@@ -11,13 +11,14 @@ from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from unittest import mock
 
-from bodycap_batch import pipeline, watch
+from bodycap_batch import pipeline, runner, watch
 from bodycap_batch.cli import main
 from bodycap_batch.runner import dask_cluster, pool
 
 CHILD = (sys.executable, str(Path(__file__).with_name("fake_stages.py")))
 _STARTING_CHILDREN = (
     (pipeline, "Settings"),
+    (runner, "Children"),
     (watch, "WatchOptions"),
     (pool, "LocalPool"),
     (dask_cluster, "Cluster"),

@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -19,6 +20,8 @@ import yaml
 
 import bodycap_batch
 from bodycap_batch.cli import main
+from bodycap_batch.runner import Children
+from bodycap_batch.tasks.check import CHECK
 from tests.pipeline.fake_bodycap import run_here
 from tests.pipeline.fake_stages import ORDERS, give_orders
 from tests.processes import gone
@@ -98,6 +101,14 @@ def test_the_second_run_has_nothing_to_do(bench: Bench) -> None:
     code, out, _ = bench.run("run", "my walk")
     assert code == 0
     assert "nothing to do, because all 13 stages were already done" in out
+
+
+def test_a_child_starts_ahead_if_there_are_no_results(bench: Bench) -> None:
+    with mock.patch.object(Children, "start_ahead", autospec=True) as start_ahead:
+        assert bench.run("run", "my walk")[0] == 0
+        assert [call.args[1] for call in start_ahead.call_args_list] == [CHECK.modules]
+        assert bench.run("run", "my walk")[0] == 0
+        assert start_ahead.call_count == 1, "all stages may be stored"
 
 
 def test_results_elsewhere_have_their_store_beside_them(bench: Bench) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,11 @@ import pytest
 
 from bodycap_batch.config.models import Job
 from bodycap_batch.pipeline import Settings, run_job
-from bodycap_batch.pipeline.flow import Flow
+from bodycap_batch.pipeline.flow import Flow, _read_ahead
 from bodycap_batch.runner import Children, Task, TaskEnvironment
+from bodycap_batch.runner.child_pool import do_nothing
 from bodycap_batch.store.artefacts import Store
+from bodycap_batch.store.code_version import Program
 from bodycap_batch.tasks.stages import STAGES
 from tests.pipeline.test_run import CHILD, Bench, bench
 
@@ -49,10 +52,16 @@ class Watched(Children):
     def __init__(self) -> None:
         super().__init__(CHILD)
         self.preload: dict[str, set[str]] = {}
+        self.steps: dict[str, str] = {}
+        self.with_reading: list[str] = []
         self.arguments: dict[str, Mapping[str, Any]] = {}
 
     def execute(self, task: Task, environment: TaskEnvironment) -> None:
-        self.preload[task.key.stage] = {name for modules in environment.preload for name in modules}
+        preload = environment.preload
+        self.preload[task.key.stage] = {name for modules in preload.modules for name in modules}
+        self.steps[task.key.stage] = preload.step
+        if preload.then is not do_nothing:
+            self.with_reading.append(task.key.stage)
         self.arguments[task.key.stage] = task.arguments
         super().execute(task, environment)
 
@@ -68,11 +77,24 @@ def test_modules_of_later_stages_load_while_a_core_is_idle(bench: Bench, threads
         executor=children,
     )
     run_job(bench.job(skeleton=skeleton), out_dir=bench.out, settings=settings)
-    later = {"registration", "export", "report"} | ({"merge", "fill"} if skeleton != "none" else set())
+    later = {"registration", "clocks", "export", "report"} | (
+        {"merge", "fill"} if skeleton != "none" else set()
+    )
     wanted = {name for stage in later for name in STAGES[stage].modules}
     assert children.preload["map"] == (wanted if threads > 1 else set())
+    assert children.steps["map"] == ("reconstruction" if threads > 1 else ""), "before it, no core is idle"
+    reading = ["map"] if skeleton == "none" else ["map", "merge"]
+    assert children.with_reading == (reading if threads > 1 else [])
     if skeleton != "none":
         assert children.preload["merge"] == (set(STAGES["preview"].modules) if threads > 1 else set())
+
+
+def test_the_code_of_later_stages_is_read_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+    monkeypatch.setattr(Program, "versions", lambda program: read.append(program.module))
+    _read_ahead([STAGES["merge"], STAGES["export"]])
+    assert read == ["tasks.merge", "tasks.export"]
+    assert "scipy.special" in sys.modules
 
 
 @pytest.mark.parametrize("board", [None, {"square_m": 0.1, "columns": 7, "rows": 5}])

@@ -17,6 +17,7 @@ import numpy as np
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.progress import RECONSTRUCTION
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, read_image_ids
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
@@ -303,7 +304,7 @@ def match_keyframes(
     ):
         verified |= match_pairs(workspace, more, intrinsics, context)
         tried |= set(more)
-    context.progress(0, 0, "reconstruction")
+    context.progress(0, 0, RECONSTRUCTION)
     between = Counter(f"{a.camera} - {b.camera}" for a, b in verified if a.camera != b.camera)
     log = {
         "pairs": len(tried),

@@ -133,10 +133,10 @@ def _largest_plane(points: FloatArray, thickness_m: float, rng: np.random.Genera
     """
     tree = cKDTree(points)
     seeds = rng.integers(len(points), size=_HYPOTHESES)
-    groups = (np.array(tree.query_ball_point(point, _NEIGHBOUR_RADIUS_M)) for point in points[seeds])
+    groups = (tree.query_ball_point(point, _NEIGHBOUR_RADIUS_M) for point in points[seeds])
     triples = np.array(
         [
-            [seed, *rng.choice(near, 2, replace=False)]
+            [seed, *(near[each] for each in rng.choice(len(near), 2, replace=False))]
             for seed, near in zip(seeds.tolist(), groups, strict=True)
             if len(near) > 3
         ],

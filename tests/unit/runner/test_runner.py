@@ -29,7 +29,7 @@ from bodycap_batch.core.errors import (
 from bodycap_batch.core.progress import Event
 from bodycap_batch.runner import Children, NotStored, Rules, Runner, Task
 from bodycap_batch.runner.child_main import DiskFailures
-from bodycap_batch.runner.child_pool import CHILDREN_LOG
+from bodycap_batch.runner.child_pool import CHILDREN_LOG, Preload
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 from tests.processes import gone
 
@@ -186,6 +186,35 @@ def test_libraries_load_ahead_in_the_child_that_will_need_them(bench: Bench) -> 
     made, _ = bench.runner.run(replace(a_task("work"), modules=("colorsys",)))
     loaded = (made.path / "process.txt").read_text().split()[3:]
     assert loaded == ["colorsys"]
+
+
+@pytest.mark.parametrize(("step", "children"), [("", 2), ("steps", 2), ("no such step", 1)])
+def test_idle_children_begin_to_load_at_a_step_of_the_task(bench: Bench, step: str, children: int) -> None:
+    calls: list[str] = []
+    bench.runner.run(a_task("work"), Preload(modules=[["wave"]], step=step, then=lambda: calls.append(step)))
+    assert len(bench.children._idle) == children
+    assert calls == [step][: children - 1], "the step has several reports"
+    made, _ = bench.runner.run(replace(a_task("work", 2), modules=("wave",)))
+    assert (made.path / "process.txt").read_text().split()[3:] == ["wave"][: children - 1]
+
+
+def test_a_child_that_starts_ahead_runs_the_first_task(bench: Bench) -> None:
+    bench.children.start_ahead(["wave"])
+    (ahead,) = bench.children._idle
+    made, _ = bench.runner.run(a_task("work"))
+    process = (made.path / "process.txt").read_text().split()
+    assert process[2:] == [str(ahead._process.pid), "wave"]
+    bench.runner.close()
+    assert gone(ahead._process.pid)
+
+
+def test_a_child_that_starts_ahead_and_dies_is_replaced(bench: Bench) -> None:
+    bench.children.start_ahead(["no_such_module_anywhere"])
+    (ahead,) = bench.children._idle
+    os.kill(ahead._process.pid, signal.SIGKILL)
+    wait_for(lambda: gone(ahead._process.pid))
+    assert pid_of(bench, "work") != ahead._process.pid
+    assert not bench.logs.joinpath(CHILDREN_LOG).read_text(), "what it printed is not kept"
 
 
 def test_modules_that_cannot_be_loaded_ahead_are_left_to_the_stage(bench: Bench) -> None:
