@@ -112,8 +112,9 @@ if __name__ == "__main__":
         sys.exit(child_main.main(sys.argv[2:], stages))
     versions = json.loads(Path(os.environ[VERSIONS]).read_text())
     code_version.algorithm_version = versions.__getitem__
-    from bodycap_batch import pipeline
+    from bodycap_batch import pipeline, runner
     from bodycap_batch.cli import main
 
     pipeline.Settings = functools.partial(pipeline.Settings, command=CHILD)  # type: ignore[assignment, misc]
+    runner.Children = functools.partial(runner.Children, command=CHILD)  # type: ignore[assignment, misc]
     sys.exit(main(sys.argv[1:]))
