@@ -307,10 +307,8 @@ class Flow:
         try:
             rebuilt = self._build(keyframes, refined)
         except EstimationError as error:
-            note = (
-                f"no map from keypoints corrected for the shutters, the earlier map is kept: {error.message}"
-            )
-            self.runner.note(note, "map")
+            cause = "no map could be built from keypoints that were corrected for the rolling shutters"
+            self.runner.note(f"{cause}, so the earlier map is kept: {error.message}", "map")
             return None
         again = self.register(rebuilt, keyframes, registrations)
         rebuilt, again = self.extend_map(rebuilt, again, keyframes)

@@ -30,6 +30,8 @@ sees the trunk is at most 0.6 m from it, and a room is seen at 3 m. Evidence: do
 _MIN_ROOM_SHARE = 0.5
 """Minimum share of points of the room in a keyframe whose pose the room determines. Derivation: a robust pose
 follows the majority of the points."""
+_MIN_ROOM = 6
+"""Minimum number of points of the room in such a keyframe. Evidence: none."""
 _MIN_SHARED = 30
 """Minimum number of observations of shared points that determine the usual depth of a camera. Evidence:
 none."""
@@ -51,9 +53,10 @@ class _Sight:
     near: dict[int, float]
 
     def sees_room(self) -> bool:
-        """Return whether most of its points cannot be on the wearer."""
+        """Return whether none of its points, or at most half of them, may be on the wearer."""
         within_reach = sum(ratio < _MAX_REACH_RATIO for ratio in self.near.values())
-        return len(self.points) - within_reach >= _MIN_ROOM_SHARE * len(self.points)
+        in_room = len(self.points) - within_reach
+        return not within_reach or in_room >= max(_MIN_ROOM, _MIN_ROOM_SHARE * len(self.points))
 
 
 def remove_points_on_wearer(model: pycolmap.Reconstruction) -> int:
@@ -65,7 +68,7 @@ def remove_points_on_wearer(model: pycolmap.Reconstruction) -> int:
     for a camera that shares too few points with other cameras: its usual depth is unknown.
 
     Args:
-        model: A reconstruction, changed in place. The caller adjusts it afterwards.
+        model: A reconstruction, changed in place. What is left does not move.
     """
     points_before = model.num_points3D()
     refs = {int(image): ImageRef.parse(model.image(image).name) for image in model.reg_image_ids()}

@@ -503,8 +503,8 @@ def _two_cameras(palm: str, depth: float = 0.6) -> pycolmap.Reconstruction:
     """Return a model of 40 points of a room at a depth of 4, and of 60 near points of one of two cameras.
 
     Args:
-        palm: A letter for each image of the palm: it sees the `r`oom, `n`ear points, or `b`oth. The two
-            images of the torso see the room.
+        palm: A letter for each image of the palm: it sees the `r`oom, `n`ear points, `b`oth, or `f`ive of
+            each. The two images of the torso see the room.
         depth: Depth of the near points. A tenth of the depth of the room is 0.4, a fifth is 0.8.
     """
     rng = np.random.default_rng(3)
@@ -516,7 +516,7 @@ def _two_cameras(palm: str, depth: float = 0.6) -> pycolmap.Reconstruction:
     room = rng.uniform((-1, -1, 3.8), (1, 1, 4.2), (40, 3))
     near = rng.uniform((-0.1, -0.1, 1.0), (0.1, 0.1, 1.1), (60, 3)) * depth
     points = np.concatenate([room, near])
-    seen_by = {"r": range(40), "n": range(40, 100), "b": range(70)}
+    seen_by = {"r": range(40), "n": range(40, 100), "b": range(70), "f": range(35, 45)}
     names = [("torso", 0, "r"), ("torso", 1, "r"), *(("palm", *item) for item in enumerate(palm))]
     tracks = [pycolmap.Track() for _ in points]
     for number, (camera, frame, sees) in enumerate(names, start=1):
@@ -550,6 +550,7 @@ def _two_cameras(palm: str, depth: float = 0.6) -> pycolmap.Reconstruction:
         ),  # a table, which is seen together with the room before and after
         ("rbnnbr", 0.3, [0, 1, 4, 5], 40),  # the hand touches something that no other camera sees
         ("rbnnr", 0.9, [0, 1, 2, 3, 4], 100),  # out of reach
+        ("rffr", 0.6, [0, 3], 40),  # five points of the room are too few
         ("rrrr", 0.6, [0, 1, 2, 3], 40),
     ],
 )
