@@ -40,6 +40,10 @@ _ITERATIONS = 20
 _EPSILON_PX = 0.02
 """Minimum movement, pixels, of a point from one iteration to the next. The iterations end after a smaller
 movement. Evidence: none."""
+_MAX_DISTORTION_PX = 0.1
+"""Pixels: maximum distance between a corner of a tracker's window and its position if the window only moved
+with its centre. If the expected motion distorts windows further, the first image is warped by this motion before
+tracking. Evidence: docs/decisions/registration.md."""
 _MAX_ROUND_TRIP_PX = 1.0
 """Maximum distance, pixels, between a point and its position after tracking forwards and back. Evidence:
 none."""
@@ -100,21 +104,26 @@ def track_points(
     first: GreyImage,
     second: GreyImage,
     px: Pixels,
-    guess_px: Pixels | None = None,
+    homography: FloatArray | None = None,
     *,
     with_check: bool = True,
     window_px: int = _WINDOW_PX,
 ) -> TrackedPoints:
     """Track points from one image to another by pyramidal Lucas–Kanade.
 
+    The tracker moves windows, but does not turn or scale them. So the first image is warped by the expected
+    motion if this motion turns or scales windows.
+
     Args:
         first: (H,W) uint8 image in which the points are given.
         second: (H,W) uint8 image in which the points are searched.
         px: (N,2) float32 points in the first image.
-        guess_px: (N,2) expected positions in the second image; None if they are unknown.
+        homography: (3,3) expected motion of the whole image, from the first to the second image; None if it
+            is unknown.
         with_check: True to check each point: the point is also tracked back to the first image, and rejected
-            if it does not return to its start. False to skip this check. If `guess_px` is given and the check
-            is skipped, only the surroundings of `guess_px` are searched. This reduces the cost to a quarter.
+            if it does not return to its start. False to skip this check. If `homography` is given and the
+            check is skipped, only the surroundings of the expected position are searched. This reduces the
+            cost to a quarter.
         window_px: Side length, pixels, of the square window around a point. The tracker compares the content
             of this window in both images.
 
@@ -124,7 +133,11 @@ def track_points(
     if len(px) == 0:
         return TrackedPoints(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
     start = np.ascontiguousarray(px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
-    guess = None if guess_px is None else np.asarray(guess_px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+    guess: Pixels | None = None
+    if homography is not None:
+        guess = np.asarray(apply_homography(px, homography) - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+        if _window_distortion_px(px, homography, window_px) > _MAX_DISTORTION_PX:
+            first, start = _warp_image(first, homography, second.shape), guess
     levels = _LEVELS if guess is None else (_GUIDED_LEVELS if with_check else _UNCHECKED_LEVELS)
     tracked, is_found = _lucas_kanade(first, second, start, guess, (window_px, levels))
     height, width = second.shape
@@ -143,6 +156,30 @@ def track_points(
     round_trip = np.linalg.norm(returned_px - start, axis=1).astype(np.float32)
     limit = _MAX_ROUND_TRIP_PX * pixel_scale(width, height)
     return TrackedPoints(found_px, is_found & (round_trip < limit), round_trip)
+
+
+def _window_distortion_px(px: Pixels, homography: FloatArray, window_px: int) -> float:
+    """Return how far (pixels, median of all points) a homography distorts the windows around points (N,2).
+
+    This is the largest distance between the corners of a window that is transformed and those of a window
+    that only moves with its centre.
+    """
+    half = 0.5 * window_px
+    corners = np.array([[-half, -half], [half, -half], [-half, half], [half, half]])
+    moved = apply_homography((px[:, None] + corners).reshape(-1, 2), homography).reshape(-1, 4, 2)
+    only_shifted = apply_homography(px, homography)[:, None] + corners
+    return float(np.median(np.linalg.norm(moved - only_shifted, axis=2).max(axis=1)))
+
+
+def _warp_image(image: GreyImage, homography: FloatArray, shape: tuple[int, ...]) -> GreyImage:
+    """Return the image (H,W) of a given shape, transformed by a homography of pixels with COLMAP's origin."""
+    import cv2
+
+    offset = np.array([[1.0, 0.0, CV2_PIXEL_OFFSET_PX], [0.0, 1.0, CV2_PIXEL_OFFSET_PX], [0.0, 0.0, 1.0]])
+    in_cv2 = np.linalg.inv(offset) @ homography @ offset
+    return np.asarray(
+        cv2.warpPerspective(image, in_cv2, (shape[1], shape[0]), borderMode=cv2.BORDER_REPLICATE), np.uint8
+    )
 
 
 def _lucas_kanade(
