@@ -42,8 +42,8 @@ _EPSILON_PX = 0.02
 movement. Evidence: none."""
 _MAX_DISTORTION_PX = 0.1
 """Pixels: maximum distance between a corner of a tracker's window and its position if the window only moved
-with its centre. If the expected motion distorts windows further, the first image is warped by this motion before
-tracking. Evidence: docs/decisions/registration.md."""
+with its centre. If the expected motion distorts windows further, the first image is warped by this motion
+before tracking. Evidence: docs/decisions/registration.md."""
 _MAX_ROUND_TRIP_PX = 1.0
 """Maximum distance, pixels, between a point and its position after tracking forwards and back. Evidence:
 none."""
@@ -104,7 +104,7 @@ def track_points(
     first: GreyImage,
     second: GreyImage,
     px: Pixels,
-    homography: FloatArray | None = None,
+    motion: ImageMotion | None = None,
     *,
     with_check: bool = True,
     window_px: int = _WINDOW_PX,
@@ -112,16 +112,15 @@ def track_points(
     """Track points from one image to another by pyramidal Lucas–Kanade.
 
     The tracker moves windows, but does not turn or scale them. So the first image is warped by the expected
-    motion if this motion turns or scales windows.
+    motion if this motion is reliable and turns or scales windows.
 
     Args:
         first: (H,W) uint8 image in which the points are given.
         second: (H,W) uint8 image in which the points are searched.
         px: (N,2) float32 points in the first image.
-        homography: (3,3) expected motion of the whole image, from the first to the second image; None if it
-            is unknown.
+        motion: Expected motion of the whole image from the first to the second image; None if it is unknown.
         with_check: True to check each point: the point is also tracked back to the first image, and rejected
-            if it does not return to its start. False to skip this check. If `homography` is given and the
+            if it does not return to its start. False to skip this check. If `motion` is given and the
             check is skipped, only the surroundings of the expected position are searched. This reduces the
             cost to a quarter.
         window_px: Side length, pixels, of the square window around a point. The tracker compares the content
@@ -134,10 +133,11 @@ def track_points(
         return TrackedPoints(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
     start = np.ascontiguousarray(px - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
     guess: Pixels | None = None
-    if homography is not None:
-        guess = np.asarray(apply_homography(px, homography) - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
-        if _window_distortion_px(px, homography, window_px) > _MAX_DISTORTION_PX:
-            first, start = _warp_image(first, homography, second.shape), guess
+    if motion is not None:
+        guess = np.asarray(apply_homography(px, motion.homography) - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
+        distortion_px = _window_distortion_px(px, motion.homography, window_px)
+        if motion.is_reliable and distortion_px > _MAX_DISTORTION_PX:
+            first, start = _warp_image(first, motion.homography, second.shape), guess
     levels = _LEVELS if guess is None else (_GUIDED_LEVELS if with_check else _UNCHECKED_LEVELS)
     tracked, is_found = _lucas_kanade(first, second, start, guess, (window_px, levels))
     height, width = second.shape

@@ -247,12 +247,11 @@ class _ActiveTracks:
 
     def advance(self, first: _VideoFrame, second: _VideoFrame, motion: ImageMotion | None) -> bool:
         """Follow the tracks from the first frame into the second; return False if too few remain."""
-        homography = None if motion is None else motion.homography
         # The check tracks each point back to the first frame, which is slow. It is only done if the image
         # motion is unknown or unreliable, because many tracks may then move to wrong points. A single wrong
         # track is rejected later, when the pose is estimated.
         with_check = motion is None or not motion.is_reliable
-        tracked = track_points(first.grey, second.grey, self.px, homography, with_check=with_check)
+        tracked = track_points(first.grey, second.grey, self.px, motion, with_check=with_check)
         keep = tracked.ok & second.camera.is_unmasked(tracked.px, second.index)
         self.rows, self.px = self.rows[keep], tracked.px[keep]
         return len(self.rows) >= _MIN_TRACKS
