@@ -28,6 +28,11 @@ Evidence: docs/decisions/mapping.md."""
 _MIN_RESECTION_INLIERS = 20
 """Minimum number of map points that must agree with the pose of a keyframe to register the keyframe. COLMAP's
 default is 30. Evidence: docs/decisions/mapping.md."""
+_MAX_RESECTION_ERROR_PX = 4.0
+"""Maximum reprojection error of a map point that agrees with the pose of a keyframe when the keyframe is
+registered, px of an image with a long side of 640 px. Origin: the maximum error of a match. COLMAP's default
+of 12 is for larger images; here, 12 px also accept a wall of bricks that is shifted by a row.
+Evidence: docs/decisions/mapping.md."""
 _MAX_EXTRA_PARAM = 1e3
 """Maximum absolute value of an accepted distortion parameter. COLMAP's default of 1 rejects cameras with
 k3 > 1 without a message, but a given calibration must be accepted."""
@@ -64,7 +69,7 @@ def make_mapper_options(
     for part in (settings, settings.mapper, settings.triangulation):
         part.max_extra_param = _MAX_EXTRA_PARAM
     settings.mapper.abs_pose_min_num_inliers = _MIN_RESECTION_INLIERS
-    settings.mapper.abs_pose_max_error *= scale
+    settings.mapper.abs_pose_max_error = _MAX_RESECTION_ERROR_PX * scale
     settings.mapper.init_max_error *= scale
     settings.mapper.filter_max_reproj_error *= scale
     return settings
