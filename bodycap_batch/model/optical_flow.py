@@ -40,7 +40,7 @@ _ITERATIONS = 20
 _EPSILON_PX = 0.02
 """Minimum movement, pixels, of a point from one iteration to the next. The iterations end after a smaller
 movement. Evidence: none."""
-_MAX_DISTORTION_PX = 0.1
+_MAX_DISTORTION_PX = 0.25
 """Pixels: maximum distance between a corner of a tracker's window and its position if the window only moved
 with its centre. If the expected motion distorts windows further, the first image is warped by this motion
 before tracking. Evidence: docs/decisions/registration.md."""
