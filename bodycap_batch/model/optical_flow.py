@@ -175,11 +175,21 @@ def _warp_image(image: GreyImage, homography: FloatArray, shape: tuple[int, ...]
     """Return the image (H,W) of a given shape, transformed by a homography of pixels with COLMAP's origin."""
     import cv2
 
-    offset = np.array([[1.0, 0.0, CV2_PIXEL_OFFSET_PX], [0.0, 1.0, CV2_PIXEL_OFFSET_PX], [0.0, 0.0, 1.0]])
-    in_cv2 = np.linalg.inv(offset) @ homography @ offset
+    colmap_from_cv2 = _colmap_from_cv2(1.0)
+    in_cv2 = np.linalg.inv(colmap_from_cv2) @ homography @ colmap_from_cv2
     return np.asarray(
         cv2.warpPerspective(image, in_cv2, (shape[1], shape[0]), borderMode=cv2.BORDER_REPLICATE), np.uint8
     )
+
+
+def _colmap_from_cv2(scale: float) -> FloatArray:
+    """Return the matrix (3,3) from OpenCV's pixels of a reduced image to COLMAP's pixels of the full image.
+
+    Args:
+        scale: Width of the reduced image divided by the width of the full image; 1 for the full image.
+    """
+    offset = CV2_PIXEL_OFFSET_PX
+    return np.array([[1.0, 0.0, offset], [0.0, 1.0, offset], [0.0, 0.0, scale]])
 
 
 def _lucas_kanade(
@@ -261,8 +271,7 @@ def estimate_coarse_motion(
     chosen = px[np.linspace(0, len(px) - 1, min(len(px), _COARSE_POINTS)).astype(int)] if len(px) else px
     start = np.ascontiguousarray(chosen * scale - CV2_PIXEL_OFFSET_PX, dtype=np.float32)
     best, inliers = None, 0
-    # This matrix converts OpenCV's pixels of the reduced images to COLMAP's pixels of the full-size images.
-    full_from_coarse = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, scale]])
+    full_from_coarse = _colmap_from_cv2(scale)
     if expected is not None and len(start):
         arrived = apply_homography(start, np.linalg.inv(full_from_coarse) @ expected @ full_from_coarse)
         best, inliers = _fit_homography(first, second, start, arrived)
