@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from bodycap_batch.mapping.intrinsics.readout_time import (
     map_with_readouts,
 )
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
-from bodycap_batch.mapping.intrinsics.shutters import read_shutters
+from bodycap_batch.mapping.intrinsics.shutters import read_shutters, readouts_of_maps
 from bodycap_batch.mapping.matching.database import read_camera_ids, read_detected_px
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
@@ -99,10 +99,13 @@ def refine_map(
             for image_id in model.reg_image_ids()
             if (px := read_detected_px(workspace, image_id)) is not None
         }
-        rolling = RollingShutterModel(model, paths, cameras, detected, _rotations(workspace, paths))
-        rolling, readouts = estimate_readouts(
+        rotations = _rotations(workspace, scene_map.cameras, paths)
+        rolling = RollingShutterModel(model, paths, cameras, detected, rotations)
+        rolling, estimated = estimate_readouts(
             rolling, cameras, settings, calibrated_ids, scene_map, from_matches
         )
+        # A camera that was registered against another model keeps the readout time of its keyframes here.
+        readouts = readouts_of_maps([scene_map]) | estimated
         readout_s = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         corrected_px = None
         distorted |= distorted_cameras(rolling, readout_s, scene_map.readout_s.keys())
@@ -155,15 +158,22 @@ def distorted_cameras(
     }
 
 
-def _rotations(workspace: Path, paths: Mapping[str, Trajectory]) -> dict[str, RotationPath]:
+def _rotations(
+    workspace: Path, names: Iterable[str], paths: Mapping[str, Trajectory]
+) -> dict[str, RotationPath]:
     """Return the rotation of each camera whose keyframes were corrected, by camera name.
 
     It comes from the camera's gyroscope if that corrected the keyframes, else from matches between frames.
+
+    Args:
+        workspace: Folder of the map's database.
+        names: Names of the cameras of the map.
+        paths: Trajectories against the map, by camera name.
     """
     out = {}
-    for name, shutter in read_shutters(workspace, paths).items():
+    for name, shutter in read_shutters(workspace, names).items():
         gyro = shutter.path.gyro
-        if gyro is None:
+        if gyro is None or name not in paths:
             out[name] = shutter.path
         elif (related := related_to_poses(gyro, paths[name])) is not None:
             out[name] = RotationPath.from_gyro(paths[name].times_ns, related)

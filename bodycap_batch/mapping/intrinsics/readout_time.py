@@ -16,6 +16,7 @@ from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust, sub_model
 from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
 from bodycap_batch.mapping.reconstruction.reprojection import image_residuals_px
+from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.optical_flow import pixel_scale
 from bodycap_batch.model.rotation_path import PosePath, RotationPath, near_in_time
 from bodycap_batch.model.scene import Map, Trajectory
@@ -246,7 +247,8 @@ class RollingShutterModel:
     Args:
         model: COLMAP's reconstruction; not changed.
         trajectories: Trajectories in the model's gauge, by camera name. A camera without a trajectory was
-            registered against another model; its keypoints are not moved.
+            registered against another model. Its keypoints are moved with the poses of its keyframes and its
+            rotation. They are not moved if its rotation is unknown.
         cameras: The capture's cameras by name.
         detected_px: Detected positions (N,2) of all keypoints of each image whose keypoints are at other
             positions in the model, by image id.
@@ -267,10 +269,6 @@ class RollingShutterModel:
         self._detected_px = detected_px or {}
         self._rotations = rotations or {}
         measured = {name: path for name, path in self._rotations.items() if path.gyro is not None}
-        self._paths = {
-            name: PosePath.create(path.gauge_from_cam, path.times_ns, measured.get(name), shrunk=False)
-            for name, path in trajectories.items()
-        }
         self._trajectories = trajectories
         self._cameras = cameras
         self._intrinsics = {
@@ -280,6 +278,14 @@ class RollingShutterModel:
             for image_id in model.reg_image_ids()
         }
         self._keypoints = [self._keypoints_of(image_id) for image_id in sorted(model.reg_image_ids())]
+        poses = {name: (path.gauge_from_cam, path.times_ns) for name, path in trajectories.items()}
+        elsewhere = (self._intrinsics.keys() & self._rotations.keys()) - poses.keys()
+        self._poses = poses | {
+            name: (self._keyframe_poses(name), cameras[name].times_ns) for name in elsewhere
+        }
+        self._paths = {
+            name: PosePath.create(*path, measured.get(name), shrunk=False) for name, path in poses.items()
+        } | {name: PosePath.create(*self._poses[name], self._rotations[name]) for name in elsewhere}
         self._inner = {name: inner_poses(path) for name, path in trajectories.items()}
 
     def corrected(self, readout_s: Mapping[str, float]) -> pycolmap.Reconstruction:
@@ -309,8 +315,8 @@ class RollingShutterModel:
         """
         out = copy.copy(self)
         out._paths = dict(self._paths)
-        for name, trajectory in self._trajectories.items():
-            path = PosePath.create(trajectory.gauge_from_cam, trajectory.times_ns, self._rotations.get(name))
+        for name, poses in self._poses.items():
+            path = PosePath.create(*poses, self._rotations.get(name))
             own = [item for item in self._keypoints if item.camera == name]
             out._paths[name] = path
             if own and readout_s.get(name) and name in corrected:
@@ -437,9 +443,8 @@ class RollingShutterModel:
         if not unknown:
             return out
         frame_s = {name: float(np.median(np.diff(self._cameras[name].times_ns))) * 1e-9 for name in unknown}
-        readout_s = {name: readout.seconds for name, readout in out.items()} | {
-            name: (start_s or {}).get(name, 0.0) for name in unknown
-        }
+        readout_s = dict(start_s or {}) | {name: readout.seconds for name, readout in out.items()}
+        readout_s |= {name: readout_s.get(name, 0.0) for name in unknown}
         model = self.corrected(readout_s)
         bundle_adjust(model, settings, calibrated_ids, _TRIAL_ITERATIONS)
         before = self._residuals(model)
@@ -505,6 +510,17 @@ class RollingShutterModel:
             np.full(len(feature), ref.frame, dtype=np.int64),
             self._points(image, feature),
         )
+
+    def _keyframe_poses(self, name: str) -> FloatArray:
+        """Return the poses (N,4,4) of a camera's keyframes, map_from_cam; NaN for all other frames."""
+        out = np.full((len(self._cameras[name].times_ns), 4, 4), np.nan)
+        for image_id in self._model.reg_image_ids():
+            image = self._model.image(image_id)
+            ref = ImageRef.parse(image.name)
+            if ref.camera == name:
+                pose = image.cam_from_world().inverse().matrix()
+                out[ref.frame] = make_transform(pose[:, :3], pose[:, 3])
+        return out
 
     def _tells_readout(self, item: _Keypoints) -> bool:
         """Return True if the velocity of a keyframe is known from poses on both sides."""

@@ -31,6 +31,7 @@ from bodycap_batch.model.rolling_shutter import (
     image_velocity,
     px_at_mid_row,
 )
+from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import FrameStatus, Map, Registration, Trajectory
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
@@ -277,6 +278,20 @@ def test_a_camera_whose_frames_lie_in_another_map_is_left_alone() -> None:
     for image_id in before.reg_image_ids():
         pairs = zip(before.image(image_id).points2D, after.image(image_id).points2D, strict=True)
         assert all((one.xy == other.xy).all() for one, other in pairs)
+
+
+def test_a_camera_whose_frames_lie_in_another_map_is_corrected_by_its_rotation() -> None:
+    film = Film(0.02)
+    turned = film.map_from_cam[:, :3, :3]
+    steps = np.swapaxes(turned[1:], 1, 2) @ turned[:-1]
+    rotation = RotationPath.from_steps(film.trajectory().times_ns, steps, np.ones(FRAMES - 1, dtype=bool))
+    rolling = RollingShutterModel(
+        the_map(film, range(1, FRAMES, 5)), {}, {"head": camera_of(film)}, rotations={"head": rotation}
+    )
+    assert rolling.estimate(make_mapper_options(MapOptions(), [1], 1.0), [1], {"head": 0.02}) == {}
+    # What remains is the motion of the position: 2 m/s at a distance of 3 to 6 m.
+    for model in (rolling, rolling.with_exact_rates({"head": 0.02}, ["head"])):
+        assert misfit_px(model.corrected({"head": 0.02}), film) < 0.6 * misfit_px(model.corrected({}), film)
 
 
 def test_what_could_not_be_determined_says_why_and_keeps_what_was_stated() -> None:
