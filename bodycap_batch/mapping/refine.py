@@ -35,6 +35,9 @@ _MAX_DISPLACEMENT_PX = 4.0
 """Maximum displacement of the keypoints of a camera by its rolling shutter in a map that was built without a
 correction, px of an image with a long side of 640 px. If it is larger, right matches contradict the geometry
 of their pairs. Origin: COLMAP's limit of the deviation of a match. Evidence: docs/decisions/mapping.md."""
+_MAX_KEYFRAMES = 300
+"""Maximum number of keyframes of a model whose velocities are adjusted. Origin: 160 MB for the reduced
+system, and some seconds for each step."""
 
 
 def refine_map(
@@ -50,10 +53,12 @@ def refine_map(
 
     Readout times that are not given in the job are estimated from the keyframes. The velocity of each
     keypoint in the image is computed from the poses of neighbouring frames. With this velocity, the keypoint
-    is moved to its position at the instant of the image's middle row. Then each model is adjusted. In the
-    result, the observations are at their detected positions again. `Map.readout_s` holds the readout times
-    with which the correction can be repeated. `MapDiagnostics.distorted_cameras` names the cameras for which
-    the map should be built again from corrected keypoints.
+    is moved to its position at the instant of the image's middle row. Then each model is adjusted. If the
+    model was built from corrected keypoints and the velocities from the poses are not exact enough, poses,
+    points and velocities of the keyframes are adjusted together, and the velocities from the poses are their
+    expected values. In the result, the observations are at their detected positions again. `Map.readout_s`
+    holds the readout times with which the correction can be repeated. `MapDiagnostics.distorted_cameras`
+    names the cameras for which the map should be built again from corrected keypoints.
 
     Args:
         capture: All cameras.
@@ -71,8 +76,7 @@ def refine_map(
     Raises:
         EstimationError: The adjustment failed.
 
-    Source: Hedborg et al., "Rolling shutter bundle adjustment", CVPR 2012, for the idea. Here the velocities
-        come from the poses of neighbouring frames; they are not additional unknowns.
+    Source: Hedborg et al., "Rolling shutter bundle adjustment", CVPR 2012, for the idea.
     """
     capture = with_map_intrinsics(capture, previous)
     workspace = context.work_dir / "workspace"
@@ -112,7 +116,14 @@ def refine_map(
         if readout_s:
             model = rolling.with_exact_rates(readout_s, scene_map.readout_s.keys()).corrected(readout_s)
             removed += remove_dominant_points(model)
-            if mapping.is_large(model.num_reg_images()):
+            built_for_shutters = readout_s.keys() <= scene_map.readout_s.keys()
+            if (
+                built_for_shutters
+                and model.num_reg_images() <= _MAX_KEYFRAMES
+                and rolling.adjust_with_velocities(model, readout_s)
+            ):
+                adjust_robustly(model, settings, calibrated_ids)
+            elif mapping.is_large(model.num_reg_images()):
                 adjust_in_two_steps(model, settings, calibrated_ids)
             else:
                 adjust_and_filter(model, settings, calibrated_ids)

@@ -98,6 +98,23 @@ def so3_log(rotation: FloatArray) -> FloatArray:
     return np.asarray(vec.reshape(*rotation.shape[:-2], 3))
 
 
+def so3_right_jacobian(rotvec_rad: FloatArray) -> FloatArray:
+    """Return the right Jacobians (...,3,3) of rotation vectors (...,3), radians.
+
+    A small change δ of a rotation vector φ turns the rotation by the right Jacobian times δ, in the axes of
+    the source frame: exp(φ + δ) = exp(φ) exp(J δ).
+
+    Source: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", 2018.
+    """
+    angle = np.linalg.norm(rotvec_rad, axis=-1)[..., None, None]
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    cross = skew(rotvec_rad)
+    return np.asarray(np.eye(3) - first * cross + second * (cross @ cross))
+
+
 def rotation_angle_rad(rotation: FloatArray) -> FloatArray:
     """Return the angles (...), radians, of rotations (...,3,3)."""
     return np.asarray(np.linalg.norm(so3_log(rotation), axis=-1))

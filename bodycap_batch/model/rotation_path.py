@@ -52,6 +52,12 @@ Evidence: docs/decisions/registration.md."""
 _ACCELERATION_DEVIATION_RATIO = 1.0
 """Expected change of the angular velocity in one frame interval that the cubic does not contain, as a ratio
 of the same deviation. Evidence: docs/decisions/registration.md."""
+_VELOCITY_DEVIATION_RATIO = 0.3
+"""Expected error of the velocity of a frame, as a ratio of its deviation from both neighbours. Origin: the
+same ratio as for angular velocities."""
+_MIN_SPEED_SIGMA_RATIO = 0.01
+"""Smallest expected error of a velocity, as a ratio of the largest usual speed of the camera. Evidence:
+none."""
 _SPEED_PERCENTILE = 90.0
 """Percentile of the speeds of a camera from which its largest plausible speed is computed. Evidence: none."""
 _MAX_SPEED_RATIO = 2.0
@@ -626,6 +632,39 @@ class PosePath:
         rotation = replace(self.rotation, rate=rate, acceleration=acceleration)
         return replace(self, rotation=rotation, rate_sigma=sigma)
 
+    def velocity_errors(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the expected errors of the velocities of the frames, along each axis.
+
+        They follow from the deviations of a frame's velocities from those of its neighbours. They are larger
+        where a velocity is extrapolated.
+
+        Returns:
+            Errors (N,) of the angular velocity, rad/s; of its change in a frame interval, rad/s; and of the
+            velocity, map units per second.
+        """
+        turning = self.rotation
+        deviation = np.where(turning.measured(), 0.0, turning.rate_deviations())
+        rate = np.maximum(_MIN_RATE_SIGMA, _RATE_DEVIATION_RATIO * deviation)
+        at_end = turning.is_end() & ~turning.measured()
+        end = _END_RATE_SIGMA + _END_RATE_SIGMA_RATIO * np.linalg.norm(turning.rate, axis=1)
+        rate = np.where(at_end, np.maximum(rate, end), rate)
+        rate = np.where(at_end & turning.is_alone(), _RATE_SIGMA, rate)
+        change = np.maximum(_MIN_RATE_SIGMA, _ACCELERATION_DEVIATION_RATIO * deviation)
+        has_pose: BoolArray = np.asarray(np.isfinite(self.map_from_cam).all(axis=(1, 2)))
+        linked = has_pose[1:] & has_pose[:-1] & near_in_time(turning.times_ns)
+        nothing = np.zeros(1, dtype=bool)
+        inner: BoolArray = np.asarray(np.concatenate([nothing, linked]) & np.concatenate([linked, nothing]))
+        step = np.diff(self.velocity, axis=0)
+        bend = np.zeros(len(inner))
+        bend[1:-1] = 0.5 * np.linalg.norm(step[:-1] - step[1:], axis=1)
+        # A neighbour at an end has an extrapolated velocity, so its deviation is no measure.
+        usual = float(np.median(bend[inner])) if inner.any() else 0.0
+        speed = np.linalg.norm(self.velocity[has_pose], axis=1)
+        fast = float(np.percentile(speed, _SPEED_PERCENTILE)) if len(speed) else 0.0
+        velocity = _VELOCITY_DEVIATION_RATIO * np.maximum(bend, usual)
+        velocity = np.where(inner, velocity, np.maximum(velocity, _EXTRAPOLATION_RATIO * fast))
+        return rate, change, np.maximum(velocity, _MIN_SPEED_SIGMA_RATIO * fast)
+
     def rate_leverage_s(
         self, camera: Camera, frame: IntArray, px: FloatArray, readout_s: float
     ) -> FloatArray:
@@ -638,6 +677,26 @@ class PosePath:
             readout_s: Readout time, seconds.
         """
         return self.rotation.rate_leverage_s(frame, row_delay(camera, px) * readout_s)
+
+    def turn_and_shift(
+        self, camera: Camera, frame: IntArray, px: FloatArray, readout_s: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the motion of the camera from frame times until pixels are exposed.
+
+        Args:
+            camera: The camera model.
+            frame: (M,) frame index of each pixel.
+            px: (M,2) observed pixels.
+            readout_s: Readout time, seconds.
+
+        Returns:
+            The rotation vectors (M,3) from the camera at the exposure to the camera at the frame time, rad;
+            and the shifts (M,3) of the camera in its frame at the frame time, map units. The shift is 0 in a
+            frame without a pose.
+        """
+        delay_s = row_delay(camera, px) * readout_s
+        shift = np.nan_to_num(self._shift_in_cam(frame, delay_s))
+        return self.rotation.rotvec_to_instant(frame, delay_s), shift
 
     def _shift_in_cam(self, frame: IntArray, delay_s: FloatArray) -> FloatArray:
         """Return how far (M,3) the camera moves from frame times to instants, in its frame of the frame time.

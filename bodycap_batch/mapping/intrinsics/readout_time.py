@@ -16,8 +16,16 @@ from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust, sub_model
 from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
 from bodycap_batch.mapping.reconstruction.reprojection import image_residuals_px
+from bodycap_batch.mapping.reconstruction.rolling_adjustment import (
+    RollingMap,
+    RowObservations,
+    VelocityErrors,
+    adjust_with_velocities,
+    px_at_mid_row,
+)
 from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.optical_flow import pixel_scale
+from bodycap_batch.model.rolling_shutter import row_delay
 from bodycap_batch.model.rotation_path import PosePath, RotationPath, near_in_time
 from bodycap_batch.model.scene import Map, Trajectory
 
@@ -64,6 +72,22 @@ _MAX_POOLED_SIGMAS = 3.0
 deviations. With a larger deviation, the cameras do not share the mean. Evidence: none."""
 _UNDETERMINED = "not determined: "
 """First words of `Readout.source` of a camera whose readout time is unknown; the reason follows."""
+_NOISE_PX = 0.7
+"""Standard deviation of an observation in an adjustment with velocities, px of an image with a long side of
+640 px. Origin: the same as for angular velocities in `model.rotation_path`."""
+_FIRST_LOSS_WIDTH = 4.0
+"""First width of the loss of an adjustment with velocities, in standard deviations of an observation. It
+keeps observations that disagree because the velocities of the path are wrong. The last width is the median
+residual. Evidence: docs/decisions/mapping.md."""
+_RATE_ERROR_FACTOR = 3.0
+"""Factor of the expected errors of the angular velocities of keyframes and of their changes, because the
+poses beside a keyframe are inexact, too. Evidence: docs/decisions/mapping.md."""
+_EXACT_RATIO = 0.5
+"""A path is exact enough if its expected errors displace keypoints by less than this ratio of the noise.
+Origin: they then add 12 % to the noise."""
+_NO_MOTION_SIGMA = 1e-6
+"""Expected error of a velocity that moves no observation: a global shutter. It only prevents a division by
+zero."""
 _BLOCKS = 8
 """Number of blocks of successive keyframes from which a standard deviation is estimated. Evidence: none."""
 _FLOOR_SIGMA_S = 0.0002
@@ -342,6 +366,109 @@ class RollingShutterModel:
             points = model.image(item.image_id).points2D
             for feature, xy in zip(item.feature.tolist(), px, strict=True):
                 points[feature].xy = xy
+
+    def adjust_with_velocities(self, model: pycolmap.Reconstruction, readout_s: Mapping[str, float]) -> bool:
+        """Adjust poses, points and the velocities of all keyframes of a copy of the model together.
+
+        The keypoints are then moved to their positions at the instant of the middle row, with the adjusted
+        velocities. The caller adjusts the model for these positions afterwards: intrinsics and gauge are not
+        fixed here.
+
+        Args:
+            model: The copy of the model, changed in place.
+            readout_s: Readout time (seconds) of each camera, by camera name. The keypoints of all other
+                cameras are moved to their detected positions.
+
+        Returns:
+            True if the model was adjusted. False if the velocities of the paths are exact enough: then the
+            model is unchanged.
+        """
+        import pycolmap
+
+        items = [self._remaining(item, model) for item in self._keypoints]
+        seen, errors, point_ids = self._row_observations(items, readout_s)
+        focal_px = np.array([lens.focal_px for lens in seen.lenses])[seen.lens[seen.keyframe]]
+        expected_px = focal_px * np.abs(seen.delay_s) * errors.rate[seen.keyframe]
+        if not len(seen.px) or np.percentile(expected_px, _DISPLACED_PERCENT) < _EXACT_RATIO * seen.noise_px:
+            return False
+        poses = [model.image(item.image_id).cam_from_world().matrix() for item in items]
+        start = RollingMap(
+            cam_from_map=np.array([make_transform(pose[:, :3], pose[:, 3]) for pose in poses]),
+            points=np.array([model.point3D(number).xyz for number in point_ids]),
+            velocities=np.zeros((len(poses), 9)),
+        )
+        found = adjust_with_velocities(seen, start, errors, [_FIRST_LOSS_WIDTH * seen.noise_px, 0.0])
+        px = px_at_mid_row(seen, found)
+        for number, xyz in zip(point_ids, found.points, strict=True):
+            model.point3D(number).xyz = xyz
+        bounds = np.searchsorted(seen.keyframe, np.arange(len(poses) + 1))
+        for row, item in enumerate(items):
+            image = model.image(item.image_id)
+            pose = pycolmap.Rigid3d(found.cam_from_map[row, :3])
+            model.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
+            for feature, xy in zip(item.feature.tolist(), px[bounds[row] : bounds[row + 1]], strict=True):
+                image.points2D[feature].xy = xy
+        return True
+
+    def _row_observations(
+        self, items: Sequence[_Keypoints], readout_s: Mapping[str, float]
+    ) -> tuple[RowObservations, VelocityErrors, list[int]]:
+        """Return all observations with the expected motion, the errors of the velocities, and point ids."""
+        names = sorted(self._intrinsics)
+        lens = np.array([names.index(item.camera) for item in items], dtype=np.int64)
+        ids = [self._point_ids(item) for item in items]
+        sizes = [len(item.px) for item in items]
+        keyframe = np.repeat(np.arange(len(sizes)), sizes)
+        point_ids, point = np.unique(np.concatenate([np.zeros(0, np.int64), *ids]), return_inverse=True)
+        px = np.concatenate([np.zeros((0, 2)), *(item.px for item in items)])
+        frame = np.concatenate([np.zeros(0, np.int64), *(item.frame for item in items)])
+        delay = np.zeros(len(px))
+        turn, shift = np.zeros((len(px), 3)), np.zeros((len(px), 3))
+        rate = np.full(len(sizes), _NO_MOTION_SIGMA)
+        change, velocity = rate.copy(), rate.copy()
+        own_frame = np.array([item.frame[0] if len(item.frame) else 0 for item in items])
+        for number, name in enumerate(names):
+            poses, camera = self._poses.get(name), self._intrinsics[name]
+            if poses is None or not readout_s.get(name):
+                continue
+            path = PosePath.create(*poses, self._rotations.get(name))
+            rows, kept = lens[keyframe] == number, lens == number
+            delay[rows] = row_delay(camera, px[rows]) * readout_s[name]
+            turn[rows], shift[rows] = path.turn_and_shift(camera, frame[rows], px[rows], readout_s[name])
+            expected = path.velocity_errors()
+            rate[kept], change[kept], velocity[kept] = (each[own_frame[kept]] for each in expected)
+        intervals_ns = [np.diff(camera.times_ns) for camera in self._cameras.values()]
+        scale = max(pixel_scale(each.width_px, each.height_px) for each in self._intrinsics.values())
+        seen_rows = RowObservations(
+            lenses=[self._intrinsics[name] for name in names],
+            lens=lens,
+            keyframe=keyframe,
+            point=np.ravel(point),
+            px=px,
+            delay_s=delay,
+            turn=turn,
+            shift=shift,
+            noise_px=_NOISE_PX * scale,
+            interval_s=1e-9 * float(np.median(np.concatenate(intervals_ns))),
+        )
+        errors = VelocityErrors(
+            rate=_RATE_ERROR_FACTOR * rate,
+            rate_change=_RATE_ERROR_FACTOR * change,
+            velocity=np.maximum(velocity, _NO_MOTION_SIGMA),
+        )
+        return seen_rows, errors, point_ids.tolist()
+
+    def _remaining(self, item: _Keypoints, model: pycolmap.Reconstruction) -> _Keypoints:
+        """Return the observations whose points are left in a copy of the model."""
+        points = model.image(item.image_id).points2D
+        left = np.array([points[index].has_point3D() for index in item.feature.tolist()], dtype=bool)
+        parts = {name: getattr(item, name)[left] for name in ("feature", "px", "frame", "points")}
+        return replace(item, **parts)
+
+    def _point_ids(self, item: _Keypoints) -> IntArray:
+        """Return the ids (N,) of the points that the observations of a keyframe see."""
+        points = self._model.image(item.image_id).points2D
+        return np.array([points[index].point3D_id for index in item.feature.tolist()], dtype=np.int64)
 
     def displacement_px(self, name: str, readout_s: float) -> float:
         """Return how far the rolling shutter displaces the keypoints of a camera.

@@ -23,6 +23,7 @@ from bodycap_batch.model.geometry import (
     skew,
     so3_exp,
     so3_log,
+    so3_right_jacobian,
     transform_points,
 )
 
@@ -183,3 +184,11 @@ def test_the_adjoint_moves_a_small_motion_to_other_axes() -> None:
         return make_transform(so3_exp(step[:3]), step[3:])
 
     assert np.allclose(pose @ small(motion), small(se3_adjoint(pose) @ motion) @ pose, atol=1e-10)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-5, 0.3, 2.5])
+def test_the_right_jacobian_turns_small_changes_of_a_rotation_vector(angle: float) -> None:
+    vector = angle * np.array([0.6, -0.48, 0.64])
+    for step in 1e-6 * np.eye(3):
+        turned = so3_log(so3_exp(vector).T @ so3_exp(vector + step))
+        assert turned == pytest.approx(so3_right_jacobian(vector) @ step, abs=1e-10)

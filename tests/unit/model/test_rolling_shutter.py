@@ -211,6 +211,45 @@ def test_a_map_is_built_again_only_if_a_shutter_found_late_displaces_keypoints_f
     assert distorted_cameras(rolling, {"head": 0.04}, ("head",)) == set()
 
 
+def test_keyframes_are_adjusted_together_with_their_velocities() -> None:
+    film = Film(0.02)
+    path = film.trajectory()
+    jitter = np.random.default_rng(2).normal(0.0, 0.01, (FRAMES, 3))
+    inexact = path.gauge_from_cam @ make_transform(so3_exp(jitter), np.zeros((FRAMES, 3)))
+    rolling = RollingShutterModel(
+        the_map(film, range(1, FRAMES, 5)),
+        {"head": replace(path, gauge_from_cam=inexact)},
+        {"head": camera_of(film)},
+    )
+    model = rolling.corrected({"head": 0.02})
+    dropped = next(iter(model.point3D_ids()))
+    model.delete_point3D(dropped)
+    before = misfit_px(model, film)
+    assert rolling.adjust_with_velocities(model, {"head": 0.02})
+    # Without noise in the start, pixels are corrected to their noise of 0.38 px. The gauge may move a little.
+    assert misfit_px(model, film) < 0.8 < 0.7 * before
+    assert not model.exists_point3D(dropped)
+
+
+def test_velocities_of_a_smooth_path_are_exact_enough() -> None:
+    film = Film(0.02)
+    rolling = rolling_model(film)
+    model = rolling.corrected({"head": 0.02})
+    before = misfit_px(model, film)
+    assert not rolling.adjust_with_velocities(model, {"head": 0.02})
+    assert misfit_px(model, film) == before
+
+
+def test_without_a_readout_time_keypoints_stay_where_they_are() -> None:
+    film = Film(0.02)
+    rolling = rolling_model(film)
+    model, before = rolling.corrected({}), rolling.corrected({})
+    assert not rolling.adjust_with_velocities(model, {})
+    for number in model.reg_image_ids():
+        pairs = zip(model.image(number).points2D, before.image(number).points2D, strict=True)
+        assert all(one.xy == pytest.approx(other.xy, abs=1e-6) for one, other in pairs)
+
+
 def test_a_stated_readout_runs_the_way_the_video_is_turned() -> None:
     film = Film(0.02, sideways=True)
     _, reported = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))

@@ -342,3 +342,26 @@ def test_an_extrapolated_velocity_is_uncertain_where_the_camera_turns_fast() -> 
     for frame in (19, 20):
         assert 0.005 < shutter.uncertainty(frame) < 0.04
     assert replace(shutter, path=replace(path, rate=0.0 * path.rate)).uncertainty(19) == 0.0
+
+
+def test_expected_errors_of_velocities_are_larger_where_a_path_jerks_or_ends() -> None:
+    times_s = np.arange(FRAMES) * FRAME_S
+    smooth = PosePath.create(poses_at(times_s, sway_m=0.3), TIMES_NS).velocity_errors()
+    jerking = poses_at(times_s, sway_m=0.3)
+    jerking[20, :3, :3] = jerking[20, :3, :3] @ so3_exp(np.array([0.05, 0.0, 0.0]))
+    jerking[20, :3, 3] += 0.05
+    errors = PosePath.create(jerking, TIMES_NS).velocity_errors()
+    for before, after in zip(smooth, errors, strict=True):
+        assert after[19] > 3.0 * before[19]
+        assert after[10] == pytest.approx(before[10], rel=0.2)
+        assert (after > 0.0).all()
+    # The velocities of the first and the last frame are extrapolated.
+    assert smooth[0][[0, -1]].min() > 2.0 * np.median(smooth[0])
+    assert smooth[2][[0, -1]].min() > 2.0 * np.median(smooth[2])
+
+
+def test_a_path_without_poses_expects_the_largest_error_of_its_rates() -> None:
+    rate, change, velocity = PosePath.create(np.full((FRAMES, 4, 4), np.nan), TIMES_NS).velocity_errors()
+    assert (rate == 2.0).all()
+    assert (change > 0.0).all()
+    assert (velocity == 0.0).all()

@@ -1,0 +1,176 @@
+"""Keyframes of a rolling shutter, adjusted together with their velocities."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.mapping.reconstruction.rolling_adjustment import (
+    RollingMap,
+    RowObservations,
+    VelocityErrors,
+    _derivatives,
+    _residuals,
+    adjust_with_velocities,
+    px_at_mid_row,
+)
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import (
+    align_points,
+    invert,
+    make_transform,
+    so3_exp,
+    so3_log,
+    transform_points,
+)
+from bodycap_batch.model.rolling_shutter import row_delay
+from bodycap_batch.model.rotation_path import PosePath
+
+LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
+READOUT_S = 0.02
+FRAME_S = 1 / 30
+FRAMES = 40
+KEYFRAMES = np.array([1, 2, 4, 5, 8, 9, 11, 14, 15, 17, 18, 21, 23, 24, 27, 29, 30, 32, 35, 36, 38])
+NOISE_PX = 0.2
+
+
+def poses_at(time_s: npt.ArrayLike) -> FloatArray:
+    """A hand that moves by half a metre and shakes at 7 Hz: no path through frames follows it."""
+    phase = 2 * np.pi * np.asarray(time_s, dtype=np.float64)
+    shake = 7.3 * phase
+    centre = [0.5 * np.sin(0.7 * phase), 0.3 * np.cos(1.1 * phase), 0.2 * np.sin(0.9 * phase)]
+    turn = [
+        0.25 * np.sin(0.8 * phase) + 0.03 * np.sin(shake),
+        0.3 * np.cos(0.6 * phase) + 0.03 * np.cos(1.1 * shake),
+        0.2 * np.sin(phase),
+    ]
+    return make_transform(so3_exp(np.stack(turn, axis=1)), np.stack(centre, axis=1))
+
+
+def scene() -> tuple[RowObservations, RollingMap, VelocityErrors]:
+    """Observations of a wall, the true map, and the expected errors of the path through the true frames."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform((-4, -3, 3), (4, 3, 6), (400, 3))
+    times_s = np.arange(FRAMES) * FRAME_S
+    path = PosePath.create(poses_at(times_s), np.round(times_s * 1e9).astype(np.int64))
+    keyframe, point, px = [], [], []
+    for number, frame in enumerate(KEYFRAMES.tolist()):
+        delay = np.zeros(len(points))
+        for _ in range(5):
+            seen = LENS.project(transform_points(invert(poses_at(times_s[frame] + delay)), points))
+            delay = (np.clip(seen[:, 1] / 480.0, 0, 1) - 0.5) * READOUT_S
+        inside = np.flatnonzero(((seen > 0) & (seen < (640, 480))).all(axis=1))
+        keyframe.append(np.full(len(inside), number))
+        point.append(inside)
+        px.append(seen[inside] + rng.normal(0, NOISE_PX, (len(inside), 2)))
+    k, pixels = np.concatenate(keyframe), np.concatenate(px)
+    frame_of = KEYFRAMES[k]
+    turn, shift = path.turn_and_shift(LENS, frame_of, pixels, READOUT_S)
+    rate, change, velocity = (each[KEYFRAMES] for each in path.velocity_errors())
+    seen_rows = RowObservations(
+        lenses=[LENS],
+        lens=np.zeros(len(KEYFRAMES), np.int64),
+        keyframe=k,
+        point=np.concatenate(point),
+        px=pixels,
+        delay_s=row_delay(LENS, pixels) * READOUT_S,
+        turn=turn,
+        shift=shift,
+        noise_px=0.7,
+        interval_s=FRAME_S,
+    )
+    truth = RollingMap(
+        cam_from_map=invert(poses_at(times_s[KEYFRAMES])),
+        points=points,
+        velocities=np.zeros((len(KEYFRAMES), 9)),
+    )
+    errors = VelocityErrors(rate=3.0 * rate, rate_change=3.0 * change, velocity=velocity)
+    return seen_rows, truth, errors
+
+
+def centre_error(found: RollingMap, truth: RollingMap) -> float:
+    """Root mean square error of the keyframes' centres under the best similarity, map units."""
+    here, there = (invert(each.cam_from_map)[:, :3, 3] for each in (found, truth))
+    fit = align_points(here, there)
+    return float(np.sqrt(((fit.apply(here) - there) ** 2).sum(axis=1).mean()))
+
+
+def test_derivatives_are_those_of_the_residuals() -> None:
+    seen, truth, _ = scene()
+    rng = np.random.default_rng(1)
+    found = replace(truth, velocities=0.3 * rng.standard_normal(truth.velocities.shape))
+    residual, valid = _residuals(seen, found)
+    by_keyframe, by_point = _derivatives(seen, found, valid)
+    nothing = np.zeros((len(found.points), 3))
+    for axis in range(15):
+        step = np.zeros((len(KEYFRAMES), 15))
+        step[:, axis] = 1e-6
+        change = (_residuals(seen, found.moved(step, nothing))[0] - residual) / 1e-6
+        assert change == pytest.approx(by_keyframe[:, :, axis], abs=0.02, rel=1e-3)
+    for axis in range(3):
+        step = nothing.copy()
+        step[:, axis] = 1e-6
+        moved = found.moved(np.zeros((len(KEYFRAMES), 15)), step)
+        change = (_residuals(seen, moved)[0] - residual) / 1e-6
+        assert change == pytest.approx(by_point[:, :, axis], abs=0.02, rel=1e-3)
+
+
+def rate_errors(found: RollingMap) -> FloatArray:
+    """Errors (K,) of the angular velocities of the keyframes with their corrections, rad/s."""
+    times_s = np.arange(FRAMES) * FRAME_S
+    path = PosePath.create(poses_at(times_s), np.round(times_s * 1e9).astype(np.int64))
+    before, after = (poses_at(times_s[KEYFRAMES] + step)[:, :3, :3] for step in (-1e-4, 1e-4))
+    true = so3_log(np.swapaxes(before, 1, 2) @ after) / 2e-4
+    return np.asarray(np.linalg.norm(path.rotation.rate[KEYFRAMES] + found.velocities[:, :3] - true, axis=1))
+
+
+def test_velocities_that_the_path_does_not_contain_are_found() -> None:
+    seen, truth, errors = scene()
+    found = adjust_with_velocities(seen, truth, errors, (2.8, 0.0))
+    # The shake turns by 1.4 rad/s at most. The rows of 150 points tell it to some 0.1 rad/s.
+    assert np.median(rate_errors(truth)) > 0.1
+    assert np.median(rate_errors(found)) < 0.5 * np.median(rate_errors(truth))
+    # Seen at one instant, the points lie where the true poses show them, but for the gauge.
+    pose = truth.cam_from_map[seen.keyframe]
+    in_cam = np.einsum("mij,mj->mi", pose[:, :3, :3], truth.points[seen.point]) + pose[:, :3, 3]
+    off, corrected = (
+        np.median(np.linalg.norm(LENS.project(in_cam) - px, axis=1))
+        for px in (seen.px, px_at_mid_row(seen, found))
+    )
+    assert corrected < 0.5 * off
+
+
+def test_without_a_shutter_nothing_but_noise_is_adjusted() -> None:
+    seen, truth, errors = scene()
+    rng = np.random.default_rng(2)
+    pose = truth.cam_from_map[seen.keyframe]
+    in_cam = np.einsum("mij,mj->mi", pose[:, :3, :3], truth.points[seen.point]) + pose[:, :3, 3]
+    nothing = np.zeros(len(seen.px))
+    still = replace(
+        seen,
+        px=LENS.project(in_cam) + rng.normal(0, NOISE_PX, seen.px.shape),
+        delay_s=nothing,
+        turn=np.zeros_like(seen.turn),
+        shift=np.zeros_like(seen.shift),
+    )
+    found = adjust_with_velocities(still, truth, errors, (0.0,))
+    assert np.abs(found.velocities).max() < 1e-9
+    # 0.2 px at 400 px and 4 m is 2 mm; 150 points determine a keyframe to a fraction of it.
+    assert centre_error(found, truth) < 0.002
+    assert px_at_mid_row(still, found) == pytest.approx(still.px, abs=1e-6)
+
+
+def test_a_point_behind_the_camera_keeps_its_pixel_and_moves_nothing() -> None:
+    seen, truth, errors = scene()
+    behind = replace(truth, points=truth.points.copy())
+    lost = int(seen.point[0])
+    behind.points[lost] = (0.0, 0.0, -50.0)
+    found = adjust_with_velocities(seen, behind, errors, (0.0,))
+    rows = seen.point == lost
+    assert np.isfinite(found.cam_from_map).all()
+    assert np.isfinite(found.points).all()
+    assert (px_at_mid_row(seen, found)[rows] == seen.px[rows]).all()
