@@ -114,7 +114,7 @@ def run_refine(task: RefineTask, context: StageContext, files: Path) -> None:
     _save_map(
         result,
         files,
-        late=sorted(rolling - before),
+        unsettled=sorted((rolling - before) | set(result.diagnostics.inexact_paths)),
         corrected=sorted(rolling),
         corrected_before=sorted(before),
         distorted=result.diagnostics.distorted_cameras,
@@ -130,7 +130,7 @@ def _save_map(
     result: MapResult,
     files: Path,
     *,
-    late: Sequence[str] = (),
+    unsettled: Sequence[str] = (),
     corrected: Sequence[str] = (),
     corrected_before: Sequence[str] = (),
     distorted: Sequence[str] = (),
@@ -140,7 +140,8 @@ def _save_map(
     Args:
         result: The map.
         files: Folder of the artefact.
-        late: Names of the cameras whose rolling shutters are corrected for the first time.
+        unsettled: Names of the cameras whose rolling shutters the poses against this map correct better:
+            they are corrected for the first time, or their paths were not exact enough.
         corrected: Names of the cameras whose rolling shutters are corrected.
         corrected_before: Names of the cameras whose rolling shutters were corrected in the map before it.
         distorted: Names of the cameras for whose rolling shutters the map should be built again.
@@ -159,7 +160,7 @@ def _save_map(
         files,
         keyframes=len(largest.keyframe_camera),
         points=len(largest.points),
-        late=list(late),
+        unsettled=list(unsettled),
         corrected=list(corrected),
         corrected_before=list(corrected_before),
         distorted=list(distorted),
