@@ -21,6 +21,11 @@ from bodycap_batch.mapping.inputs import (
     make_mapping_context,
 )
 from bodycap_batch.mapping.intrinsics.intrinsics_check import find_misfit_intrinsics
+from bodycap_batch.mapping.intrinsics.readout_pairs import (
+    doubtful_groups,
+    estimate_from_pairs,
+    sampled_keyframes,
+)
 from bodycap_batch.mapping.intrinsics.readout_profile import estimate_from_matches
 from bodycap_batch.mapping.intrinsics.readout_time import Readout, map_with_readouts
 from bodycap_batch.mapping.intrinsics.recalibration import recalibrate_if_misfit
@@ -56,6 +61,8 @@ from bodycap_batch.model.scene import KeyframeSelection, MapResult
 
 WORKSPACE = "workspace"
 """Name of the folder of a map's database, in the work folder."""
+_TRIAL = "trial"
+"""Name of the folder, in the work folder, with the features from which readout times are estimated."""
 _MIN_MOTION_PX = 2.0
 """Minimum motion of the picture of a camera that moves, px of an image with a long side of 640 px. Evidence:
 docs/decisions/mapping.md."""
@@ -204,6 +211,7 @@ def build_map_once(
     workspace = context.work_dir / WORKSPACE
     workspace.mkdir(parents=True, exist_ok=True)
     estimated = with_gyroscopes(estimate_from_matches(capture, selections), selections)
+    estimated, earlier = _judged_by_pairs(capture, selections, estimated, options, context, earlier)
     readouts = {**known_readouts(capture), **estimated}
     used = {**readouts, **earlier.readouts}
     shutters = turning_shutters(capture, selections, used)
@@ -252,6 +260,42 @@ def build_map_once(
     ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
     refused = refused or add_flip_hint(check_consistency(max(ratios)), flips)
     return result, refused
+
+
+def _judged_by_pairs(
+    capture: Capture,
+    selections: Sequence[KeyframeSelection],
+    readouts: Mapping[str, Readout],
+    options: MapOptions,
+    context: StageContext,
+    earlier: EarlierResults,
+) -> tuple[dict[str, Readout], EarlierResults]:
+    """Estimate undetermined readout times that may displace keypoints far from pairs of keyframes.
+
+    Args:
+        capture: All cameras.
+        selections: Keyframes of each camera.
+        readouts: Readout times from matches between adjacent frames, by camera name.
+        options: The stage's options.
+        context: Work folder, threads, progress.
+        earlier: What earlier maps give. Cameras with an earlier readout time are left out.
+
+    Returns:
+        The readout times by camera name; the earlier results with the features that were extracted here.
+    """
+    out = dict(readouts)
+    unknown = {name: item for name, item in readouts.items() if name not in earlier.readouts}
+    extracted: dict[str, Path] = {}
+    for number, names in enumerate(doubtful_groups(capture, selections, unknown)):
+        folder = context.work_dir / _TRIAL / str(number)
+        folder.mkdir(parents=True, exist_ok=True)
+        own = sampled_keyframes(selections, names)
+        add_keyframes(folder, _keyframes_of(folder, capture, own, {}, earlier), options, context)
+        refs = [ImageRef(item.camera, int(frame)) for item in own for frame in item.frames]
+        generator = PairGenerator(folder, refs, frame_times_ns(capture), options, context)
+        out |= estimate_from_pairs(folder, capture, own, readouts, context, generator)
+        extracted |= dict.fromkeys(names, folder)
+    return out, replace(earlier, features={**extracted, **earlier.features})
 
 
 def _keyframes_of(

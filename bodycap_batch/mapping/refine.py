@@ -19,7 +19,11 @@ from bodycap_batch.mapping.intrinsics.readout_time import (
     map_with_readouts,
 )
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
-from bodycap_batch.mapping.intrinsics.shutters import read_shutters, readouts_of_maps
+from bodycap_batch.mapping.intrinsics.shutters import (
+    MAX_DISPLACEMENT_PX,
+    read_shutters,
+    readouts_of_maps,
+)
 from bodycap_batch.mapping.matching.database import read_camera_ids, read_detected_px
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
@@ -31,10 +35,6 @@ from bodycap_batch.mapping.validation.dominant_points import remove_dominant_poi
 from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import MapResult, Trajectory
 
-_MAX_DISPLACEMENT_PX = 4.0
-"""Maximum displacement of the keypoints of a camera by its rolling shutter in a map that was built without a
-correction, px of an image with a long side of 640 px. If it is larger, right matches contradict the geometry
-of their pairs. Origin: COLMAP's limit of the deviation of a match. Evidence: docs/decisions/mapping.md."""
 _MAX_KEYFRAMES = 300
 """Maximum number of keyframes of a model whose velocities are adjusted. Origin: 160 MB for the reduced
 system, and some seconds for each step."""
@@ -167,7 +167,7 @@ def distorted_cameras(
     return {
         name
         for name in readout_s.keys() - set(corrected)
-        if rolling.displacement_px(name, readout_s[name]) > _MAX_DISPLACEMENT_PX
+        if rolling.displacement_px(name, readout_s[name]) > MAX_DISPLACEMENT_PX
     }
 
 

@@ -93,7 +93,7 @@ _BLOCKS = 8
 _FLOOR_SIGMA_S = 0.0002
 """Standard deviation that is added to each estimate and to each mean of equal cameras, seconds, because the
 path between frames is a spline. Evidence: docs/decisions/mapping.md."""
-_DISPLACED_PERCENT = 95.0
+DISPLACED_PERCENT = 95.0
 """Percentile of the displacements of keypoints that is compared with a limit. Evidence: none."""
 _LOSS_PX = 1.0
 """Width (px) of the robust weight function of a residual. Evidence: none."""
@@ -393,7 +393,7 @@ class RollingShutterModel:
         for number, (name, lens) in enumerate(sorted(self._intrinsics.items())):
             own_rad = expected_rad[seen.lens[seen.keyframe] == number]
             limit_px = _EXACT_RATIO * seen.noise_px
-            if len(own_rad) and lens.focal_px * np.percentile(own_rad, _DISPLACED_PERCENT) > limit_px:
+            if len(own_rad) and lens.focal_px * np.percentile(own_rad, DISPLACED_PERCENT) > limit_px:
                 inexact.append(name)
         if not inexact:
             return ()
@@ -492,7 +492,7 @@ class RollingShutterModel:
             return 0.0
         moved = [np.linalg.norm(self._px_at_mid_row(item, readout_s) - item.px, axis=1) for item in own]
         scale = pixel_scale(lens.width_px, lens.height_px)
-        return float(np.percentile(np.concatenate(moved), _DISPLACED_PERCENT)) / scale
+        return float(np.percentile(np.concatenate(moved), DISPLACED_PERCENT)) / scale
 
     def _px_at_mid_row(self, item: _Keypoints, readout_s: float) -> FloatArray:
         """Return the positions (N,2) of keypoints at the instant of the middle row, for a readout time."""

@@ -9,12 +9,25 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.capture import Capture
+from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
 from bodycap_batch.inertial import camera_rotation
-from bodycap_batch.mapping.intrinsics.readout_time import Readout, judged_readout, stated_readout
+from bodycap_batch.mapping.intrinsics.readout_time import (
+    DISPLACED_PERCENT,
+    Readout,
+    judged_readout,
+    stated_readout,
+)
+from bodycap_batch.model.optical_flow import pixel_scale
 from bodycap_batch.model.rotation_path import TurningShutter
 from bodycap_batch.model.scene import KeyframeSelection, Map
 
+MAX_DISPLACEMENT_PX = 4.0
+"""Maximum displacement of the keypoints of a camera by its rolling shutter in a map that was built without a
+correction, px of an image with a long side of 640 px. If it is larger, right matches contradict the geometry
+of their pairs. Origin: COLMAP's limit of the deviation of a match. Evidence: docs/decisions/mapping.md."""
+_GRID = 8
+"""Number of rows and of columns of the pixels whose displacement is computed. Evidence: none."""
 _MAX_SIGMAS = 3.0
 """Maximum difference of two readout times that agree, in its standard deviations. Evidence: none."""
 _FOLDER = "shutters"
@@ -108,6 +121,26 @@ def turning_shutters(
         if path is not None:
             out[selection.camera] = TurningShutter(lens, path, readout.seconds)
     return out
+
+
+def grid_displacement_px(shutter: TurningShutter, frames: IntArray) -> float:
+    """Return how far a rolling shutter displaces evenly spaced pixels.
+
+    Args:
+        shutter: The shutter.
+        frames: (K,) frames of the camera.
+
+    Returns:
+        The 95th percentile, px of an image with a long side of 640 px; 0 if there are no frames.
+    """
+    lens = shutter.camera
+    if len(frames) == 0:
+        return 0.0
+    inside = (np.arange(_GRID) + 0.5) / _GRID
+    grid = np.stack(np.meshgrid(inside * lens.width_px, inside * lens.height_px), axis=-1).reshape(-1, 2)
+    px = np.tile(grid, (len(frames), 1))
+    moved = np.linalg.norm(shutter.px_at_mid_row(np.repeat(frames, len(grid)), px) - px, axis=1)
+    return float(np.percentile(moved, DISPLACED_PERCENT)) / pixel_scale(lens.width_px, lens.height_px)
 
 
 def write_shutters(workspace: Path, shutters: Mapping[str, TurningShutter]) -> None:

@@ -78,6 +78,30 @@ class KeyframeFeatures:
     error: float
     calibrated: bool
 
+    @staticmethod
+    def of(
+        px: FloatArray,
+        descriptors: ByteDescriptors,
+        intrinsics: CameraIntrinsics,
+        max_error_px: float = _MAX_ERROR_PX,
+    ) -> KeyframeFeatures:
+        """Return the features of a keyframe.
+
+        Args:
+            px: (N,2) positions of the features, px.
+            descriptors: (N,128) root-normalised descriptors as bytes.
+            intrinsics: Intrinsics of the keyframe's camera.
+            max_error_px: Maximum epipolar error of an inlier, px of an image with a long side of 640 px.
+        """
+        camera, calibrated = intrinsics.camera, intrinsics.calibrated
+        error = max_error_px * pixel_scale(camera.width_px, camera.height_px)
+        return KeyframeFeatures(
+            descriptors=descriptors,
+            rays=camera.unproject(px) if calibrated else px - CV2_PIXEL_OFFSET_PX,
+            error=error / camera.focal_px if calibrated else error,
+            calibrated=calibrated,
+        )
+
 
 def match_pairs(
     workspace: Path,
@@ -125,18 +149,14 @@ def _read_features(
     intrinsics: Mapping[str, CameraIntrinsics],
 ) -> dict[ImageRef, KeyframeFeatures]:
     """Read the features of the keyframes `refs` from the database."""
-    out = {}
-    for ref in sorted(refs):
-        camera, calibrated = intrinsics[ref.camera].camera, intrinsics[ref.camera].calibrated
-        pixels = np.asarray(database.read_keypoints(ids[ref]), dtype=np.float64)[:, :2]
-        error = _MAX_ERROR_PX * pixel_scale(camera.width_px, camera.height_px)
-        out[ref] = KeyframeFeatures(
-            descriptors=np.asarray(database.read_descriptors(ids[ref]).data),
-            rays=camera.unproject(pixels) if calibrated else pixels - CV2_PIXEL_OFFSET_PX,
-            error=error / camera.focal_px if calibrated else error,
-            calibrated=calibrated,
+    return {
+        ref: KeyframeFeatures.of(
+            np.asarray(database.read_keypoints(ids[ref]), dtype=np.float64)[:, :2],
+            np.asarray(database.read_descriptors(ids[ref]).data),
+            intrinsics[ref.camera],
         )
-    return out
+        for ref in sorted(refs)
+    }
 
 
 def _match_block(
