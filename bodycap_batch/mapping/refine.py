@@ -93,7 +93,6 @@ def refine_map(
     models, all_readouts, adjusted_px = [], [], []
     removed = 0
     distorted: set[str] = set()
-    inexact: set[str] = set()
     for number, scene_map in enumerate(previous.maps):
         context.check_cancelled()
         context.progress(number, len(previous.maps), "maps refined")
@@ -117,12 +116,12 @@ def refine_map(
         if readout_s:
             model = rolling.with_exact_rates(readout_s, scene_map.readout_s.keys()).corrected(readout_s)
             removed += remove_dominant_points(model)
-            own_inexact: tuple[str, ...] = ()
             built_for_shutters = readout_s.keys() <= scene_map.readout_s.keys()
-            if built_for_shutters and model.num_reg_images() <= _MAX_KEYFRAMES:
-                own_inexact = rolling.adjust_with_velocities(model, readout_s)
-            if own_inexact:
-                inexact |= set(own_inexact)
+            if (
+                built_for_shutters
+                and model.num_reg_images() <= _MAX_KEYFRAMES
+                and rolling.adjust_with_velocities(model, readout_s)
+            ):
                 adjust_robustly(model, settings, calibrated_ids)
             elif mapping.is_large(model.num_reg_images()):
                 adjust_in_two_steps(model, settings, calibrated_ids)
@@ -144,7 +143,6 @@ def refine_map(
     diagnostics = replace(
         previous.diagnostics,
         distorted_cameras=tuple(sorted(distorted)),
-        inexact_paths=tuple(sorted(inexact)),
         details={**previous.log, **log},
     )
     result = make_result(models, workspace, diagnostics.to_log(), adjusted_px)

@@ -19,7 +19,6 @@ _REACH = "reach"
 _MISPLACED = "misplaced_keyframes"
 _UNKNOWN_SHUTTERS = "unknown_shutters"
 _DISTORTED_CAMERAS = "distorted_cameras"
-_INEXACT_PATHS = "inexact_paths"
 
 CameraGroups = tuple[tuple[str, ...], tuple[str, ...]]
 """Two groups of cameras, by name."""
@@ -64,8 +63,6 @@ class MapDiagnostics:
             frames determine.
         distorted_cameras: Names of the cameras whose rolling shutter displaces keypoints so far that the map
             should be built again from corrected keypoints.
-        inexact_paths: Names of the cameras whose paths were not exact enough to correct their rolling
-            shutters, so that the velocities of their keyframes were adjusted together with the map.
         details: All entries of the log in the order of the log, including the entries of the other fields.
     """
 
@@ -81,7 +78,6 @@ class MapDiagnostics:
     misplaced: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     unknown_shutters: tuple[str, ...] = ()
     distorted_cameras: tuple[str, ...] = ()
-    inexact_paths: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
@@ -107,7 +103,6 @@ class MapDiagnostics:
             misplaced={name: tuple(frames) for name, frames in log.get(_MISPLACED, {}).items()},
             unknown_shutters=tuple(log.get(_UNKNOWN_SHUTTERS, ())),
             distorted_cameras=tuple(log.get(_DISTORTED_CAMERAS, ())),
-            inexact_paths=tuple(log.get(_INEXACT_PATHS, ())),
             details=log,
         )
 
@@ -146,12 +141,8 @@ class MapDiagnostics:
             log[_REACH] = dict(self.reach)
         if self.misplaced or _MISPLACED in log:
             log[_MISPLACED] = {name: list(frames) for name, frames in self.misplaced.items()}
-        for key, names in (
-            (_DISTORTED_CAMERAS, self.distorted_cameras),
-            (_INEXACT_PATHS, self.inexact_paths),
-        ):
-            if names or key in log:
-                log[key] = list(names)
+        if self.distorted_cameras or _DISTORTED_CAMERAS in log:
+            log[_DISTORTED_CAMERAS] = list(self.distorted_cameras)
         return log
 
 

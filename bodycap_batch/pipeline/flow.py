@@ -264,11 +264,10 @@ class Flow:
         """Remove the deformation of the map that rolling shutters cause, and solve all poses again.
 
         If no camera has a rolling shutter, the map and the registrations are returned unchanged. If readout
-        times are unknown, and the poses show no rolling shutter, the registrations are unchanged.
-
-        The first pass starts from wrong poses if the map was built from keypoints that were not corrected, or
-        if the paths are not exact enough to correct them. Then there is a second pass. If the shutters
-        displace keypoints far, the map is built again before it, from corrected keypoints.
+        times are unknown, and the poses show no rolling shutter, the registrations are unchanged. If the map
+        was built from keypoints that were not corrected, the first pass starts from wrong poses. Then there
+        is a second pass. If the shutters displace keypoints far, the map is built again before it, from
+        corrected keypoints.
         """
         if not any(read_summary(artefact.path)["rolling"] for artefact in registrations.values()):
             return scene_map, registrations
@@ -290,7 +289,7 @@ class Flow:
             if again is None:
                 again = scene_map, self.register(scene_map, keyframes, registrations)
             scene_map, registrations = again
-            if not summary["unsettled"]:
+            if not summary["late"]:
                 break
         return scene_map, registrations
 

@@ -114,7 +114,7 @@ def run_refine(task: RefineTask, context: StageContext, files: Path) -> None:
     _save_map(
         result,
         files,
-        unsettled=sorted((rolling - before) | set(result.diagnostics.inexact_paths)),
+        late=sorted(rolling - before),
         corrected=sorted(rolling),
         corrected_before=sorted(before),
         distorted=result.diagnostics.distorted_cameras,
@@ -130,7 +130,7 @@ def _save_map(
     result: MapResult,
     files: Path,
     *,
-    unsettled: Sequence[str] = (),
+    late: Sequence[str] = (),
     corrected: Sequence[str] = (),
     corrected_before: Sequence[str] = (),
     distorted: Sequence[str] = (),
@@ -140,8 +140,7 @@ def _save_map(
     Args:
         result: The map.
         files: Folder of the artefact.
-        unsettled: Names of the cameras whose rolling shutters the poses against this map correct better:
-            they are corrected for the first time, or their paths were not exact enough.
+        late: Names of the cameras whose rolling shutters are corrected for the first time.
         corrected: Names of the cameras whose rolling shutters are corrected.
         corrected_before: Names of the cameras whose rolling shutters were corrected in the map before it.
         distorted: Names of the cameras for whose rolling shutters the map should be built again.
@@ -160,7 +159,7 @@ def _save_map(
         files,
         keyframes=len(largest.keyframe_camera),
         points=len(largest.points),
-        unsettled=list(unsettled),
+        late=list(late),
         corrected=list(corrected),
         corrected_before=list(corrected_before),
         distorted=list(distorted),

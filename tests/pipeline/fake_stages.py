@@ -22,7 +22,7 @@ ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
  "masked": [cameras], "without_wearer": localised frames, of each camera or {camera: frames},
- "unused": {camera: reason}, "rolling": true, "unsettled": number of maps,
+ "unused": {camera: reason}, "rolling": true, "late": number of maps,
  "corrected" | "corrected_before" | "distorted": [cameras] in refined maps,
  "fail_rebuilt": true, "telemetry": [cameras],
  "real": [stages that are no stand-ins]}.
@@ -155,17 +155,17 @@ def placed(options: Json, arguments: Json, files: Path) -> None:
 
 
 def refined(options: Json, arguments: Json, files: Path) -> None:
-    """The poses against the first `unsettled` refined maps correct the shutters better."""
+    """The readout times are found late in the first `late` maps that are refined."""
     before = Path(arguments["map"]["path"]) / "summary.json"
     passes = json.loads(before.read_text()).get("passes", 0) + 1 if before.exists() else 1
-    unsettled = ["torso"] if passes <= orders().get("unsettled", 0) else []
-    corrected, distorted = orders().get("corrected", ["torso"]), orders().get("distorted", unsettled)
+    late = ["torso"] if passes <= orders().get("late", 0) else []
+    corrected, distorted = orders().get("corrected", ["torso"]), orders().get("distorted", late)
     (files / "summary.json").write_text(
         json.dumps(
             {
                 "notes": [],
                 "passes": passes,
-                "unsettled": unsettled,
+                "late": late,
                 "corrected": corrected,
                 "distorted": distorted,
                 "corrected_before": orders().get("corrected_before", []),

@@ -458,11 +458,11 @@ def test_poses_that_were_solved_with_readouts_are_solved_again_without_them(benc
     assert bench.executed().count("registration torso") == 2
 
 
-@pytest.mark.parametrize(("unsettled", "passes"), [(0, 1), (1, 2), (9, 2)])
+@pytest.mark.parametrize(("late", "passes"), [(0, 1), (1, 2), (9, 2)])
 def test_a_readout_that_is_found_late_is_followed_by_a_new_map_and_a_second_pass(
-    bench: Bench, unsettled: int, passes: int
+    bench: Bench, late: int, passes: int
 ) -> None:
-    bench.order(rolling=True, unsettled=unsettled)
+    bench.order(rolling=True, late=late)
     executed = bench.executed()
     assert executed.count("refine") == executed.count("map") == passes
     assert executed.count("registration torso") == 1 + passes
@@ -473,7 +473,7 @@ def test_a_readout_that_is_found_late_is_followed_by_a_new_map_and_a_second_pass
 
 
 def test_a_map_that_the_shutter_distorts_little_is_not_built_again(bench: Bench) -> None:
-    bench.order(rolling=True, unsettled=1, distorted=[])
+    bench.order(rolling=True, late=1, distorted=[])
     executed = bench.executed()
     assert (executed.count("map"), executed.count("refine")) == (1, 2)
 
@@ -486,7 +486,7 @@ def test_a_map_that_the_shutter_distorts_little_is_not_built_again(bench: Bench)
 def test_a_worse_map_from_corrected_keypoints_is_not_used(
     bench: Bench, order: dict[str, Any], is_noted: bool
 ) -> None:
-    bench.order(rolling=True, unsettled=1, **order)
+    bench.order(rolling=True, late=1, **order)
     executed = bench.executed()
     notes = [event.what for event in bench.events if event.kind == "note"]
     assert any("the earlier map is kept" in note for note in notes) == is_noted

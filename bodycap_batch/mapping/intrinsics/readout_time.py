@@ -367,9 +367,7 @@ class RollingShutterModel:
             for feature, xy in zip(item.feature.tolist(), px, strict=True):
                 points[feature].xy = xy
 
-    def adjust_with_velocities(
-        self, model: pycolmap.Reconstruction, readout_s: Mapping[str, float]
-    ) -> tuple[str, ...]:
+    def adjust_with_velocities(self, model: pycolmap.Reconstruction, readout_s: Mapping[str, float]) -> bool:
         """Adjust poses, points and the velocities of all keyframes of a copy of the model together.
 
         The keypoints are then moved to their positions at the instant of the middle row, with the adjusted
@@ -382,21 +380,17 @@ class RollingShutterModel:
                 cameras are moved to their detected positions.
 
         Returns:
-            Names of the cameras whose paths are not exact enough. If there are none, the model is unchanged.
+            True if the model was adjusted. False if the velocities of the paths are exact enough: then the
+            model is unchanged.
         """
         import pycolmap
 
         items = [self._remaining(item, model) for item in self._keypoints]
         seen, errors, point_ids = self._row_observations(items, readout_s)
-        expected_rad = np.abs(seen.delay_s) * errors.rate[seen.keyframe]
-        inexact = []
-        for number, (name, lens) in enumerate(sorted(self._intrinsics.items())):
-            own_rad = expected_rad[seen.lens[seen.keyframe] == number]
-            limit_px = _EXACT_RATIO * seen.noise_px
-            if len(own_rad) and lens.focal_px * np.percentile(own_rad, DISPLACED_PERCENT) > limit_px:
-                inexact.append(name)
-        if not inexact:
-            return ()
+        focal_px = np.array([lens.focal_px for lens in seen.lenses])[seen.lens[seen.keyframe]]
+        expected_px = focal_px * np.abs(seen.delay_s) * errors.rate[seen.keyframe]
+        if not len(seen.px) or np.percentile(expected_px, DISPLACED_PERCENT) < _EXACT_RATIO * seen.noise_px:
+            return False
         poses = [model.image(item.image_id).cam_from_world().matrix() for item in items]
         start = RollingMap(
             cam_from_map=np.array([make_transform(pose[:, :3], pose[:, 3]) for pose in poses]),
@@ -414,7 +408,7 @@ class RollingShutterModel:
             model.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
             for feature, xy in zip(item.feature.tolist(), px[bounds[row] : bounds[row + 1]], strict=True):
                 image.points2D[feature].xy = xy
-        return tuple(inexact)
+        return True
 
     def _row_observations(
         self, items: Sequence[_Keypoints], readout_s: Mapping[str, float]

@@ -20,7 +20,6 @@ LOG = {
     "growth": [{"new_keyframes": 2}],
     "unknown_shutters": ["torso"],
     "distorted_cameras": ["torso"],
-    "inexact_paths": ["torso"],
 }
 
 
@@ -37,7 +36,7 @@ def test_the_fields_hold_what_the_log_holds() -> None:
     assert found.recalibrated == ("torso",)
     assert found.refined_intrinsics == {"torso": RefinedIntrinsics("RADIAL", (400.0, 320.0, 240.0, 0.1, 0.0))}
     assert found.reach == LOG["reach"]
-    assert found.unknown_shutters == found.distorted_cameras == found.inexact_paths == ("torso",)
+    assert found.unknown_shutters == found.distorted_cameras == ("torso",)
     assert found.extensions == ({"new_keyframes": 2},)
 
 
