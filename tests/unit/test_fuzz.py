@@ -5,8 +5,10 @@ The fast tests take a few hundred inputs, the slow tests some thousands, ``make 
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -190,6 +192,7 @@ def all_job_blocks() -> dict[str, Any]:
 
 
 FOLDER = Path(tempfile.mkdtemp(prefix="bodycap-fuzz-"))
+atexit.register(shutil.rmtree, FOLDER, ignore_errors=True)
 
 
 def reads_or_refuses(
