@@ -109,8 +109,8 @@ class Readout:
         seconds: Time (seconds) from the exposure of the sensor's first row to the exposure of the last row;
             0 for a global shutter.
         sigma_s: Standard deviation of the readout time, seconds; 0 if the time is given in the job.
-        source: "stated" (given in the job), "estimated", "none found", or the reason why the time could not
-            be determined.
+        source: "stated" (given in the job), "estimated", "none found", "of the map" (the time for which an
+            earlier map was corrected), or the reason why the time could not be determined.
         best_s: Readout time (seconds) with the smallest residuals, even if it is not significant.
         sideways: True if the sensor's rows are columns of the image.
     """
