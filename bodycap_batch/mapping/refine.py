@@ -119,7 +119,7 @@ def refine_map(
             built_for_shutters = readout_s.keys() <= scene_map.readout_s.keys()
             if (
                 built_for_shutters
-                and model.num_reg_images() <= _MAX_KEYFRAMES
+                and model.num_reg_images() <= min(_MAX_KEYFRAMES, skeletal_above)
                 and rolling.adjust_with_velocities(model, readout_s)
             ):
                 adjust_robustly(model, settings, calibrated_ids)
