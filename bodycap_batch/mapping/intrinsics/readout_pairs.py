@@ -17,7 +17,7 @@ from bodycap_batch.capture import Capture
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
-from bodycap_batch.mapping.intrinsics.readout_time import Readout, few_blocks_factor
+from bodycap_batch.mapping.intrinsics.readout_time import Readout, few_blocks_factor, weighted_mean
 from bodycap_batch.mapping.intrinsics.shutters import (
     MAX_DISPLACEMENT_PX,
     grid_displacement_px,
@@ -207,8 +207,7 @@ def estimate_from_pairs(
     place, sigma = _peak(np.stack([counts(best + step) for step in (-1, 0, 1)]), sample.blocks)
     value = np.array([first.best_s, first.best_s + (best + place) * _STEP_S])
     sigma_s = np.array([first.sigma_s, sigma * _STEP_S])
-    weight = 1.0 / sigma_s**2
-    best_s, mean_sigma_s = float(weight @ value / weight.sum()), float(1.0 / np.sqrt(weight.sum()))
+    best_s, mean_sigma_s = weighted_mean(value, sigma_s)
     if (
         abs(value[1] - value[0]) > _MIN_SIGMAS * float(np.hypot(*sigma_s))
         or not 0.0 < abs(best_s) < interval_s

@@ -130,7 +130,7 @@ class Readout:
         Source: Birge, "The calculation of errors by the method of least squares", 1932, for the standard
             deviation of a mean of values that scatter more than their standard deviations.
         """
-        mean = _weighted_mean(others, _MAX_POOLED_SIGMAS)
+        mean = _consistent_mean(others, _MAX_POOLED_SIGMAS)
         if mean is None or list(others) == [self]:
             return self
         best_s = mean[0]
@@ -146,7 +146,7 @@ class Readout:
         Args:
             other: The readout time from matches between adjacent frames.
         """
-        mean = _weighted_mean([self, other], np.inf)
+        mean = _consistent_mean([self, other], np.inf)
         difference_s = abs(self.best_s - other.best_s)
         if difference_s > _MAX_DIFFERENCE_S or mean is None:
             sigma_s = max(difference_s, other.sigma_s)
@@ -196,7 +196,7 @@ def judged_readout(best_s: float, sigma_s: float, *, sideways: bool = False) -> 
     )
 
 
-def _weighted_mean(readouts: Sequence[Readout], max_sigmas: float) -> tuple[float, float] | None:
+def _consistent_mean(readouts: Sequence[Readout], max_sigmas: float) -> tuple[float, float] | None:
     """Return the weighted mean of readout times and its standard deviation without the common part, seconds.
 
     Args:
@@ -210,13 +210,23 @@ def _weighted_mean(readouts: Sequence[Readout], max_sigmas: float) -> tuple[floa
     sigma = np.array([item.scatter_s for item in readouts])
     if len(readouts) == 0 or not np.isfinite(sigma).all() or not all(item.sigma_s for item in readouts):
         return None
-    weight = 1.0 / sigma**2
-    mean = float((weight * value).sum() / weight.sum())
+    mean, mean_sigma = weighted_mean(value, sigma)
     deviation = (value - mean) / sigma
     if np.abs(deviation).max() > max_sigmas:
         return None
     scatter = max(1.0, float((deviation**2).sum()) / max(1, len(readouts) - 1))
-    return mean, float(np.sqrt(scatter / weight.sum()))
+    return mean, mean_sigma * float(np.sqrt(scatter))
+
+
+def weighted_mean(values: FloatArray, sigmas: FloatArray) -> tuple[float, float]:
+    """Return the mean of independent values (N,), weighted by their information, and its standard deviation.
+
+    Args:
+        values: The values.
+        sigmas: Their standard deviations, in the same unit.
+    """
+    weight = 1.0 / sigmas**2
+    return float(weight @ values / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def few_blocks_factor(blocks: int) -> float:

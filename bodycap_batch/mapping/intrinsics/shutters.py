@@ -17,6 +17,7 @@ from bodycap_batch.mapping.intrinsics.readout_time import (
     Readout,
     judged_readout,
     stated_readout,
+    weighted_mean,
 )
 from bodycap_batch.model.optical_flow import pixel_scale
 from bodycap_batch.model.rotation_path import TurningShutter
@@ -78,10 +79,9 @@ def with_gyroscopes(
             continue
         value = np.array([gyro.readout_s, own.best_s])
         sigma = np.array([gyro.readout_sigma_s, own.sigma_s])
-        weight = 1.0 / sigma**2
-        if abs(value[0] - value[1]) > _MAX_SIGMAS * float(np.hypot(*sigma)):
-            weight = np.where(sigma == sigma.min(), weight, 0.0)
-        best_s, sigma_s = float(weight @ value / weight.sum()), float(weight.sum() ** -0.5)
+        agree = abs(value[0] - value[1]) <= _MAX_SIGMAS * float(np.hypot(*sigma))
+        used = np.isfinite(sigma) & (agree | (sigma == sigma.min()))
+        best_s, sigma_s = weighted_mean(value[used], sigma[used])
         out[selection.camera] = judged_readout(best_s, sigma_s, sideways=own.sideways)
     return out
 
