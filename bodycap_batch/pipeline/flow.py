@@ -31,7 +31,7 @@ from bodycap_batch.pipeline.settings import Settings
 from bodycap_batch.pipeline.stage_results import StageResults, preview_task, report_task
 from bodycap_batch.pipeline.stage_runner import StageRunner
 from bodycap_batch.pipeline.task_keys import make_task, program_of
-from bodycap_batch.runner import Task
+from bodycap_batch.runner import NotStored, Task
 from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, Preload
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.tasks.body import camera_distances
@@ -535,8 +535,17 @@ class Flow:
         if self._threads > 1:
             return self.runner.start(task)
         done = Future[Artefact]()
-        done.set_result(self.runner.run(task))
+        try:
+            done.set_result(self.runner.run(task))
+        except NotStored as error:
+            # As in another thread, the stages that do not use the sound go on.
+            done.set_exception(error)
         return done
+
+    @property
+    def sound(self) -> Future[Artefact] | None:
+        """The artefact of the sound and sensors; None before the check, or if there is only one camera."""
+        return self._sound
 
     def _apply_sound_offsets(self) -> None:
         """Select the frames between start_s and end_s with the clocks that are known before the map.

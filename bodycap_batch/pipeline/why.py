@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from bodycap_batch.pipeline.run import run_stages
 from bodycap_batch.pipeline.settings import Settings
 from bodycap_batch.pipeline.stage_results import StageResults
 from bodycap_batch.runner import NotStored, Task
-from bodycap_batch.store.artefacts import MANIFEST, Store
+from bodycap_batch.store.artefacts import MANIFEST, Artefact, Store
 from bodycap_batch.tasks.order import STAGE_ORDER
 
 _INPUTS = {
@@ -77,8 +78,8 @@ def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
             for _ in run_stages(job, flow, results):
                 pass
         except NotStored as error:
-            preview = [task for task in _missing_preview(results) if task not in error.tasks]
-            missing = (*error.tasks, *preview)
+            beside = [*_missing(flow.sound), *_missing(results.preview)]
+            missing = (*error.tasks, *(task for task in beside if task not in error.tasks))
         records = tuple(flow.runner.records)
     steps = [
         Step(stage=task_label(item.stage, item.camera, item.round), stored=True)
@@ -93,14 +94,9 @@ def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
     return steps
 
 
-def _missing_preview(results: StageResults) -> Sequence[Task]:
-    """Return the preview's task if its result is not stored; otherwise return an empty sequence.
-
-    A thread has looked up the result in the store.
-    """
-    if results.preview is None:
-        return ()
-    failure = results.preview.exception()
+def _missing(beside: Future[Artefact] | None) -> Sequence[Task]:
+    """Return the task that runs beside other stages if its result is not stored; else an empty sequence."""
+    failure = None if beside is None else beside.exception()
     return failure.tasks if isinstance(failure, NotStored) else ()
 
 

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -44,9 +45,10 @@ def executed(bench: Bench, changes: dict[str, Any] | None = None, **values: Any)
     return sorted(f"{s.stage} {s.camera}".strip() for s in summary.stages if not s.reused)
 
 
-def steps(bench: Bench, **changes: Any) -> dict[str, str]:
+def steps(bench: Bench, *, threads: int = 2, **changes: Any) -> dict[str, str]:
     """What `why` says of each stage: "" where it is stored."""
-    found = explain_job(bench.job(**changes), out_dir=bench.out, settings=settings(bench))
+    asked = replace(settings(bench), threads=threads)
+    found = explain_job(bench.job(**changes), out_dir=bench.out, settings=asked)
     return {step.stage: step.reason for step in found}
 
 
@@ -178,6 +180,17 @@ def test_why_describes_a_changed_input(
     with store.draft(keys[0]) as draft:
         store.commit(draft, keys[0], {})
     assert _reason(Task(key=keys[1]), store) == expected
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_why_lists_the_sound_that_runs_beside_the_keyframes(done: Bench, threads: int) -> None:
+    shutil.rmtree(done.folder / "store" / "artefacts" / "sound")
+    found = steps(done, threads=threads, map={"features": 1024})
+    assert found["keyframes torso"] == ""
+    assert found["map"] == "features: 512 -> 1024"
+    assert found["sound"] == "this stage has not been computed before"
+    assert found["registration"] == "after map"
+    assert not (done.folder / "store" / "artefacts" / "sound").exists(), "asking computes nothing"
 
 
 def test_why_lists_the_preview_that_runs_beside_the_export(done: Bench) -> None:
