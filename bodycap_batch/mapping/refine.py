@@ -90,7 +90,7 @@ def refine_map(
         for name, entry in previous.log.get("readouts_from_matches", {}).items()
         if (readout := Readout(**entry)).seconds and readout.source != "stated"
     }
-    models, all_readouts, adjusted_px = [], [], []
+    models, all_readouts, adjusted_px, motions = [], [], [], []
     removed = 0
     distorted: set[str] = set()
     for number, scene_map in enumerate(previous.maps):
@@ -130,6 +130,8 @@ def refine_map(
                 adjust_robustly(model, settings, calibrated_ids)
             corrected_px = observed_px(model)
             rolling.move_keypoints(model, {})
+        sigma_s = {name: readout.sigma_s for name, readout in readouts.items()}
+        motions.append(rolling.motions(readout_s, sigma_s))
         models.append(model)
         adjusted_px.append(observed_px(model) if corrected_px is None else corrected_px)
         all_readouts.append(readouts)
@@ -145,7 +147,7 @@ def refine_map(
         distorted_cameras=tuple(sorted(distorted)),
         details={**previous.log, **log},
     )
-    result = make_result(models, workspace, diagnostics.to_log(), adjusted_px)
+    result = make_result(models, workspace, diagnostics.to_log(), adjusted_px, motions)
     maps = [
         map_with_readouts(item, readouts) for item, readouts in zip(result.maps, all_readouts, strict=True)
     ]

@@ -12,6 +12,7 @@ from bodycap_batch.mapping.inputs import frame_times_ns
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robustly
+from bodycap_batch.mapping.reconstruction.camera_motion import CameraMotion
 from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction
 from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, registered_ids
 from bodycap_batch.mapping.validation.dominant_points import remove_dominant_points
@@ -74,6 +75,7 @@ def make_result(
     workspace: Path,
     log: dict[str, Any],
     adjusted_px: Sequence[Mapping[int, FloatArray]] | None = None,
+    motions: Sequence[Mapping[str, CameraMotion]] | None = None,
 ) -> MapResult:
     """Return the stage's result; add the size and mean reprojection error of each model to the log.
 
@@ -82,10 +84,12 @@ def make_result(
         workspace: Folder of the database of their keypoints.
         log: Diagnostics of the stage.
         adjusted_px: For each model, the positions to which it was adjusted; see `map_from_reconstruction`.
+        motions: For each model, the motions of its cameras with rolling shutters, by camera name.
     """
     adjusted = [None] * len(models) if adjusted_px is None else adjusted_px
     maps = tuple(
-        map_from_reconstruction(model, workspace, px) for model, px in zip(models, adjusted, strict=True)
+        map_from_reconstruction(model, workspace, px, moving)
+        for model, px, moving in zip(models, adjusted, motions or [{}] * len(models), strict=True)
     )
     log = {
         **log,

@@ -14,6 +14,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust, sub_model
+from bodycap_batch.mapping.reconstruction.camera_motion import CameraMotion
 from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
 from bodycap_batch.mapping.reconstruction.reprojection import image_residuals_px
 from bodycap_batch.mapping.reconstruction.rolling_adjustment import (
@@ -25,7 +26,6 @@ from bodycap_batch.mapping.reconstruction.rolling_adjustment import (
 )
 from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.optical_flow import pixel_scale
-from bodycap_batch.model.rolling_shutter import row_delay
 from bodycap_batch.model.rotation_path import PosePath, RotationPath, near_in_time
 from bodycap_batch.model.scene import Map, Trajectory
 
@@ -79,9 +79,6 @@ _FIRST_LOSS_WIDTH = 4.0
 """First width of the loss of an adjustment with velocities, in standard deviations of an observation. It
 keeps observations that disagree because the velocities of the path are wrong. The last width is the median
 residual. Evidence: docs/decisions/mapping.md."""
-_RATE_ERROR_FACTOR = 3.0
-"""Factor of the expected errors of the angular velocities of keyframes and of their changes, because the
-poses beside a keyframe are inexact, too. Evidence: docs/decisions/mapping.md."""
 _EXACT_RATIO = 0.5
 """A path is exact enough if its expected errors displace keypoints by less than this ratio of the noise.
 Origin: they then add 12 % to the noise."""
@@ -437,16 +434,11 @@ class RollingShutterModel:
         rate = np.full(len(sizes), _NO_MOTION_SIGMA)
         change, velocity = rate.copy(), rate.copy()
         own_frame = np.array([item.frame[0] if len(item.frame) else 0 for item in items])
-        for number, name in enumerate(names):
-            poses, camera = self._poses.get(name), self._intrinsics[name]
-            if poses is None or not readout_s.get(name):
-                continue
-            path = PosePath.create(*poses, self._rotations.get(name))
-            rows, kept = lens[keyframe] == number, lens == number
-            delay[rows] = row_delay(camera, px[rows]) * readout_s[name]
-            turn[rows], shift[rows] = path.turn_and_shift(camera, frame[rows], px[rows], readout_s[name])
-            expected = path.velocity_errors()
-            rate[kept], change[kept], velocity[kept] = (each[own_frame[kept]] for each in expected)
+        for name, motion in self.motions(readout_s).items():
+            rows, kept = lens[keyframe] == names.index(name), lens == names.index(name)
+            until = motion.until_exposure(frame[rows], px[rows])
+            delay[rows], turn[rows], shift[rows] = until.delay_s, until.turn, until.shift
+            rate[kept], change[kept], velocity[kept] = motion.errors(own_frame[kept]).T
         intervals_ns = [np.diff(camera.times_ns) for camera in self._cameras.values()]
         scale = max(pixel_scale(each.width_px, each.height_px) for each in self._intrinsics.values())
         seen_rows = RowObservations(
@@ -462,11 +454,32 @@ class RollingShutterModel:
             interval_s=1e-9 * float(np.median(np.concatenate(intervals_ns))),
         )
         errors = VelocityErrors(
-            rate=_RATE_ERROR_FACTOR * rate,
-            rate_change=_RATE_ERROR_FACTOR * change,
+            rate=rate,
+            rate_change=change,
             velocity=np.maximum(velocity, _NO_MOTION_SIGMA),
         )
         return seen_rows, errors, point_ids.tolist()
+
+    def motions(
+        self, readout_s: Mapping[str, float], sigma_s: Mapping[str, float] | None = None
+    ) -> dict[str, CameraMotion]:
+        """Return the motion of each camera with a path and a readout time, by camera name.
+
+        Args:
+            readout_s: Readout times (seconds) by camera name.
+            sigma_s: Their standard deviations (seconds) by camera name; 0 for a camera without an entry.
+        """
+        out = {}
+        for name, poses in self._poses.items():
+            if name in self._intrinsics and readout_s.get(name):
+                out[name] = CameraMotion(
+                    camera=self._intrinsics[name],
+                    path=PosePath.create(*poses, self._rotations.get(name)),
+                    readout_s=readout_s[name],
+                    readout_sigma_s=(sigma_s or {}).get(name, 0.0),
+                    interval_s=1e-9 * float(np.median(np.diff(self._cameras[name].times_ns))),
+                )
+        return out
 
     def _remaining(self, item: _Keypoints, model: pycolmap.Reconstruction) -> _Keypoints:
         """Return the observations whose points are left in a copy of the model."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.mapping.matching.database import ImageRef, read_detected_px, read_keypoint_colours
+from bodycap_batch.mapping.reconstruction.camera_motion import CameraMotion
 from bodycap_batch.mapping.reconstruction.keyframe_covariance import keyframe_covariances
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform
@@ -35,7 +36,10 @@ def observed_px(model: pycolmap.Reconstruction) -> dict[int, FloatArray]:
 
 
 def map_from_reconstruction(
-    model: pycolmap.Reconstruction, workspace: Path, adjusted_px: Mapping[int, FloatArray] | None = None
+    model: pycolmap.Reconstruction,
+    workspace: Path,
+    adjusted_px: Mapping[int, FloatArray] | None = None,
+    motions: Mapping[str, CameraMotion] | None = None,
 ) -> Map:
     """Convert a reconstruction into a `Map`, with keyframes and points in a fixed order.
 
@@ -44,6 +48,8 @@ def map_from_reconstruction(
         workspace: Folder of the reconstruction's database, from which the keypoints' colours are read.
         adjusted_px: The positions of the observations, from `observed_px`, to which the reconstruction was
             adjusted, if they have been moved since then.
+        motions: The motions of the cameras with rolling shutters, by camera name, whose errors are contained
+            in the covariances.
     """
     positions = observed_px(model)
     images = sorted(
@@ -87,7 +93,7 @@ def map_from_reconstruction(
         obs_feature=_concatenate(features),
         obs_px=np.concatenate([np.zeros((0, 2)), *pixels]),
     )
-    covariance = keyframe_covariances(scene_map, np.concatenate([np.zeros((0, 2)), *adjusted]))
+    covariance = keyframe_covariances(scene_map, np.concatenate([np.zeros((0, 2)), *adjusted]), motions)
     return replace(scene_map, keyframe_covariance=covariance)
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.mapping.reconstruction.camera_motion import CameraMotion
 from bodycap_batch.model.geometry import invert, skew, transform_points
 from bodycap_batch.model.reprojection_derivatives import (
     common_error_ratio,
@@ -20,26 +22,30 @@ from bodycap_batch.model.scene import Map
 _MAX_KEYFRAMES = 300
 """Maximum number of keyframes in one system of equations. Of a larger map, evenly spaced keyframes are used.
 The covariances are then too large rather than too small, because fewer keyframes see each point. Origin: 100
-MB of memory and some seconds. Evidence: none."""
+MB of memory and some seconds, six times as much with the velocities of rolling shutters. Evidence: none."""
 _MIN_OBSERVATIONS = 12
 """Minimum number of observations of a keyframe whose covariance is computed. Evidence: none."""
 _DAMPING = 1e-9
 """Damping of a point, as a fraction of the trace of its information. It only prevents a singular matrix."""
 
 
-def keyframe_covariances(scene_map: Map, adjusted_px: FloatArray) -> FloatArray:
+def keyframe_covariances(
+    scene_map: Map, adjusted_px: FloatArray, motions: Mapping[str, CameraMotion] | None = None
+) -> FloatArray:
     """Return the covariances (K,6,6) of the keyframes' poses; see `Map.keyframe_covariance`.
 
-    The points are unknown too, so their errors are contained. The gauge is the one in which the mean variance
-    of all keyframes is least. The noise is the reduced chi-squared of all observations. It contains large
-    errors, whose influence on the map the robust loss reduces: the advantage of this loss is not counted,
-    because it does not reduce errors that neighbouring observations have in common. The result is multiplied
-    by the ratio by which such common errors increase the variance in the pictures. Evidence:
-    docs/decisions/mapping.md.
+    The points are unknown too, so their errors are contained. So are the velocities of keyframes with rolling
+    shutters, within their expected errors, and the readout times, within their standard deviations. The gauge
+    is the one in which the mean variance of all keyframes is least. The noise is the reduced chi-squared of
+    all observations. It contains large errors, whose influence on the map the robust loss reduces: the
+    advantage of this loss is not counted, because it does not reduce errors that neighbouring observations
+    have in common. The result is multiplied by the ratio by which such common errors increase the variance in
+    the pictures. Evidence: docs/decisions/mapping.md.
 
     Args:
         scene_map: The map.
         adjusted_px: (M,2) pixels to which the map was adjusted: corrected for a rolling shutter.
+        motions: The motions of the cameras with rolling shutters, by camera name.
 
     Returns:
         The covariances, in the unit of the gauge. Zero rows if the map does not determine them.
@@ -48,16 +54,15 @@ def keyframe_covariances(scene_map: Map, adjusted_px: FloatArray) -> FloatArray:
     """
     count = len(scene_map.keyframe_camera)
     chosen = _chosen_keyframes(scene_map)
-    system = _Observations.create(scene_map, adjusted_px, chosen)
+    system = _Observations.create(scene_map, adjusted_px, chosen, motions or {})
     redundancy = 2 * len(system.point) - 6 * len(chosen) - 3 * system.point_count + 7
     if len(chosen) < 2 or redundancy <= 0:
         return np.zeros((0, 6, 6))
-    own = _marginal_blocks(system, scene_map, chosen)
+    variance_px2 = float((system.residual**2).sum()) / redundancy * _growth(system, len(chosen))
+    own = _marginal_blocks(system, scene_map, chosen, variance_px2)
     if own is None:
         return np.zeros((0, 6, 6))
-    variance_px2 = float((system.residual**2).sum()) / redundancy
-    nearest = _nearest_chosen(scene_map, chosen)
-    covariance = own[nearest] * variance_px2 * _growth(system, len(chosen))
+    covariance = own[_nearest_chosen(scene_map, chosen)] * variance_px2
     return covariance.reshape(count, 6, 6)
 
 
@@ -73,6 +78,9 @@ class _Observations:
         residual: (2,M) projected minus observed pixel.
         by_pose: (2,6,M) derivative with respect to a left perturbation of cam_from_map.
         by_point: (2,3,M) derivative with respect to the point.
+        by_velocity: (2,V,M) derivative with respect to the velocities of the keyframe, in their expected
+            errors; V is 0 without rolling shutters.
+        by_readout: (2,R,M) derivative with respect to the readout times, in their standard deviations.
         depth: Median depth of the points.
     """
 
@@ -83,10 +91,14 @@ class _Observations:
     residual: FloatArray
     by_pose: FloatArray
     by_point: FloatArray
+    by_velocity: FloatArray
+    by_readout: FloatArray
     depth: float
 
     @staticmethod
-    def create(scene_map: Map, adjusted_px: FloatArray, chosen: IntArray) -> _Observations:
+    def create(
+        scene_map: Map, adjusted_px: FloatArray, chosen: IntArray, motions: Mapping[str, CameraMotion]
+    ) -> _Observations:
         number = np.full(len(scene_map.keyframe_camera), -1)
         number[chosen] = np.arange(len(chosen))
         used: BoolArray = number[scene_map.obs_keyframe] >= 0
@@ -109,6 +121,7 @@ class _Observations:
             rays[:, 0], rays[:, 1], 1.0 / in_cam[:, 2], px_from_ray[valid].transpose(1, 2, 0)
         )
         points, point = np.unique(scene_map.obs_point[rows], return_inverse=True)
+        by_velocity, by_readout = _motion_derivatives(scene_map, rows, derivatives, motions)
         return _Observations(
             keyframe=number[scene_map.obs_keyframe[rows]],
             point=np.ravel(point),
@@ -117,8 +130,49 @@ class _Observations:
             residual=residual.T,
             by_pose=derivatives,
             by_point=np.einsum("dim,mij->djm", derivatives[:, 3:], cam_from_map[valid, :3, :3]),
+            by_velocity=by_velocity,
+            by_readout=by_readout,
             depth=float(np.median(in_cam[:, 2])) if len(in_cam) else 1.0,
         )
+
+
+def _motion_derivatives(
+    scene_map: Map, rows: IntArray, by_pose: FloatArray, motions: Mapping[str, CameraMotion]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives of residuals with respect to velocities and readout times, in expected errors.
+
+    Until its row is exposed, the camera moves against its pose. So another velocity changes the pixel like
+    another pose. Cameras with equal readout times have one readout time in common.
+
+    Args:
+        scene_map: The map.
+        rows: (M,) observations of the map.
+        by_pose: (2,6,M) derivatives with respect to the pose at the middle row.
+        motions: The motions of the cameras with rolling shutters, by camera name.
+
+    Returns:
+        The derivatives (2,9,M) with respect to angular velocity, its change and velocity, or (2,0,M) without
+        rolling shutters, and the derivatives (2,R,M) with respect to the readout times.
+    """
+    names = np.array(scene_map.keyframe_camera)[scene_map.obs_keyframe[rows]]
+    frame = scene_map.keyframe_frame[scene_map.obs_keyframe[rows]]
+    readouts = sorted({(each.readout_s, each.readout_sigma_s) for each in motions.values()})
+    by_velocity = np.zeros((2, 9 if motions else 0, len(rows)))
+    by_readout = np.zeros((2, len(readouts), len(rows)))
+    for name, motion in motions.items():
+        own = np.flatnonzero(names == name)
+        until = motion.until_exposure(frame[own], scene_map.obs_px[rows[own]])
+        errors = motion.errors(frame[own]).T
+        by_turn, by_shift = by_pose[:, :3, own], by_pose[:, 3:, own]
+        by_velocity[:, :3, own] = by_turn * (until.delay_s * errors[0])
+        by_velocity[:, 3:6, own] = by_turn * (0.5 / motion.interval_s * until.delay_s**2 * errors[1])
+        by_velocity[:, 6:, own] = by_shift * (until.delay_s * errors[2])
+        by_motion = np.einsum("dim,mi->dm", by_turn, until.turn) + np.einsum(
+            "dim,mi->dm", by_shift, until.shift
+        )
+        number = readouts.index((motion.readout_s, motion.readout_sigma_s))
+        by_readout[:, number, own] = by_motion * (motion.readout_sigma_s / motion.readout_s)
+    return by_velocity, by_readout
 
 
 def _chosen_keyframes(scene_map: Map) -> IntArray:
@@ -144,39 +198,69 @@ def _nearest_chosen(scene_map: Map, chosen: IntArray) -> IntArray:
     return out
 
 
-def _marginal_blocks(system: _Observations, scene_map: Map, chosen: IntArray) -> FloatArray | None:
-    """Return the marginal covariances (C,6,6) for 1 px of noise; None if the system is singular."""
+def _marginal_blocks(
+    system: _Observations, scene_map: Map, chosen: IntArray, variance_px2: float
+) -> FloatArray | None:
+    """Return the marginal covariances (C,6,6) for 1 px of noise; None if the system is singular.
+
+    Args:
+        system: The observations.
+        scene_map: The map.
+        chosen: (C,) rows of the chosen keyframes.
+        variance_px2: Variance of the noise, px squared, with which the expected errors of the motion are
+            weighted.
+    """
     from scipy.linalg.lapack import dpotrf, dpotri
     from scipy.sparse import csr_array
 
-    count, unit = 6 * len(chosen), np.repeat([1.0, 1.0 / system.depth], 3)
+    unit = np.repeat([1.0, 1.0 / system.depth], 3)
     # In units of the depth, rotations and translations have variances of the same size.
-    by_pose = system.by_pose / unit[None, :, None]
+    by_own = np.concatenate([system.by_pose / unit[None, :, None], system.by_velocity], axis=1)
+    size, common = by_own.shape[1], system.by_readout.shape[1]
+    count = size * len(chosen)
     order = np.argsort(system.keyframe, kind="stable")
-    present, starts = np.unique(system.keyframe[order], return_index=True)
-    if len(present) < len(chosen):
+    bounds = np.searchsorted(system.keyframe[order], np.arange(len(chosen) + 1))
+    if (np.diff(bounds) == 0).any():
         return None
-    hessians = weighted_hessians(by_pose[:, :, order], np.ones(len(order)), starts)
     by_point = np.zeros((system.point_count, 3, 3))
     np.add.at(by_point, system.point, np.einsum("dim,djm->mij", system.by_point, system.by_point))
     by_point += _DAMPING * np.einsum("pii->p", by_point)[:, None, None] * np.eye(3)
     half = np.linalg.cholesky(np.linalg.inv(by_point))
-    mixed = np.einsum("dim,djm->mij", by_pose, system.by_point) @ half[system.point]
-    rows = np.broadcast_to(6 * system.keyframe[:, None, None] + np.arange(6)[:, None], mixed.shape)
+    by_all = np.concatenate([by_own, system.by_readout], axis=1)
+    mixed = np.einsum("dim,djm->mij", by_all, system.by_point) @ half[system.point]
+    places = np.concatenate(
+        [
+            size * system.keyframe[:, None] + np.arange(size),
+            np.broadcast_to(count + np.arange(common), (len(system.keyframe), common)),
+        ],
+        axis=1,
+    )
+    rows = np.broadcast_to(places[:, :, None], mixed.shape)
     columns = np.broadcast_to(3 * system.point[:, None, None] + np.arange(3), mixed.shape)
     coupling = csr_array(
-        (mixed.ravel(), (rows.ravel(), columns.ravel())), shape=(count, 3 * system.point_count)
+        (mixed.ravel(), (rows.ravel(), columns.ravel())), shape=(count + common, 3 * system.point_count)
     )
     reduced = (coupling @ coupling.T).toarray()
     np.negative(reduced, out=reduced)
     del mixed, rows, columns, coupling
-    for number, hessian in enumerate(hessians):
-        block = slice(6 * number, 6 * number + 6)
-        reduced[block, block] += hessian
+    expected = np.r_[np.zeros(6), np.full(size - 6, variance_px2)]
+    last = slice(count, count + common)
+    reduced[last, last] += variance_px2 * np.eye(common)
+    for number in range(len(chosen)):
+        seen = order[bounds[number] : bounds[number + 1]]
+        own = by_all[:, :, seen].transpose(0, 2, 1).reshape(-1, size + common)
+        hessian = own.T @ own
+        block = slice(size * number, size * number + size)
+        reduced[block, block] += hessian[:size, :size] + np.diag(expected)
+        reduced[block, last] += hessian[:size, size:]
+        reduced[last, block] += hessian[size:, :size]
+        reduced[last, last] += hessian[size:, size:]
     gauge = _gauge_directions(scene_map.map_from_cam[chosen]) * np.tile(unit, len(chosen))[:, None]
-    free = np.linalg.qr(gauge)[0]
-    size = float(np.trace(reduced)) / count
-    reduced += size * (free @ free.T)
+    poses = (size * np.arange(len(chosen))[:, None] + np.arange(6)).ravel()
+    free = np.zeros((count + common, 7))
+    free[poses] = np.linalg.qr(gauge)[0]
+    weight = float(np.diag(reduced)[poses].mean())
+    reduced += weight * (free @ free.T)
     # The matrix is symmetric, so its transpose is the same matrix in the order that needs no copy.
     factor, failed = dpotrf(reduced.T, lower=1, overwrite_a=1)
     if failed:
@@ -186,9 +270,9 @@ def _marginal_blocks(system: _Observations, scene_map: Map, chosen: IntArray) ->
         return None
     blocks = np.empty((len(chosen), 6, 6))
     for number in range(len(chosen)):
-        rows_of = slice(6 * number, 6 * number + 6)
+        rows_of = slice(size * number, size * number + 6)
         lower = np.tril(inverse[rows_of, rows_of])
-        blocks[number] = lower + np.tril(lower, -1).T - free[rows_of] @ free[rows_of].T / size
+        blocks[number] = lower + np.tril(lower, -1).T - free[rows_of] @ free[rows_of].T / weight
     return np.asarray(blocks / np.outer(unit, unit))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pycolmap
@@ -11,6 +12,7 @@ import pytest
 
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction import keyframe_covariance
+from bodycap_batch.mapping.reconstruction.camera_motion import RowMotion
 from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction, observed_px
 from bodycap_batch.mapping.reconstruction.keyframe_covariance import keyframe_covariances
 from bodycap_batch.model.camera import Camera
@@ -108,6 +110,70 @@ def test_common_errors_of_neighbours_make_keyframes_less_certain(exact: tuple[Ma
     # About three points share a cell, with four fifths of their variance. As if all errors were independent,
     # the mean would be more than 2.
     assert 0.6 < np.mean(errors) < 1.6
+
+
+class _Motion:
+    """A camera with a readout time of 10 ms that turns and moves while its rows are exposed."""
+
+    readout_s, readout_sigma_s, interval_s = 0.01, 0.0004, 0.033
+    sigmas = (0.5, 5.0, 0.5)
+    rate, speed = np.array([0.5, -1.5, 0.3]), np.array([0.6, 0.2, -0.4])
+
+    def until_exposure(self, frame: np.ndarray, px: np.ndarray) -> RowMotion:
+        delay = (px[:, 1] / LENS.height_px - 0.5) * self.readout_s
+        return RowMotion(delay_s=delay, turn=np.outer(delay, self.rate), shift=np.outer(delay, self.speed))
+
+    def errors(self, frame: np.ndarray) -> np.ndarray:
+        return np.tile(self.sigmas, (len(frame), 1))
+
+
+def _seen_while_moving(scene: Map, velocities: np.ndarray, readout: float) -> np.ndarray:
+    """Return pixels of a moving camera; velocities (K,9) and readout time in units of their sigmas."""
+    motion = _Motion()
+    v = (velocities * np.repeat(motion.sigmas, 3))[scene.obs_keyframe]
+    delay = motion.until_exposure(scene.obs_keyframe, scene.obs_px).delay_s[:, None]
+    longer = readout * motion.readout_sigma_s / motion.readout_s * delay
+    turn = longer * motion.rate + delay * v[:, :3] + 0.5 / motion.interval_s * delay**2 * v[:, 3:6]
+    shift = longer * motion.speed + delay * v[:, 6:]
+    in_cam = transform_points(invert(scene.map_from_cam)[scene.obs_keyframe], scene.points[scene.obs_point])
+    return LENS.project(np.einsum("mij,mj->mi", so3_exp(-turn), in_cam - shift))
+
+
+def test_unknown_velocities_and_readout_times_are_contained(exact: tuple[Map, np.ndarray]) -> None:
+    scene = exact[0]
+    count, extra, step = 6 * KEYFRAMES + 3 * POINTS, 9 * KEYFRAMES + 1, 1e-4
+
+    def moving(values: np.ndarray) -> np.ndarray:
+        return _seen_while_moving(scene, values[:-1].reshape(-1, 9), values[-1]).ravel()
+
+    by_map = np.array(
+        [
+            (_projected(_moved(scene, each)) - _projected(_moved(scene, -each))).ravel() / (2.0 * step)
+            for each in step * np.eye(count)
+        ]
+    ).T
+    by_motion = np.array([(moving(each) - moving(-each)) / (2.0 * step) for each in step * np.eye(extra)]).T
+    # The best estimate weights the residuals and the expected errors of the motion.
+    system = np.block([[by_map / NOISE_PX, by_motion / NOISE_PX], [np.zeros((extra, count)), np.eye(extra)]])
+    unit = np.concatenate(
+        [np.tile(np.repeat([1.0, 3.0], 3), KEYFRAMES), np.full(3 * POINTS, 1e3), np.ones(extra)]
+    )
+    inverse = unit[:, None] * np.linalg.pinv(system * unit, rcond=1e-9)
+    rng = np.random.default_rng(4)
+    ratios: list[list[float]] = [[], []]
+    for _ in range(40):
+        true = rng.normal(size=extra)
+        noise = rng.normal(0, NOISE_PX, by_map.shape[0])
+        found = inverse @ np.concatenate([(noise + by_motion @ true) / NOISE_PX, np.zeros(extra)])
+        adjusted = _moved(scene, found[:count])
+        seen = scene.obs_px + (noise + by_motion @ (true - found[count:])).reshape(-1, 2)
+        error = found[: 6 * KEYFRAMES].reshape(KEYFRAMES, 6)
+        for ratio, motions in zip(ratios, ({"torso": _Motion()}, None), strict=True):
+            stated = keyframe_covariances(adjusted, seen, cast("Any", motions))
+            squared = np.einsum("ki,kij,kj->k", error, np.linalg.inv(stated), error)
+            ratio.append(float(squared.mean()) / 6.0)
+    assert 0.7 < np.mean(ratios[0]) < 1.15
+    assert np.mean(ratios[1]) > 2.0, "without the errors of the motion, the covariances are too small"
 
 
 def test_a_part_of_the_keyframes_gives_no_smaller_covariances(
