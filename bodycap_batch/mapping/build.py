@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -211,8 +211,8 @@ def build_map_once(
     workspace = context.work_dir / WORKSPACE
     workspace.mkdir(parents=True, exist_ok=True)
     estimated = with_gyroscopes(estimate_from_matches(capture, selections), selections)
-    estimated, earlier = _judged_by_pairs(capture, selections, estimated, options, context, earlier)
-    readouts = {**known_readouts(capture), **estimated}
+    judged, earlier = _judged_by_pairs(capture, selections, estimated, options, context, earlier)
+    readouts = {**known_readouts(capture), **judged}
     used = {**readouts, **earlier.readouts}
     shutters = turning_shutters(capture, selections, used)
     write_shutters(workspace, shutters)
@@ -248,8 +248,7 @@ def build_map_once(
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
     removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
-    if readouts:
-        log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
+    log |= _readouts_log(readouts, [name for name in judged if judged[name] != estimated[name]])
     unknown = unknown_shutters(capture, selections, readouts)
     log = MapDiagnostics(
         misfit_factors=misfits, misplaced=misplaced, unknown_shutters=unknown, details=log
@@ -260,6 +259,21 @@ def build_map_once(
     ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
     refused = refused or add_flip_hint(check_consistency(max(ratios)), flips)
     return result, refused
+
+
+def _readouts_log(readouts: Mapping[str, Readout], by_pairs: Collection[str]) -> dict[str, object]:
+    """Return the log entries of the readout times for which keypoints are corrected.
+
+    Args:
+        readouts: The readout times by camera name.
+        by_pairs: Names of the cameras whose readout times pairs of keyframes determined.
+    """
+    log: dict[str, object] = {}
+    if readouts:
+        log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
+    if by_pairs:
+        log["readouts_by_keyframe_pairs"] = sorted(by_pairs)
+    return log
 
 
 def _judged_by_pairs(

@@ -172,6 +172,7 @@ def test_a_readout_time_that_pairs_determine_corrects_the_map(
         monkeypatch.setattr(f"bodycap_batch.mapping.build.{function}", answer)
     result = build_map(estimated.capture, estimated.selections, MapOptions(), context(tmp_path))
     assert result.maps[0].readout_s == dict.fromkeys(names, 0.008)
+    assert result.log["readouts_by_keyframe_pairs"] == sorted(names)
     frames = {(item.camera, int(frame)) for item in estimated.selections for frame in item.frames}
     assert set(asked) == frames, "the features of all keyframes"
 
