@@ -660,6 +660,10 @@ class PosePath:
         # A neighbour at an end has an extrapolated velocity, so its deviation is no measure.
         usual = float(np.median(bend[inner])) if inner.any() else 0.0
         speed = np.linalg.norm(self.velocity[has_pose], axis=1)
+        if not linked.any():
+            # No velocity is known, so the speed follows from poses that are further apart.
+            apart_s = np.diff(turning.times_ns[has_pose])[:, None] * 1e-9
+            speed = np.linalg.norm(np.diff(self.map_from_cam[has_pose, :3, 3], axis=0) / apart_s, axis=1)
         fast = float(np.percentile(speed, _SPEED_PERCENTILE)) if len(speed) else 0.0
         velocity = _VELOCITY_DEVIATION_RATIO * np.maximum(bend, usual)
         velocity = np.where(inner, velocity, np.maximum(velocity, _EXTRAPOLATION_RATIO * fast))

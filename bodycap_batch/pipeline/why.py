@@ -18,7 +18,7 @@ from bodycap_batch.pipeline.settings import Settings
 from bodycap_batch.pipeline.stage_results import StageResults
 from bodycap_batch.runner import NotStored, Task
 from bodycap_batch.store.artefacts import MANIFEST, Artefact, Store
-from bodycap_batch.tasks.order import STAGE_ORDER
+from bodycap_batch.tasks.order import BESIDE_KEYFRAMES, STAGE_ORDER
 
 _INPUTS = {
     "capture": "the video, the calibration, start_s or end_s of {}",
@@ -89,7 +89,14 @@ def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
     if missing:
         first = missing[0].key.stage
         after = _position(first)
-        later = [name for name in STAGE_ORDER if _position(name) > after and _depends_on(name, first, job)]
+        # The keyframes may wait for the sound, which runs beside them.
+        beside_it = {name for name in STAGE_ORDER if _position(name) == after} - {first}
+        waiting = beside_it - {item.stage for item in records}
+        later = [
+            name
+            for name in STAGE_ORDER
+            if (_position(name) > after or name in waiting) and _depends_on(name, first, job)
+        ]
         steps += [Step(stage=name, stored=False, reason=f"after {first}") for name in later]
     return steps
 
@@ -110,9 +117,12 @@ def _depends_on(stage: str, first: str, job: Job) -> bool:
 def _position(stage: str) -> int:
     """Return the position of a stage in `STAGE_ORDER`.
 
-    A stage that is not in `STAGE_ORDER` follows the registration and has the position of the registration.
+    Of the stages that are not in `STAGE_ORDER`, those beside the keyframes have the position of the
+    keyframes. The others follow the registration and have the position of the registration.
     """
-    return STAGE_ORDER.index(stage if stage in STAGE_ORDER else "registration")
+    if stage not in STAGE_ORDER:
+        stage = "keyframes" if stage in BESIDE_KEYFRAMES else "registration"
+    return STAGE_ORDER.index(stage)
 
 
 def _reason(task: Task, store: Store) -> str:

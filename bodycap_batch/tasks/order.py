@@ -9,7 +9,7 @@ StageName = Literal[
 ]
 STAGE_ORDER: tuple[StageName, ...] = get_args(StageName)
 """The stages of a job in the order in which they run."""
-_BESIDE_KEYFRAMES = frozenset({"sound"})
+BESIDE_KEYFRAMES = frozenset({"sound"})
 """Further stages that run at the same time as the keyframes."""
 _DURING_REGISTRATION = frozenset({"extend", "refine", "rig", "recover", "clocks", "places", "inertial"})
 """Further stages that may run up to the merge. They extend and refine the map, solve the cameras of a rig
@@ -23,7 +23,7 @@ def stages_from(stage: StageName) -> frozenset[str]:
     """Return the name of a given stage of `STAGE_ORDER`, and the names of all stages that run after it."""
     later = set[str](STAGE_ORDER[STAGE_ORDER.index(stage) :])
     if "keyframes" in later:
-        later |= _BESIDE_KEYFRAMES
+        later |= BESIDE_KEYFRAMES
     if "registration" in later:
         later |= _DURING_REGISTRATION
     if "fill" in later:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -17,6 +18,9 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build_map, refine_map
+from bodycap_batch.mapping.reconstruction import conversion
+from bodycap_batch.mapping.reconstruction.camera_motion import CameraMotion
+from bodycap_batch.mapping.reconstruction.keyframe_covariance import keyframe_covariances
 from bodycap_batch.model.geometry import align_points
 from bodycap_batch.model.rolling_shutter import has_visible_rolling_shutter
 from bodycap_batch.model.scene import KeyframeSelection, Map, MapResult, Registration, Trajectory
@@ -112,9 +116,21 @@ def test_a_very_large_map_loses_its_rolling_shutter_too(
         return create(options, config, model)
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", noted)
+    motions = list[Mapping[str, CameraMotion]]()
+
+    def covariances(
+        scene_map: Map, adjusted_px: FloatArray, moving: Mapping[str, CameraMotion]
+    ) -> FloatArray:
+        motions.append(moving)
+        return keyframe_covariances(scene_map, adjusted_px, moving)
+
+    monkeypatch.setattr(conversion, "keyframe_covariances", covariances)
     surroundings = StageContext(work_dir=tmp_path, threads=2)
     paths = [outcome.before.trajectory]
     refined = refine_map(outcome.capture, outcome.maps[0], paths, OPTIONS, surroundings, skeletal_above=20)
+    # The errors of the motion between rows are contained in the covariances.
+    assert {name: motion.readout_s for name, motion in motions[0].items()} == refined.maps[0].readout_s
+    assert all(motion.readout_sigma_s > 0.0 for motion in motions[0].values())
     assert max(adjusted) < len(refined.maps[0].keyframe_camera)
     camera = outcome.capture.cameras[0]
     after = register_frames(

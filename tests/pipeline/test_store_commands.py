@@ -16,7 +16,7 @@ import pytest
 
 from bodycap_batch.core.errors import Cancelled, StoreError
 from bodycap_batch.pipeline import Settings, explain_job, run_job
-from bodycap_batch.pipeline.why import _reason
+from bodycap_batch.pipeline.why import _position, _reason
 from bodycap_batch.runner import Task
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 from bodycap_batch.store.digests import _entry_text
@@ -191,6 +191,11 @@ def test_why_lists_the_sound_that_runs_beside_the_keyframes(done: Bench, threads
     assert found["sound"] == "this stage has not been computed before"
     assert found["registration"] == "after map"
     assert not (done.folder / "store" / "artefacts" / "sound").exists(), "asking computes nothing"
+
+
+def test_the_sound_runs_beside_the_keyframes() -> None:
+    assert _position("sound") == _position("keyframes") < _position("map")
+    assert _position("recover") == _position("registration")
 
 
 def test_why_lists_the_preview_that_runs_beside_the_export(done: Bench) -> None:

@@ -432,14 +432,14 @@ class RollingShutterModel:
         delay = np.zeros(len(px))
         turn, shift = np.zeros((len(px), 3)), np.zeros((len(px), 3))
         rate = np.full(len(sizes), _NO_MOTION_SIGMA)
-        change, velocity = rate.copy(), rate.copy()
+        change, velocity, interval_s = rate.copy(), rate.copy(), np.ones(len(sizes))
         own_frame = np.array([item.frame[0] if len(item.frame) else 0 for item in items])
         for name, motion in self.motions(readout_s).items():
             rows, kept = lens[keyframe] == names.index(name), lens == names.index(name)
             until = motion.until_exposure(frame[rows], px[rows])
             delay[rows], turn[rows], shift[rows] = until.delay_s, until.turn, until.shift
             rate[kept], change[kept], velocity[kept] = motion.errors(own_frame[kept]).T
-        intervals_ns = [np.diff(camera.times_ns) for camera in self._cameras.values()]
+            interval_s[kept] = motion.interval_s
         scale = max(pixel_scale(each.width_px, each.height_px) for each in self._intrinsics.values())
         seen_rows = RowObservations(
             lenses=[self._intrinsics[name] for name in names],
@@ -451,7 +451,7 @@ class RollingShutterModel:
             turn=turn,
             shift=shift,
             noise_px=_NOISE_PX * scale,
-            interval_s=1e-9 * float(np.median(np.concatenate(intervals_ns))),
+            interval_s=interval_s,
         )
         errors = VelocityErrors(
             rate=rate,

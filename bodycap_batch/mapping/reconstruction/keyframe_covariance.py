@@ -22,7 +22,8 @@ from bodycap_batch.model.scene import Map
 _MAX_KEYFRAMES = 300
 """Maximum number of keyframes in one system of equations. Of a larger map, evenly spaced keyframes are used.
 The covariances are then too large rather than too small, because fewer keyframes see each point. Origin: 100
-MB of memory and some seconds, six times as much with the velocities of rolling shutters. Evidence: none."""
+MB of memory and some seconds. With the velocities of rolling shutters, it takes six times the memory.
+Evidence: none."""
 _MIN_OBSERVATIONS = 12
 """Minimum number of observations of a keyframe whose covariance is computed. Evidence: none."""
 _DAMPING = 1e-9
@@ -35,7 +36,9 @@ def keyframe_covariances(
     """Return the covariances (K,6,6) of the keyframes' poses; see `Map.keyframe_covariance`.
 
     The points are unknown too, so their errors are contained. So are the velocities of keyframes with rolling
-    shutters, within their expected errors, and the readout times, within their standard deviations. The gauge
+    shutters, within their expected errors, and the readout times, within their standard deviations; a readout
+    time that is not determined is taken as 0. If the velocities were not adjusted together with the map, the
+    covariances are those of an adjustment that weights the observations by these errors. The gauge
     is the one in which the mean variance of all keyframes is least. The noise is the reduced chi-squared of
     all observations. It contains large errors, whose influence on the map the robust loss reduces: the
     advantage of this loss is not counted, because it does not reduce errors that neighbouring observations
@@ -56,7 +59,8 @@ def keyframe_covariances(
     chosen = _chosen_keyframes(scene_map)
     system = _Observations.create(scene_map, adjusted_px, chosen, motions or {})
     redundancy = 2 * len(system.point) - 6 * len(chosen) - 3 * system.point_count + 7
-    if len(chosen) < 2 or redundancy <= 0:
+    seen = np.bincount(system.keyframe, minlength=len(chosen))
+    if len(chosen) < 2 or redundancy <= 0 or not seen.all():
         return np.zeros((0, 6, 6))
     variance_px2 = float((system.residual**2).sum()) / redundancy * _growth(system, len(chosen))
     own = _marginal_blocks(system, scene_map, chosen, variance_px2)
@@ -141,7 +145,7 @@ def _motion_derivatives(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the derivatives of residuals with respect to velocities and readout times, in expected errors.
 
-    Until its row is exposed, the camera moves against its pose. So another velocity changes the pixel like
+    Until its row is exposed, the camera moves away from its pose. So another velocity changes the pixel like
     another pose. Cameras with equal readout times have one readout time in common.
 
     Args:
@@ -220,8 +224,6 @@ def _marginal_blocks(
     count = size * len(chosen)
     order = np.argsort(system.keyframe, kind="stable")
     bounds = np.searchsorted(system.keyframe[order], np.arange(len(chosen) + 1))
-    if (np.diff(bounds) == 0).any():
-        return None
     by_point = np.zeros((system.point_count, 3, 3))
     np.add.at(by_point, system.point, np.einsum("dim,djm->mij", system.by_point, system.by_point))
     by_point += _DAMPING * np.einsum("pii->p", by_point)[:, None, None] * np.eye(3)

@@ -56,7 +56,7 @@ class RowObservations:
         shift: (M,3) expected motion of the camera until the exposure, in its frame at the time of the
             keyframe, map units.
         noise_px: Standard deviation of an observation, px.
-        interval_s: Frame interval, seconds.
+        interval_s: (K,) frame interval of the camera of each keyframe, seconds.
     """
 
     lenses: Sequence[Camera]
@@ -68,7 +68,7 @@ class RowObservations:
     turn: FloatArray
     shift: FloatArray
     noise_px: float
-    interval_s: float
+    interval_s: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -195,7 +195,7 @@ def _at_exposure(
     pose = found.cam_from_map[k]
     at_middle = np.einsum("mij,mj->mi", pose[:, :3, :3], found.points[seen.point]) + pose[:, :3, 3]
     rate, change, velocity = np.split(found.velocities[k], 3, axis=1)
-    turn = seen.turn + delay * rate + (0.5 / seen.interval_s) * delay**2 * change
+    turn = seen.turn + delay * rate + (0.5 / seen.interval_s[k][:, None]) * delay**2 * change
     rotation = so3_exp(-turn)
     in_cam = np.einsum("mij,mj->mi", rotation, at_middle - seen.shift - delay * velocity)
     return in_cam, at_middle, turn, rotation
@@ -329,7 +329,7 @@ def _derivatives(seen: RowObservations, found: RollingMap, valid: BoolArray) -> 
             -by_middle @ skew(at_middle),
             by_middle,
             by_turn * delay,
-            by_turn * (0.5 / seen.interval_s * delay**2),
+            by_turn * (0.5 / seen.interval_s[seen.keyframe][:, None, None] * delay**2),
             -by_middle * delay,
         ],
         axis=2,

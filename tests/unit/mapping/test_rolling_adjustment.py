@@ -81,7 +81,7 @@ def scene() -> tuple[RowObservations, RollingMap, VelocityErrors]:
         turn=turn,
         shift=shift,
         noise_px=0.7,
-        interval_s=FRAME_S,
+        interval_s=np.full(len(KEYFRAMES), FRAME_S),
     )
     truth = RollingMap(
         cam_from_map=invert(poses_at(times_s[KEYFRAMES])),

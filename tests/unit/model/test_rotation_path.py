@@ -360,6 +360,15 @@ def test_expected_errors_of_velocities_are_larger_where_a_path_jerks_or_ends() -
     assert smooth[2][[0, -1]].min() > 2.0 * np.median(smooth[2])
 
 
+def test_without_neighbouring_poses_the_velocity_is_as_uncertain_as_the_camera_is_fast() -> None:
+    poses = poses_at(np.arange(FRAMES) * FRAME_S, sway_m=0.3)
+    sparse = np.full_like(poses, np.nan)
+    sparse[::4] = poses[::4]
+    speed = np.linalg.norm(np.diff(poses[::4, :3, 3], axis=0), axis=1) / (4 * FRAME_S)
+    velocity = PosePath.create(sparse, TIMES_NS).velocity_errors()[2]
+    assert np.median(velocity) > 0.3 * speed.max() > 0.0
+
+
 def test_a_path_without_poses_expects_the_largest_error_of_its_rates() -> None:
     rate, change, velocity = PosePath.create(np.full((FRAMES, 4, 4), np.nan), TIMES_NS).velocity_errors()
     assert (rate == 2.0).all()
