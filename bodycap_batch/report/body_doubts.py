@@ -123,7 +123,7 @@ def _agreement_criteria(
         name=name,
         grade=grade_value(chance, _GOOD_SCALE_CHANCE, _FAIR_SCALE_CHANCE, more_is_better=True),
         finding=f"the scales from {sources} {'agree' if chance >= _GOOD_SCALE_CHANCE else 'disagree'} "
-        f"(chi-square {squares:.1f} with {freedom} degrees of freedom)",
+        f"(chi-square {squares:.1f} with {freedom} {'degree' if freedom == 1 else 'degrees'} of freedom)",
         rationale="Each scale has a stated uncertainty. If correct scales disagree so much in less than one "
         "capture of a hundred, a bone length, a clock, the place of a camera or a part of the map is "
         "wrong.",
