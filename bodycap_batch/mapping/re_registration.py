@@ -14,7 +14,12 @@ if TYPE_CHECKING:
 
 
 def re_register_images(
-    model: pycolmap.Reconstruction, image_ids: Collection[int], context: MappingContext, total: int
+    model: pycolmap.Reconstruction,
+    image_ids: Collection[int],
+    context: MappingContext,
+    total: int,
+    *,
+    structure_less: bool = True,
 ) -> Any:
     """Remove some images from a model. Then register these images and all new images of the database.
 
@@ -23,16 +28,19 @@ def re_register_images(
         image_ids: Ids of the images to remove and to register again.
         context: Workspace, intrinsics, mapper options.
         total: Number of all keyframes, for the progress.
+        structure_less: Whether images that see no points of the map are registered from their matches.
 
     Returns:
         A copy of the model in which these images are registered, as far as they fit. All poses of the copy
         are adjusted if the model is not large.
     """
     rest = sub_model(model, set(model.reg_image_ids()) - set(image_ids))
+    settings = context.mapper_options()
+    settings.structure_less_registration_fallback = structure_less
     extended = with_new_images(
         context.workspace,
         rest,
-        context.mapper_options(),
+        settings,
         context.stage,
         total,
         adjust_globally=not context.is_large(rest.num_reg_frames()),

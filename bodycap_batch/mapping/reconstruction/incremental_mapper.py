@@ -213,6 +213,11 @@ class _MapperRun:
         self._triangulation = settings.get_triangulation()
         self._local = settings.get_local_bundle_adjustment()
         self._global = settings.get_global_bundle_adjustment()
+        self._given = {
+            number: camera.params.copy()
+            for number, camera in self._model.cameras.items()
+            if number in settings.constant_cameras
+        }
 
     def initialise(self) -> bool:
         """Start the model with the initial pair from the options.
@@ -265,7 +270,21 @@ class _MapperRun:
         for image_id in self._mapper.find_next_images(self._options, structure_less=False):
             if self._mapper.register_next_image(self._options, image_id):
                 return int(image_id)
+        if not self._settings.structure_less_registration_fallback:
+            return None
+        for image_id in self._mapper.find_next_images(self._options, structure_less=True):
+            if self._mapper.register_next_structure_less_image(self._options, image_id):
+                self._restore_intrinsics()
+                return int(image_id)
         return None
+
+    def _restore_intrinsics(self) -> None:
+        """Restore the intrinsics of the constant cameras.
+
+        COLMAP refines them if the first image of a camera is registered without points of the map.
+        """
+        for number, params in self._given.items():
+            self._model.camera(number).params = params
 
     def _extend_from(self, image_id: int) -> None:
         """Triangulate the points of a new image and adjust the map around it."""

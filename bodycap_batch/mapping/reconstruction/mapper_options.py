@@ -65,9 +65,6 @@ def make_mapper_options(
     settings.extract_colors = False
     settings.min_model_size = MIN_MODEL_KEYFRAMES
     settings.constant_cameras = set(calibrated_ids)
-    # COLMAP would refine the intrinsics of a camera whose first image is registered without points of the
-    # map, even if they are to stay constant. Evidence: docs/decisions/mapping.md.
-    settings.structure_less_registration_fallback = False
     settings.ba_refine_sensor_from_rig = False
     for part in (settings, settings.mapper, settings.triangulation):
         part.max_extra_param = _MAX_EXTRA_PARAM

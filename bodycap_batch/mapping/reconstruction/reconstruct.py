@@ -86,7 +86,10 @@ def _reconstruct_from_search(
     """Return the models that start from initial pairs of COLMAP's own search, largest first."""
     settings.init_image_id1, settings.init_image_id2 = -1, -1
     settings.init_num_trials, settings.multiple_models = _MAX_SEARCH_TRIALS, True
-    return _run_colmap(workspace, settings, context, total)
+    models = _run_colmap(workspace, settings, context, total)
+    if models:
+        models[0] = _with_registered_images(models[0], workspace, settings, context, total)
+    return sorted(models, key=model_order)
 
 
 def _reconstruct_from_pair(
@@ -149,9 +152,14 @@ def _with_registered_images(
 def _run_colmap(
     workspace: Path, settings: pycolmap.IncrementalPipelineOptions, context: StageContext, total: int
 ) -> list[Any]:
-    """Run COLMAP's incremental mapping and return the models, largest first."""
+    """Run COLMAP's incremental mapping and return the models, largest first.
+
+    No image is registered without points of the map, because COLMAP would change the intrinsics of constant
+    cameras. Evidence: docs/decisions/mapping.md.
+    """
     import pycolmap
 
+    settings.structure_less_registration_fallback = False
     target = workspace / "mapper"
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir()
@@ -166,6 +174,7 @@ def _run_colmap(
         next_image_callback=progress_counter(context, total, token.cancel),
         cancellation_token=token,
     )
+    settings.structure_less_registration_fallback = True
     shutil.rmtree(target, ignore_errors=True)
     context.check_cancelled()
     return sorted(found.values(), key=model_order)

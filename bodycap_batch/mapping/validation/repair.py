@@ -98,7 +98,8 @@ def repair_model(
         log.append(entry)
         if not verified and not wrong:
             break
-        other = re_register_images(model, wrong, context, len(ids))
+        # Most keyframes that are registered from their matches alone are removed again.
+        other = re_register_images(model, wrong, context, len(ids), structure_less=False)
         other_pairs = evaluate_pairs(context.workspace, other)
         still_wrong = find_wrong_images(context, other, other_pairs)
         sound_before = len(registered - wrong)

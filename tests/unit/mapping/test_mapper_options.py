@@ -13,7 +13,3 @@ def test_a_keyframe_is_registered_with_points_as_exact_as_matches(scale: float) 
     settings = make_mapper_options(MapOptions(), [1], scale)
     assert settings.mapper.abs_pose_max_error == pytest.approx(4.0 * scale)
     assert settings.mapper.abs_pose_max_error <= settings.mapper.filter_max_reproj_error * 1.001
-
-
-def test_no_keyframe_is_registered_without_points_of_the_map() -> None:
-    assert not make_mapper_options(MapOptions(), [1], 1.0).structure_less_registration_fallback

@@ -37,7 +37,7 @@ from bodycap_batch.mapping.reconstruction.bundle_adjustment import (
     adjust_robustly,
     sub_model,
 )
-from bodycap_batch.mapping.reconstruction.incremental_mapper import register_images
+from bodycap_batch.mapping.reconstruction.incremental_mapper import _MapperRun, register_images
 from bodycap_batch.mapping.reconstruction.initial_pair import find_user_pair, rank_initial_pairs
 from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
 from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
@@ -665,6 +665,30 @@ def test_an_initial_pair_in_the_unconnected_half_loses_no_keyframes(tmp_path: Pa
     models, _ = reconstruct(tmp_path, settings, context, _KEYFRAMES, [pair])
     assert [model.num_reg_images() for model in models] == [_KEYFRAMES]
     assert _rms(models[0], poses) < 0.01
+
+
+def test_a_camera_that_joins_without_points_of_the_map_keeps_its_calibration() -> None:
+    model = pycolmap.Reconstruction()
+    for number in (1, 2):
+        model.add_camera(pycolmap.Camera(model="PINHOLE", params=_CAMERA.params, camera_id=number))
+
+    class Mapper:
+        """Registers one image without points, and refines the intrinsics as COLMAP does."""
+
+        reconstruction = model
+
+        def find_next_images(self, _: object, *, structure_less: bool) -> list[int]:
+            return [7] if structure_less else []
+
+        def register_next_structure_less_image(self, _: object, image_id: int) -> bool:
+            for camera in model.cameras.values():
+                camera.params = [394.0, 411.0, 320.0, 240.0]
+            return image_id == 7
+
+    run = _MapperRun(cast("Any", Mapper()), make_mapper_options(MapOptions(), [2], 1.0))
+    assert run._register_next() == 7
+    assert model.camera(2).params.tolist() == _CAMERA.params.tolist()
+    assert model.camera(1).params[0] == 394.0, "an unknown lens is refined"
 
 
 @pytest.mark.slow
