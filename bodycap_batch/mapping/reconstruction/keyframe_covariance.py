@@ -38,12 +38,13 @@ def keyframe_covariances(
     The points are unknown too, so their errors are contained. So are the velocities of keyframes with rolling
     shutters, within their expected errors, and the readout times, within their standard deviations; a readout
     time that is not determined is taken as 0. If the velocities were not adjusted together with the map, the
-    covariances are those of an adjustment that weights the observations by these errors. The gauge
-    is the one in which the mean variance of all keyframes is least. The noise is the reduced chi-squared of
-    all observations. It contains large errors, whose influence on the map the robust loss reduces: the
-    advantage of this loss is not counted, because it does not reduce errors that neighbouring observations
-    have in common. The result is multiplied by the ratio by which such common errors increase the variance in
-    the pictures. Evidence: docs/decisions/mapping.md.
+    covariances are too small: they are those of an adjustment that weights the observations by these errors.
+
+    The gauge is the one in which the mean variance of all keyframes is least. The noise is the reduced
+    chi-squared of all observations. It contains large errors, whose influence on the map the robust loss
+    reduces: the advantage of this loss is not counted, because it does not reduce errors that neighbouring
+    observations have in common. The result is multiplied by the ratio by which such common errors increase
+    the variance in the pictures. Evidence: docs/decisions/mapping.md.
 
     Args:
         scene_map: The map.

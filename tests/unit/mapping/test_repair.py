@@ -691,6 +691,23 @@ def test_a_camera_that_joins_without_points_of_the_map_keeps_its_calibration() -
     assert model.camera(1).params[0] == 394.0, "an unknown lens is refined"
 
 
+def test_colmaps_own_pipeline_registers_no_image_without_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: list[bool] = []
+
+    def mapping(*arguments: Any, **_: Any) -> dict[int, Any]:
+        used.append(arguments[3].structure_less_registration_fallback)
+        return {}
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
+    settings = make_mapper_options(MapOptions(), [1], 1.0)
+    assert reconstruct(tmp_path, settings, StageContext(work_dir=tmp_path, threads=1), 9)[0] == []
+    assert used
+    assert not any(used)
+    assert settings.structure_less_registration_fallback, "further images may be registered so"
+
+
 @pytest.mark.slow
 def test_the_users_initial_pair_is_used(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
     _, poses, mapping, _ = built
