@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from bodycap_batch.capture import Capture
+from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import MapOptions
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.inertial.camera_rotation import related_to_poses
 from bodycap_batch.mapping.inputs import calibrated_camera_ids, make_mapping_context
 from bodycap_batch.mapping.intrinsics.readout_time import (
+    STATED,
     Readout,
     RollingShutterModel,
     estimate_readouts,
     map_with_readouts,
+    sideways_cameras,
+    stated_readout,
 )
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
 from bodycap_batch.mapping.intrinsics.shutters import (
@@ -24,6 +29,7 @@ from bodycap_batch.mapping.intrinsics.shutters import (
     read_shutters,
     readouts_of_maps,
 )
+from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import read_camera_ids, read_detected_px
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
@@ -33,7 +39,7 @@ from bodycap_batch.mapping.reconstruction.two_step_adjustment import adjust_in_t
 from bodycap_batch.mapping.results import make_result
 from bodycap_batch.mapping.validation.dominant_points import remove_dominant_points
 from bodycap_batch.model.rotation_path import RotationPath
-from bodycap_batch.model.scene import MapResult, Trajectory
+from bodycap_batch.model.scene import Map, MapResult, Trajectory
 
 _MAX_KEYFRAMES = 300
 """Maximum number of keyframes of a model whose velocities are adjusted. Origin: 160 MB for the reduced
@@ -83,13 +89,9 @@ def refine_map(
     shutil.copytree(previous.workspace, workspace)
     calibrated_ids = calibrated_camera_ids(capture, read_camera_ids(workspace))
     mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, skeletal_above)
-    settings = mapping.mapper_options()
     cameras = {camera.name: camera for camera in capture.cameras}
-    from_matches = {
-        name: readout
-        for name, entry in previous.log.get("readouts_from_matches", {}).items()
-        if (readout := Readout(**entry)).seconds and readout.source != "stated"
-    }
+    entries = previous.log.get("readouts_from_matches", {})
+    from_matches = {name: Readout(**entry) for name, entry in entries.items()}
     models, all_readouts, adjusted_px, motions = [], [], [], []
     removed = 0
     distorted: set[str] = set()
@@ -105,35 +107,14 @@ def refine_map(
         }
         rotations = _rotations(workspace, scene_map.cameras, paths)
         rolling = RollingShutterModel(model, paths, cameras, detected, rotations)
-        rolling, estimated = estimate_readouts(
-            rolling, cameras, settings, calibrated_ids, scene_map, from_matches
-        )
-        # A camera that was registered against another model keeps the readout time of its keyframes here.
-        readouts = readouts_of_maps([scene_map]) | estimated
-        readout_s = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
-        corrected_px = None
-        distorted |= distorted_cameras(rolling, readout_s, scene_map.readout_s.keys())
-        if readout_s:
-            model = rolling.with_exact_rates(readout_s, scene_map.readout_s.keys()).corrected(readout_s)
-            removed += remove_dominant_points(model)
-            built_for_shutters = readout_s.keys() <= scene_map.readout_s.keys()
-            if (
-                built_for_shutters
-                and model.num_reg_images() <= min(_MAX_KEYFRAMES, skeletal_above)
-                and rolling.adjust_with_velocities(model, readout_s)
-            ):
-                adjust_robustly(model, settings, calibrated_ids)
-            elif mapping.is_large(model.num_reg_images()):
-                adjust_in_two_steps(model, settings, calibrated_ids)
-            else:
-                adjust_and_filter(model, settings, calibrated_ids)
-                adjust_robustly(model, settings, calibrated_ids)
-            corrected_px = observed_px(model)
-            rolling.move_keypoints(model, {})
-        sigma_s = {name: readout.sigma_s for name, readout in readouts.items()}
-        motions.append(rolling.motions(readout_s, sigma_s))
-        models.append(model)
-        adjusted_px.append(observed_px(model) if corrected_px is None else corrected_px)
+        refined = _Refinement(model, rolling, scene_map, cameras, from_matches, mapping).run()
+        readouts, corrected_px = refined.readouts, refined.corrected_px
+        readout_s = _seconds(readouts)
+        distorted |= distorted_cameras(refined.rolling, readout_s, scene_map.readout_s.keys())
+        removed += refined.removed
+        motions.append(refined.rolling.motions(readouts, refined.error_scales))
+        models.append(refined.model)
+        adjusted_px.append(observed_px(refined.model) if corrected_px is None else corrected_px)
         all_readouts.append(readouts)
     write_models(workspace, models)
     log = {
@@ -152,6 +133,141 @@ def refine_map(
         map_with_readouts(item, readouts) for item, readouts in zip(result.maps, all_readouts, strict=True)
     ]
     return replace(result, maps=tuple(maps))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Refined:
+    """A refined model.
+
+    Attributes:
+        rolling: The model before, with the row directions that were used.
+        model: The model, with all observations at their detected positions.
+        readouts: Readout times by camera name.
+        corrected_px: Pixels to which the model was adjusted, by image id; None without a rolling shutter.
+        removed: Number of dominant points that were removed.
+        error_scales: (N,3) factors of the expected errors of the velocities of each frame, by camera name;
+            None if the velocities were not adjusted.
+    """
+
+    rolling: RollingShutterModel
+    model: Any
+    readouts: dict[str, Readout]
+    corrected_px: dict[int, FloatArray] | None
+    removed: int
+    error_scales: Mapping[str, FloatArray] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Refinement:
+    """The correction of one model for its rolling shutters.
+
+    Attributes:
+        model: The model; not changed.
+        rolling: The model with the motion of its keypoints.
+        scene_map: The map of the model.
+        cameras: The capture's cameras by name.
+        from_matches: Readout times from matches between adjacent frames, by camera name.
+        mapping: Workspace, mapper options.
+    """
+
+    model: Any
+    rolling: RollingShutterModel
+    scene_map: Map
+    cameras: Mapping[str, CaptureCamera]
+    from_matches: Mapping[str, Readout]
+    mapping: MappingContext
+
+    def run(self) -> _Refined:
+        """Return the model after the adjustment with the most exact motion."""
+        settings, calibrated_ids = self.mapping.mapper_options(), list(self.mapping.calibrated_ids)
+        if self._readouts_are_decided():
+            rolling = self.rolling.with_sideways(sideways_cameras(self.cameras, self.scene_map))
+            refined = self._with_velocities(rolling, self._readouts())
+            if refined is not None:
+                return refined
+        others = {
+            name: item for name, item in self.from_matches.items() if item.seconds and item.source != STATED
+        }
+        rolling, estimated = estimate_readouts(
+            self.rolling, self.cameras, settings, calibrated_ids, self.scene_map, others
+        )
+        # A camera that was registered against another model keeps the readout time of its keyframes here.
+        readouts = readouts_of_maps([self.scene_map]) | estimated
+        if not (readout_s := _seconds(readouts)):
+            return _Refined(
+                rolling=rolling, model=self.model, readouts=readouts, corrected_px=None, removed=0
+            )
+        if (refined := self._with_velocities(rolling, readouts)) is not None:
+            return refined
+        model = rolling.with_exact_rates(readout_s, self.scene_map.readout_s.keys()).corrected(readout_s)
+        removed = remove_dominant_points(model)
+        if self.mapping.is_large(model.num_reg_images()):
+            adjust_in_two_steps(model, settings, calibrated_ids)
+        else:
+            adjust_and_filter(model, settings, calibrated_ids)
+            adjust_robustly(model, settings, calibrated_ids)
+        return self._finished(rolling, model, readouts, removed)
+
+    def _readouts_are_decided(self) -> bool:
+        """Return True if each camera's readout time is known, from the map or from matches."""
+        undecided = {
+            name
+            for name in self.scene_map.cameras.keys() - self.scene_map.readout_s.keys()
+            if not self.cameras[name].rolling_shutter_known
+            and (name not in self.from_matches or not self.from_matches[name].determined)
+        }
+        return bool(self.scene_map.readout_s) and not undecided
+
+    def _readouts(self) -> dict[str, Readout]:
+        """Return the readout times of the map, and those of 0 that are stated or come from matches."""
+        stated = {
+            name: stated_readout(camera.rolling_shutter_s)
+            for name, camera in self.cameras.items()
+            if camera.rolling_shutter_known
+        }
+        known = {name: item for name, item in ({**self.from_matches, **stated}).items() if not item.seconds}
+        own = self.scene_map.cameras.keys()
+        return {name: item for name, item in known.items() if name in own} | readouts_of_maps(
+            [self.scene_map]
+        )
+
+    def _with_velocities(
+        self, rolling: RollingShutterModel, readouts: Mapping[str, Readout]
+    ) -> _Refined | None:
+        """Return the model after an adjustment with velocities and readout times; None if none is of use."""
+        readout_s = _seconds(readouts)
+        built_for_shutters = readout_s.keys() <= self.scene_map.readout_s.keys()
+        largest = min(_MAX_KEYFRAMES, self.mapping.skeletal_above)
+        if not built_for_shutters or len(self.scene_map.keyframe_camera) > largest:
+            return None
+        model = rolling.with_exact_rates(readout_s, readout_s.keys()).corrected(readout_s)
+        removed = remove_dominant_points(model)
+        adjusted = rolling.adjust_with_velocities(model, readouts, self.from_matches)
+        if adjusted is None:
+            return None
+        adjust_robustly(model, self.mapping.mapper_options(), self.mapping.calibrated_ids)
+        refined = self._finished(rolling, model, adjusted.readouts, removed)
+        return replace(refined, error_scales=adjusted.error_scales)
+
+    @staticmethod
+    def _finished(
+        rolling: RollingShutterModel, model: Any, readouts: Mapping[str, Readout], removed: int
+    ) -> _Refined:
+        """Return a result with the observations of the model at their detected positions."""
+        corrected_px = observed_px(model)
+        rolling.move_keypoints(model, {})
+        return _Refined(
+            rolling=rolling,
+            model=model,
+            readouts=dict(readouts),
+            corrected_px=corrected_px,
+            removed=removed,
+        )
+
+
+def _seconds(readouts: Mapping[str, Readout]) -> dict[str, float]:
+    """Return the readout times (seconds) of the cameras with a rolling shutter, by camera name."""
+    return {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
 
 
 def distorted_cameras(

@@ -14,16 +14,10 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust, sub_model
-from bodycap_batch.mapping.reconstruction.camera_motion import CameraMotion
+from bodycap_batch.mapping.reconstruction.camera_motion import CameraMotion, camera_motions
 from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
+from bodycap_batch.mapping.reconstruction.motion_adjustment import MotionAdjustment
 from bodycap_batch.mapping.reconstruction.reprojection import image_residuals_px
-from bodycap_batch.mapping.reconstruction.rolling_adjustment import (
-    RollingMap,
-    RowObservations,
-    VelocityErrors,
-    adjust_with_velocities,
-    px_at_mid_row,
-)
 from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.optical_flow import pixel_scale
 from bodycap_batch.model.rotation_path import PosePath, RotationPath, near_in_time
@@ -67,24 +61,19 @@ the residuals are not used. Evidence: none."""
 _MODEL_SIGMA_RATIO = 0.025
 """Standard deviation that is added to each estimate, as a ratio of the readout time. A hand shakes faster
 than the spline through the poses of the frames follows. Evidence: docs/decisions/mapping.md."""
+_ADJUSTED_SIGMA_RATIO = 0.012
+"""The same for a readout time that was adjusted together with the velocities: they are free there, and only
+their mean is that of the spline. Evidence: docs/decisions/mapping.md."""
+_ADJUSTED_FLOOR_S = 0.0001
+"""Standard deviation that is added to each adjusted readout time, seconds. Evidence:
+docs/decisions/mapping.md."""
 _MAX_POOLED_SIGMAS = 3.0
 """Maximum deviation of the readout time of a camera from the mean of equal cameras, in its standard
 deviations. With a larger deviation, the cameras do not share the mean. Evidence: none."""
+STATED = "stated"
+"""`Readout.source` of a readout time that is given in the job."""
 _UNDETERMINED = "not determined: "
 """First words of `Readout.source` of a camera whose readout time is unknown; the reason follows."""
-_NOISE_PX = 0.7
-"""Standard deviation of an observation in an adjustment with velocities, px of an image with a long side of
-640 px. Origin: the same as for angular velocities in `model.rotation_path`."""
-_FIRST_LOSS_WIDTH = 4.0
-"""First width of the loss of an adjustment with velocities, in standard deviations of an observation. It
-keeps observations that disagree because the velocities of the path are wrong. The last width is the median
-residual. Evidence: docs/decisions/mapping.md."""
-_EXACT_RATIO = 0.5
-"""A path is exact enough if its expected errors displace keypoints by less than this ratio of the noise.
-Origin: they then add 12 % to the noise."""
-_NO_MOTION_SIGMA = 1e-6
-"""Expected error of a velocity that moves no observation: a global shutter. It only prevents a division by
-zero."""
 _BLOCKS = 8
 """Number of blocks of successive keyframes from which a standard deviation is estimated. Evidence: none."""
 _FLOOR_SIGMA_S = 0.0002
@@ -154,6 +143,19 @@ class Readout:
         # The angular velocities of both estimates are those of splines, with the same systematic error.
         sigma_s = float(np.hypot(mean[1], _MODEL_SIGMA_RATIO * best_s))
         return replace(self, seconds=best_s, best_s=best_s, sigma_s=sigma_s, source="estimated")
+
+    def adjusted(self, best_s: float, sigma_s: float) -> Readout:
+        """Return the readout time after an adjustment in which it was an unknown.
+
+        Args:
+            best_s: The adjusted readout time, seconds.
+            sigma_s: Its standard deviation from the adjustment, seconds.
+        """
+        if not self.sigma_s:
+            return self
+        # The expected velocities of the adjustment are those of a spline.
+        sigma_s = float(np.linalg.norm([sigma_s, _ADJUSTED_FLOOR_S, _ADJUSTED_SIGMA_RATIO * best_s]))
+        return replace(self, seconds=best_s, sigma_s=sigma_s, source="estimated", best_s=best_s)
 
     @property
     def determined(self) -> bool:
@@ -270,6 +272,19 @@ class _Keypoints:
     points: FloatArray
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdjustedMotion:
+    """The motion of cameras after an adjustment.
+
+    Attributes:
+        readouts: Readout times by camera name.
+        error_scales: (N,3) factors of the expected errors of the velocities of each frame, by camera name.
+    """
+
+    readouts: dict[str, Readout]
+    error_scales: Mapping[str, FloatArray]
+
+
 class RollingShutterModel:
     """A model with the motion of its keypoints, to estimate readout times and to correct rolling shutters.
 
@@ -374,8 +389,13 @@ class RollingShutterModel:
             for feature, xy in zip(item.feature.tolist(), px, strict=True):
                 points[feature].xy = xy
 
-    def adjust_with_velocities(self, model: pycolmap.Reconstruction, readout_s: Mapping[str, float]) -> bool:
-        """Adjust poses, points and the velocities of all keyframes of a copy of the model together.
+    def adjust_with_velocities(
+        self,
+        model: pycolmap.Reconstruction,
+        readouts: Mapping[str, Readout],
+        expected: Mapping[str, Readout] | None = None,
+    ) -> AdjustedMotion | None:
+        """Adjust poses, points, velocities of keyframes and readout times of a copy of the model together.
 
         The keypoints are then moved to their positions at the instant of the middle row, with the adjusted
         velocities. The caller adjusts the model for these positions afterwards: intrinsics and gauge are not
@@ -383,103 +403,73 @@ class RollingShutterModel:
 
         Args:
             model: The copy of the model, changed in place.
-            readout_s: Readout time (seconds) of each camera, by camera name. The keypoints of all other
-                cameras are moved to their detected positions.
+            readouts: Readout time of each camera at the start, by camera name. The keypoints of cameras
+                without one are moved to their detected positions. A time with a standard deviation of 0 is
+                constant.
+            expected: Readout times that do not come from this model, by camera name. They count as
+                observations.
 
         Returns:
-            True if the model was adjusted. False if the velocities of the paths are exact enough: then the
-            model is unchanged.
+            The adjusted readout times of the cameras in `readouts`, and the expected errors of their
+            velocities. None if the velocities of the paths are exact enough: then the model is unchanged.
         """
         import pycolmap
 
         items = [self._remaining(item, model) for item in self._keypoints]
-        seen, errors, point_ids = self._row_observations(items, readout_s)
-        focal_px = np.array([lens.focal_px for lens in seen.lenses])[seen.lens[seen.keyframe]]
-        expected_px = focal_px * np.abs(seen.delay_s) * errors.rate[seen.keyframe]
-        if not len(seen.px) or np.percentile(expected_px, DISPLACED_PERCENT) < _EXACT_RATIO * seen.noise_px:
-            return False
-        poses = [model.image(item.image_id).cam_from_world().matrix() for item in items]
-        start = RollingMap(
-            cam_from_map=np.array([make_transform(pose[:, :3], pose[:, 3]) for pose in poses]),
-            points=np.array([model.point3D(number).xyz for number in point_ids]),
-            velocities=np.zeros((len(poses), 9)),
-        )
-        found = adjust_with_velocities(seen, start, errors, [_FIRST_LOSS_WIDTH * seen.noise_px, 0.0])
-        px = px_at_mid_row(seen, found)
-        for number, xyz in zip(point_ids, found.points, strict=True):
-            model.point3D(number).xyz = xyz
-        bounds = np.searchsorted(seen.keyframe, np.arange(len(poses) + 1))
-        for row, item in enumerate(items):
-            image = model.image(item.image_id)
-            pose = pycolmap.Rigid3d(found.cam_from_map[row, :3])
-            model.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
-            for feature, xy in zip(item.feature.tolist(), px[bounds[row] : bounds[row + 1]], strict=True):
-                image.points2D[feature].xy = xy
-        return True
-
-    def _row_observations(
-        self, items: Sequence[_Keypoints], readout_s: Mapping[str, float]
-    ) -> tuple[RowObservations, VelocityErrors, list[int]]:
-        """Return all observations with the expected motion, the errors of the velocities, and point ids."""
-        names = sorted(self._intrinsics)
-        lens = np.array([names.index(item.camera) for item in items], dtype=np.int64)
         ids = [self._point_ids(item) for item in items]
         sizes = [len(item.px) for item in items]
-        keyframe = np.repeat(np.arange(len(sizes)), sizes)
         point_ids, point = np.unique(np.concatenate([np.zeros(0, np.int64), *ids]), return_inverse=True)
-        px = np.concatenate([np.zeros((0, 2)), *(item.px for item in items)])
-        frame = np.concatenate([np.zeros(0, np.int64), *(item.frame for item in items)])
-        delay = np.zeros(len(px))
-        turn, shift = np.zeros((len(px), 3)), np.zeros((len(px), 3))
-        rate = np.full(len(sizes), _NO_MOTION_SIGMA)
-        change, velocity, interval_s = rate.copy(), rate.copy(), np.ones(len(sizes))
-        own_frame = np.array([item.frame[0] if len(item.frame) else 0 for item in items])
-        for name, motion in self.motions(readout_s).items():
-            rows, kept = lens[keyframe] == names.index(name), lens == names.index(name)
-            until = motion.until_exposure(frame[rows], px[rows])
-            delay[rows], turn[rows], shift[rows] = until.delay_s, until.turn, until.shift
-            rate[kept], change[kept], velocity[kept] = motion.errors(own_frame[kept]).T
-            interval_s[kept] = motion.interval_s
-        scale = max(pixel_scale(each.width_px, each.height_px) for each in self._intrinsics.values())
-        seen_rows = RowObservations(
-            lenses=[self._intrinsics[name] for name in names],
-            lens=lens,
-            keyframe=keyframe,
+        poses = [model.image(item.image_id).cam_from_world().matrix() for item in items]
+        adjustment = MotionAdjustment(
+            lenses=self._intrinsics,
+            poses=self._poses,
+            rotations=self._rotations,
+            camera=tuple(item.camera for item in items),
+            frame=np.array([ImageRef.parse(model.image(item.image_id).name).frame for item in items]),
+            keyframe=np.repeat(np.arange(len(sizes)), sizes),
             point=np.ravel(point),
-            px=px,
-            delay_s=delay,
-            turn=turn,
-            shift=shift,
-            noise_px=_NOISE_PX * scale,
-            interval_s=interval_s,
+            px=np.concatenate([np.zeros((0, 2)), *(item.px for item in items)]),
         )
-        errors = VelocityErrors(
-            rate=rate,
-            rate_change=change,
-            velocity=np.maximum(velocity, _NO_MOTION_SIGMA),
+        seconds = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
+        adjusted = adjustment.run(
+            np.array([make_transform(pose[:, :3], pose[:, 3]) for pose in poses]),
+            np.array([model.point3D(number).xyz for number in point_ids.tolist()]).reshape(-1, 3),
+            seconds,
+            {name: _expected_readout(readouts[name], (expected or {}).get(name)) for name in seconds},
         )
-        return seen_rows, errors, point_ids.tolist()
+        if adjusted is None:
+            return None
+        for number, xyz in zip(point_ids.tolist(), adjusted.points, strict=True):
+            model.point3D(number).xyz = xyz
+        parts = np.split(adjusted.px_at_mid_row, np.cumsum(sizes)[:-1])
+        for item, pose, px in zip(items, adjusted.cam_from_map, parts, strict=True):
+            image = model.image(item.image_id)
+            model.frame(image.frame_id).set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose[:3]))
+            for feature, xy in zip(item.feature.tolist(), px, strict=True):
+                image.points2D[feature].xy = xy
+        found = {
+            name: readout.adjusted(*adjusted.readouts[name]) if name in seconds else readout
+            for name, readout in readouts.items()
+        }
+        for names in groups_of_equal_cameras(self._cameras[name] for name in seconds):
+            found |= _with_differences({name: found[name] for name in names})
+        return AdjustedMotion(readouts=found, error_scales=adjusted.error_scales)
 
     def motions(
-        self, readout_s: Mapping[str, float], sigma_s: Mapping[str, float] | None = None
+        self,
+        readouts: Mapping[str, Readout],
+        error_scales: Mapping[str, FloatArray] | None = None,
     ) -> dict[str, CameraMotion]:
         """Return the motion of each camera with a path and a readout time, by camera name.
 
         Args:
-            readout_s: Readout times (seconds) by camera name.
-            sigma_s: Their standard deviations (seconds) by camera name; 0 for a camera without an entry.
+            readouts: Readout times by camera name.
+            error_scales: (N,3) factors of the expected errors of the velocities of each frame, by camera
+                name.
         """
-        out = {}
-        for name, poses in self._poses.items():
-            if name in self._intrinsics and readout_s.get(name):
-                out[name] = CameraMotion(
-                    camera=self._intrinsics[name],
-                    path=PosePath.create(*poses, self._rotations.get(name)),
-                    readout_s=readout_s[name],
-                    readout_sigma_s=(sigma_s or {}).get(name, 0.0),
-                    interval_s=1e-9 * float(np.median(np.diff(self._cameras[name].times_ns))),
-                )
-        return out
+        seconds = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
+        sigma_s = {name: readout.sigma_s for name, readout in readouts.items()}
+        return camera_motions(self._intrinsics, self._poses, self._rotations, seconds, sigma_s, error_scales)
 
     def _remaining(self, item: _Keypoints, model: pycolmap.Reconstruction) -> _Keypoints:
         """Return the observations whose points are left in a copy of the model."""
@@ -794,10 +784,8 @@ def estimate_readouts(
     Returns:
         The model with the row directions that fit best; the readout times by camera name.
     """
-    stated = {name for name, camera in cameras.items() if camera.camera.sideways}
+    stated = sideways_cameras(cameras, corrected)
     start_s = {} if corrected is None else dict(corrected.readout_s)
-    if corrected is not None:
-        stated |= {name for name, camera in corrected.cameras.items() if camera.sideways}
     rolling = rolling.with_sideways(stated)
     try:
         part = rolling.most_dynamic_subset()
@@ -820,6 +808,19 @@ def estimate_readouts(
     return rolling.with_sideways(stated | better), readouts
 
 
+def sideways_cameras(cameras: Mapping[str, CaptureCamera], corrected: Map | None) -> set[str]:
+    """Return the names of the cameras whose sensor's rows are known to be columns of the image.
+
+    Args:
+        cameras: The capture's cameras by name.
+        corrected: The map whose row directions were estimated before; None if there is none.
+    """
+    out = {name for name, camera in cameras.items() if camera.camera.sideways}
+    if corrected is not None:
+        out |= {name for name, camera in corrected.cameras.items() if camera.sideways}
+    return out
+
+
 def map_with_readouts(scene: Map, readouts: Mapping[str, Readout]) -> Map:
     """Return a copy of a corrected map that holds the readout times and row directions of the correction."""
     nonzero = {name: readout for name, readout in readouts.items() if readout.seconds}
@@ -835,6 +836,37 @@ def map_with_readouts(scene: Map, readouts: Mapping[str, Readout]) -> Map:
     )
 
 
+def _with_differences(readouts: Mapping[str, Readout]) -> dict[str, Readout]:
+    """Return adjusted readout times of equal cameras with standard deviations that explain their differences.
+
+    Args:
+        readouts: The readout times by camera name. Those with a standard deviation of 0 are kept.
+    """
+    estimated = {name: readout for name, readout in readouts.items() if readout.sigma_s}
+    if len(estimated) < 2:
+        return dict(readouts)
+    values, sigmas = np.array([(each.best_s, each.sigma_s) for each in estimated.values()]).T
+    mean_s, _ = weighted_mean(values, sigmas)
+    return dict(readouts) | {
+        name: replace(readout, sigma_s=float(np.hypot(readout.sigma_s, readout.best_s - mean_s)))
+        for name, readout in estimated.items()
+    }
+
+
+def _expected_readout(start: Readout, other: Readout | None) -> tuple[float, float]:
+    """Return the expected readout time and its standard deviation, seconds, before an adjustment.
+
+    Args:
+        start: The readout time at the start.
+        other: A readout time that does not come from the adjusted model; None if there is none.
+    """
+    if not start.sigma_s:
+        return start.seconds, 0.0
+    if other is None or not other.seconds or not other.sigma_s:
+        return start.seconds, _MAX_SIGMA_S
+    return other.seconds, other.sigma_s
+
+
 def stated_readout(readout_s: float) -> Readout:
     """Return the readout time of a camera whose readout time is given in the job."""
-    return Readout(readout_s, 0.0, "stated", readout_s)
+    return Readout(readout_s, 0.0, STATED, readout_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.rolling_shutter import row_delay
-from bodycap_batch.model.rotation_path import PosePath
+from bodycap_batch.model.rotation_path import PosePath, RotationPath
 
 _RATE_ERROR_FACTOR = 3.0
 """Factor of the expected errors of the angular velocities of keyframes and of their changes, because the
@@ -42,6 +43,8 @@ class CameraMotion:
         readout_s: Readout time, seconds.
         readout_sigma_s: Standard deviation of the readout time, seconds; 0 if it is given.
         interval_s: Frame interval, seconds.
+        error_scales: (N,3) factors of the expected errors of the velocities of each frame; None if an
+            adjustment has not determined them.
     """
 
     camera: Camera
@@ -49,6 +52,7 @@ class CameraMotion:
     readout_s: float
     readout_sigma_s: float
     interval_s: float
+    error_scales: FloatArray | None = None
 
     def until_exposure(self, frame: IntArray, px: FloatArray) -> RowMotion:
         """Return the motion until pixels (M,2) of frames (M,) are exposed."""
@@ -62,4 +66,38 @@ class CameraMotion:
         the velocity, map units per second.
         """
         errors = np.stack(self.path.velocity_errors(), axis=1)[frame]
-        return np.asarray(errors * [_RATE_ERROR_FACTOR, _RATE_ERROR_FACTOR, 1.0])
+        scales = 1.0 if self.error_scales is None else self.error_scales[frame]
+        return np.asarray(errors * [_RATE_ERROR_FACTOR, _RATE_ERROR_FACTOR, 1.0] * scales)
+
+
+def camera_motions(
+    lenses: Mapping[str, Camera],
+    poses: Mapping[str, tuple[FloatArray, IntArray]],
+    rotations: Mapping[str, RotationPath],
+    readout_s: Mapping[str, float],
+    readout_sigma_s: Mapping[str, float],
+    error_scales: Mapping[str, FloatArray] | None = None,
+) -> dict[str, CameraMotion]:
+    """Return the motion of each camera with poses and a readout time, by camera name.
+
+    Args:
+        lenses: Camera models by camera name.
+        poses: Poses map_from_cam (N,4,4) and times (N,) in nanoseconds of the frames, by camera name.
+        rotations: Rotations of the cameras between frames without poses, by camera name.
+        readout_s: Readout times (seconds) by camera name.
+        readout_sigma_s: Their standard deviations (seconds) by camera name; 0 for a camera without an entry.
+        error_scales: See `CameraMotion`, by camera name.
+    """
+    return {
+        name: CameraMotion(
+            camera=lenses[name],
+            # Shrunk velocities are too slow where a hand shakes, so readout times would be too long.
+            path=PosePath.create(map_from_cam, times_ns, rotations.get(name), shrunk=False),
+            readout_s=readout_s[name],
+            readout_sigma_s=readout_sigma_s.get(name, 0.0),
+            interval_s=1e-9 * float(np.median(np.diff(times_ns))),
+            error_scales=(error_scales or {}).get(name),
+        )
+        for name, (map_from_cam, times_ns) in poses.items()
+        if name in lenses and readout_s.get(name)
+    }

@@ -1,14 +1,16 @@
-"""Adjust keyframes of rolling shutters together with their velocities.
+"""Adjust keyframes of rolling shutters together with their velocities and readout times.
 
 Between two frames, a hand turns otherwise than a smooth path through the poses of the frames. An adjustment
 with the velocities of this path moves poses and points until they agree with the wrong velocities. So the
-velocities are unknowns of the adjustment, too. The path gives their expected values.
+velocities are unknowns of the adjustment, too. The path gives their expected values. The same holds for a
+wrong readout time: it is an unknown that all keyframes of a camera have in common.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +36,9 @@ _MAX_ITERATIONS = 8
 """Maximum number of steps with one width of the loss. Evidence: none."""
 _POINT_DAMPING = 1e-9
 """Damping of a point, as a fraction of the trace of its information. It only prevents a singular matrix."""
+_MIN_NOISE_RATIO = 0.1
+"""Smallest noise that residuals can show, as a ratio of the expected noise. It only prevents a division by
+zero."""
 _NOT_SEEN_PX = 1e3
 """Residual (px) of a point that has no projection."""
 
@@ -57,6 +62,8 @@ class RowObservations:
             keyframe, map units.
         noise_px: Standard deviation of an observation, px.
         interval_s: (K,) frame interval of the camera of each keyframe, seconds.
+        readout: (K,) number of the readout time of the camera of each keyframe, one of R. Turns and shifts
+            are proportional to it.
     """
 
     lenses: Sequence[Camera]
@@ -69,21 +76,26 @@ class RowObservations:
     shift: FloatArray
     noise_px: float
     interval_s: FloatArray
+    readout: IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VelocityErrors:
-    """Expected errors of the velocities of the path, along each axis.
+class MotionErrors:
+    """Expected errors of the velocities of the path, along each axis, and of the readout times.
 
     Attributes:
         rate: (K,) of the angular velocity of each keyframe, rad/s.
         rate_change: (K,) of the change of the angular velocity in a frame interval, rad/s.
         velocity: (K,) of the velocity, map units per second.
+        readout_ratio: (R,) expected ratio of each readout time to that of the observations.
+        readout: (R,) expected error of this ratio.
     """
 
     rate: FloatArray
     rate_change: FloatArray
     velocity: FloatArray
+    readout_ratio: FloatArray
+    readout: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,68 +107,45 @@ class RollingMap:
         points: (P,3) points in the map frame.
         velocities: (K,9) corrections of the angular velocity (rad/s), of its change in a frame interval
             (rad/s) and of the velocity in the camera frame (map units per second).
+        readout_ratio: (R,) ratio of each readout time to that of the observations. It does not change the
+            displacements by the corrections of the velocities. If it did, a longer readout time would make
+            the same displacements cheaper, and all estimates would be too long.
     """
 
     cam_from_map: FloatArray
     points: FloatArray
     velocities: FloatArray
+    readout_ratio: FloatArray
 
-    def moved(self, step: FloatArray, point_step: FloatArray) -> RollingMap:
-        """Return the map after steps of the keyframes (K,15) and of the points (P,3)."""
+    def moved(self, step: FloatArray, point_step: FloatArray, readout_step: FloatArray) -> RollingMap:
+        """Return the map after steps of the keyframes (K,15), of the points (P,3) and of the ratios (R,)."""
         return RollingMap(
             cam_from_map=make_transform(so3_exp(step[:, :3]), step[:, 3:6]) @ self.cam_from_map,
             points=self.points + point_step,
             velocities=self.velocities + step[:, 6:],
+            readout_ratio=self.readout_ratio + readout_step,
         )
 
 
 def adjust_with_velocities(
-    seen: RowObservations, start: RollingMap, errors: VelocityErrors, widths_px: Sequence[float]
+    seen: RowObservations, start: RollingMap, errors: MotionErrors, width_px: float
 ) -> RollingMap:
-    """Minimise the residuals of all observations over poses, velocities and points, with a Cauchy loss.
+    """Minimise the residuals of all observations over poses, velocities, readout times and points.
 
-    The gauge is free. Intrinsics and readout times are constant.
+    The loss is that of Cauchy. The gauge is free. Intrinsics are constant.
 
     Args:
         seen: The observations.
         start: The map so far.
-        errors: The expected errors of the velocities of the path.
-        widths_px: Widths of the loss, px, one after the other. Large ones first keep observations that
-            disagree because the start is wrong. A width of 0 stands for the median absolute residual.
+        errors: The expected errors of the velocities of the path and of the readout times.
+        width_px: Width of the loss, px. A large one keeps observations that disagree because the start is
+            wrong.
 
     Source: Hedborg et al., "Rolling shutter bundle adjustment", CVPR 2012, for velocities in an adjustment;
         Triggs et al., "Bundle adjustment: a modern synthesis", 2000, section 6, for the reduced system.
     """
+    prior = _prior(seen, errors)
     found = start
-    for width_px in widths_px:
-        width = width_px or max(0.1 * seen.noise_px, float(np.median(np.abs(_residuals(seen, found)[0]))))
-        found = _adjust(seen, found, errors, width)
-    return found
-
-
-def px_at_mid_row(seen: RowObservations, found: RollingMap) -> FloatArray:
-    """Return the observed pixels (M,2) moved to the instant of the middle row.
-
-    They are the projections of the points at this instant plus the residuals of the adjustment, which are
-    not turned with the camera. A point without a projection keeps its detected pixel.
-    """
-    k = seen.keyframe
-    residual, seen_at = _residuals(seen, found)
-    pose = found.cam_from_map[k]
-    in_cam = np.einsum("mij,mj->mi", pose[:, :3, :3], found.points[seen.point]) + pose[:, :3, 3]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        px = _project(seen, in_cam[:, :2] / in_cam[:, 2:]) - residual
-    good = seen_at & (in_cam[:, 2] > 0.0) & np.isfinite(px).all(axis=1)
-    return np.where(good[:, None], px, seen.px)
-
-
-def _adjust(seen: RowObservations, found: RollingMap, errors: VelocityErrors, width_px: float) -> RollingMap:
-    """Return the map after Levenberg-Marquardt steps with one width of the loss."""
-    prior = np.zeros((len(found.cam_from_map), _UNKNOWNS))
-    for part, sigma in zip(
-        np.split(prior[:, 6:], 3, axis=1), (errors.rate, errors.rate_change, errors.velocity), strict=True
-    ):
-        part[:] = (seen.noise_px / sigma[:, None]) ** 2
     cost, damping = _cost(seen, found, prior, width_px), _FIRST_DAMPING
     for _ in range(_MAX_ITERATIONS):
         system = _Normal.create(seen, found, prior, width_px)
@@ -176,10 +165,96 @@ def _adjust(seen: RowObservations, found: RollingMap, errors: VelocityErrors, wi
     return found
 
 
-def _cost(seen: RowObservations, found: RollingMap, prior: FloatArray, width_px: float) -> float:
+def readout_errors(seen: RowObservations, found: RollingMap, errors: MotionErrors) -> FloatArray:
+    """Return the standard deviations (R,) of the ratios of the readout times of an adjusted map.
+
+    They follow from the scatter of the influences of single keyframes, because the residuals of a keyframe
+    have common errors and its velocities may be wrong. A standard deviation is infinite if the adjustment
+    does not determine it.
+
+    Source: Liang, Zeger, "Longitudinal data analysis using generalized linear models", 1986, for the variance
+        of an estimate from clusters.
+    """
+    prior = _prior(seen, errors)
+    width_px = usual_residual_px(seen, found)
+    return _Normal.create(seen, found, prior, width_px).readout_errors(seen, found, prior, width_px)
+
+
+def usual_residual_px(seen: RowObservations, found: RollingMap) -> float:
+    """Return the median absolute residual, px; at least a part of the noise."""
+    return max(_MIN_NOISE_RATIO * seen.noise_px, float(np.median(np.abs(_residuals(seen, found)[0]))))
+
+
+def velocity_squares(seen: RowObservations, found: RollingMap, errors: MotionErrors) -> FloatArray:
+    """Return the expected squares (K,3) of the corrections of the velocities, along each axis.
+
+    They are the squares of the adjusted corrections plus the variances of their errors: of angular velocity,
+    (rad/s) squared; of its change in a frame interval, the same; and of velocity. The points are taken as
+    known.
+    """
+    width_px = usual_residual_px(seen, found)
+    own = _Normal.create(seen, found, _prior(seen, errors), width_px).own[:, :_UNKNOWNS, :_UNKNOWNS].copy()
+    axes = np.arange(_UNKNOWNS)
+    own[:, axes, axes] *= 1.0 + _MIN_DAMPING
+    own[:, axes, axes] += _POINT_DAMPING * np.maximum(own[:, axes, axes].max(axis=1, keepdims=True), 1.0)
+    variance = seen.noise_px**2 * np.linalg.inv(own)[:, axes, axes][:, 6:]
+    return np.asarray((found.velocities**2 + variance).reshape(-1, 3, 3).mean(axis=2))
+
+
+def px_at_mid_row(seen: RowObservations, found: RollingMap) -> FloatArray:
+    """Return the observed pixels (M,2) moved to the instant of the middle row.
+
+    They are the projections of the points at this instant plus the residuals of the adjustment, which are
+    not turned with the camera. A point without a projection keeps its detected pixel.
+    """
+    k = seen.keyframe
+    residual, seen_at = _residuals(seen, found)
+    pose = found.cam_from_map[k]
+    in_cam = np.einsum("mij,mj->mi", pose[:, :3, :3], found.points[seen.point]) + pose[:, :3, 3]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        px = _project(seen, in_cam[:, :2] / in_cam[:, 2:]) - residual
+    good = seen_at & (in_cam[:, 2] > 0.0) & np.isfinite(px).all(axis=1)
+    return np.where(good[:, None], px, seen.px)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Prior:
+    """Weights of the expected errors, in px squared, and the expected ratios of the readout times.
+
+    Attributes:
+        by_keyframe: (K,15) weights; 0 for the pose.
+        by_readout: (R,) weights.
+        readout_ratio: (R,) expected ratios.
+    """
+
+    by_keyframe: FloatArray
+    by_readout: FloatArray
+    readout_ratio: FloatArray
+
+    def cost(self, found: RollingMap) -> float:
+        """Return the cost of the deviations from the expected motion, px squared."""
+        own = float((self.by_keyframe[:, 6:] * found.velocities**2).sum())
+        return own + float((self.by_readout * (found.readout_ratio - self.readout_ratio) ** 2).sum())
+
+
+def _prior(seen: RowObservations, errors: MotionErrors) -> _Prior:
+    by_keyframe = np.zeros((len(errors.rate), _UNKNOWNS))
+    for part, sigma in zip(
+        np.split(by_keyframe[:, 6:], 3, axis=1),
+        (errors.rate, errors.rate_change, errors.velocity),
+        strict=True,
+    ):
+        part[:] = (seen.noise_px / sigma[:, None]) ** 2
+    return _Prior(
+        by_keyframe=by_keyframe,
+        by_readout=(seen.noise_px / errors.readout) ** 2,
+        readout_ratio=errors.readout_ratio,
+    )
+
+
+def _cost(seen: RowObservations, found: RollingMap, prior: _Prior, width_px: float) -> float:
     squared = (_residuals(seen, found)[0] ** 2).sum(axis=1)
-    loss = width_px**2 * np.log1p(squared / width_px**2)
-    return float(loss.sum() + (prior[:, 6:] * found.velocities**2).sum())
+    return float((width_px**2 * np.log1p(squared / width_px**2)).sum()) + prior.cost(found)
 
 
 def _at_exposure(
@@ -191,13 +266,15 @@ def _at_exposure(
         Points (M,3) at the exposure, points (M,3) at the middle row, rotation vectors (M,3) and rotations
         exposure_from_middle (M,3,3).
     """
-    k, delay = seen.keyframe, seen.delay_s[:, None]
+    k = seen.keyframe
+    ratio = found.readout_ratio[seen.readout[k]][:, None]
+    delay = seen.delay_s[:, None]
     pose = found.cam_from_map[k]
     at_middle = np.einsum("mij,mj->mi", pose[:, :3, :3], found.points[seen.point]) + pose[:, :3, 3]
     rate, change, velocity = np.split(found.velocities[k], 3, axis=1)
-    turn = seen.turn + delay * rate + (0.5 / seen.interval_s[k][:, None]) * delay**2 * change
+    turn = ratio * seen.turn + delay * rate + (0.5 / seen.interval_s[k][:, None]) * delay**2 * change
     rotation = so3_exp(-turn)
-    in_cam = np.einsum("mij,mj->mi", rotation, at_middle - seen.shift - delay * velocity)
+    in_cam = np.einsum("mij,mj->mi", rotation, at_middle - ratio * seen.shift - delay * velocity)
     return in_cam, at_middle, turn, rotation
 
 
@@ -221,43 +298,74 @@ def _residuals(seen: RowObservations, found: RollingMap) -> tuple[FloatArray, Bo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class _Factored:
+    """The reduced system of one step, factored.
+
+    Attributes:
+        factor: Factor of the reduced matrix (15K+R,15K+R), as `scipy.linalg.cho_solve` takes it.
+        coupling: (15K+R,3P) sparse coupling of keyframes and readout times with points, times `half`.
+        half: (P,3,3) roots of the inverse blocks of the points.
+    """
+
+    factor: tuple[FloatArray, bool]
+    coupling: Any
+    half: FloatArray
+
+    def solve(self, keyframes: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the solution (15K+R,) and (P,3) for right sides (15K+R,) and (P,3)."""
+        from scipy.linalg import cho_solve
+
+        from_points = np.einsum("pij,pi->pj", self.half, points).ravel()
+        own = cho_solve(self.factor, keyframes - self.coupling @ from_points, check_finite=False)
+        left = (from_points - self.coupling.T @ own).reshape(-1, 3)
+        return np.asarray(own), np.einsum("pij,pj->pi", self.half, left)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Normal:
     """The weighted normal equations of one step, with the points still to be eliminated.
 
     Attributes:
         keyframe: (M,) keyframe of each observation.
         point: (M,) point of each observation.
-        own: (K,15,15) blocks of the keyframes, with the prior.
-        gradient: (K,15) gradient of half the cost with respect to the keyframes.
+        readout: (K,) number of the readout time of each keyframe.
+        own: (K,16,16) blocks of the keyframes and their readout times, with the prior of the keyframes.
+        gradient: (15K+R,) gradient of half the cost with respect to keyframes and readout times.
+        by_readout: (R,) weights of the prior of the readout times.
         by_point: (P,3,3) blocks of the points.
         point_gradient: (P,3) gradient with respect to the points.
-        mixed: (M,15,3) blocks of keyframe and point of each observation.
+        mixed: (M,16,3) blocks of each observation: of keyframe and readout time with its point.
     """
 
     keyframe: IntArray
     point: IntArray
+    readout: IntArray
     own: FloatArray
     gradient: FloatArray
+    by_readout: FloatArray
     by_point: FloatArray
     point_gradient: FloatArray
     mixed: FloatArray
 
     @staticmethod
-    def create(seen: RowObservations, found: RollingMap, prior: FloatArray, width_px: float) -> _Normal:
+    def create(seen: RowObservations, found: RollingMap, prior: _Prior, width_px: float) -> _Normal:
         residual, valid = _residuals(seen, found)
         by_keyframe, by_point = _derivatives(seen, found, valid)
-        weight = valid / (1.0 + (residual**2).sum(axis=1) / width_px**2)
+        weight = _weights(residual, valid, width_px)
+        count, size = len(prior.by_keyframe), _UNKNOWNS + 1
         order = np.argsort(seen.keyframe, kind="stable")
-        bounds = np.searchsorted(seen.keyframe[order], np.arange(len(prior) + 1))
-        own = np.zeros((len(prior), _UNKNOWNS, _UNKNOWNS))
-        gradient = np.zeros((len(prior), _UNKNOWNS))
-        gradient[:, 6:] = prior[:, 6:] * found.velocities
-        for number in range(len(prior)):
+        bounds = np.searchsorted(seen.keyframe[order], np.arange(count + 1))
+        own, sums = np.zeros((count, size, size)), np.zeros((count, size))
+        for number in range(count):
             rows = order[bounds[number] : bounds[number + 1]]
-            flat = by_keyframe[rows].reshape(-1, _UNKNOWNS)
+            flat = by_keyframe[rows].reshape(-1, size)
             weighted = flat * np.repeat(weight[rows], 2)[:, None]
-            own[number] = weighted.T @ flat + np.diag(prior[number])
-            gradient[number] += weighted.T @ residual[rows].ravel()
+            own[number] = weighted.T @ flat
+            sums[number] = weighted.T @ residual[rows].ravel()
+        own[:, np.arange(_UNKNOWNS), np.arange(_UNKNOWNS)] += prior.by_keyframe
+        sums[:, 6:_UNKNOWNS] += prior.by_keyframe[:, 6:] * found.velocities
+        by_readout = prior.by_readout * (found.readout_ratio - prior.readout_ratio)
+        np.add.at(by_readout, seen.readout, sums[:, _UNKNOWNS])
         weighted = by_point * weight[:, None, None]
         blocks, point_gradient = np.zeros((len(found.points), 3, 3)), np.zeros((len(found.points), 3))
         np.add.at(blocks, seen.point, np.einsum("mdi,mdj->mij", weighted, by_point))
@@ -265,49 +373,117 @@ class _Normal:
         return _Normal(
             keyframe=seen.keyframe,
             point=seen.point,
+            readout=seen.readout,
             own=own,
-            gradient=gradient,
+            gradient=np.concatenate([sums[:, :_UNKNOWNS].ravel(), by_readout]),
+            by_readout=prior.by_readout,
             by_point=blocks,
             point_gradient=point_gradient,
             mixed=np.einsum("mdi,mdj->mij", by_keyframe, weighted),
         )
 
-    def solve(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
-        """Return the steps (K,15) of the keyframes and (P,3) of the points; None if there is no step."""
-        from scipy.linalg import LinAlgError, cho_factor, cho_solve
-        from scipy.sparse import csr_array
+    def solve(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Return the steps of keyframes (K,15), points (P,3) and readouts (R,); None if there is no step."""
+        factored = self.factored(damping)
+        if factored is None:
+            return None
+        step, point_step = factored.solve(-self.gradient, -self.point_gradient)
+        own, readouts = np.split(step, [_UNKNOWNS * len(self.own)])
+        return own.reshape(-1, _UNKNOWNS), point_step, readouts
 
-        count, size = self.gradient.shape
-        axes = np.arange(3)
+    def places(self) -> IntArray:
+        """Return the unknowns (K,16) of the reduced system that belong to each keyframe."""
+        count = len(self.own)
+        first = _UNKNOWNS * np.arange(count)[:, None] + np.arange(_UNKNOWNS)
+        return np.concatenate([first, _UNKNOWNS * count + self.readout[:, None]], axis=1)
+
+    def factored(self, damping: float) -> _Factored | None:
+        """Return the reduced system with damping; None if it is singular."""
+        from scipy.linalg import LinAlgError, cho_factor
+        from scipy.sparse import bsr_array, csr_array, vstack
+
+        places, axes = self.places(), np.arange(3)
         diagonal = self.by_point[:, axes, axes]
         damped = self.by_point.copy()
         trace = diagonal.sum(axis=1, keepdims=True)
         damped[:, axes, axes] += damping * diagonal + _POINT_DAMPING * np.maximum(trace, 1.0)
         half = np.linalg.cholesky(np.linalg.inv(damped))
-        mixed = self.mixed @ half[self.point]
-        rows = np.broadcast_to(size * self.keyframe[:, None, None] + np.arange(size)[:, None], mixed.shape)
-        columns = np.broadcast_to(3 * self.point[:, None, None] + axes, mixed.shape)
-        coupling = csr_array(
-            (mixed.ravel(), (rows.ravel(), columns.ravel())), shape=(size * count, 3 * len(half))
+        order = np.argsort(self.keyframe, kind="stable")
+        mixed = self.mixed[order] @ half[self.point[order]]
+        bounds = np.searchsorted(self.keyframe[order], np.arange(len(self.own) + 1))
+        shape = len(self.gradient), 3 * len(half)
+        # The product of blocks is several times faster than that of single numbers.
+        by_keyframe = bsr_array(
+            (np.ascontiguousarray(mixed[:, :_UNKNOWNS]), self.point[order], bounds),
+            shape=(_UNKNOWNS * len(self.own), shape[1]),
         )
-        reduced = (coupling @ coupling.T).toarray()
+        readout = np.broadcast_to(self.readout[self.keyframe[order]][:, None], mixed[:, -1].shape)
+        columns = 3 * self.point[order][:, None] + axes
+        by_readout = csr_array(
+            (mixed[:, -1].ravel(), (readout.ravel(), columns.ravel())),
+            shape=(len(self.by_readout), shape[1]),
+        )
+        common = (by_keyframe @ by_readout.T).toarray()
+        reduced = np.empty((shape[0], shape[0]))
+        first = by_keyframe.shape[0]
+        reduced[:first, :first] = (by_keyframe @ by_keyframe.T).toarray()
+        reduced[:first, first:], reduced[first:, :first] = common, common.T
+        reduced[first:, first:] = (by_readout @ by_readout.T).toarray()
         np.negative(reduced, out=reduced)
-        for number, block in enumerate(self.own):
-            place = slice(size * number, size * number + size)
-            own = np.diag(block)
-            reduced[place, place] += block + np.diag(damping * own + _POINT_DAMPING * max(own.max(), 1.0))
-        from_points = np.einsum("pij,pi->pj", half, self.point_gradient).ravel()
+        coupling = vstack([by_keyframe.tocsr(), by_readout], format="csr")
+        for place, block in zip(places, self.own, strict=True):
+            reduced[place[:, None], place] += block
+            own = np.diag(block)[:_UNKNOWNS]
+            reduced[place[:_UNKNOWNS], place[:_UNKNOWNS]] += damping * own + _POINT_DAMPING * max(
+                own.max(), 1.0
+            )
+        last = np.arange(shape[0] - len(self.by_readout), shape[0])
+        reduced[last, last] += self.by_readout
         try:
             factor = cho_factor(reduced, overwrite_a=True, check_finite=False)
         except LinAlgError:
             return None
-        step = cho_solve(factor, coupling @ from_points - self.gradient.ravel(), check_finite=False)
-        point_step = -np.einsum("pij,pj->pi", half, (from_points + coupling.T @ step).reshape(-1, 3))
-        return step.reshape(count, size), point_step
+        return _Factored(factor=factor, coupling=coupling, half=half)
+
+    def readout_errors(
+        self, seen: RowObservations, found: RollingMap, prior: _Prior, width_px: float
+    ) -> FloatArray:
+        """Return the standard deviations (R,) of the ratios of the readout times; see `readout_errors`."""
+        count = len(self.by_readout)
+        factored = self.factored(_MIN_DAMPING)
+        if factored is None:
+            return np.full(count, np.inf)
+        residual, valid = _residuals(seen, found)
+        by_keyframe, by_point = _derivatives(seen, found, valid)
+        force = residual * _weights(residual, valid, width_px)[:, None]
+        out = np.empty(count)
+        for number in range(count):
+            unit = np.zeros(len(self.gradient))
+            unit[number - count] = 1.0
+            own, points = factored.solve(unit, np.zeros_like(self.point_gradient))
+            change = np.einsum("mdi,mi->md", by_keyframe, own[self.places()][self.keyframe])
+            change += np.einsum("mdi,mi->md", by_point, points[self.point])
+            influence = np.bincount(self.keyframe, (change * force).sum(axis=1), minlength=len(self.own))
+            # An expected velocity is an observation, too. So is an expected readout time.
+            expected = prior.by_keyframe[:, 6:] * found.velocities
+            influence += (own[self.places()[:, 6:_UNKNOWNS]] * expected).sum(axis=1)
+            readout = own[number - count] * seen.noise_px
+            out[number] = np.sqrt((influence**2).sum() + readout**2 * self.by_readout[number])
+        return out
+
+
+def _weights(residual: FloatArray, valid: BoolArray, width_px: float) -> FloatArray:
+    """Return the weights (M,) of residuals (M,2) with a Cauchy loss."""
+    return np.asarray(valid / (1.0 + (residual**2).sum(axis=1) / width_px**2))
 
 
 def _derivatives(seen: RowObservations, found: RollingMap, valid: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives of the residuals with respect to keyframes (M,2,15) and points (M,2,3)."""
+    """Return the derivatives of the residuals.
+
+    Returns:
+        The derivatives (M,2,16) with respect to the keyframes and the ratio of their readout time, and
+        (M,2,3) with respect to the points.
+    """
     in_cam, at_middle, turn, rotation = _at_exposure(seen, found)
     depth = np.where(valid, in_cam[:, 2], 1.0)
     rays = in_cam[:, :2] / depth[:, None]
@@ -323,15 +499,18 @@ def _derivatives(seen: RowObservations, found: RollingMap, valid: BoolArray) -> 
     by_exposed = px_from_ray @ ray_from_cam / depth[:, None, None]
     by_middle = by_exposed @ rotation
     by_turn = by_exposed @ skew(in_cam) @ so3_right_jacobian(turn)
+    k = seen.keyframe
     delay = seen.delay_s[:, None, None]
+    by_ratio = np.einsum("mdi,mi->md", by_turn, seen.turn) - np.einsum("mdi,mi->md", by_middle, seen.shift)
     by_keyframe = np.concatenate(
         [
             -by_middle @ skew(at_middle),
             by_middle,
             by_turn * delay,
-            by_turn * (0.5 / seen.interval_s[seen.keyframe][:, None, None] * delay**2),
+            by_turn * (0.5 / seen.interval_s[k][:, None, None] * delay**2),
             -by_middle * delay,
+            by_ratio[:, :, None],
         ],
         axis=2,
     )
-    return by_keyframe, by_middle @ found.cam_from_map[seen.keyframe][:, :3, :3]
+    return by_keyframe, by_middle @ found.cam_from_map[k][:, :3, :3]

@@ -10,13 +10,16 @@ import pytest
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.mapping.reconstruction.rolling_adjustment import (
+    MotionErrors,
     RollingMap,
     RowObservations,
-    VelocityErrors,
     _derivatives,
     _residuals,
     adjust_with_velocities,
     px_at_mid_row,
+    readout_errors,
+    usual_residual_px,
+    velocity_squares,
 )
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import (
@@ -36,6 +39,7 @@ FRAME_S = 1 / 30
 FRAMES = 40
 KEYFRAMES = np.array([1, 2, 4, 5, 8, 9, 11, 14, 15, 17, 18, 21, 23, 24, 27, 29, 30, 32, 35, 36, 38])
 NOISE_PX = 0.2
+EXACT = 1e-6
 
 
 def poses_at(time_s: npt.ArrayLike) -> FloatArray:
@@ -51,12 +55,12 @@ def poses_at(time_s: npt.ArrayLike) -> FloatArray:
     return make_transform(so3_exp(np.stack(turn, axis=1)), np.stack(centre, axis=1))
 
 
-def scene() -> tuple[RowObservations, RollingMap, VelocityErrors]:
+def scene(*, shrunk: bool = False) -> tuple[RowObservations, RollingMap, MotionErrors]:
     """Observations of a wall, the true map, and the expected errors of the path through the true frames."""
     rng = np.random.default_rng(3)
     points = rng.uniform((-4, -3, 3), (4, 3, 6), (400, 3))
     times_s = np.arange(FRAMES) * FRAME_S
-    path = PosePath.create(poses_at(times_s), np.round(times_s * 1e9).astype(np.int64))
+    path = PosePath.create(poses_at(times_s), np.round(times_s * 1e9).astype(np.int64), shrunk=shrunk)
     keyframe, point, px = [], [], []
     for number, frame in enumerate(KEYFRAMES.tolist()):
         delay = np.zeros(len(points))
@@ -82,13 +86,21 @@ def scene() -> tuple[RowObservations, RollingMap, VelocityErrors]:
         shift=shift,
         noise_px=0.7,
         interval_s=np.full(len(KEYFRAMES), FRAME_S),
+        readout=np.zeros(len(KEYFRAMES), np.int64),
     )
     truth = RollingMap(
         cam_from_map=invert(poses_at(times_s[KEYFRAMES])),
         points=points,
         velocities=np.zeros((len(KEYFRAMES), 9)),
+        readout_ratio=np.ones(1),
     )
-    errors = VelocityErrors(rate=3.0 * rate, rate_change=3.0 * change, velocity=velocity)
+    errors = MotionErrors(
+        rate=3.0 * rate,
+        rate_change=3.0 * change,
+        velocity=velocity,
+        readout_ratio=np.ones(1),
+        readout=np.full(1, EXACT),
+    )
     return seen_rows, truth, errors
 
 
@@ -97,6 +109,12 @@ def centre_error(found: RollingMap, truth: RollingMap) -> float:
     here, there = (invert(each.cam_from_map)[:, :3, 3] for each in (found, truth))
     fit = align_points(here, there)
     return float(np.sqrt(((fit.apply(here) - there) ** 2).sum(axis=1).mean()))
+
+
+def adjusted(seen: RowObservations, start: RollingMap, errors: MotionErrors) -> RollingMap:
+    """Return the map after an adjustment with a wide loss, and one with the width of the usual residual."""
+    found = adjust_with_velocities(seen, start, errors, 4.0 * seen.noise_px)
+    return adjust_with_velocities(seen, found, errors, usual_residual_px(seen, found))
 
 
 def test_derivatives_are_those_of_the_residuals() -> None:
@@ -109,14 +127,17 @@ def test_derivatives_are_those_of_the_residuals() -> None:
     for axis in range(15):
         step = np.zeros((len(KEYFRAMES), 15))
         step[:, axis] = 1e-6
-        change = (_residuals(seen, found.moved(step, nothing))[0] - residual) / 1e-6
+        change = (_residuals(seen, found.moved(step, nothing, np.zeros(1)))[0] - residual) / 1e-6
         assert change == pytest.approx(by_keyframe[:, :, axis], abs=0.02, rel=1e-3)
     for axis in range(3):
         step = nothing.copy()
         step[:, axis] = 1e-6
-        moved = found.moved(np.zeros((len(KEYFRAMES), 15)), step)
+        moved = found.moved(np.zeros((len(KEYFRAMES), 15)), step, np.zeros(1))
         change = (_residuals(seen, moved)[0] - residual) / 1e-6
         assert change == pytest.approx(by_point[:, :, axis], abs=0.02, rel=1e-3)
+    moved = found.moved(np.zeros((len(KEYFRAMES), 15)), nothing, np.full(1, 1e-6))
+    change = (_residuals(seen, moved)[0] - residual) / 1e-6
+    assert change == pytest.approx(by_keyframe[:, :, 15], abs=0.02, rel=1e-3)
 
 
 def rate_errors(found: RollingMap) -> FloatArray:
@@ -129,8 +150,8 @@ def rate_errors(found: RollingMap) -> FloatArray:
 
 
 def test_velocities_that_the_path_does_not_contain_are_found() -> None:
-    seen, truth, errors = scene()
-    found = adjust_with_velocities(seen, truth, errors, (2.8, 0.0))
+    seen, truth, errors = scene(shrunk=True)
+    found = adjusted(seen, truth, errors)
     # The shake turns by 1.4 rad/s at most. The rows of 150 points tell it to some 0.1 rad/s.
     assert np.median(rate_errors(truth)) > 0.1
     assert np.median(rate_errors(found)) < 0.5 * np.median(rate_errors(truth))
@@ -142,6 +163,40 @@ def test_velocities_that_the_path_does_not_contain_are_found() -> None:
         for px in (seen.px, px_at_mid_row(seen, found))
     )
     assert corrected < 0.5 * off
+
+
+def with_readout_ratio(seen: RowObservations, ratio: float) -> RowObservations:
+    """Return observations whose expected motion is that of another readout time."""
+    parts = {name: ratio * getattr(seen, name) for name in ("delay_s", "turn", "shift")}
+    return replace(seen, **parts)
+
+
+@pytest.mark.parametrize("ratio", [0.8, 1.2])
+def test_a_wrong_readout_time_is_corrected(ratio: float) -> None:
+    seen, truth, errors = scene()
+    wrong = with_readout_ratio(seen, ratio)
+    loose = replace(errors, readout=np.full(1, 0.5))
+    found = adjusted(wrong, truth, loose)
+    sigma = float(readout_errors(wrong, found, loose)[0])
+    off = float(found.readout_ratio[0]) * ratio - 1.0
+    # The spline is some per cent too slow for a shake of 7 Hz at 30 frames/s.
+    assert abs(off) < 0.05
+    assert 0.001 < sigma * ratio < 0.03
+
+
+def test_a_readout_time_that_is_known_otherwise_counts_as_an_observation() -> None:
+    seen, truth, errors = scene()
+    expected = replace(errors, readout_ratio=np.full(1, 1.2), readout=np.full(1, EXACT))
+    found = adjust_with_velocities(seen, truth, expected, usual_residual_px(seen, truth))
+    assert found.readout_ratio == pytest.approx(1.2, abs=1e-4)
+    assert readout_errors(seen, found, expected) == pytest.approx(EXACT, rel=0.01)
+
+
+def test_a_camera_that_does_not_move_tells_no_readout_time() -> None:
+    seen, truth, errors = scene()
+    still = with_readout_ratio(seen, 0.0)
+    expected = replace(errors, readout=np.full(1, 0.3))
+    assert readout_errors(still, truth, expected) == pytest.approx(0.3)
 
 
 def test_without_a_shutter_nothing_but_noise_is_adjusted() -> None:
@@ -157,11 +212,22 @@ def test_without_a_shutter_nothing_but_noise_is_adjusted() -> None:
         turn=np.zeros_like(seen.turn),
         shift=np.zeros_like(seen.shift),
     )
-    found = adjust_with_velocities(still, truth, errors, (0.0,))
+    found = adjust_with_velocities(still, truth, errors, usual_residual_px(still, truth))
     assert np.abs(found.velocities).max() < 1e-9
     # 0.2 px at 400 px and 4 m is 2 mm; 150 points determine a keyframe to a fraction of it.
     assert centre_error(found, truth) < 0.002
     assert px_at_mid_row(still, found) == pytest.approx(still.px, abs=1e-6)
+
+
+def test_the_errors_of_velocities_are_told_by_their_corrections() -> None:
+    seen, truth, errors = scene(shrunk=True)
+    found = adjusted(seen, truth, errors)
+    noise = replace(seen, noise_px=NOISE_PX)
+    told = np.sqrt(velocity_squares(noise, found, errors)[:, 0])
+    # Each square is a correction and its variance, so it is not less than the correction.
+    assert (told**2 >= (found.velocities[:, :3] ** 2).mean(axis=1)).all()
+    true = rate_errors(truth) / np.sqrt(3.0)
+    assert 0.5 < np.sqrt((told**2).mean() / (true**2).mean()) < 2.0
 
 
 def test_a_point_behind_the_camera_keeps_its_pixel_and_moves_nothing() -> None:
@@ -169,7 +235,7 @@ def test_a_point_behind_the_camera_keeps_its_pixel_and_moves_nothing() -> None:
     behind = replace(truth, points=truth.points.copy())
     lost = int(seen.point[0])
     behind.points[lost] = (0.0, 0.0, -50.0)
-    found = adjust_with_velocities(seen, behind, errors, (0.0,))
+    found = adjust_with_velocities(seen, behind, errors, usual_residual_px(seen, behind))
     rows = seen.point == lost
     assert np.isfinite(found.cam_from_map).all()
     assert np.isfinite(found.points).all()

@@ -18,7 +18,9 @@ from bodycap_batch.mapping.intrinsics.readout_time import (
     Readout,
     RollingShutterModel,
     estimate_readouts,
+    judged_readout,
     map_with_readouts,
+    stated_readout,
 )
 from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
 from bodycap_batch.mapping.refine import distorted_cameras
@@ -124,13 +126,13 @@ def camera_of(
     )
 
 
-def misfit_px(model: Any, film: Film) -> float:
-    """Mean distance of a model's pixels from its points under the true poses."""
-    off = []
+def misfit_px(model: Any, film: Film, true: Any = None) -> float:
+    """Mean distance of a model's pixels from its points, or those of the true model, under the true poses."""
+    off, true = [], model if true is None else true
     for image_id in model.reg_image_ids():
         image = model.image(image_id)
         points = np.array(
-            [model.point3D(each.point3D_id).xyz for each in image.points2D if each.has_point3D()]
+            [true.point3D(each.point3D_id).xyz for each in image.points2D if each.has_point3D()]
         )
         px = np.array([each.xy for each in image.points2D if each.has_point3D()])
         cam_from_map = invert(film.map_from_cam[int(image.name[-7:])])
@@ -211,24 +213,54 @@ def test_a_map_is_built_again_only_if_a_shutter_found_late_displaces_keypoints_f
     assert distorted_cameras(rolling, {"head": 0.04}, ("head",)) == set()
 
 
-def test_keyframes_are_adjusted_together_with_their_velocities() -> None:
-    film = Film(0.02)
+def model_with_inexact_path(film: Film, sigma_rad: float = 0.002) -> Any:
+    """A model whose frames have noisy poses, so their velocities are inexact."""
     path = film.trajectory()
-    jitter = np.random.default_rng(2).normal(0.0, 0.01, (FRAMES, 3))
+    jitter = np.random.default_rng(2).normal(0.0, sigma_rad, (FRAMES, 3))
     inexact = path.gauge_from_cam @ make_transform(so3_exp(jitter), np.zeros((FRAMES, 3)))
-    rolling = RollingShutterModel(
+    return RollingShutterModel(
         the_map(film, range(1, FRAMES, 5)),
         {"head": replace(path, gauge_from_cam=inexact)},
         {"head": camera_of(film)},
     )
+
+
+def test_keyframes_are_adjusted_together_with_their_velocities() -> None:
+    film = Film(0.02)
+    rolling = model_with_inexact_path(film, 0.005)
     model = rolling.corrected({"head": 0.02})
+    true = rolling.corrected({})
     dropped = next(iter(model.point3D_ids()))
     model.delete_point3D(dropped)
-    before = misfit_px(model, film)
-    assert rolling.adjust_with_velocities(model, {"head": 0.02})
-    # Without noise in the start, pixels are corrected to their noise of 0.38 px. The gauge may move a little.
-    assert misfit_px(model, film) < 0.8 < 0.7 * before
+    before = misfit_px(model, film, true)
+    assert rolling.adjust_with_velocities(model, {"head": stated_readout(0.02)}) is not None
+    # The noise of the pixels is 0.38 px.
+    assert misfit_px(model, film, true) < 0.5 < 0.8 * before
     assert not model.exists_point3D(dropped)
+
+
+def test_the_readout_time_is_adjusted_together_with_the_keyframes() -> None:
+    film = Film(0.02)
+    rolling = model_with_inexact_path(film)
+    start = {"head": judged_readout(0.015, 0.003), "other": judged_readout(0.0, 0.0001)}
+    adjusted = rolling.adjust_with_velocities(rolling.corrected({"head": 0.015}), start).readouts
+    assert adjusted["head"].source == "estimated"
+    # The poses of the path jump by 2 mrad from frame to frame.
+    assert adjusted["head"].sigma_s < 0.0005
+    assert abs(adjusted["head"].seconds - 0.02) < 3.0 * adjusted["head"].sigma_s
+    assert adjusted["other"] == start["other"]
+
+
+def test_an_adjustment_weights_readout_times_from_elsewhere() -> None:
+    film = Film(0.02)
+    rolling = model_with_inexact_path(film)
+    start = {"head": judged_readout(0.015, 0.003)}
+    elsewhere = {"head": judged_readout(0.016, 1e-7)}
+    model = rolling.corrected({"head": 0.015})
+    adjusted = rolling.adjust_with_velocities(model, start, elsewhere).readouts
+    assert adjusted["head"].seconds == pytest.approx(0.016, abs=1e-5)
+    # Only the common error of all splines is left.
+    assert adjusted["head"].sigma_s == pytest.approx(np.hypot(0.0001, 0.012 * 0.016), rel=0.01)
 
 
 def test_velocities_of_a_smooth_path_are_exact_enough() -> None:
@@ -236,7 +268,7 @@ def test_velocities_of_a_smooth_path_are_exact_enough() -> None:
     rolling = rolling_model(film)
     model = rolling.corrected({"head": 0.02})
     before = misfit_px(model, film)
-    assert not rolling.adjust_with_velocities(model, {"head": 0.02})
+    assert rolling.adjust_with_velocities(model, {"head": stated_readout(0.02)}) is None
     assert misfit_px(model, film) == before
 
 
@@ -244,7 +276,7 @@ def test_without_a_readout_time_keypoints_stay_where_they_are() -> None:
     film = Film(0.02)
     rolling = rolling_model(film)
     model, before = rolling.corrected({}), rolling.corrected({})
-    assert not rolling.adjust_with_velocities(model, {})
+    assert rolling.adjust_with_velocities(model, {}) is None
     for number in model.reg_image_ids():
         pairs = zip(model.image(number).points2D, before.image(number).points2D, strict=True)
         assert all(one.xy == pytest.approx(other.xy, abs=1e-6) for one, other in pairs)

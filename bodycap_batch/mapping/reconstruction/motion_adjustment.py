@@ -1,0 +1,302 @@
+"""Adjust a map of rolling shutters together with the motion of its cameras, in a few passes.
+
+Each pass starts from what the last one found: the paths of the cameras between their keyframes, the noise of
+the observations, and how wrong the velocities of the paths usually are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.mapping.reconstruction.camera_motion import camera_motions
+from bodycap_batch.mapping.reconstruction.rolling_adjustment import (
+    MotionErrors,
+    RollingMap,
+    RowObservations,
+    adjust_with_velocities,
+    px_at_mid_row,
+    readout_errors,
+    usual_residual_px,
+    velocity_squares,
+)
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import interpolate_pose, invert, make_transform
+from bodycap_batch.model.optical_flow import pixel_scale
+from bodycap_batch.model.rotation_path import RotationPath
+
+_NOISE_PX = 0.7
+"""Standard deviation of an observation in the first pass, px of an image with a long side of 640 px. Origin:
+the same as for angular velocities in `model.rotation_path`."""
+_FIRST_LOSS_WIDTH = 4.0
+"""Width of the loss in the first pass, in standard deviations of an observation. It keeps observations that
+disagree because the velocities of the path are wrong. The later width is the median residual. Evidence:
+docs/decisions/mapping.md."""
+_LATER_PASSES = 2
+"""Number of passes with the noise and the errors that the residuals show. Evidence:
+docs/decisions/mapping.md."""
+_MEDIAN_OF_NORMAL = 0.6745
+"""Median absolute value of a normal variable, in its standard deviations."""
+_EXACT_RATIO = 0.5
+"""A path is exact enough if its expected errors displace keypoints by less than this ratio of the noise.
+Origin: they then add 12 % to the noise."""
+_EXACT_PERCENT = 95.0
+"""Percentile of these displacements. Evidence: none."""
+_NO_MOTION_SIGMA = 1e-6
+"""Expected error of a velocity that moves no observation, and of a given readout time as a ratio. It only
+prevents a division by zero."""
+_FREEDOM = 3.0
+"""Degrees of freedom of the distribution of the errors of velocities: a few errors are much larger than
+usual, where a hand hits something or the recorded motion jumps. Evidence: docs/decisions/mapping.md."""
+_SCALE_STEPS = 20
+"""Number of steps in which the usual size of the errors is computed. They converge by a factor of two or more
+each."""
+_MIN_OBSERVATIONS = 12
+"""Minimum number of observations of a keyframe that tells how wrong velocities are. Evidence: none."""
+_MIN_SCALE = 0.05
+"""Smallest factor of the expected errors of velocities. It only prevents that an exact path leaves no
+freedom."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdjustedMap:
+    """The result of an adjustment.
+
+    Attributes:
+        cam_from_map: (K,4,4) poses of the keyframes at the exposure of the middle row.
+        points: (P,3) points in the map frame.
+        px_at_mid_row: (M,2) observed pixels at the exposure of the middle row.
+        readouts: Readout time and standard deviation (seconds) by camera name.
+        error_scales: (N,3) factors of the expected errors of the velocities of each frame, by camera name.
+            They are 1 for a frame that is no keyframe.
+    """
+
+    cam_from_map: FloatArray
+    points: FloatArray
+    px_at_mid_row: FloatArray
+    readouts: dict[str, tuple[float, float]]
+    error_scales: dict[str, FloatArray]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionAdjustment:
+    """An adjustment of keyframes, points, velocities and readout times.
+
+    K is the number of keyframes, M the number of observations.
+
+    Attributes:
+        lenses: Camera models by camera name.
+        poses: Poses map_from_cam (N,4,4) and times (N,) in nanoseconds of the frames, by camera name.
+        rotations: Rotations of the cameras between frames without poses, by camera name.
+        camera: (K) camera names of the keyframes.
+        frame: (K,) frame indices of the keyframes.
+        keyframe: (M,) keyframe of each observation, not decreasing.
+        point: (M,) observed point.
+        px: (M,2) detected pixel.
+    """
+
+    lenses: Mapping[str, Camera]
+    poses: Mapping[str, tuple[FloatArray, IntArray]]
+    rotations: Mapping[str, RotationPath]
+    camera: tuple[str, ...]
+    frame: IntArray
+    keyframe: IntArray
+    point: IntArray
+    px: FloatArray
+
+    def run(
+        self,
+        cam_from_map: FloatArray,
+        points: FloatArray,
+        readout_s: Mapping[str, float],
+        expected_s: Mapping[str, tuple[float, float]],
+    ) -> AdjustedMap | None:
+        """Return the adjusted map; None if the velocities of the paths are exact enough.
+
+        Cameras with equal readout times have one unknown readout time in common.
+
+        Args:
+            cam_from_map: (K,4,4) poses of the keyframes at the start.
+            points: (P,3) points at the start.
+            readout_s: Readout times of the cameras with rolling shutters at the start, by camera name,
+                seconds.
+            expected_s: Their expected values and standard deviations before the adjustment, seconds. A
+                readout time with a standard deviation of 0 is constant.
+        """
+        start_s = np.array(sorted(set(readout_s.values())) or [0.0])
+        number = {name: int(np.searchsorted(start_s, value)) for name, value in readout_s.items()}
+        expected = np.ones((len(start_s), 2)) * (1.0, _NO_MOTION_SIGMA)
+        for name, index in number.items():
+            expected[index] = np.array(expected_s[name]) / start_s[index]
+        scales: FloatArray = np.ones((len(self.camera), 3))
+        ratio: FloatArray = np.ones(len(start_s))
+        found = RollingMap(
+            cam_from_map=cam_from_map,
+            points=points,
+            velocities=np.zeros((len(cam_from_map), 9)),
+            readout_ratio=ratio,
+        )
+        noise_px = _NOISE_PX * max(
+            pixel_scale(each.width_px, each.height_px) for each in self.lenses.values()
+        )
+        for passed in range(1 + _LATER_PASSES):
+            at_s = {name: float(start_s[index] * ratio[index]) for name, index in number.items()}
+            seen, own = self._observations(found.cam_from_map, at_s, number, len(start_s), noise_px)
+            errors = _motion_errors(own * scales, expected / ratio[:, None])
+            if not passed and self._is_exact_enough(seen, errors):
+                return None
+            found = replace(
+                found, velocities=np.zeros_like(found.velocities), readout_ratio=np.ones_like(ratio)
+            )
+            width_px = usual_residual_px(seen, found) if passed else _FIRST_LOSS_WIDTH * noise_px
+            found = adjust_with_velocities(seen, found, errors, width_px)
+            ratio = ratio * found.readout_ratio
+            noise_px = usual_residual_px(seen, found) / _MEDIAN_OF_NORMAL
+            squares = velocity_squares(replace(seen, noise_px=noise_px), found, errors)
+            scales = self._error_scales(squares / own**2)
+        sigma_s = start_s * ratio * readout_errors(seen, found, errors) / found.readout_ratio
+        return AdjustedMap(
+            cam_from_map=found.cam_from_map,
+            points=found.points,
+            px_at_mid_row=px_at_mid_row(seen, found),
+            readouts={
+                name: (float(start_s[index] * ratio[index]), float(sigma_s[index]))
+                for name, index in number.items()
+            },
+            error_scales=self._scales_of_frames(scales),
+        )
+
+    def _observations(
+        self,
+        cam_from_map: FloatArray,
+        readout_s: Mapping[str, float],
+        number: Mapping[str, int],
+        count: int,
+        noise_px: float,
+    ) -> tuple[RowObservations, FloatArray]:
+        """Return all observations, and the expected errors (K,3) of the velocities of the paths.
+
+        Args:
+            cam_from_map: (K,4,4) poses of the keyframes so far.
+            readout_s: Readout times by camera name, seconds.
+            number: Numbers of the readout times by camera name.
+            count: Number of readout times.
+            noise_px: Standard deviation of an observation, px.
+        """
+        names, camera = sorted(self.lenses), np.array(self.camera)
+        delay = np.zeros(len(self.px))
+        turn, shift = np.zeros((len(self.px), 3)), np.zeros((len(self.px), 3))
+        errors, interval_s = np.full((len(camera), 3), _NO_MOTION_SIGMA), np.ones(len(camera))
+        poses = {name: self._moved_poses(name, cam_from_map) for name in self.poses}
+        motions = camera_motions(self.lenses, poses, self.rotations, readout_s, {})
+        for name, motion in motions.items():
+            kept = camera == name
+            rows = kept[self.keyframe]
+            until = motion.until_exposure(self.frame[self.keyframe[rows]], self.px[rows])
+            delay[rows], turn[rows], shift[rows] = until.delay_s, until.turn, until.shift
+            errors[kept] = motion.errors(self.frame[kept])
+            interval_s[kept] = motion.interval_s
+        seen = RowObservations(
+            lenses=[self.lenses[name] for name in names],
+            lens=np.searchsorted(names, camera),
+            keyframe=self.keyframe,
+            point=self.point,
+            px=self.px,
+            delay_s=delay,
+            turn=turn,
+            shift=shift,
+            noise_px=noise_px,
+            interval_s=interval_s,
+            readout=np.array([number.get(name, count - 1) for name in self.camera], dtype=np.int64),
+        )
+        return seen, np.maximum(errors, _NO_MOTION_SIGMA)
+
+    def _is_exact_enough(self, seen: RowObservations, errors: MotionErrors) -> bool:
+        """Return True if the expected errors of the velocities displace no observation by much."""
+        focal_px = np.array([lens.focal_px for lens in seen.lenses])[seen.lens[seen.keyframe]]
+        expected_px = focal_px * np.abs(seen.delay_s) * errors.rate[seen.keyframe]
+        limit_px = _EXACT_RATIO * seen.noise_px
+        return not len(expected_px) or bool(np.percentile(expected_px, _EXACT_PERCENT) < limit_px)
+
+    def _moved_poses(self, name: str, cam_from_map: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Return the poses of a camera's frames, moved with its keyframes, and their times.
+
+        A frame between two keyframes gets a part of the changes of both, by its time. A frame before the
+        first or after the last keyframe gets the change of this keyframe.
+
+        Args:
+            name: Name of the camera.
+            cam_from_map: (K,4,4) poses of the keyframes.
+        """
+        poses, times_ns = self.poses[name]
+        rows = np.flatnonzero(np.array(self.camera) == name)
+        rows = rows[np.isfinite(poses[self.frame[rows]]).all(axis=(1, 2))]
+        rows = rows[np.argsort(self.frame[rows])]
+        if not len(rows):
+            return poses, times_ns
+        frames, new = self.frame[rows], invert(cam_from_map[rows])
+        old = poses[frames]
+        change = make_transform(
+            new[:, :3, :3] @ np.swapaxes(old[:, :3, :3], 1, 2), new[:, :3, 3] - old[:, :3, 3]
+        )
+        every = np.arange(len(poses))
+        after = np.minimum(np.searchsorted(frames, every), len(frames) - 1)
+        before = np.maximum(np.searchsorted(frames, every, side="right") - 1, 0)
+        span_ns = np.maximum(times_ns[frames[after]] - times_ns[frames[before]], 1)
+        part = np.clip((times_ns - times_ns[frames[before]]) / span_ns, 0.0, 1.0)
+        between = interpolate_pose(change[before], change[after], part)
+        moved = make_transform(between[:, :3, :3] @ poses[:, :3, :3], between[:, :3, 3] + poses[:, :3, 3])
+        return moved, times_ns
+
+    def _error_scales(self, squares: FloatArray) -> FloatArray:
+        """Return factors (K,3) of the expected errors of velocities.
+
+        The errors of the keyframes of a camera have a Student distribution: each has its own size, near the
+        usual size of the camera unless its square says otherwise.
+
+        Args:
+            squares: (K,3) expected squares of the errors along an axis, in the expected errors of the path.
+
+        Source: Lange, Little, Taylor, "Robust statistical modeling using the t distribution", 1989.
+        """
+        seen: BoolArray = np.bincount(self.keyframe, minlength=len(self.camera)) >= _MIN_OBSERVATIONS
+        scales, camera = np.ones_like(squares), np.array(self.camera)
+        for name in np.unique(camera).tolist():
+            own = camera == name
+            told = squares[own & seen]
+            if not len(told):
+                continue
+            usual, weight = np.maximum(told.mean(axis=0), _MIN_SCALE**2), np.ones_like(told)
+            for _ in range(_SCALE_STEPS):
+                weight = (_FREEDOM + 3.0) / (_FREEDOM + 3.0 * told / usual)
+                usual = np.maximum((weight * told).mean(axis=0), _MIN_SCALE**2)
+            weight = (_FREEDOM + 3.0) / (_FREEDOM + 3.0 * squares[own] / usual)
+            scales[own] = np.sqrt(usual / weight)
+        return scales
+
+    def _scales_of_frames(self, scales: FloatArray) -> dict[str, FloatArray]:
+        """Return the factors (N,3) of all frames of each camera from those of the keyframes (K,3)."""
+        out = {name: np.ones((len(times_ns), 3)) for name, (_, times_ns) in self.poses.items()}
+        for name, frame, scale in zip(self.camera, self.frame.tolist(), scales, strict=True):
+            if name in out:
+                out[name][frame] = scale
+        return out
+
+
+def _motion_errors(velocities: FloatArray, readouts: FloatArray) -> MotionErrors:
+    """Return expected errors.
+
+    Args:
+        velocities: (K,3) expected errors of angular velocity, its change and velocity.
+        readouts: (R,2) expected ratios of the readout times, and their errors.
+    """
+    return MotionErrors(
+        rate=velocities[:, 0],
+        rate_change=velocities[:, 1],
+        velocity=velocities[:, 2],
+        readout_ratio=readouts[:, 0],
+        readout=np.maximum(readouts[:, 1], _NO_MOTION_SIGMA),
+    )

@@ -1,0 +1,148 @@
+"""A map of rolling shutters, adjusted together with the motion of its cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.mapping.reconstruction.motion_adjustment import MotionAdjustment
+from bodycap_batch.mapping.reconstruction.rolling_adjustment import RollingMap
+from bodycap_batch.model.geometry import invert, make_transform, so3_exp
+from tests.unit.mapping.test_rolling_adjustment import (
+    FRAME_S,
+    FRAMES,
+    KEYFRAMES,
+    LENS,
+    READOUT_S,
+    centre_error,
+    poses_at,
+    scene,
+)
+
+TIMES_NS = np.round(np.arange(FRAMES) * FRAME_S * 1e9).astype(np.int64)
+
+
+def hand() -> tuple[MotionAdjustment, RollingMap]:
+    """Return the adjustment of a hand that shakes, and the true map."""
+    seen, truth, _ = scene()
+    adjustment = MotionAdjustment(
+        lenses={"hand": LENS},
+        poses={"hand": (poses_at(TIMES_NS * 1e-9), TIMES_NS)},
+        rotations={},
+        camera=("hand",) * len(KEYFRAMES),
+        frame=KEYFRAMES,
+        keyframe=seen.keyframe,
+        point=seen.point,
+        px=seen.px,
+    )
+    return adjustment, truth
+
+
+@pytest.mark.parametrize("ratio", [0.75, 1.25])
+def test_a_wrong_readout_time_is_corrected(ratio: float) -> None:
+    adjustment, truth = hand()
+    found = adjustment.run(
+        truth.cam_from_map, truth.points, {"hand": ratio * READOUT_S}, {"hand": (ratio * READOUT_S, 0.01)}
+    )
+    assert found is not None
+    readout_s, sigma_s = found.readouts["hand"]
+    assert abs(readout_s - READOUT_S) < 0.0004
+    assert sigma_s < 0.0002
+
+
+def test_a_given_readout_time_stays() -> None:
+    adjustment, truth = hand()
+    found = adjustment.run(truth.cam_from_map, truth.points, {"hand": 0.018}, {"hand": (0.018, 0.0)})
+    assert found is not None
+    assert found.readouts["hand"] == pytest.approx((0.018, 0.0), abs=1e-6)
+
+
+def test_a_path_that_is_exact_enough_is_left_alone() -> None:
+    adjustment, truth = hand()
+    start = truth.cam_from_map, truth.points
+    assert adjustment.run(*start, {"hand": 1e-4}, {"hand": (1e-4, 1e-5)}) is None
+    assert adjustment.run(*start, {}, {}) is None
+
+
+def test_the_frames_between_keyframes_move_with_them() -> None:
+    adjustment, truth = hand()
+    change = make_transform(so3_exp(np.array([0.0, 0.02, 0.0])), np.array([0.1, 0.0, 0.0]))
+    map_from_cam = invert(truth.cam_from_map)
+    moved = make_transform(change[:3, :3] @ map_from_cam[:, :3, :3], map_from_cam[:, :3, 3] + change[:3, 3])
+    poses, times_ns = adjustment._moved_poses("hand", invert(moved))
+    before, _ = adjustment.poses["hand"]
+    assert (times_ns == TIMES_NS).all()
+    assert poses[:, :3, 3] == pytest.approx(before[:, :3, 3] + change[:3, 3], abs=1e-6)
+    assert poses[:, :3, :3] == pytest.approx(change[:3, :3] @ before[:, :3, :3], abs=1e-6)
+
+
+def test_a_frame_is_moved_by_the_keyframes_beside_it() -> None:
+    adjustment, truth = hand()
+    moved = invert(truth.cam_from_map)
+    last = len(KEYFRAMES) - 1
+    moved[last, :3, 3] += (0.3, 0.0, 0.0)
+    poses, _ = adjustment._moved_poses("hand", invert(moved))
+    shift = (poses - adjustment.poses["hand"][0])[:, 0, 3]
+    # Keyframes are frames 36 and 38, so frame 37 moves half as far, and frame 39 as far as frame 38.
+    assert shift[[35, 36, 37, 38, 39]] == pytest.approx([0.0, 0.0, 0.15, 0.3, 0.3], abs=1e-6)
+
+
+def test_a_keyframe_without_a_pose_in_the_path_moves_no_frame() -> None:
+    adjustment, truth = hand()
+    poses = adjustment.poses["hand"][0].copy()
+    poses[KEYFRAMES] = np.nan
+    lost = replace(adjustment, poses={"hand": (poses, TIMES_NS)})
+    moved, _ = lost._moved_poses("hand", truth.cam_from_map)
+    assert np.array_equal(moved, poses, equal_nan=True)
+
+
+def scales_of(squares: FloatArray, cameras: tuple[str, ...], seen: int = 20) -> FloatArray:
+    """Return the factors of the expected errors for keyframes with a number of observations each."""
+    adjustment = MotionAdjustment(
+        lenses={},
+        poses={},
+        rotations={},
+        camera=cameras,
+        frame=np.arange(len(cameras)),
+        keyframe=np.repeat(np.arange(len(cameras)), seen),
+        point=np.zeros(seen * len(cameras), np.int64),
+        px=np.zeros((seen * len(cameras), 2)),
+    )
+    return adjustment._error_scales(squares)
+
+
+def test_each_camera_has_its_own_usual_error_and_a_violent_keyframe_a_larger_one() -> None:
+    squares = np.concatenate([np.full((20, 3), 0.04), np.full((20, 3), 4.0)])
+    squares[5] = 9.0
+    scales = scales_of(squares, ("a",) * 20 + ("b",) * 20)
+    calm = np.delete(scales[:20], 5, axis=0)
+    assert calm == pytest.approx(0.2, abs=0.05)
+    assert scales[20:] == pytest.approx(2.0, rel=0.01)
+    # The size of one keyframe follows from its own error and from the usual one.
+    assert (scales[5] > 1.0).all()
+    assert (scales[5] < 3.0).all()
+
+
+def test_keyframes_with_few_observations_tell_no_errors() -> None:
+    assert (scales_of(np.full((4, 3), 25.0), ("a",) * 4, seen=3) == 1.0).all()
+
+
+def test_the_errors_of_the_path_follow_from_the_adjustment() -> None:
+    adjustment, truth = hand()
+    found = adjustment.run(truth.cam_from_map, truth.points, {"hand": READOUT_S}, {"hand": (READOUT_S, 0.0)})
+    assert found is not None
+    scales = found.error_scales["hand"]
+    between = np.setdiff1d(np.arange(FRAMES), KEYFRAMES)
+    assert (scales[between] == 1.0).all()
+    # The path through exact poses follows this shake nearly exactly.
+    assert (scales[KEYFRAMES, 0] < 0.5).all()
+    start = RollingMap(
+        cam_from_map=found.cam_from_map,
+        points=found.points,
+        velocities=np.zeros((len(KEYFRAMES), 9)),
+        readout_ratio=np.ones(1),
+    )
+    assert centre_error(start, truth) < 0.003
