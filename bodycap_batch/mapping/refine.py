@@ -19,6 +19,7 @@ from bodycap_batch.mapping.intrinsics.readout_time import (
     Readout,
     RollingShutterModel,
     estimate_readouts,
+    groups_of_equal_cameras,
     map_with_readouts,
     sideways_cameras,
     stated_readout,
@@ -84,6 +85,8 @@ def refine_map(
 
     Source: Hedborg et al., "Rolling shutter bundle adjustment", CVPR 2012, for the idea.
     """
+    # A check may have changed the intrinsics of some of the cameras of one model.
+    equal_cameras = groups_of_equal_cameras(capture.cameras)
     capture = with_map_intrinsics(capture, previous)
     workspace = context.work_dir / "workspace"
     shutil.copytree(previous.workspace, workspace)
@@ -107,7 +110,7 @@ def refine_map(
         }
         rotations = _rotations(workspace, scene_map.cameras, paths)
         rolling = RollingShutterModel(model, paths, cameras, detected, rotations)
-        refined = _Refinement(model, rolling, scene_map, cameras, from_matches, mapping).run()
+        refined = _Refinement(model, rolling, scene_map, cameras, equal_cameras, from_matches, mapping).run()
         readouts, corrected_px = refined.readouts, refined.corrected_px
         readout_s = _seconds(readouts)
         distorted |= distorted_cameras(refined.rolling, readout_s, scene_map.readout_s.keys())
@@ -166,6 +169,7 @@ class _Refinement:
         rolling: The model with the motion of its keypoints.
         scene_map: The map of the model.
         cameras: The capture's cameras by name.
+        equal_cameras: Groups of names of cameras that may be of one model.
         from_matches: Readout times from matches between adjacent frames, by camera name.
         mapping: Workspace, mapper options.
     """
@@ -174,6 +178,7 @@ class _Refinement:
     rolling: RollingShutterModel
     scene_map: Map
     cameras: Mapping[str, CaptureCamera]
+    equal_cameras: Sequence[Sequence[str]]
     from_matches: Mapping[str, Readout]
     mapping: MappingContext
 
@@ -242,7 +247,7 @@ class _Refinement:
             return None
         model = rolling.with_exact_rates(readout_s, readout_s.keys()).corrected(readout_s)
         removed = remove_dominant_points(model)
-        adjusted = rolling.adjust_with_velocities(model, readouts, self.from_matches)
+        adjusted = rolling.adjust_with_velocities(model, readouts, self.from_matches, self.equal_cameras)
         if adjusted is None:
             return None
         adjust_robustly(model, self.mapping.mapper_options(), self.mapping.calibrated_ids)

@@ -394,6 +394,7 @@ class RollingShutterModel:
         model: pycolmap.Reconstruction,
         readouts: Mapping[str, Readout],
         expected: Mapping[str, Readout] | None = None,
+        equal_cameras: Sequence[Sequence[str]] = (),
     ) -> AdjustedMotion | None:
         """Adjust poses, points, velocities of keyframes and readout times of a copy of the model together.
 
@@ -408,6 +409,7 @@ class RollingShutterModel:
                 constant.
             expected: Readout times that do not come from this model, by camera name. They count as
                 observations.
+            equal_cameras: Groups of names of cameras that may be of one model.
 
         Returns:
             The adjusted readout times of the cameras in `readouts`, and the expected errors of their
@@ -429,6 +431,7 @@ class RollingShutterModel:
             keyframe=np.repeat(np.arange(len(sizes)), sizes),
             point=np.ravel(point),
             px=np.concatenate([np.zeros((0, 2)), *(item.px for item in items)]),
+            equal_cameras=equal_cameras,
         )
         seconds = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         adjusted = adjustment.run(
@@ -451,8 +454,6 @@ class RollingShutterModel:
             name: readout.adjusted(*adjusted.readouts[name]) if name in seconds else readout
             for name, readout in readouts.items()
         }
-        for names in groups_of_equal_cameras(self._cameras[name] for name in seconds):
-            found |= _with_differences({name: found[name] for name in names})
         return AdjustedMotion(readouts=found, error_scales=adjusted.error_scales)
 
     def motions(
@@ -834,23 +835,6 @@ def map_with_readouts(scene: Map, readouts: Mapping[str, Readout]) -> Map:
         readout_s={name: readout.seconds for name, readout in nonzero.items()},
         readout_sigma_s={name: readout.sigma_s for name, readout in nonzero.items() if readout.sigma_s},
     )
-
-
-def _with_differences(readouts: Mapping[str, Readout]) -> dict[str, Readout]:
-    """Return adjusted readout times of equal cameras with standard deviations that explain their differences.
-
-    Args:
-        readouts: The readout times by camera name. Those with a standard deviation of 0 are kept.
-    """
-    estimated = {name: readout for name, readout in readouts.items() if readout.sigma_s}
-    if len(estimated) < 2:
-        return dict(readouts)
-    values, sigmas = np.array([(each.best_s, each.sigma_s) for each in estimated.values()]).T
-    mean_s, _ = weighted_mean(values, sigmas)
-    return dict(readouts) | {
-        name: replace(readout, sigma_s=float(np.hypot(readout.sigma_s, readout.best_s - mean_s)))
-        for name, readout in estimated.items()
-    }
 
 
 def _expected_readout(start: Readout, other: Readout | None) -> tuple[float, float]:

@@ -6,7 +6,7 @@ the observations, and how wrong the velocities of the paths usually are.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,6 +51,9 @@ prevents a division by zero."""
 _FREEDOM = 3.0
 """Degrees of freedom of the distribution of the errors of velocities: a few errors are much larger than
 usual, where a hand hits something or the recorded motion jumps. Evidence: docs/decisions/mapping.md."""
+_MAX_DIFFERENCE = 0.08
+"""Largest difference of the readout times of equal cameras that share one, as a ratio. Origin: in walks, the
+estimates of single cameras are wrong by up to 4 %."""
 _SCALE_STEPS = 20
 """Number of steps in which the usual size of the errors is computed. They converge by a factor of two or more
 each."""
@@ -82,6 +85,53 @@ class AdjustedMap:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class _Readouts:
+    """The unknown readout times.
+
+    Attributes:
+        seconds: (R,) readout times so far, seconds; one of 0 without rolling shutters.
+        number: Number of the readout time of each camera with a rolling shutter, by camera name.
+        expected_s: (R,2) expected values before the adjustment and their standard deviations, seconds.
+    """
+
+    seconds: FloatArray
+    number: Mapping[str, int]
+    expected_s: FloatArray
+
+    @staticmethod
+    def create(readout_s: Mapping[str, float], expected_s: Mapping[str, tuple[float, float]]) -> _Readouts:
+        """Return one unknown for each readout time; see `MotionAdjustment.run`."""
+        seconds = np.array(sorted(set(readout_s.values())) or [0.0])
+        number = {name: int(np.searchsorted(seconds, value)) for name, value in readout_s.items()}
+        expected = np.zeros((len(seconds), 2))
+        for name, index in number.items():
+            expected[index] = expected_s[name]
+        return _Readouts(seconds=seconds, number=number, expected_s=expected)
+
+    def shared(self, groups: Sequence[Sequence[str]], sigma_s: FloatArray) -> _Readouts:
+        """Return the readout times with one for the cameras of each group whose times nearly agree.
+
+        Their common time is the mean that is weighted by the information of each. A given time is kept.
+
+        Args:
+            groups: Groups of names of equal cameras.
+            sigma_s: (R,) standard deviations of the readout times, seconds.
+        """
+        seconds, number, expected = self.seconds.copy(), dict(self.number), self.expected_s.copy()
+        for group in groups:
+            own = sorted({number[name] for name in group if name in number})
+            told = self.seconds[own]
+            if len(own) < 2 or not self.expected_s[own, 1].all() or not np.isfinite(sigma_s[own]).all():
+                continue
+            if told.max() > (1.0 + _MAX_DIFFERENCE) * told.min():
+                continue
+            seconds[own[0]] = np.average(told, weights=1.0 / np.maximum(sigma_s[own], 1e-9) ** 2)
+            expected[own[0]] = min(self.expected_s[own].tolist(), key=lambda each: each[1])
+            number |= {name: own[0] for name in group if number.get(name) in own}
+        return _Readouts(seconds=seconds, number=number, expected_s=expected)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MotionAdjustment:
     """An adjustment of keyframes, points, velocities and readout times.
 
@@ -96,6 +146,7 @@ class MotionAdjustment:
         keyframe: (M,) keyframe of each observation, not decreasing.
         point: (M,) observed point.
         px: (M,2) detected pixel.
+        equal_cameras: Groups of names of cameras that may be of one model.
     """
 
     lenses: Mapping[str, Camera]
@@ -106,6 +157,7 @@ class MotionAdjustment:
     keyframe: IntArray
     point: IntArray
     px: FloatArray
+    equal_cameras: Sequence[Sequence[str]] = ()
 
     def run(
         self,
@@ -116,7 +168,8 @@ class MotionAdjustment:
     ) -> AdjustedMap | None:
         """Return the adjusted map; None if the velocities of the paths are exact enough.
 
-        Cameras with equal readout times have one unknown readout time in common.
+        Cameras with equal readout times have one unknown readout time in common. So do equal cameras whose
+        readout times nearly agree after a pass.
 
         Args:
             cam_from_map: (K,4,4) poses of the keyframes at the start.
@@ -126,64 +179,55 @@ class MotionAdjustment:
             expected_s: Their expected values and standard deviations before the adjustment, seconds. A
                 readout time with a standard deviation of 0 is constant.
         """
-        start_s = np.array(sorted(set(readout_s.values())) or [0.0])
-        number = {name: int(np.searchsorted(start_s, value)) for name, value in readout_s.items()}
-        expected = np.ones((len(start_s), 2)) * (1.0, _NO_MOTION_SIGMA)
-        for name, index in number.items():
-            expected[index] = np.array(expected_s[name]) / start_s[index]
+        readouts = _Readouts.create(readout_s, expected_s)
         scales: FloatArray = np.ones((len(self.camera), 3))
-        ratio: FloatArray = np.ones(len(start_s))
         found = RollingMap(
             cam_from_map=cam_from_map,
             points=points,
             velocities=np.zeros((len(cam_from_map), 9)),
-            readout_ratio=ratio,
+            readout_ratio=np.ones(len(readouts.seconds)),
         )
         noise_px = _NOISE_PX * max(
             pixel_scale(each.width_px, each.height_px) for each in self.lenses.values()
         )
         for passed in range(1 + _LATER_PASSES):
-            at_s = {name: float(start_s[index] * ratio[index]) for name, index in number.items()}
-            seen, own = self._observations(found.cam_from_map, at_s, number, len(start_s), noise_px)
-            errors = _motion_errors(own * scales, expected / ratio[:, None])
+            seen, own = self._observations(found.cam_from_map, readouts, noise_px)
+            errors = _motion_errors(own * scales, readouts)
             if not passed and self._is_exact_enough(seen, errors):
                 return None
             found = replace(
-                found, velocities=np.zeros_like(found.velocities), readout_ratio=np.ones_like(ratio)
+                found,
+                velocities=np.zeros_like(found.velocities),
+                readout_ratio=np.ones(len(readouts.seconds)),
             )
             width_px = usual_residual_px(seen, found) if passed else _FIRST_LOSS_WIDTH * noise_px
             found = adjust_with_velocities(seen, found, errors, width_px)
-            ratio = ratio * found.readout_ratio
+            sigma_s = readouts.seconds * readout_errors(seen, found, errors)
+            readouts = replace(readouts, seconds=readouts.seconds * found.readout_ratio)
+            if passed < _LATER_PASSES:
+                readouts = readouts.shared(self.equal_cameras, sigma_s)
             noise_px = usual_residual_px(seen, found) / _MEDIAN_OF_NORMAL
             squares = velocity_squares(replace(seen, noise_px=noise_px), found, errors)
             scales = self._error_scales(squares / own**2)
-        sigma_s = start_s * ratio * readout_errors(seen, found, errors) / found.readout_ratio
         return AdjustedMap(
             cam_from_map=found.cam_from_map,
             points=found.points,
             px_at_mid_row=px_at_mid_row(seen, found),
             readouts={
-                name: (float(start_s[index] * ratio[index]), float(sigma_s[index]))
-                for name, index in number.items()
+                name: (float(readouts.seconds[index]), float(sigma_s[index]))
+                for name, index in readouts.number.items()
             },
             error_scales=self._scales_of_frames(scales),
         )
 
     def _observations(
-        self,
-        cam_from_map: FloatArray,
-        readout_s: Mapping[str, float],
-        number: Mapping[str, int],
-        count: int,
-        noise_px: float,
+        self, cam_from_map: FloatArray, readouts: _Readouts, noise_px: float
     ) -> tuple[RowObservations, FloatArray]:
         """Return all observations, and the expected errors (K,3) of the velocities of the paths.
 
         Args:
             cam_from_map: (K,4,4) poses of the keyframes so far.
-            readout_s: Readout times by camera name, seconds.
-            number: Numbers of the readout times by camera name.
-            count: Number of readout times.
+            readouts: The readout times so far.
             noise_px: Standard deviation of an observation, px.
         """
         names, camera = sorted(self.lenses), np.array(self.camera)
@@ -191,6 +235,7 @@ class MotionAdjustment:
         turn, shift = np.zeros((len(self.px), 3)), np.zeros((len(self.px), 3))
         errors, interval_s = np.full((len(camera), 3), _NO_MOTION_SIGMA), np.ones(len(camera))
         poses = {name: self._moved_poses(name, cam_from_map) for name in self.poses}
+        readout_s = {name: float(readouts.seconds[index]) for name, index in readouts.number.items()}
         motions = camera_motions(self.lenses, poses, self.rotations, readout_s, {})
         for name, motion in motions.items():
             kept = camera == name
@@ -210,7 +255,7 @@ class MotionAdjustment:
             shift=shift,
             noise_px=noise_px,
             interval_s=interval_s,
-            readout=np.array([number.get(name, count - 1) for name in self.camera], dtype=np.int64),
+            readout=np.array([readouts.number.get(name, 0) for name in self.camera], dtype=np.int64),
         )
         return seen, np.maximum(errors, _NO_MOTION_SIGMA)
 
@@ -286,17 +331,18 @@ class MotionAdjustment:
         return out
 
 
-def _motion_errors(velocities: FloatArray, readouts: FloatArray) -> MotionErrors:
+def _motion_errors(velocities: FloatArray, readouts: _Readouts) -> MotionErrors:
     """Return expected errors.
 
     Args:
         velocities: (K,3) expected errors of angular velocity, its change and velocity.
-        readouts: (R,2) expected ratios of the readout times, and their errors.
+        readouts: The readout times so far.
     """
+    expected = readouts.expected_s / np.where(readouts.seconds, readouts.seconds, 1.0)[:, None]
     return MotionErrors(
         rate=velocities[:, 0],
         rate_change=velocities[:, 1],
         velocity=velocities[:, 2],
-        readout_ratio=readouts[:, 0],
-        readout=np.maximum(readouts[:, 1], _NO_MOTION_SIGMA),
+        readout_ratio=expected[:, 0],
+        readout=np.maximum(expected[:, 1], _NO_MOTION_SIGMA),
     )

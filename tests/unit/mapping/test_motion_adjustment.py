@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.mapping.reconstruction.motion_adjustment import MotionAdjustment
+from bodycap_batch.mapping.reconstruction.motion_adjustment import MotionAdjustment, _Readouts
 from bodycap_batch.mapping.reconstruction.rolling_adjustment import RollingMap
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
 from tests.unit.mapping.test_rolling_adjustment import (
@@ -65,6 +65,25 @@ def test_a_path_that_is_exact_enough_is_left_alone() -> None:
     start = truth.cam_from_map, truth.points
     assert adjustment.run(*start, {"hand": 1e-4}, {"hand": (1e-4, 1e-5)}) is None
     assert adjustment.run(*start, {}, {}) is None
+
+
+def test_equal_cameras_whose_readout_times_nearly_agree_share_one() -> None:
+    readouts = _Readouts.create(
+        {"a": 0.0100, "b": 0.0103, "c": 0.0101, "d": 0.0102, "e": 0.02},
+        {"a": (0.01, 0.001), "b": (0.01, 0.002), "c": (0.01, 0.001), "d": (0.0102, 0.0), "e": (0.02, 0.001)},
+    )
+    sigma_s = np.array([0.0001, 0.0001, 0.0001, 0.0002, 0.0001])
+    shared = readouts.shared([["a", "b"], ["c", "d"], ["e", "other"]], sigma_s)
+    at_s = {name: shared.seconds[index] for name, index in shared.number.items()}
+    assert shared.number["a"] == shared.number["b"]
+    assert at_s == pytest.approx({"a": 0.01006, "b": 0.01006, "c": 0.0101, "d": 0.0102, "e": 0.02})
+    assert shared.expected_s[shared.number["a"]].tolist() == [0.01, 0.001]
+
+
+def test_equal_cameras_with_other_readout_times_keep_them() -> None:
+    expected = {"a": (0.01, 0.001), "b": (0.011, 0.001)}
+    readouts = _Readouts.create({"a": 0.010, "b": 0.011}, expected)
+    assert readouts.shared([["a", "b"]], np.full(2, 1e-4)).number == {"a": 0, "b": 1}
 
 
 def test_the_frames_between_keyframes_move_with_them() -> None:
