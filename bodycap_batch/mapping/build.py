@@ -31,6 +31,7 @@ from bodycap_batch.mapping.intrinsics.readout_time import Readout, map_with_read
 from bodycap_batch.mapping.intrinsics.recalibration import recalibrate_if_misfit
 from bodycap_batch.mapping.intrinsics.shutters import (
     known_readouts,
+    possible_readouts,
     readouts_of_maps,
     turning_shutters,
     unknown_shutters,
@@ -213,7 +214,7 @@ def build_map_once(
     estimated = with_gyroscopes(estimate_from_matches(capture, selections), selections)
     judged, earlier = _judged_by_pairs(capture, selections, estimated, options, context, earlier)
     readouts = {**known_readouts(capture), **judged}
-    used = {**readouts, **earlier.readouts}
+    used = {**readouts, **possible_readouts(capture, selections, readouts), **earlier.readouts}
     shutters = turning_shutters(capture, selections, used)
     write_shutters(workspace, shutters)
     keyframes = _keyframes_of(workspace, capture, selections, shutters, earlier)

@@ -72,6 +72,8 @@ _MAX_POOLED_SIGMAS = 3.0
 deviations. With a larger deviation, the cameras do not share the mean. Evidence: none."""
 STATED = "stated"
 """`Readout.source` of a readout time that is given in the job."""
+_NONE_FOUND = "none found"
+"""`Readout.source` of a camera without a rolling shutter, as far as an estimate can tell."""
 _UNDETERMINED = "not determined: "
 """First words of `Readout.source` of a camera whose readout time is unknown; the reason follows."""
 _BLOCKS = 8
@@ -145,7 +147,7 @@ class Readout:
         return replace(self, seconds=best_s, best_s=best_s, sigma_s=sigma_s, source="estimated")
 
     def adjusted(self, best_s: float, sigma_s: float) -> Readout:
-        """Return the readout time after an adjustment in which it was an unknown.
+        """Return the readout time after an adjustment in which it was an unknown; 0 if none was found.
 
         Args:
             best_s: The adjusted readout time, seconds.
@@ -155,12 +157,20 @@ class Readout:
             return self
         # The expected velocities of the adjustment are those of a spline.
         sigma_s = float(np.linalg.norm([sigma_s, _ADJUSTED_FLOOR_S, _ADJUSTED_SIGMA_RATIO * best_s]))
+        is_short = best_s < _MIN_SIGMAS * sigma_s and best_s + 2.0 * sigma_s < _MAX_GLOBAL_S
+        if best_s <= 0.0 or is_short:
+            return replace(self, seconds=0.0, sigma_s=sigma_s, source=_NONE_FOUND, best_s=best_s)
         return replace(self, seconds=best_s, sigma_s=sigma_s, source="estimated", best_s=best_s)
 
     @property
     def determined(self) -> bool:
         """True if the readout time is known, or known to be short; False if the data do not tell it."""
         return not self.source.startswith(_UNDETERMINED)
+
+    @property
+    def excludes_rolling(self) -> bool:
+        """True if an estimate found no rolling shutter: the readout time is short, or 0."""
+        return self.source == _NONE_FOUND
 
     @property
     def scatter_s(self) -> float:
@@ -189,7 +199,7 @@ def judged_readout(best_s: float, sigma_s: float, *, sideways: bool = False) -> 
     if sigma_s <= _MAX_SIGMA_S and abs(best_s) >= max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s):
         return Readout(best_s, sigma_s, "estimated", best_s, sideways)
     if abs(best_s) + 2.0 * sigma_s < _MAX_GLOBAL_S:
-        return Readout(0.0, sigma_s, "none found", best_s, sideways)
+        return Readout(0.0, sigma_s, _NONE_FOUND, best_s, sideways)
     return Readout(
         0.0, sigma_s, f"{_UNDETERMINED}the camera turns too evenly, or too little", best_s, sideways
     )
@@ -846,9 +856,9 @@ def _expected_readout(start: Readout, other: Readout | None) -> tuple[float, flo
     """
     if not start.sigma_s:
         return start.seconds, 0.0
-    if other is None or not other.seconds or not other.sigma_s:
+    if other is None or not other.determined or not other.sigma_s:
         return start.seconds, _MAX_SIGMA_S
-    return other.seconds, other.sigma_s
+    return other.best_s, other.sigma_s
 
 
 def stated_readout(readout_s: float) -> Readout:

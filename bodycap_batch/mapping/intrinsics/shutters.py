@@ -27,6 +27,9 @@ MAX_DISPLACEMENT_PX = 4.0
 """Maximum displacement of the keypoints of a camera by its rolling shutter in a map that was built without a
 correction, px of an image with a long side of 640 px. If it is larger, right matches contradict the geometry
 of their pairs. Origin: COLMAP's limit of the deviation of a match. Evidence: docs/decisions/mapping.md."""
+_MIN_POSSIBLE_S = 0.0001
+"""Smallest readout time with which an adjustment looks for a short one, seconds. It only makes the
+displacements proportional to something."""
 _GRID = 8
 """Number of rows and of columns of the pixels whose displacement is computed. Evidence: none."""
 _MAX_SIGMAS = 3.0
@@ -121,6 +124,32 @@ def turning_shutters(
         if path is not None:
             out[selection.camera] = TurningShutter(lens, path, readout.seconds)
     return out
+
+
+def possible_readouts(
+    capture: Capture, selections: Sequence[KeyframeSelection], readouts: Mapping[str, Readout]
+) -> dict[str, Readout]:
+    """Return short readout times that matches do not exclude, of cameras that turn fast, by camera name.
+
+    If matches find no rolling shutter, the readout time is shorter than 2 ms. Where a camera turns fast, this
+    still displaces keypoints far. Such a readout time is an unknown of the adjustment of the map.
+
+    Args:
+        capture: All cameras.
+        selections: Keyframes of each camera, with the matches between adjacent frames.
+        readouts: Readout times from these matches, by camera name.
+    """
+    short = {name: item for name, item in readouts.items() if item.excludes_rolling}
+    trial = {
+        name: replace(item, seconds=abs(item.best_s) + 2.0 * item.sigma_s) for name, item in short.items()
+    }
+    shutters = turning_shutters(capture, selections, trial)
+    frames = {item.camera: np.asarray(item.frames) for item in selections}
+    return {
+        name: replace(short[name], seconds=max(short[name].best_s, _MIN_POSSIBLE_S))
+        for name, shutter in shutters.items()
+        if grid_displacement_px(shutter, frames[name]) > MAX_DISPLACEMENT_PX
+    }
 
 
 def grid_displacement_px(shutter: TurningShutter, frames: IntArray) -> float:

@@ -260,9 +260,11 @@ class MotionAdjustment:
         return seen, np.maximum(errors, _NO_MOTION_SIGMA)
 
     def _is_exact_enough(self, seen: RowObservations, errors: MotionErrors) -> bool:
-        """Return True if the expected errors of the velocities displace no observation by much."""
+        """Return True if the expected errors of velocities and readout times displace nothing by much."""
         focal_px = np.array([lens.focal_px for lens in seen.lenses])[seen.lens[seen.keyframe]]
-        expected_px = focal_px * np.abs(seen.delay_s) * errors.rate[seen.keyframe]
+        by_velocity = np.abs(seen.delay_s) * errors.rate[seen.keyframe]
+        by_readout = np.linalg.norm(seen.turn, axis=1) * errors.readout[seen.readout[seen.keyframe]]
+        expected_px = focal_px * np.hypot(by_velocity, by_readout)
         limit_px = _EXACT_RATIO * seen.noise_px
         return not len(expected_px) or bool(np.percentile(expected_px, _EXACT_PERCENT) < limit_px)
 

@@ -14,9 +14,11 @@ import pytest
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.mapping.intrinsics import shutters
 from bodycap_batch.mapping.intrinsics.readout_time import Readout, judged_readout
 from bodycap_batch.mapping.intrinsics.shutters import (
     known_readouts,
+    possible_readouts,
     read_shutters,
     readouts_of_maps,
     turning_shutters,
@@ -79,12 +81,12 @@ class _Pan:
             yield frame, np.repeat(_picture(frame)[..., None], 3, axis=2).copy()
 
 
-def _shutter() -> TurningShutter:
-    """A shutter of a camera that turns to the right at a constant rate."""
+def _shutter(rate: float = RATE, readout_s: float = READOUT_S) -> TurningShutter:
+    """A shutter of a camera that turns to the right at a constant rate (rad/s)."""
     times = np.arange(6) * 33_333_333
-    step = np.tile(so3_exp([0.0, -RATE / 30, 0.0]), (5, 1, 1))
+    step = np.tile(so3_exp([0.0, -rate / 30, 0.0]), (5, 1, 1))
     path = RotationPath.from_steps(times, step, np.ones(5, bool))
-    return TurningShutter(LENS, path, READOUT_S)
+    return TurningShutter(LENS, path, readout_s)
 
 
 @pytest.fixture
@@ -197,6 +199,28 @@ def test_a_shutter_is_unknown_if_neither_the_job_nor_matches_determine_it() -> N
         "left_palm": judged_readout(0.003, 0.0027),
     }
     assert unknown_shutters(capture, selections, readouts) == ("left_palm", "right_palm")
+
+
+def test_a_camera_that_turns_fast_may_have_a_short_readout_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    rates = {"calm": 0.5, "fast": 15.0, "exact": 15.0, "rolling": 15.0, "unknown": 15.0, "negative": 15.0}
+    readouts = {
+        "calm": judged_readout(0.0003, 0.0008),
+        "fast": judged_readout(0.0003, 0.0008),
+        "exact": judged_readout(0.0003, 0.0001),
+        "rolling": judged_readout(0.01, 0.0005),
+        "unknown": judged_readout(0.003, 0.0027),
+        "negative": judged_readout(-0.0003, 0.0008),
+    }
+
+    def shutters_of(_: object, __: object, trial: dict[str, Readout]) -> dict[str, TurningShutter]:
+        return {name: _shutter(rates[name], item.seconds) for name, item in trial.items()}
+
+    monkeypatch.setattr(shutters, "turning_shutters", shutters_of)
+    selections: Any = [SimpleNamespace(camera=name, frames=np.arange(1, 5)) for name in rates]
+    possible = possible_readouts(cast(Any, None), selections, readouts)
+    # The largest plausible readout time is 1.9 ms. Until the first row, this camera turns by 14 mrad.
+    assert {name: item.seconds for name, item in possible.items()} == {"fast": 0.0003, "negative": 0.0001}
+    assert possible["fast"].sigma_s == 0.0008
 
 
 def test_the_readouts_of_corrected_maps_are_used_for_their_extension() -> None:

@@ -251,6 +251,16 @@ def test_the_readout_time_is_adjusted_together_with_the_keyframes() -> None:
     assert adjusted["other"] == start["other"]
 
 
+@pytest.mark.parametrize(
+    ("best_s", "seconds"), [(0.0002, 0.0), (-0.0003, 0.0), (0.0005, 0.0005), (0.0031, 0.0031)]
+)
+def test_an_adjusted_readout_time_near_zero_is_none(best_s: float, seconds: float) -> None:
+    start = Readout(0.0001, 0.0008, "of the map", 0.0001)
+    found = start.adjusted(best_s, 0.00005)
+    assert (found.seconds, found.best_s) == (seconds, best_s)
+    assert found.excludes_rolling == (seconds == 0.0)
+
+
 def test_an_adjustment_weights_readout_times_from_elsewhere() -> None:
     film = Film(0.02)
     rolling = model_with_inexact_path(film)
