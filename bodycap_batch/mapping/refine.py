@@ -215,26 +215,32 @@ class _Refinement:
 
     def _readouts_are_decided(self) -> bool:
         """Return True if each camera's readout time is known, from the map or from matches."""
+        own = self.scene_map.cameras.keys()
+        known = self._known_readouts()
         undecided = {
             name
-            for name in self.scene_map.cameras.keys() - self.scene_map.readout_s.keys()
-            if not self.cameras[name].rolling_shutter_known
-            and (name not in self.from_matches or not self.from_matches[name].determined)
+            for name in own - self.scene_map.readout_s.keys()
+            if name not in known or not known[name].determined or known[name].seconds
         }
         return bool(self.scene_map.readout_s) and not undecided
 
-    def _readouts(self) -> dict[str, Readout]:
-        """Return the readout times of the map, and those of 0 that are stated or come from matches."""
+    def _known_readouts(self) -> dict[str, Readout]:
+        """Return the readout times that are stated or come from matches, by camera name."""
         stated = {
             name: stated_readout(camera.rolling_shutter_s)
             for name, camera in self.cameras.items()
             if camera.rolling_shutter_known
         }
-        known = {name: item for name, item in ({**self.from_matches, **stated}).items() if not item.seconds}
-        own = self.scene_map.cameras.keys()
-        return {name: item for name, item in known.items() if name in own} | readouts_of_maps(
-            [self.scene_map]
-        )
+        return {**self.from_matches, **stated}
+
+    def _readouts(self) -> dict[str, Readout]:
+        """Return the readout times of the map, and those of 0 that are stated or come from matches."""
+        own, known = self.scene_map.cameras.keys(), self._known_readouts()
+        of_map = {
+            name: replace(item, source=STATED) if self.cameras[name].rolling_shutter_known else item
+            for name, item in readouts_of_maps([self.scene_map]).items()
+        }
+        return {name: item for name, item in known.items() if name in own and not item.seconds} | of_map
 
     def _with_velocities(
         self, rolling: RollingShutterModel, readouts: Mapping[str, Readout]

@@ -16,7 +16,12 @@ from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust, sub_model
 from bodycap_batch.mapping.reconstruction.camera_motion import CameraMotion, camera_motions
 from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
-from bodycap_batch.mapping.reconstruction.motion_adjustment import MotionAdjustment
+from bodycap_batch.mapping.reconstruction.motion_adjustment import (
+    MAX_GLOBAL_S,
+    MIN_SIGMAS,
+    AdjustedReadout,
+    MotionAdjustment,
+)
 from bodycap_batch.mapping.reconstruction.reprojection import image_residuals_px
 from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.optical_flow import pixel_scale
@@ -47,12 +52,6 @@ a little larger, because the estimate is uncertain."""
 _MIN_READOUT_S = 0.001
 """Minimum estimated readout time (seconds) of a rolling shutter. A shorter one moves no pixel by much.
 Evidence: none."""
-_MAX_GLOBAL_S = 0.002
-"""A shutter is treated as global if its readout time is shorter than this value (seconds) with 95 %
-probability. Evidence: none."""
-_MIN_SIGMAS = 3.0
-"""Minimum ratio of a readout time to its standard deviation. Origin: the correction then removes at least two
-thirds of the displacements."""
 _MAX_SIGMA_S = 0.004
 """Maximum standard deviation of a determined readout time, seconds. Evidence: none."""
 _MAX_DIFFERENCE_S = 0.003
@@ -61,12 +60,6 @@ the residuals are not used. Evidence: none."""
 _MODEL_SIGMA_RATIO = 0.025
 """Standard deviation that is added to each estimate, as a ratio of the readout time. A hand shakes faster
 than the spline through the poses of the frames follows. Evidence: docs/decisions/mapping.md."""
-_ADJUSTED_SIGMA_RATIO = 0.012
-"""The same for a readout time that was adjusted together with the velocities: they are free there, and only
-their mean is that of the spline. Evidence: docs/decisions/mapping.md."""
-_ADJUSTED_FLOOR_S = 0.0001
-"""Standard deviation that is added to each adjusted readout time, seconds. Evidence:
-docs/decisions/mapping.md."""
 _MAX_POOLED_SIGMAS = 3.0
 """Maximum deviation of the readout time of a camera from the mean of equal cameras, in its standard
 deviations. With a larger deviation, the cameras do not share the mean. Evidence: none."""
@@ -146,21 +139,12 @@ class Readout:
         sigma_s = float(np.hypot(mean[1], _MODEL_SIGMA_RATIO * best_s))
         return replace(self, seconds=best_s, best_s=best_s, sigma_s=sigma_s, source="estimated")
 
-    def adjusted(self, best_s: float, sigma_s: float) -> Readout:
-        """Return the readout time after an adjustment in which it was an unknown; 0 if none was found.
-
-        Args:
-            best_s: The adjusted readout time, seconds.
-            sigma_s: Its standard deviation from the adjustment, seconds.
-        """
-        if not self.sigma_s:
+    def adjusted(self, found: AdjustedReadout) -> Readout:
+        """Return the readout time after an adjustment in which it may have been an unknown."""
+        if found.sigma_s is None:
             return self
-        # The expected velocities of the adjustment are those of a spline.
-        sigma_s = float(np.linalg.norm([sigma_s, _ADJUSTED_FLOOR_S, _ADJUSTED_SIGMA_RATIO * best_s]))
-        is_short = best_s < _MIN_SIGMAS * sigma_s and best_s + 2.0 * sigma_s < _MAX_GLOBAL_S
-        if best_s <= 0.0 or is_short:
-            return replace(self, seconds=0.0, sigma_s=sigma_s, source=_NONE_FOUND, best_s=best_s)
-        return replace(self, seconds=best_s, sigma_s=sigma_s, source="estimated", best_s=best_s)
+        source = "estimated" if found.seconds else _NONE_FOUND
+        return replace(self, seconds=found.seconds, sigma_s=found.sigma_s, source=source, best_s=found.best_s)
 
     @property
     def determined(self) -> bool:
@@ -196,9 +180,9 @@ def judged_readout(best_s: float, sigma_s: float, *, sideways: bool = False) -> 
         sigma_s: Its standard deviation, seconds; infinity if it is unknown.
         sideways: True if the sensor's rows are columns of the image.
     """
-    if sigma_s <= _MAX_SIGMA_S and abs(best_s) >= max(_MIN_READOUT_S, _MIN_SIGMAS * sigma_s):
+    if sigma_s <= _MAX_SIGMA_S and abs(best_s) >= max(_MIN_READOUT_S, MIN_SIGMAS * sigma_s):
         return Readout(best_s, sigma_s, "estimated", best_s, sideways)
-    if abs(best_s) + 2.0 * sigma_s < _MAX_GLOBAL_S:
+    if abs(best_s) + 2.0 * sigma_s < MAX_GLOBAL_S:
         return Readout(0.0, sigma_s, _NONE_FOUND, best_s, sideways)
     return Readout(
         0.0, sigma_s, f"{_UNDETERMINED}the camera turns too evenly, or too little", best_s, sideways
@@ -423,7 +407,8 @@ class RollingShutterModel:
 
         Returns:
             The adjusted readout times of the cameras in `readouts`, and the expected errors of their
-            velocities. None if the velocities of the paths are exact enough: then the model is unchanged.
+            velocities. None if the velocities of the paths are exact enough, or if a readout time becomes
+            longer than a frame interval: then the model is unchanged.
         """
         import pycolmap
 
@@ -448,9 +433,9 @@ class RollingShutterModel:
             np.array([make_transform(pose[:, :3], pose[:, 3]) for pose in poses]),
             np.array([model.point3D(number).xyz for number in point_ids.tolist()]).reshape(-1, 3),
             seconds,
-            {name: _expected_readout(readouts[name], (expected or {}).get(name)) for name in seconds},
+            {name: self._expected(name, readouts[name], (expected or {}).get(name)) for name in seconds},
         )
-        if adjusted is None:
+        if adjusted is None or self._are_too_long(adjusted.readouts):
             return None
         for number, xyz in zip(point_ids.tolist(), adjusted.points, strict=True):
             model.point3D(number).xyz = xyz
@@ -461,7 +446,7 @@ class RollingShutterModel:
             for feature, xy in zip(item.feature.tolist(), px, strict=True):
                 image.points2D[feature].xy = xy
         found = {
-            name: readout.adjusted(*adjusted.readouts[name]) if name in seconds else readout
+            name: readout.adjusted(adjusted.readouts[name]) if name in seconds else readout
             for name, readout in readouts.items()
         }
         return AdjustedMotion(readouts=found, error_scales=adjusted.error_scales)
@@ -481,6 +466,35 @@ class RollingShutterModel:
         seconds = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         sigma_s = {name: readout.sigma_s for name, readout in readouts.items()}
         return camera_motions(self._intrinsics, self._poses, self._rotations, seconds, sigma_s, error_scales)
+
+    def _expected(self, name: str, start: Readout, other: Readout | None) -> tuple[float, float]:
+        """Return the expected readout time and its standard deviation, seconds, before an adjustment.
+
+        The standard deviation of a constant one is 0. A camera without a trajectory has one, because the
+        rotations from matches are too smooth for an estimate.
+
+        Args:
+            name: Name of the camera.
+            start: The readout time at the start.
+            other: A readout time that does not come from the adjusted model; None if there is none.
+        """
+        rotation = self._rotations.get(name)
+        is_measured = name in self._trajectories or (rotation is not None and rotation.gyro is not None)
+        if not start.sigma_s or not is_measured:
+            return start.seconds, 0.0
+        if other is None or not other.determined or not other.sigma_s:
+            return start.seconds, _MAX_SIGMA_S
+        return other.best_s, other.sigma_s
+
+    def _are_too_long(self, readouts: Mapping[str, AdjustedReadout]) -> bool:
+        """Return True if a readout time that was adjusted is longer than a frame interval, or unknown."""
+        for name, found in readouts.items():
+            limit_s = _MAX_READOUT_FRAMES * 1e-9 * float(np.median(np.diff(self._cameras[name].times_ns)))
+            if found.sigma_s is not None and not (
+                abs(found.best_s) <= limit_s and np.isfinite(found.sigma_s)
+            ):
+                return True
+        return False
 
     def _remaining(self, item: _Keypoints, model: pycolmap.Reconstruction) -> _Keypoints:
         """Return the observations whose points are left in a copy of the model."""
@@ -845,20 +859,6 @@ def map_with_readouts(scene: Map, readouts: Mapping[str, Readout]) -> Map:
         readout_s={name: readout.seconds for name, readout in nonzero.items()},
         readout_sigma_s={name: readout.sigma_s for name, readout in nonzero.items() if readout.sigma_s},
     )
-
-
-def _expected_readout(start: Readout, other: Readout | None) -> tuple[float, float]:
-    """Return the expected readout time and its standard deviation, seconds, before an adjustment.
-
-    Args:
-        start: The readout time at the start.
-        other: A readout time that does not come from the adjusted model; None if there is none.
-    """
-    if not start.sigma_s:
-        return start.seconds, 0.0
-    if other is None or not other.determined or not other.sigma_s:
-        return start.seconds, _MAX_SIGMA_S
-    return other.best_s, other.sigma_s
 
 
 def stated_readout(readout_s: float) -> Readout:

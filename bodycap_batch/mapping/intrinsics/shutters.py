@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -132,24 +133,34 @@ def possible_readouts(
     """Return short readout times that matches do not exclude, of cameras that turn fast, by camera name.
 
     If matches find no rolling shutter, the readout time is shorter than 2 ms. Where a camera turns fast, this
-    still displaces keypoints far. Such a readout time is an unknown of the adjustment of the map.
+    still displaces keypoints far. Such a readout time is an unknown of the adjustment of the map. It tells no
+    direction of the rows, so cameras with an unknown direction are left out.
 
     Args:
         capture: All cameras.
         selections: Keyframes of each camera, with the matches between adjacent frames.
         readouts: Readout times from these matches, by camera name.
     """
-    short = {name: item for name, item in readouts.items() if item.excludes_rolling}
+    short = {
+        name: item
+        for name, item in readouts.items()
+        if item.excludes_rolling and not capture.camera(name).may_be_sideways
+    }
     trial = {
         name: replace(item, seconds=abs(item.best_s) + 2.0 * item.sigma_s) for name, item in short.items()
     }
     shutters = turning_shutters(capture, selections, trial)
     frames = {item.camera: np.asarray(item.frames) for item in selections}
     return {
-        name: replace(short[name], seconds=max(short[name].best_s, _MIN_POSSIBLE_S))
+        name: replace(short[name], seconds=_at_least(short[name].best_s, _MIN_POSSIBLE_S))
         for name, shutter in shutters.items()
         if grid_displacement_px(shutter, frames[name]) > MAX_DISPLACEMENT_PX
     }
+
+
+def _at_least(value: float, size: float) -> float:
+    """Return a value whose absolute value is at least the given size, with the same sign."""
+    return math.copysign(max(abs(value), size), value)
 
 
 def grid_displacement_px(shutter: TurningShutter, frames: IntArray) -> float:

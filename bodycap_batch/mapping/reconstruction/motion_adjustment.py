@@ -18,6 +18,7 @@ from bodycap_batch.mapping.reconstruction.rolling_adjustment import (
     RollingMap,
     RowObservations,
     adjust_with_velocities,
+    correction_ratios,
     px_at_mid_row,
     readout_errors,
     usual_residual_px,
@@ -28,6 +29,12 @@ from bodycap_batch.model.geometry import interpolate_pose, invert, make_transfor
 from bodycap_batch.model.optical_flow import pixel_scale
 from bodycap_batch.model.rotation_path import RotationPath
 
+MIN_SIGMAS = 3.0
+"""Minimum ratio of a readout time to its standard deviation. Origin: the correction then removes at least two
+thirds of the displacements."""
+MAX_GLOBAL_S = 0.002
+"""A shutter is treated as global if its readout time is shorter than this value (seconds) with 95 %
+probability. Evidence: none."""
 _NOISE_PX = 0.7
 """Standard deviation of an observation in the first pass, px of an image with a long side of 640 px. Origin:
 the same as for angular velocities in `model.rotation_path`."""
@@ -51,9 +58,21 @@ prevents a division by zero."""
 _FREEDOM = 3.0
 """Degrees of freedom of the distribution of the errors of velocities: a few errors are much larger than
 usual, where a hand hits something or the recorded motion jumps. Evidence: docs/decisions/mapping.md."""
-_MAX_DIFFERENCE = 0.08
-"""Largest difference of the readout times of equal cameras that share one, as a ratio. Origin: in walks, the
-estimates of single cameras are wrong by up to 4 %."""
+_MAX_POOLED_SIGMAS = 3.0
+"""Maximum deviation of the readout time of a camera from the mean of equal cameras, in its standard
+deviations. With a larger deviation, the cameras do not share one. Evidence: none."""
+_MIN_SCALE_S = 0.0001
+"""Smallest readout time (seconds) with which motions are computed. It only makes the displacements by a
+short readout time proportional to something."""
+_SYSTEMATIC_PX = 0.02
+"""Systematic error of detected pixels, px of an image with a long side of 640 px. Evidence:
+docs/decisions/mapping.md."""
+_COMMON_RATIO = 0.25
+"""Part of the usual error of the velocities of a path that all velocities have in common, because a spline is
+too smooth. A readout time is wrong by this part. Evidence: docs/decisions/mapping.md."""
+_MIN_KEYFRAMES = 4
+"""Minimum number of keyframes that tell a readout time. With fewer, the scatter of single keyframes is
+unknown. Evidence: docs/decisions/mapping.md."""
 _SCALE_STEPS = 20
 """Number of steps in which the usual size of the errors is computed. They converge by a factor of two or more
 each."""
@@ -65,6 +84,22 @@ freedom."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AdjustedReadout:
+    """A readout time after an adjustment.
+
+    Attributes:
+        seconds: Readout time for which the map was adjusted, seconds; 0 if the adjustment shows that the
+            shutter is global, as far as it can tell.
+        best_s: Most likely readout time, seconds.
+        sigma_s: Its standard deviation, seconds; None if the readout time was constant.
+    """
+
+    seconds: float
+    best_s: float
+    sigma_s: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AdjustedMap:
     """The result of an adjustment.
 
@@ -72,7 +107,7 @@ class AdjustedMap:
         cam_from_map: (K,4,4) poses of the keyframes at the exposure of the middle row.
         points: (P,3) points in the map frame.
         px_at_mid_row: (M,2) observed pixels at the exposure of the middle row.
-        readouts: Readout time and standard deviation (seconds) by camera name.
+        readouts: Readout times by camera name.
         error_scales: (N,3) factors of the expected errors of the velocities of each frame, by camera name.
             They are 1 for a frame that is no keyframe.
     """
@@ -80,55 +115,121 @@ class AdjustedMap:
     cam_from_map: FloatArray
     points: FloatArray
     px_at_mid_row: FloatArray
-    readouts: dict[str, tuple[float, float]]
+    readouts: dict[str, AdjustedReadout]
     error_scales: dict[str, FloatArray]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Readouts:
-    """The unknown readout times.
+    """The readout times of an adjustment. Cameras of one model share one.
 
     Attributes:
         seconds: (R,) readout times so far, seconds; one of 0 without rolling shutters.
         number: Number of the readout time of each camera with a rolling shutter, by camera name.
-        expected_s: (R,2) expected values before the adjustment and their standard deviations, seconds.
+        expected_s: (R,2) expected values before the adjustment and their standard deviations, seconds. A
+            readout time with a standard deviation of 0 is constant.
+        best_s: (R,) most likely readout times, seconds.
+        sigma_s: (R,) their standard deviations, seconds; NaN for one that was always constant.
     """
 
     seconds: FloatArray
     number: Mapping[str, int]
     expected_s: FloatArray
+    best_s: FloatArray
+    sigma_s: FloatArray
 
     @staticmethod
-    def create(readout_s: Mapping[str, float], expected_s: Mapping[str, tuple[float, float]]) -> _Readouts:
-        """Return one unknown for each readout time; see `MotionAdjustment.run`."""
-        seconds = np.array(sorted(set(readout_s.values())) or [0.0])
-        number = {name: int(np.searchsorted(seconds, value)) for name, value in readout_s.items()}
-        expected = np.zeros((len(seconds), 2))
-        for name, index in number.items():
-            expected[index] = expected_s[name]
-        return _Readouts(seconds=seconds, number=number, expected_s=expected)
+    def create(
+        readout_s: Mapping[str, float],
+        expected_s: Mapping[str, tuple[float, float]],
+        groups: Sequence[Sequence[str]],
+    ) -> _Readouts:
+        """Return the readout times at the start; see `MotionAdjustment.run`.
 
-    def shared(self, groups: Sequence[Sequence[str]], sigma_s: FloatArray) -> _Readouts:
-        """Return the readout times with one for the cameras of each group whose times nearly agree.
+        Args:
+            readout_s: Readout times by camera name, seconds.
+            expected_s: Expected values and standard deviations by camera name, seconds.
+            groups: Groups of names of equal cameras.
+        """
+        group_of = {name: number for number, group in enumerate(groups) for name in group}
+        keys: dict[str, tuple[object, ...]] = {
+            name: (group_of.get(name, name), readout_s[name], *expected_s[name]) for name in readout_s
+        }
+        different = list(dict.fromkeys(keys.values()))
+        number = {name: different.index(key) for name, key in keys.items()}
+        first = {index: name for name, index in reversed(number.items())}
+        names = [first[index] for index in range(len(different))]
+        seconds = np.array([readout_s[name] for name in names] or [0.0])
+        return _Readouts(
+            seconds=seconds,
+            number=number,
+            expected_s=np.array([expected_s[name] for name in names] or [(0.0, 0.0)], dtype=np.float64),
+            best_s=seconds,
+            sigma_s=np.full(len(seconds), np.nan),
+        )
 
-        Their common time is the mean that is weighted by the information of each. A given time is kept.
+    @property
+    def scale_s(self) -> FloatArray:
+        """Readout times (R,) of the motions of the observations, seconds; never 0."""
+        return np.copysign(np.maximum(np.abs(self.seconds), _MIN_SCALE_S), self.seconds)
+
+    @property
+    def constant(self) -> BoolArray:
+        """Mask (R,) of the readout times that are not adjusted."""
+        return np.asarray(self.expected_s[:, 1] == 0.0)
+
+    def held(self, kept: BoolArray, seconds: FloatArray | float) -> _Readouts:
+        """Return the readout times with constant values (seconds) where a mask (R,) is true."""
+        changed = np.where(kept, seconds, self.seconds)
+        expected = np.where(kept[:, None], np.stack([changed, np.zeros(len(kept))], axis=1), self.expected_s)
+        return replace(self, seconds=changed, expected_s=expected)
+
+    def after_pass(self, ratio: FloatArray, sigma_s: FloatArray) -> _Readouts:
+        """Return the readout times after a pass.
+
+        Args:
+            ratio: (R,) ratios of the readout times to those of the observations.
+            sigma_s: (R,) standard deviations of the new readout times, seconds.
+        """
+        seconds = np.where(self.constant, self.seconds, self.scale_s * ratio)
+        return replace(
+            self,
+            seconds=seconds,
+            best_s=np.where(self.constant, self.best_s, seconds),
+            sigma_s=np.where(self.constant, self.sigma_s, sigma_s),
+        )
+
+    def without_short_ones(self) -> _Readouts:
+        """Return the readout times with a constant 0 for those that a global shutter may have."""
+        size_s = np.abs(self.seconds)
+        with np.errstate(invalid="ignore"):
+            short = (size_s < MIN_SIGMAS * self.sigma_s) & (size_s + 2.0 * self.sigma_s < MAX_GLOBAL_S)
+        return self.held(short & ~self.constant, 0.0)
+
+    def shared(self, groups: Sequence[Sequence[str]]) -> _Readouts:
+        """Return the readout times with one for the cameras of each group whose times agree.
+
+        Their common time is the mean that is weighted by the information of each. A constant time is kept.
 
         Args:
             groups: Groups of names of equal cameras.
-            sigma_s: (R,) standard deviations of the readout times, seconds.
         """
-        seconds, number, expected = self.seconds.copy(), dict(self.number), self.expected_s.copy()
+        out = self
         for group in groups:
-            own = sorted({number[name] for name in group if name in number})
-            told = self.seconds[own]
-            if len(own) < 2 or not self.expected_s[own, 1].all() or not np.isfinite(sigma_s[own]).all():
+            own = np.unique([out.number[name] for name in group if name in out.number]).astype(np.int64)
+            own = own[~out.constant[own]]
+            if len(own) < 2 or not np.isfinite(out.sigma_s[own]).all():
                 continue
-            if told.max() > (1.0 + _MAX_DIFFERENCE) * told.min():
+            told, sigma_s = out.seconds[own], np.maximum(out.sigma_s[own], 1e-9)
+            mean_s = float(np.average(told, weights=1.0 / sigma_s**2))
+            if (np.abs(told - mean_s) > _MAX_POOLED_SIGMAS * sigma_s).any():
                 continue
-            seconds[own[0]] = np.average(told, weights=1.0 / np.maximum(sigma_s[own], 1e-9) ** 2)
-            expected[own[0]] = min(self.expected_s[own].tolist(), key=lambda each: each[1])
-            number |= {name: own[0] for name in group if number.get(name) in own}
-        return _Readouts(seconds=seconds, number=number, expected_s=expected)
+            seconds, expected = out.seconds.copy(), out.expected_s.copy()
+            seconds[own[0]] = mean_s
+            expected[own[0]] = expected[own[np.argmin(expected[own, 1])]]
+            number = {name: int(own[0]) if index in own else index for name, index in out.number.items()}
+            out = replace(out, seconds=seconds, number=number, expected_s=expected)
+        return out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,8 +269,8 @@ class MotionAdjustment:
     ) -> AdjustedMap | None:
         """Return the adjusted map; None if the velocities of the paths are exact enough.
 
-        Cameras with equal readout times have one unknown readout time in common. So do equal cameras whose
-        readout times nearly agree after a pass.
+        Equal cameras have one unknown readout time in common if they start from the same one, or if their
+        readout times agree after a pass.
 
         Args:
             cam_from_map: (K,4,4) poses of the keyframes at the start.
@@ -179,7 +280,7 @@ class MotionAdjustment:
             expected_s: Their expected values and standard deviations before the adjustment, seconds. A
                 readout time with a standard deviation of 0 is constant.
         """
-        readouts = _Readouts.create(readout_s, expected_s)
+        readouts = _Readouts.create(readout_s, expected_s, self.equal_cameras)
         scales: FloatArray = np.ones((len(self.camera), 3))
         found = RollingMap(
             cam_from_map=cam_from_map,
@@ -187,25 +288,26 @@ class MotionAdjustment:
             velocities=np.zeros((len(cam_from_map), 9)),
             readout_ratio=np.ones(len(readouts.seconds)),
         )
-        noise_px = _NOISE_PX * max(
-            pixel_scale(each.width_px, each.height_px) for each in self.lenses.values()
-        )
+        noise_px = _NOISE_PX * self._pixel_scale()
         for passed in range(1 + _LATER_PASSES):
             seen, own = self._observations(found.cam_from_map, readouts, noise_px)
+            if not passed:
+                readouts = readouts.held(self._uncertain(seen, readouts), readouts.seconds)
             errors = _motion_errors(own * scales, readouts)
             if not passed and self._is_exact_enough(seen, errors):
                 return None
             found = replace(
                 found,
                 velocities=np.zeros_like(found.velocities),
-                readout_ratio=np.ones(len(readouts.seconds)),
+                readout_ratio=readouts.seconds / readouts.scale_s,
             )
             width_px = usual_residual_px(seen, found) if passed else _FIRST_LOSS_WIDTH * noise_px
             found = adjust_with_velocities(seen, found, errors, width_px)
-            sigma_s = readouts.seconds * readout_errors(seen, found, errors)
-            readouts = replace(readouts, seconds=readouts.seconds * found.readout_ratio)
+            readouts = self._after_pass(seen, found, errors, readouts, width_px)
             if passed < _LATER_PASSES:
-                readouts = readouts.shared(self.equal_cameras, sigma_s)
+                readouts = readouts.shared(self.equal_cameras)
+            if passed == _LATER_PASSES - 1:
+                readouts = readouts.without_short_ones()
             noise_px = usual_residual_px(seen, found) / _MEDIAN_OF_NORMAL
             squares = velocity_squares(replace(seen, noise_px=noise_px), found, errors)
             scales = self._error_scales(squares / own**2)
@@ -214,7 +316,11 @@ class MotionAdjustment:
             points=found.points,
             px_at_mid_row=px_at_mid_row(seen, found),
             readouts={
-                name: (float(readouts.seconds[index]), float(sigma_s[index]))
+                name: AdjustedReadout(
+                    seconds=float(readouts.seconds[index]),
+                    best_s=float(readouts.best_s[index]),
+                    sigma_s=None if np.isnan(readouts.sigma_s[index]) else float(readouts.sigma_s[index]),
+                )
                 for name, index in readouts.number.items()
             },
             error_scales=self._scales_of_frames(scales),
@@ -235,7 +341,7 @@ class MotionAdjustment:
         turn, shift = np.zeros((len(self.px), 3)), np.zeros((len(self.px), 3))
         errors, interval_s = np.full((len(camera), 3), _NO_MOTION_SIGMA), np.ones(len(camera))
         poses = {name: self._moved_poses(name, cam_from_map) for name in self.poses}
-        readout_s = {name: float(readouts.seconds[index]) for name, index in readouts.number.items()}
+        readout_s = {name: float(readouts.scale_s[index]) for name, index in readouts.number.items()}
         motions = camera_motions(self.lenses, poses, self.rotations, readout_s, {})
         for name, motion in motions.items():
             kept = camera == name
@@ -258,6 +364,46 @@ class MotionAdjustment:
             readout=np.array([readouts.number.get(name, 0) for name in self.camera], dtype=np.int64),
         )
         return seen, np.maximum(errors, _NO_MOTION_SIGMA)
+
+    def _pixel_scale(self) -> float:
+        """Return the size of the pixels of the largest image, in px of an image of 640 px."""
+        return max(pixel_scale(each.width_px, each.height_px) for each in self.lenses.values())
+
+    def _systematic_errors(self, seen: RowObservations, readouts: _Readouts) -> FloatArray:
+        """Return the errors (R,) of the readout times by systematic errors of detected pixels, seconds.
+
+        They are large where the camera turns slowly, so that a readout time displaces pixels by little.
+        """
+        of = seen.readout[seen.keyframe]
+        focal_px = np.array([lens.focal_px for lens in seen.lenses])[seen.lens[seen.keyframe]]
+        squares = (focal_px * np.linalg.norm(seen.turn, axis=1)) ** 2
+        count, total = (np.bincount(of, each, len(readouts.seconds)) for each in (np.ones(len(of)), squares))
+        px = np.sqrt(total / np.maximum(count, 1.0))
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.abs(readouts.scale_s) * _SYSTEMATIC_PX * self._pixel_scale() / px)
+
+    def _uncertain(self, seen: RowObservations, readouts: _Readouts) -> BoolArray:
+        """Return a mask (R,) of the readout times that the adjustment tells less well than they are known."""
+        keyframes = np.bincount(seen.readout, minlength=len(readouts.seconds))
+        unsure = self._systematic_errors(seen, readouts) > readouts.expected_s[:, 1]
+        return np.asarray(unsure | (keyframes < _MIN_KEYFRAMES))
+
+    def _after_pass(
+        self,
+        seen: RowObservations,
+        found: RollingMap,
+        errors: MotionErrors,
+        readouts: _Readouts,
+        width_px: float,
+    ) -> _Readouts:
+        """Return the readout times after a pass, with all their errors."""
+        seconds = readouts.scale_s * found.readout_ratio
+        parts = (
+            np.abs(readouts.scale_s) * readout_errors(seen, found, errors, width_px),
+            self._systematic_errors(seen, readouts),
+            _COMMON_RATIO * correction_ratios(seen, found) * np.abs(seconds),
+        )
+        return readouts.after_pass(found.readout_ratio, np.linalg.norm(parts, axis=0))
 
     def _is_exact_enough(self, seen: RowObservations, errors: MotionErrors) -> bool:
         """Return True if the expected errors of velocities and readout times displace nothing by much."""
@@ -340,11 +486,11 @@ def _motion_errors(velocities: FloatArray, readouts: _Readouts) -> MotionErrors:
         velocities: (K,3) expected errors of angular velocity, its change and velocity.
         readouts: The readout times so far.
     """
-    expected = readouts.expected_s / np.where(readouts.seconds, readouts.seconds, 1.0)[:, None]
+    expected = readouts.expected_s / readouts.scale_s[:, None]
     return MotionErrors(
         rate=velocities[:, 0],
         rate_change=velocities[:, 1],
         velocity=velocities[:, 2],
         readout_ratio=expected[:, 0],
-        readout=np.maximum(expected[:, 1], _NO_MOTION_SIGMA),
+        readout=np.maximum(np.abs(expected[:, 1]), _NO_MOTION_SIGMA),
     )

@@ -39,6 +39,9 @@ _POINT_DAMPING = 1e-9
 _MIN_NOISE_RATIO = 0.1
 """Smallest noise that residuals can show, as a ratio of the expected noise. It only prevents a division by
 zero."""
+_MIN_LEFT_RATIO = 0.1
+"""Smallest ratio of the residuals that poses and points do not absorb. It only prevents a division by
+zero."""
 _NOT_SEEN_PX = 1e3
 """Residual (px) of a point that has no projection."""
 
@@ -165,19 +168,27 @@ def adjust_with_velocities(
     return found
 
 
-def readout_errors(seen: RowObservations, found: RollingMap, errors: MotionErrors) -> FloatArray:
+def readout_errors(
+    seen: RowObservations, found: RollingMap, errors: MotionErrors, width_px: float
+) -> FloatArray:
     """Return the standard deviations (R,) of the ratios of the readout times of an adjusted map.
 
     They follow from the scatter of the influences of single keyframes, because the residuals of a keyframe
     have common errors and its velocities may be wrong. A standard deviation is infinite if the adjustment
     does not determine it.
 
+    Args:
+        seen: The observations.
+        found: The adjusted map.
+        errors: The expected errors of the adjustment.
+        width_px: Width of the loss of the adjustment, px.
+
     Source: Liang, Zeger, "Longitudinal data analysis using generalized linear models", 1986, for the variance
         of an estimate from clusters.
     """
     prior = _prior(seen, errors)
-    width_px = usual_residual_px(seen, found)
-    return _Normal.create(seen, found, prior, width_px).readout_errors(seen, found, prior, width_px)
+    normal = _Normal.create(seen, found, prior, width_px, expected=True)
+    return normal.readout_errors(seen, found, prior, width_px)
 
 
 def usual_residual_px(seen: RowObservations, found: RollingMap) -> float:
@@ -199,6 +210,23 @@ def velocity_squares(seen: RowObservations, found: RollingMap, errors: MotionErr
     own[:, axes, axes] += _POINT_DAMPING * np.maximum(own[:, axes, axes].max(axis=1, keepdims=True), 1.0)
     variance = seen.noise_px**2 * np.linalg.inv(own)[:, axes, axes][:, 6:]
     return np.asarray((found.velocities**2 + variance).reshape(-1, 3, 3).mean(axis=2))
+
+
+def correction_ratios(seen: RowObservations, found: RollingMap) -> FloatArray:
+    """Return how wrong the velocities of the paths usually are (R,), as a ratio of the displacements.
+
+    It is the median displacement by the corrections of the velocities, divided by the median displacement by
+    the readout time; 0 for a readout time that displaces nothing.
+    """
+    rows = seen.keyframe
+    turn, correction = _turns(seen, found)
+    turned, corrected = np.linalg.norm(turn, axis=1), np.linalg.norm(correction, axis=1)
+    out = np.zeros(len(found.readout_ratio))
+    for number in range(len(out)):
+        own = seen.readout[rows] == number
+        usual = float(np.median(turned[own])) if own.any() else 0.0
+        out[number] = float(np.median(corrected[own])) / usual if usual else 0.0
+    return out
 
 
 def px_at_mid_row(seen: RowObservations, found: RollingMap) -> FloatArray:
@@ -271,11 +299,20 @@ def _at_exposure(
     delay = seen.delay_s[:, None]
     pose = found.cam_from_map[k]
     at_middle = np.einsum("mij,mj->mi", pose[:, :3, :3], found.points[seen.point]) + pose[:, :3, 3]
-    rate, change, velocity = np.split(found.velocities[k], 3, axis=1)
-    turn = ratio * seen.turn + delay * rate + (0.5 / seen.interval_s[k][:, None]) * delay**2 * change
+    turn = np.add(*_turns(seen, found))
     rotation = so3_exp(-turn)
+    velocity = found.velocities[k, 6:]
     in_cam = np.einsum("mij,mj->mi", rotation, at_middle - ratio * seen.shift - delay * velocity)
     return in_cam, at_middle, turn, rotation
+
+
+def _turns(seen: RowObservations, found: RollingMap) -> tuple[FloatArray, FloatArray]:
+    """Return the expected rotation vectors (M,3) until the exposures, and their corrections (M,3), rad."""
+    k = seen.keyframe
+    delay = seen.delay_s[:, None]
+    rate, change = np.split(found.velocities[k, :6], 2, axis=1)
+    correction = delay * rate + (0.5 / seen.interval_s[k][:, None]) * delay**2 * change
+    return found.readout_ratio[seen.readout[k]][:, None] * seen.turn, correction
 
 
 def _project(seen: RowObservations, rays: FloatArray) -> FloatArray:
@@ -348,10 +385,24 @@ class _Normal:
     mixed: FloatArray
 
     @staticmethod
-    def create(seen: RowObservations, found: RollingMap, prior: _Prior, width_px: float) -> _Normal:
+    def create(
+        seen: RowObservations, found: RollingMap, prior: _Prior, width_px: float, *, expected: bool = False
+    ) -> _Normal:
+        """Return the equations of a step.
+
+        Args:
+            seen: The observations.
+            found: The map so far.
+            prior: The expected motion.
+            width_px: Width of the loss, px.
+            expected: True for blocks of the expected second derivatives of the cost, which an error needs;
+                False for those of the weighted squares. These are larger, and a step with them is safer.
+        """
         residual, valid = _residuals(seen, found)
         by_keyframe, by_point = _derivatives(seen, found, valid)
         weight = _weights(residual, valid, width_px)
+        # The derivative of w·r along r is w² - w·(1 - w), and w across it. Their mean is w².
+        curvature = weight**2 if expected else weight
         count, size = len(prior.by_keyframe), _UNKNOWNS + 1
         order = np.argsort(seen.keyframe, kind="stable")
         bounds = np.searchsorted(seen.keyframe[order], np.arange(count + 1))
@@ -359,17 +410,16 @@ class _Normal:
         for number in range(count):
             rows = order[bounds[number] : bounds[number + 1]]
             flat = by_keyframe[rows].reshape(-1, size)
-            weighted = flat * np.repeat(weight[rows], 2)[:, None]
-            own[number] = weighted.T @ flat
-            sums[number] = weighted.T @ residual[rows].ravel()
+            own[number] = (flat * np.repeat(curvature[rows], 2)[:, None]).T @ flat
+            sums[number] = flat.T @ (residual[rows] * weight[rows, None]).ravel()
         own[:, np.arange(_UNKNOWNS), np.arange(_UNKNOWNS)] += prior.by_keyframe
         sums[:, 6:_UNKNOWNS] += prior.by_keyframe[:, 6:] * found.velocities
         by_readout = prior.by_readout * (found.readout_ratio - prior.readout_ratio)
         np.add.at(by_readout, seen.readout, sums[:, _UNKNOWNS])
-        weighted = by_point * weight[:, None, None]
+        weighted = by_point * curvature[:, None, None]
         blocks, point_gradient = np.zeros((len(found.points), 3, 3)), np.zeros((len(found.points), 3))
         np.add.at(blocks, seen.point, np.einsum("mdi,mdj->mij", weighted, by_point))
-        np.add.at(point_gradient, seen.point, np.einsum("mdi,md->mi", weighted, residual))
+        np.add.at(point_gradient, seen.point, np.einsum("mdi,md->mi", by_point, residual * weight[:, None]))
         return _Normal(
             keyframe=seen.keyframe,
             point=seen.point,
@@ -455,8 +505,12 @@ class _Normal:
             return np.full(count, np.inf)
         residual, valid = _residuals(seen, found)
         by_keyframe, by_point = _derivatives(seen, found, valid)
-        force = residual * _weights(residual, valid, width_px)[:, None]
+        weight = _weights(residual, valid, width_px)
+        force = residual * weight[:, None]
+        # Without common errors, the errors of the observations alone would make this variance.
+        variance = 0.5 * float((force**2).sum()) / max(float((weight**2).sum()), 1e-12)
         out = np.empty(count)
+        left = self._left_ratio(int(valid.sum()))
         for number in range(count):
             unit = np.zeros(len(self.gradient))
             unit[number - count] = 1.0
@@ -468,8 +522,18 @@ class _Normal:
             expected = prior.by_keyframe[:, 6:] * found.velocities
             influence += (own[self.places()[:, 6:_UNKNOWNS]] * expected).sum(axis=1)
             readout = own[number - count] * seen.noise_px
-            out[number] = np.sqrt((influence**2).sum() + readout**2 * self.by_readout[number])
+            scatter = (influence**2).sum() / left + readout**2 * self.by_readout[number]
+            out[number] = np.sqrt(max(scatter, own[number - count] * variance))
         return out
+
+    def _left_ratio(self, count: int) -> float:
+        """Return the ratio of the residuals of observations that poses and points do not absorb.
+
+        Args:
+            count: Number of observations.
+        """
+        unknowns = 6 * len(self.own) + 3 * len(self.by_point) + len(self.by_readout)
+        return max(1.0 - unknowns / max(2 * count, 1), _MIN_LEFT_RATIO)
 
 
 def _weights(residual: FloatArray, valid: BoolArray, width_px: float) -> FloatArray:

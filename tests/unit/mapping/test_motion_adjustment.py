@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.mapping.reconstruction.motion_adjustment import MotionAdjustment, _Readouts
+from bodycap_batch.mapping.reconstruction.motion_adjustment import (
+    AdjustedReadout,
+    MotionAdjustment,
+    _Readouts,
+)
 from bodycap_batch.mapping.reconstruction.rolling_adjustment import RollingMap
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
 from tests.unit.mapping.test_rolling_adjustment import (
@@ -16,6 +20,7 @@ from tests.unit.mapping.test_rolling_adjustment import (
     FRAMES,
     KEYFRAMES,
     LENS,
+    NOISE_PX,
     READOUT_S,
     centre_error,
     poses_at,
@@ -48,16 +53,78 @@ def test_a_wrong_readout_time_is_corrected(ratio: float) -> None:
         truth.cam_from_map, truth.points, {"hand": ratio * READOUT_S}, {"hand": (ratio * READOUT_S, 0.01)}
     )
     assert found is not None
-    readout_s, sigma_s = found.readouts["hand"]
-    assert abs(readout_s - READOUT_S) < 0.0004
-    assert sigma_s < 0.0002
+    told = found.readouts["hand"]
+    assert told.seconds == told.best_s
+    assert told.sigma_s is not None
+    assert abs(told.seconds - READOUT_S) < 3.0 * told.sigma_s < 0.0015
+
+
+def test_the_readout_time_of_a_camera_that_is_upside_down_is_corrected() -> None:
+    adjustment, truth = hand()
+    # The pictures are upright again, so their last row is exposed first.
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    poses, times_ns = adjustment.poses["hand"]
+    flipped = replace(
+        adjustment, poses={"hand": (poses @ half_turn, times_ns)}, px=np.array([640.0, 480.0]) - adjustment.px
+    )
+    start_s = -0.8 * READOUT_S
+    found = flipped.run(
+        half_turn @ truth.cam_from_map, truth.points, {"hand": start_s}, {"hand": (start_s, 0.01)}
+    )
+    assert found is not None
+    told = found.readouts["hand"]
+    assert told.sigma_s is not None
+    assert abs(told.seconds + READOUT_S) < 3.0 * told.sigma_s < 0.0015
+
+
+@pytest.mark.parametrize("start_s", [0.0009, 0.0001, -0.0009])
+def test_a_global_shutter_is_found_to_be_one(start_s: float) -> None:
+    adjustment, truth = hand()
+    in_cam = np.einsum(
+        "mij,mj->mi", truth.cam_from_map[adjustment.keyframe, :3, :3], truth.points[adjustment.point]
+    )
+    in_cam += truth.cam_from_map[adjustment.keyframe, :3, 3]
+    noise = np.random.default_rng(6).normal(0.0, NOISE_PX, adjustment.px.shape)
+    still = replace(adjustment, px=LENS.project(in_cam) + noise)
+    found = still.run(truth.cam_from_map, truth.points, {"hand": start_s}, {"hand": (start_s, 0.004)})
+    assert found is not None
+    told = found.readouts["hand"]
+    assert told.seconds == 0.0
+    assert told.sigma_s is not None
+    assert abs(told.best_s) < 3.0 * told.sigma_s < 0.001
+    # The map is adjusted for a global shutter.
+    assert found.px_at_mid_row == pytest.approx(still.px, abs=0.01)
 
 
 def test_a_given_readout_time_stays() -> None:
     adjustment, truth = hand()
     found = adjustment.run(truth.cam_from_map, truth.points, {"hand": 0.018}, {"hand": (0.018, 0.0)})
     assert found is not None
-    assert found.readouts["hand"] == pytest.approx((0.018, 0.0), abs=1e-6)
+    assert found.readouts["hand"] == AdjustedReadout(seconds=0.018, best_s=0.018, sigma_s=None)
+
+
+def test_a_readout_time_that_systematic_errors_exceed_stays() -> None:
+    adjustment, truth = hand()
+    found = adjustment.run(truth.cam_from_map, truth.points, {"hand": 0.018}, {"hand": (0.018, 1e-6)})
+    assert found is not None
+    assert found.readouts["hand"] == AdjustedReadout(seconds=0.018, best_s=0.018, sigma_s=None)
+
+
+def test_few_keyframes_tell_no_readout_time() -> None:
+    adjustment, truth = hand()
+    rows = adjustment.keyframe < 3
+    few = replace(
+        adjustment,
+        camera=adjustment.camera[:3],
+        frame=adjustment.frame[:3],
+        keyframe=adjustment.keyframe[rows],
+        point=adjustment.point[rows],
+        px=adjustment.px[rows],
+    )
+    found = few.run(truth.cam_from_map[:3], truth.points, {"hand": 0.018}, {"hand": (0.018, 0.01)})
+    assert found is not None
+    assert found.readouts["hand"].seconds == 0.018
+    assert found.readouts["hand"].sigma_s is None
 
 
 def test_a_path_that_is_exact_enough_is_left_alone() -> None:
@@ -67,23 +134,52 @@ def test_a_path_that_is_exact_enough_is_left_alone() -> None:
     assert adjustment.run(*start, {}, {}) is None
 
 
-def test_equal_cameras_whose_readout_times_nearly_agree_share_one() -> None:
-    readouts = _Readouts.create(
+def readouts_of(
+    seconds: dict[str, float], expected: dict[str, tuple[float, float]], groups: list[list[str]]
+) -> _Readouts:
+    """Return readout times after a pass that has not changed them, with standard deviations of 0.1 ms."""
+    readouts = _Readouts.create(seconds, expected, groups)
+    ratio = readouts.seconds / readouts.scale_s
+    return readouts.after_pass(ratio, np.full(len(ratio), 1e-4))
+
+
+def test_equal_cameras_whose_readout_times_agree_share_one() -> None:
+    groups = [["a", "b"], ["c", "d"], ["e", "other"]]
+    readouts = readouts_of(
         {"a": 0.0100, "b": 0.0103, "c": 0.0101, "d": 0.0102, "e": 0.02},
         {"a": (0.01, 0.001), "b": (0.01, 0.002), "c": (0.01, 0.001), "d": (0.0102, 0.0), "e": (0.02, 0.001)},
+        groups,
     )
-    sigma_s = np.array([0.0001, 0.0001, 0.0001, 0.0002, 0.0001])
-    shared = readouts.shared([["a", "b"], ["c", "d"], ["e", "other"]], sigma_s)
+    shared = readouts.shared(groups)
     at_s = {name: shared.seconds[index] for name, index in shared.number.items()}
     assert shared.number["a"] == shared.number["b"]
-    assert at_s == pytest.approx({"a": 0.01006, "b": 0.01006, "c": 0.0101, "d": 0.0102, "e": 0.02})
+    assert at_s == pytest.approx({"a": 0.01015, "b": 0.01015, "c": 0.0101, "d": 0.0102, "e": 0.02})
     assert shared.expected_s[shared.number["a"]].tolist() == [0.01, 0.001]
 
 
-def test_equal_cameras_with_other_readout_times_keep_them() -> None:
-    expected = {"a": (0.01, 0.001), "b": (0.011, 0.001)}
-    readouts = _Readouts.create({"a": 0.010, "b": 0.011}, expected)
-    assert readouts.shared([["a", "b"]], np.full(2, 1e-4)).number == {"a": 0, "b": 1}
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_equal_cameras_with_other_readout_times_keep_them(sign: float) -> None:
+    expected = {"a": (sign * 0.01, 0.001), "b": (sign * 0.011, 0.001)}
+    readouts = readouts_of({"a": sign * 0.010, "b": sign * 0.011}, expected, [["a", "b"]])
+    assert readouts.shared([["a", "b"]]).number == {"a": 0, "b": 1}
+
+
+def test_only_equal_cameras_start_with_a_common_readout_time() -> None:
+    seconds = dict.fromkeys(("a", "b", "c", "d"), 0.01)
+    expected = {"a": (0.01, 0.001), "b": (0.01, 0.001), "c": (0.01, 0.001), "d": (0.01, 0.0)}
+    readouts = _Readouts.create(seconds, expected, [["a", "b", "d"]])
+    assert readouts.number == {"a": 0, "b": 0, "c": 1, "d": 2}
+    assert readouts.constant.tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "left"), [(0.0002, 0.0), (-0.0002, 0.0), (0.0005, 0.0005), (-0.0031, -0.0031)]
+)
+def test_a_short_readout_time_that_may_be_none_becomes_a_global_shutter(seconds: float, left: float) -> None:
+    readouts = readouts_of({"a": seconds}, {"a": (seconds, 0.001)}, []).without_short_ones()
+    assert readouts.seconds.tolist() == [left]
+    assert readouts.best_s.tolist() == pytest.approx([seconds])
+    assert readouts.constant.tolist() == [not left]
 
 
 def test_the_frames_between_keyframes_move_with_them() -> None:

@@ -203,6 +203,7 @@ def test_a_shutter_is_unknown_if_neither_the_job_nor_matches_determine_it() -> N
 
 def test_a_camera_that_turns_fast_may_have_a_short_readout_time(monkeypatch: pytest.MonkeyPatch) -> None:
     rates = {"calm": 0.5, "fast": 15.0, "exact": 15.0, "rolling": 15.0, "unknown": 15.0, "negative": 15.0}
+    rates["turned"] = 15.0
     readouts = {
         "calm": judged_readout(0.0003, 0.0008),
         "fast": judged_readout(0.0003, 0.0008),
@@ -210,6 +211,7 @@ def test_a_camera_that_turns_fast_may_have_a_short_readout_time(monkeypatch: pyt
         "rolling": judged_readout(0.01, 0.0005),
         "unknown": judged_readout(0.003, 0.0027),
         "negative": judged_readout(-0.0003, 0.0008),
+        "turned": judged_readout(0.0003, 0.0008),
     }
 
     def shutters_of(_: object, __: object, trial: dict[str, Readout]) -> dict[str, TurningShutter]:
@@ -217,9 +219,11 @@ def test_a_camera_that_turns_fast_may_have_a_short_readout_time(monkeypatch: pyt
 
     monkeypatch.setattr(shutters, "turning_shutters", shutters_of)
     selections: Any = [SimpleNamespace(camera=name, frames=np.arange(1, 5)) for name in rates]
-    possible = possible_readouts(cast(Any, None), selections, readouts)
+    cameras = {name: SimpleNamespace(may_be_sideways=name == "turned") for name in rates}
+    capture: Any = SimpleNamespace(camera=cameras.__getitem__)
+    possible = possible_readouts(capture, selections, readouts)
     # The largest plausible readout time is 1.9 ms. Until the first row, this camera turns by 14 mrad.
-    assert {name: item.seconds for name, item in possible.items()} == {"fast": 0.0003, "negative": 0.0001}
+    assert {name: item.seconds for name, item in possible.items()} == {"fast": 0.0003, "negative": -0.0003}
     assert possible["fast"].sigma_s == 0.0008
 
 

@@ -23,6 +23,7 @@ from bodycap_batch.mapping.intrinsics.readout_time import (
     stated_readout,
 )
 from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
+from bodycap_batch.mapping.reconstruction.motion_adjustment import AdjustedReadout
 from bodycap_batch.mapping.refine import distorted_cameras
 from bodycap_batch.model import rolling_shutter
 from bodycap_batch.model.camera import Camera
@@ -251,26 +252,35 @@ def test_the_readout_time_is_adjusted_together_with_the_keyframes() -> None:
     assert adjusted["other"] == start["other"]
 
 
-@pytest.mark.parametrize(
-    ("best_s", "seconds"), [(0.0002, 0.0), (-0.0003, 0.0), (0.0005, 0.0005), (0.0031, 0.0031)]
-)
-def test_an_adjusted_readout_time_near_zero_is_none(best_s: float, seconds: float) -> None:
-    start = Readout(0.0001, 0.0008, "of the map", 0.0001)
-    found = start.adjusted(best_s, 0.00005)
-    assert (found.seconds, found.best_s) == (seconds, best_s)
-    assert found.excludes_rolling == (seconds == 0.0)
+@pytest.mark.parametrize("seconds", [0.0, 0.0031, -0.0031])
+def test_an_adjusted_readout_time_replaces_the_earlier_one(seconds: float) -> None:
+    start = Readout(0.003, 0.0008, "of the map", 0.003, sideways=True)
+    found = start.adjusted(AdjustedReadout(seconds=seconds, best_s=seconds + 1e-5, sigma_s=5e-5))
+    source = "estimated" if seconds else "none found"
+    assert found == Readout(seconds, 5e-5, source, seconds + 1e-5, sideways=True)
+    assert start.adjusted(AdjustedReadout(seconds=0.003, best_s=0.003, sigma_s=None)) == start
 
 
 def test_an_adjustment_weights_readout_times_from_elsewhere() -> None:
     film = Film(0.02)
     rolling = model_with_inexact_path(film)
     start = {"head": judged_readout(0.015, 0.003)}
-    elsewhere = {"head": judged_readout(0.016, 1e-7)}
+    elsewhere = {"head": judged_readout(0.016, 2e-4)}
     model = rolling.corrected({"head": 0.015})
-    adjusted = rolling.adjust_with_velocities(model, start, elsewhere).readouts
-    assert adjusted["head"].seconds == pytest.approx(0.016, abs=1e-5)
-    # Only the common error of all splines is left.
-    assert adjusted["head"].sigma_s == pytest.approx(np.hypot(0.0001, 0.012 * 0.016), rel=0.01)
+    alone = rolling.adjust_with_velocities(rolling.corrected({"head": 0.015}), start).readouts["head"]
+    both = rolling.adjust_with_velocities(model, start, elsewhere).readouts["head"]
+    assert 0.016 < both.seconds < alone.seconds - 2e-4
+    # The velocities then deviate from their path, which makes the result uncertain.
+    assert both.sigma_s > alone.sigma_s
+
+
+def test_a_camera_without_a_trajectory_keeps_its_readout_time() -> None:
+    film = Film(0.02)
+    rolling = model_with_inexact_path(film, 0.005)
+    start = {"head": judged_readout(0.015, 0.003)}
+    elsewhere = RollingShutterModel(the_map(film, range(1, FRAMES, 5)), {}, {"head": camera_of(film)})
+    assert rolling._expected("head", start["head"], None) == (0.015, 0.004)
+    assert elsewhere._expected("head", start["head"], None) == (0.015, 0.0)
 
 
 def test_velocities_of_a_smooth_path_are_exact_enough() -> None:
