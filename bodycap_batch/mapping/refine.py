@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -94,7 +95,7 @@ def refine_map(
     mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, skeletal_above)
     cameras = {camera.name: camera for camera in capture.cameras}
     entries = previous.log.get("readouts_from_matches", {})
-    from_matches = {name: Readout(**entry) for name, entry in entries.items()}
+    from_matches = {name: _readout_of(entry) for name, entry in entries.items()}
     models, all_readouts, adjusted_px, motions = [], [], [], []
     removed = 0
     distorted: set[str] = set()
@@ -274,6 +275,11 @@ class _Refinement:
             corrected_px=corrected_px,
             removed=removed,
         )
+
+
+def _readout_of(entry: Mapping[str, Any]) -> Readout:
+    """Return the readout time of a log entry. Logs are stored as JSON, which has no infinite numbers."""
+    return Readout(**{**entry, "sigma_s": math.inf if entry["sigma_s"] is None else entry["sigma_s"]})
 
 
 def _seconds(readouts: Mapping[str, Readout]) -> dict[str, float]:

@@ -78,7 +78,8 @@ class Site:
         told.unlink(missing_ok=True)
         where = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(told))
         self.spawn("scheduler", "dask_scheduler", *where, *options)
-        wait_for(told.exists, "the scheduler's address")
+        # The file is not written at once.
+        wait_for(lambda: told.exists() and told.read_text().strip().endswith("}"), "the scheduler's address")
         return str(json.loads(told.read_text())["address"])
 
     def worker(self, name: str, *options: str) -> None:

@@ -8,13 +8,14 @@ for a few readout times.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from bodycap_batch.capture import Capture
-from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.intrinsics.readout_time import Readout, few_blocks_factor, weighted_mean
@@ -50,6 +51,9 @@ _MAX_PAIRS = 600
 """Maximum number of pairs in the sample. It bounds the time. Evidence: docs/decisions/mapping.md."""
 _MAX_TRIED = 2400
 """Maximum number of pairs whose features are compared to find this sample. It bounds the time."""
+_PAIRS_AT_ONCE = 64
+"""Number of pairs whose features are compared between two looks at the size of the sample. The sample does
+not depend on it."""
 _MIN_DECIDING = 20
 """Minimum number of pairs with another number of matches than without the correction. Evidence: none."""
 _MIN_STEPS_APART = 5
@@ -88,13 +92,17 @@ class _Sample:
     blocks: IntArray
 
     def counts(
-        self, shutters: Mapping[str, TurningShutter], intrinsics: Mapping[str, CameraIntrinsics]
+        self,
+        shutters: Mapping[str, TurningShutter],
+        intrinsics: Mapping[str, CameraIntrinsics],
+        threads: int,
     ) -> IntArray:
         """Return the numbers (P,) of verified matches after a correction.
 
         Args:
             shutters: By camera name, what corrects the keypoints for a rolling shutter.
             intrinsics: Intrinsics by camera name.
+            threads: Number of threads.
         """
         features = {}
         for ref in {ref for pair in self.pairs for ref in pair}:
@@ -104,12 +112,22 @@ class _Sample:
             features[ref] = KeyframeFeatures.of(
                 px, self.descriptors[ref], intrinsics[ref.camera], _MAX_ERROR_PX
             )
-        return np.array(
-            [
-                len(verify_pair(matches, features[a], features[b]))
-                for (a, b), matches in zip(self.pairs, self.matches, strict=True)
-            ],
-            dtype=np.int64,
+
+        def count(number: int) -> int:
+            a, b = self.pairs[number]
+            return len(verify_pair(self.matches[number], features[a], features[b]))
+
+        with ThreadPoolExecutor(threads) as pool:
+            return np.array(list(pool.map(count, range(len(self.pairs)))), dtype=np.int64)
+
+    def of_pairs(self, kept: BoolArray) -> _Sample:
+        """Return the sample with the pairs of a mask (P,)."""
+        numbers = np.flatnonzero(kept).tolist()
+        return replace(
+            self,
+            pairs=[self.pairs[number] for number in numbers],
+            matches=[self.matches[number] for number in numbers],
+            blocks=self.blocks[kept],
         )
 
 
@@ -189,20 +207,29 @@ def estimate_from_pairs(
     sample = _read_sample(workspace, generator, capture, names, context)
     if len(np.unique(sample.blocks)) < _MIN_BLOCKS:
         return out
-    known: dict[int, IntArray] = {}
     first = readouts[names[0]]
+
+    def shutters(step: int) -> dict[str, TurningShutter]:
+        seconds = first.best_s + step * _STEP_S
+        return turning_shutters(
+            capture, selections, {name: replace(out[name], seconds=seconds) for name in names}
+        )
+
+    uncorrected = sample.counts({}, intrinsics, context.threads)
+    corrected = sample.counts(shutters(0), intrinsics, context.threads)
+    # The other pairs show different places. They would take most of the time.
+    kept = (uncorrected > 0) | (corrected > 0)
+    sample, uncorrected, known = sample.of_pairs(kept), uncorrected[kept], {0: corrected[kept]}
 
     def counts(step: int) -> IntArray:
         context.check_cancelled()
         if step not in known:
-            seconds = first.best_s + step * _STEP_S
-            trial = {name: replace(out[name], seconds=seconds) for name in names}
-            known[step] = sample.counts(turning_shutters(capture, selections, trial), intrinsics)
+            known[step] = sample.counts(shutters(step), intrinsics, context.threads)
         return known[step]
 
     best = _best_step(counts)
     interval_s = min(float(np.median(np.diff(capture.camera(name).times_ns))) * 1e-9 for name in names)
-    if not advantage_sigmas(counts(best), sample.counts({}, intrinsics), sample.blocks) >= _MIN_SIGMAS:
+    if not advantage_sigmas(counts(best), uncorrected, sample.blocks) >= _MIN_SIGMAS:
         return out
     place, sigma = _peak(np.stack([counts(best + step) for step in (-1, 0, 1)]), sample.blocks)
     value = np.array([first.best_s, first.best_s + (best + place) * _STEP_S])
@@ -240,18 +267,25 @@ def _read_sample(
     found: list[IntArray] = []
     px: dict[ImageRef, FloatArray] = {}
     descriptors: dict[ImageRef, ByteDescriptors] = {}
-    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+    with (
+        pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database,
+        ThreadPoolExecutor(context.threads) as pool,
+    ):
         ids = read_image_ids(database)
-        for number in order.tolist():
+        for start in range(0, len(order), _PAIRS_AT_ONCE):
             context.check_cancelled()
-            for ref in set(pairs[number]) - px.keys():
+            batch = [pairs[number] for number in order[start : start + _PAIRS_AT_ONCE].tolist()]
+            for ref in {ref for pair in batch for ref in pair} - px.keys():
                 px[ref] = np.asarray(database.read_keypoints(ids[ref]), dtype=np.float64)[:, :2]
                 descriptors[ref] = np.asarray(database.read_descriptors(ids[ref]).data)
-            first, second = (descriptors[ref].astype(np.float32) for ref in pairs[number])
-            matches = find_mutual_matches(first, second)
-            if len(matches) >= MIN_INLIERS:
-                used.append(pairs[number])
-                found.append(matches)
+            matches = pool.map(
+                lambda pair: find_mutual_matches(*(descriptors[ref].astype(np.float32) for ref in pair)),
+                batch,
+            )
+            for pair, own in zip(batch, matches, strict=True):
+                if len(own) >= MIN_INLIERS and len(used) < _MAX_PAIRS:
+                    used.append(pair)
+                    found.append(own)
             if len(used) == _MAX_PAIRS:
                 break
     numbers: dict[tuple[str, int], int] = {}

@@ -40,8 +40,8 @@ _NOISE_PX = 0.7
 the same as for angular velocities in `model.rotation_path`."""
 _FIRST_LOSS_WIDTH = 4.0
 """Width of the loss in the first pass, in standard deviations of an observation. It keeps observations that
-disagree because the velocities of the path are wrong. The later width is the median residual. Evidence:
-docs/decisions/mapping.md."""
+disagree because the velocities of the path are wrong. The later width is the median residual at the start of
+the pass. Evidence: docs/decisions/mapping.md."""
 _LATER_PASSES = 2
 """Number of passes with the noise and the errors that the residuals show. Evidence:
 docs/decisions/mapping.md."""

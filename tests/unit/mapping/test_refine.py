@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import asdict
 from types import SimpleNamespace
 from typing import Any, cast
 
 from bodycap_batch.mapping.intrinsics.readout_time import Readout, judged_readout
-from bodycap_batch.mapping.refine import _Refinement
+from bodycap_batch.mapping.refine import _readout_of, _Refinement
 
 
 def refinement(
@@ -67,3 +69,9 @@ def test_an_unknown_readout_time_is_not_decided() -> None:
     assert not refinement({"palm": 0.01}, {}, {"head": unknown})._readouts_are_decided()
     assert not refinement({"palm": 0.01}, {}, {})._readouts_are_decided()
     assert not refinement({}, {}, {"head": judged_readout(0.0001, 0.0003)})._readouts_are_decided()
+
+
+def test_an_unknown_error_of_a_logged_readout_time_is_infinite() -> None:
+    readout = judged_readout(0.002, math.inf)
+    assert _readout_of({**asdict(readout), "sigma_s": None}) == readout
+    assert _readout_of(asdict(judged_readout(0.02, 0.001))) == judged_readout(0.02, 0.001)
