@@ -16,6 +16,7 @@ from bodycap_batch.inertial import camera_rotation
 from bodycap_batch.mapping.intrinsics.readout_time import (
     DISPLACED_PERCENT,
     Readout,
+    groups_of_equal_cameras,
     judged_readout,
     stated_readout,
     weighted_mean,
@@ -130,11 +131,12 @@ def turning_shutters(
 def possible_readouts(
     capture: Capture, selections: Sequence[KeyframeSelection], readouts: Mapping[str, Readout]
 ) -> dict[str, Readout]:
-    """Return short readout times that matches do not exclude, of cameras that turn fast, by camera name.
+    """Return short readout times that matches do not exclude, by camera name.
 
     If matches find no rolling shutter, the readout time is shorter than 2 ms. Where a camera turns fast, this
-    still displaces keypoints far. Such a readout time is an unknown of the adjustment of the map. It tells no
-    direction of the rows, so cameras with an unknown direction are left out.
+    still displaces keypoints far. Such a readout time is an unknown of the adjustment of the map, together
+    with those of equal cameras. It tells no direction of the rows, so cameras with an unknown direction are
+    left out.
 
     Args:
         capture: All cameras.
@@ -151,10 +153,17 @@ def possible_readouts(
     }
     shutters = turning_shutters(capture, selections, trial)
     frames = {item.camera: np.asarray(item.frames) for item in selections}
-    return {
-        name: replace(short[name], seconds=_at_least(short[name].best_s, _MIN_POSSIBLE_S))
+    fast = {
+        name
         for name, shutter in shutters.items()
         if grid_displacement_px(shutter, frames[name]) > MAX_DISPLACEMENT_PX
+    }
+    groups = groups_of_equal_cameras(capture.cameras)
+    return {
+        name: replace(short[name], seconds=_at_least(short[name].best_s, _MIN_POSSIBLE_S))
+        for group in groups
+        for name in group
+        if name in shutters and not fast.isdisjoint(group)
     }
 
 
