@@ -374,9 +374,10 @@ class MotionAdjustment:
 
         They are large where the camera turns slowly, so that a readout time displaces pixels by little.
         """
-        of = seen.readout[seen.keyframe]
-        focal_px = np.array([lens.focal_px for lens in seen.lenses])[seen.lens[seen.keyframe]]
-        squares = (focal_px * np.linalg.norm(seen.turn, axis=1)) ** 2
+        rolling = seen.delay_s != 0.0
+        of = seen.readout[seen.keyframe[rolling]]
+        focal_px = np.array([lens.focal_px for lens in seen.lenses])[seen.lens[seen.keyframe[rolling]]]
+        squares = (focal_px * np.linalg.norm(seen.turn[rolling], axis=1)) ** 2
         count, total = (np.bincount(of, each, len(readouts.seconds)) for each in (np.ones(len(of)), squares))
         px = np.sqrt(total / np.maximum(count, 1.0))
         with np.errstate(divide="ignore"):
@@ -384,7 +385,8 @@ class MotionAdjustment:
 
     def _uncertain(self, seen: RowObservations, readouts: _Readouts) -> BoolArray:
         """Return a mask (R,) of the readout times that the adjustment tells less well than they are known."""
-        keyframes = np.bincount(seen.readout, minlength=len(readouts.seconds))
+        rolling = np.unique(seen.keyframe[seen.delay_s != 0.0])
+        keyframes = np.bincount(seen.readout[rolling], minlength=len(readouts.seconds))
         unsure = self._systematic_errors(seen, readouts) > readouts.expected_s[:, 1]
         return np.asarray(unsure | (keyframes < _MIN_KEYFRAMES))
 

@@ -66,7 +66,7 @@ class RowObservations:
         noise_px: Standard deviation of an observation, px.
         interval_s: (K,) frame interval of the camera of each keyframe, seconds.
         readout: (K,) number of the readout time of the camera of each keyframe, one of R. Turns and shifts
-            are proportional to it.
+            are proportional to it. A camera without a rolling shutter has any number; its delays are 0.
     """
 
     lenses: Sequence[Camera]
@@ -223,7 +223,7 @@ def correction_ratios(seen: RowObservations, found: RollingMap) -> FloatArray:
     turned, corrected = np.linalg.norm(turn, axis=1), np.linalg.norm(correction, axis=1)
     out = np.zeros(len(found.readout_ratio))
     for number in range(len(out)):
-        own = seen.readout[rows] == number
+        own = (seen.readout[rows] == number) & (seen.delay_s != 0.0)
         usual = float(np.median(turned[own])) if own.any() else 0.0
         out[number] = float(np.median(corrected[own])) / usual if usual else 0.0
     return out

@@ -13,7 +13,7 @@ from bodycap_batch.mapping.reconstruction.motion_adjustment import (
     MotionAdjustment,
     _Readouts,
 )
-from bodycap_batch.mapping.reconstruction.rolling_adjustment import RollingMap
+from bodycap_batch.mapping.reconstruction.rolling_adjustment import RollingMap, correction_ratios
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
 from tests.unit.mapping.test_rolling_adjustment import (
     FRAME_S,
@@ -108,6 +108,30 @@ def test_a_readout_time_that_systematic_errors_exceed_stays() -> None:
     found = adjustment.run(truth.cam_from_map, truth.points, {"hand": 0.018}, {"hand": (0.018, 1e-6)})
     assert found is not None
     assert found.readouts["hand"] == AdjustedReadout(seconds=0.018, best_s=0.018, sigma_s=None)
+
+
+def test_a_camera_without_a_rolling_shutter_does_not_change_the_error_of_a_readout_time() -> None:
+    adjustment, truth = hand()
+    count, rows = len(KEYFRAMES), adjustment.keyframe
+    both = replace(
+        adjustment,
+        lenses={"hand": LENS, "head": LENS},
+        camera=(*adjustment.camera, *("head",) * (2 * count)),
+        frame=np.tile(adjustment.frame, 3),
+        keyframe=np.concatenate([rows, rows + count, rows + 2 * count]),
+        point=np.tile(adjustment.point, 3),
+        px=np.tile(adjustment.px, (3, 1)),
+    )
+    readouts = _Readouts.create({"hand": READOUT_S}, {"hand": (READOUT_S, 0.01)}, [])
+    errors, ratios = [], []
+    for times, each in ((1, adjustment), (3, both)):
+        pose = np.tile(truth.cam_from_map, (times, 1, 1))
+        seen, _ = each._observations(pose, readouts, NOISE_PX)
+        moved = replace(truth, cam_from_map=pose, velocities=np.full((times * count, 9), 0.1))
+        errors.append(each._systematic_errors(seen, readouts))
+        ratios.append(correction_ratios(seen, moved))
+    assert 1e-6 < errors[0] == pytest.approx(errors[1])
+    assert 0.01 < ratios[0] == pytest.approx(ratios[1])
 
 
 def test_few_keyframes_tell_no_readout_time() -> None:
