@@ -30,20 +30,21 @@ from tests.unit.mapping.test_rolling_adjustment import (
 TIMES_NS = np.round(np.arange(FRAMES) * FRAME_S * 1e9).astype(np.int64)
 
 
-def hand() -> tuple[MotionAdjustment, RollingMap]:
-    """Return the adjustment of a hand that shakes, and the true map."""
+def hand(points: int = 400) -> tuple[MotionAdjustment, RollingMap]:
+    """Return the adjustment of a hand that shakes and sees a number of points, and the true map."""
     seen, truth, _ = scene()
+    rows = seen.point < points
     adjustment = MotionAdjustment(
         lenses={"hand": LENS},
         poses={"hand": (poses_at(TIMES_NS * 1e-9), TIMES_NS)},
         rotations={},
         camera=("hand",) * len(KEYFRAMES),
         frame=KEYFRAMES,
-        keyframe=seen.keyframe,
-        point=seen.point,
-        px=seen.px,
+        keyframe=seen.keyframe[rows],
+        point=seen.point[rows],
+        px=seen.px[rows],
     )
-    return adjustment, truth
+    return adjustment, replace(truth, points=truth.points[:points])
 
 
 @pytest.mark.parametrize("ratio", [0.75, 1.25])
@@ -60,7 +61,7 @@ def test_a_wrong_readout_time_is_corrected(ratio: float) -> None:
 
 
 def test_the_readout_time_of_a_camera_that_is_upside_down_is_corrected() -> None:
-    adjustment, truth = hand()
+    adjustment, truth = hand(120)
     # The pictures are upright again, so their last row is exposed first.
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     poses, times_ns = adjustment.poses["hand"]
@@ -79,7 +80,7 @@ def test_the_readout_time_of_a_camera_that_is_upside_down_is_corrected() -> None
 
 @pytest.mark.parametrize("start_s", [0.0009, 0.0001, -0.0009])
 def test_a_global_shutter_is_found_to_be_one(start_s: float) -> None:
-    adjustment, truth = hand()
+    adjustment, truth = hand(120)
     in_cam = np.einsum(
         "mij,mj->mi", truth.cam_from_map[adjustment.keyframe, :3, :3], truth.points[adjustment.point]
     )
@@ -97,14 +98,14 @@ def test_a_global_shutter_is_found_to_be_one(start_s: float) -> None:
 
 
 def test_a_given_readout_time_stays() -> None:
-    adjustment, truth = hand()
+    adjustment, truth = hand(120)
     found = adjustment.run(truth.cam_from_map, truth.points, {"hand": 0.018}, {"hand": (0.018, 0.0)})
     assert found is not None
     assert found.readouts["hand"] == AdjustedReadout(seconds=0.018, best_s=0.018, sigma_s=None)
 
 
 def test_a_readout_time_that_systematic_errors_exceed_stays() -> None:
-    adjustment, truth = hand()
+    adjustment, truth = hand(120)
     found = adjustment.run(truth.cam_from_map, truth.points, {"hand": 0.018}, {"hand": (0.018, 1e-6)})
     assert found is not None
     assert found.readouts["hand"] == AdjustedReadout(seconds=0.018, best_s=0.018, sigma_s=None)
