@@ -38,13 +38,17 @@ probability. Evidence: none."""
 _NOISE_PX = 0.7
 """Standard deviation of an observation in the first pass, px of an image with a long side of 640 px. Origin:
 the same as for angular velocities in `model.rotation_path`."""
-_FIRST_LOSS_WIDTH = 4.0
-"""Width of the loss in the first pass, in standard deviations of an observation. It keeps observations that
-disagree because the velocities of the path are wrong. The later width is the median residual at the start of
-the pass. Evidence: docs/decisions/mapping.md."""
-_LATER_PASSES = 2
-"""Number of passes with the noise and the errors that the residuals show. Evidence:
-docs/decisions/mapping.md."""
+_WIDE_LOSS_WIDTH = 4.0
+"""Width of the loss in the first passes, in standard deviations of an observation in the first pass. It keeps
+observations that disagree because the velocities of the path are wrong. The later width is the median
+residual at the start of the pass. Evidence: docs/decisions/mapping.md."""
+_WIDE_PASSES = 2
+"""Number of passes with this width. Evidence: docs/decisions/mapping.md."""
+_PASSES = 4
+"""Number of passes. Evidence: docs/decisions/mapping.md."""
+_FIRST_SCALE = 1.0 / 3.0
+"""Factor of the expected errors of the velocities in the first pass. With few keyframes, larger errors let
+poses and points follow wrong velocities. Evidence: docs/decisions/mapping.md."""
 _MEDIAN_OF_NORMAL = 0.6745
 """Median absolute value of a normal variable, in its standard deviations."""
 _EXACT_RATIO = 0.5
@@ -73,11 +77,13 @@ too smooth. A readout time is wrong by this part. Evidence: docs/decisions/mappi
 _MIN_KEYFRAMES = 4
 """Minimum number of keyframes that tell a readout time. With fewer, the scatter of single keyframes is
 unknown. Evidence: docs/decisions/mapping.md."""
-_SCALE_STEPS = 20
-"""Number of steps in which the usual size of the errors is computed. They converge by a factor of two or more
-each."""
+_SCALE_STEPS = 200
+"""Number of steps in which the usual size of the errors is computed. It converges slowly where the pictures
+say little about the velocities. A step takes microseconds."""
 _MIN_OBSERVATIONS = 12
 """Minimum number of observations of a keyframe that tells how wrong velocities are. Evidence: none."""
+_NO_INFORMATION = 1e-9
+"""Ratio of information, from pictures to all, that says nothing. It only prevents a division by zero."""
 _MIN_SCALE = 0.05
 """Smallest factor of the expected errors of velocities. It only prevents that an exact path leaves no
 freedom."""
@@ -281,7 +287,7 @@ class MotionAdjustment:
                 readout time with a standard deviation of 0 is constant.
         """
         readouts = _Readouts.create(readout_s, expected_s, self.equal_cameras)
-        scales: FloatArray = np.ones((len(self.camera), 3))
+        scales: FloatArray = np.full((len(self.camera), 3), _FIRST_SCALE)
         found = RollingMap(
             cam_from_map=cam_from_map,
             points=points,
@@ -289,28 +295,29 @@ class MotionAdjustment:
             readout_ratio=np.ones(len(readouts.seconds)),
         )
         noise_px = _NOISE_PX * self._pixel_scale()
-        for passed in range(1 + _LATER_PASSES):
+        wide_px = _WIDE_LOSS_WIDTH * noise_px
+        for passed in range(_PASSES):
             seen, own = self._observations(found.cam_from_map, readouts, noise_px)
             if not passed:
                 readouts = readouts.held(self._uncertain(seen, readouts), readouts.seconds)
-            errors = _motion_errors(own * scales, readouts)
-            if not passed and self._is_exact_enough(seen, errors):
+            if not passed and self._is_exact_enough(seen, _motion_errors(own, readouts)):
                 return None
+            errors = _motion_errors(own * scales, readouts)
             found = replace(
                 found,
                 velocities=np.zeros_like(found.velocities),
                 readout_ratio=readouts.seconds / readouts.scale_s,
             )
-            width_px = usual_residual_px(seen, found) if passed else _FIRST_LOSS_WIDTH * noise_px
+            width_px = wide_px if passed < _WIDE_PASSES else usual_residual_px(seen, found)
             found = adjust_with_velocities(seen, found, errors, width_px)
             readouts = self._after_pass(seen, found, errors, readouts, width_px)
-            if passed < _LATER_PASSES:
+            if passed < _PASSES - 1:
                 readouts = readouts.shared(self.equal_cameras)
-            if passed == _LATER_PASSES - 1:
+            if passed == _PASSES - 2:
                 readouts = readouts.without_short_ones()
             noise_px = usual_residual_px(seen, found) / _MEDIAN_OF_NORMAL
-            squares = velocity_squares(replace(seen, noise_px=noise_px), found, errors)
-            scales = self._error_scales(squares / own**2)
+            squares, variances = velocity_squares(replace(seen, noise_px=noise_px), found, errors)
+            scales = self._error_scales(squares / own**2, variances / own**2, scales)
         return AdjustedMap(
             cam_from_map=found.cam_from_map,
             points=found.points,
@@ -446,31 +453,37 @@ class MotionAdjustment:
         moved = make_transform(between[:, :3, :3] @ poses[:, :3, :3], between[:, :3, 3] + poses[:, :3, 3])
         return moved, times_ns
 
-    def _error_scales(self, squares: FloatArray) -> FloatArray:
+    def _error_scales(self, squares: FloatArray, variances: FloatArray, scales: FloatArray) -> FloatArray:
         """Return factors (K,3) of the expected errors of velocities.
 
         The errors of the keyframes of a camera have a Student distribution: each has its own size, near the
-        usual size of the camera unless its square says otherwise.
+        usual size of the camera unless the pictures say otherwise. What the pictures say of a velocity is
+        separated from what was expected of it, so the result hardly depends on the earlier factors.
 
         Args:
-            squares: (K,3) expected squares of the errors along an axis, in the expected errors of the path.
+            squares: (K,3) mean squares of the corrections along an axis, in the expected errors of the path.
+            variances: (K,3) their variances, in the same unit.
+            scales: (K,3) factors with which the corrections were estimated.
 
         Source: Lange, Little, Taylor, "Robust statistical modeling using the t distribution", 1989.
         """
         seen: BoolArray = np.bincount(self.keyframe, minlength=len(self.camera)) >= _MIN_OBSERVATIONS
-        scales, camera = np.ones_like(squares), np.array(self.camera)
+        information = np.maximum(1.0 / variances - 1.0 / scales**2, 0.0)
+        measured = squares / np.maximum(variances * information, _NO_INFORMATION) ** 2
+        out, camera = np.ones_like(squares), np.array(self.camera)
         for name in np.unique(camera).tolist():
-            own = camera == name
-            told = squares[own & seen]
-            if not len(told):
+            own = np.flatnonzero(camera == name)
+            if not seen[own].any():
                 continue
-            usual, weight = np.maximum(told.mean(axis=0), _MIN_SCALE**2), np.ones_like(told)
+            usual, size = np.ones(3), np.ones((len(own), 3))
             for _ in range(_SCALE_STEPS):
-                weight = (_FREEDOM + 3.0) / (_FREEDOM + 3.0 * told / usual)
-                usual = np.maximum((weight * told).mean(axis=0), _MIN_SCALE**2)
-            weight = (_FREEDOM + 3.0) / (_FREEDOM + 3.0 * squares[own] / usual)
-            scales[own] = np.sqrt(usual / weight)
-        return scales
+                variance = 1.0 / (information[own] + 1.0 / size)
+                square = (information[own] * variance) ** 2 * measured[own] + variance
+                weight = (_FREEDOM + 3.0) / (_FREEDOM + 3.0 * square / usual)
+                usual = np.maximum((weight * square)[seen[own]].mean(axis=0), _MIN_SCALE**2)
+                size = usual / weight
+            out[own] = np.sqrt(size)
+        return out
 
     def _scales_of_frames(self, scales: FloatArray) -> dict[str, FloatArray]:
         """Return the factors (N,3) of all frames of each camera from those of the keyframes (K,3)."""

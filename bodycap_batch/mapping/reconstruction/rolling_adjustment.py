@@ -196,12 +196,13 @@ def usual_residual_px(seen: RowObservations, found: RollingMap) -> float:
     return max(_MIN_NOISE_RATIO * seen.noise_px, float(np.median(np.abs(_residuals(seen, found)[0]))))
 
 
-def velocity_squares(seen: RowObservations, found: RollingMap, errors: MotionErrors) -> FloatArray:
-    """Return the expected squares (K,3) of the corrections of the velocities, along each axis.
+def velocity_squares(
+    seen: RowObservations, found: RollingMap, errors: MotionErrors
+) -> tuple[FloatArray, FloatArray]:
+    """Return the mean squares (K,3) of the corrections of the velocities, and the variances (K,3) of them.
 
-    They are the squares of the adjusted corrections plus the variances of their errors: of angular velocity,
-    (rad/s) squared; of its change in a frame interval, the same; and of velocity. The points are taken as
-    known.
+    They are means over the three axes: of angular velocity, (rad/s) squared; of its change in a frame
+    interval, the same; and of velocity. The points are taken as known.
     """
     width_px = usual_residual_px(seen, found)
     own = _Normal.create(seen, found, _prior(seen, errors), width_px).own[:, :_UNKNOWNS, :_UNKNOWNS].copy()
@@ -209,7 +210,8 @@ def velocity_squares(seen: RowObservations, found: RollingMap, errors: MotionErr
     own[:, axes, axes] *= 1.0 + _MIN_DAMPING
     own[:, axes, axes] += _POINT_DAMPING * np.maximum(own[:, axes, axes].max(axis=1, keepdims=True), 1.0)
     variance = seen.noise_px**2 * np.linalg.inv(own)[:, axes, axes][:, 6:]
-    return np.asarray((found.velocities**2 + variance).reshape(-1, 3, 3).mean(axis=2))
+    square = found.velocities**2
+    return square.reshape(-1, 3, 3).mean(axis=2), variance.reshape(-1, 3, 3).mean(axis=2)
 
 
 def correction_ratios(seen: RowObservations, found: RollingMap) -> FloatArray:

@@ -239,8 +239,18 @@ def test_a_keyframe_without_a_pose_in_the_path_moves_no_frame() -> None:
     assert np.array_equal(moved, poses, equal_nan=True)
 
 
-def scales_of(squares: FloatArray, cameras: tuple[str, ...], seen: int = 20) -> FloatArray:
-    """Return the factors of the expected errors for keyframes with a number of observations each."""
+def scales_of(
+    corrections: FloatArray, cameras: tuple[str, ...], seen: int = 20, before: float = 1.0, noise: float = 0.1
+) -> FloatArray:
+    """Return the factors of the expected errors, for keyframes with a number of observations each.
+
+    Args:
+        corrections: (K,3) velocities that the pictures tell, in the expected errors.
+        cameras: Camera of each keyframe.
+        seen: Number of observations of each keyframe.
+        before: Factor with which the corrections were estimated.
+        noise: Standard deviation of what the pictures tell.
+    """
     adjustment = MotionAdjustment(
         lenses={},
         poses={},
@@ -251,23 +261,33 @@ def scales_of(squares: FloatArray, cameras: tuple[str, ...], seen: int = 20) -> 
         point=np.zeros(seen * len(cameras), np.int64),
         px=np.zeros((seen * len(cameras), 2)),
     )
-    return adjustment._error_scales(squares)
+    variance = 1.0 / (noise**-2 + before**-2)
+    squares = (corrections * variance / noise**2) ** 2
+    return adjustment._error_scales(squares, np.full(squares.shape, variance), np.full(squares.shape, before))
 
 
-def test_each_camera_has_its_own_usual_error_and_a_violent_keyframe_a_larger_one() -> None:
-    squares = np.concatenate([np.full((20, 3), 0.04), np.full((20, 3), 4.0)])
-    squares[5] = 9.0
-    scales = scales_of(squares, ("a",) * 20 + ("b",) * 20)
+@pytest.mark.parametrize("before", [0.3, 1.0, 3.0])
+def test_each_camera_has_its_own_usual_error_and_a_violent_keyframe_a_larger_one(before: float) -> None:
+    corrections = np.concatenate([np.full((20, 3), 0.2), np.full((20, 3), 2.0)])
+    corrections[5] = 3.0
+    scales = scales_of(corrections, ("a",) * 20 + ("b",) * 20, before=before)
     calm = np.delete(scales[:20], 5, axis=0)
-    assert calm == pytest.approx(0.2, abs=0.05)
-    assert scales[20:] == pytest.approx(2.0, rel=0.01)
+    assert calm == pytest.approx(0.2, abs=0.06)
+    assert scales[20:] == pytest.approx(2.0, rel=0.02)
     # The size of one keyframe follows from its own error and from the usual one.
     assert (scales[5] > 1.0).all()
     assert (scales[5] < 3.0).all()
 
 
+def test_noise_is_no_error_of_a_velocity() -> None:
+    rng = np.random.default_rng(8)
+    # Without errors, the pictures tell only their noise.
+    scales = scales_of(rng.normal(0.0, 0.5, (200, 3)), ("a",) * 200, noise=0.5)
+    assert np.median(scales) < 0.25
+
+
 def test_keyframes_with_few_observations_tell_no_errors() -> None:
-    assert (scales_of(np.full((4, 3), 25.0), ("a",) * 4, seen=3) == 1.0).all()
+    assert (scales_of(np.full((4, 3), 5.0), ("a",) * 4, seen=3) == 1.0).all()
 
 
 def test_the_errors_of_the_path_follow_from_the_adjustment() -> None:

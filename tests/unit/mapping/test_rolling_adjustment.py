@@ -249,7 +249,8 @@ def test_the_errors_of_velocities_are_told_by_their_corrections() -> None:
     seen, truth, errors = scene(shrunk=True)
     found = adjusted(seen, truth, errors)
     noise = replace(seen, noise_px=NOISE_PX)
-    told = np.sqrt(velocity_squares(noise, found, errors)[:, 0])
+    squares, variances = velocity_squares(noise, found, errors)
+    told = np.sqrt((squares + variances)[:, 0])
     true = rate_errors(truth) / np.sqrt(3.0)
     assert 0.5 < np.sqrt((told**2).mean() / (true**2).mean()) < 2.0
 
