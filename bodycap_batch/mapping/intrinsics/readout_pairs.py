@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.capture import Capture
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.intrinsics.readout_time import Readout, few_blocks_factor, weighted_mean
@@ -120,16 +120,6 @@ class _Sample:
         with ThreadPoolExecutor(threads) as pool:
             return np.array(list(pool.map(count, range(len(self.pairs)))), dtype=np.int64)
 
-    def of_pairs(self, kept: BoolArray) -> _Sample:
-        """Return the sample with the pairs of a mask (P,)."""
-        numbers = np.flatnonzero(kept).tolist()
-        return replace(
-            self,
-            pairs=[self.pairs[number] for number in numbers],
-            matches=[self.matches[number] for number in numbers],
-            blocks=self.blocks[kept],
-        )
-
 
 def doubtful_groups(
     capture: Capture, selections: Sequence[KeyframeSelection], readouts: Mapping[str, Readout]
@@ -215,11 +205,7 @@ def estimate_from_pairs(
             capture, selections, {name: replace(out[name], seconds=seconds) for name in names}
         )
 
-    uncorrected = sample.counts({}, intrinsics, context.threads)
-    corrected = sample.counts(shutters(0), intrinsics, context.threads)
-    # The other pairs show different places. They would take most of the time.
-    kept = (uncorrected > 0) | (corrected > 0)
-    sample, uncorrected, known = sample.of_pairs(kept), uncorrected[kept], {0: corrected[kept]}
+    known: dict[int, IntArray] = {}
 
     def counts(step: int) -> IntArray:
         context.check_cancelled()
@@ -229,6 +215,7 @@ def estimate_from_pairs(
 
     best = _best_step(counts)
     interval_s = min(float(np.median(np.diff(capture.camera(name).times_ns))) * 1e-9 for name in names)
+    uncorrected = sample.counts({}, intrinsics, context.threads)
     if not advantage_sigmas(counts(best), uncorrected, sample.blocks) >= _MIN_SIGMAS:
         return out
     place, sigma = _peak(np.stack([counts(best + step) for step in (-1, 0, 1)]), sample.blocks)

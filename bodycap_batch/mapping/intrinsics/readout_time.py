@@ -427,13 +427,14 @@ class RollingShutterModel:
             point=np.ravel(point),
             px=np.concatenate([np.zeros((0, 2)), *(item.px for item in items)]),
             equal_cameras=equal_cameras,
+            silent=self._silent_cameras(),
         )
         seconds = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         adjusted = adjustment.run(
             np.array([make_transform(pose[:, :3], pose[:, 3]) for pose in poses]),
             np.array([model.point3D(number).xyz for number in point_ids.tolist()]).reshape(-1, 3),
             seconds,
-            {name: self._expected(name, readouts[name], (expected or {}).get(name)) for name in seconds},
+            {name: _expected_readout(readouts[name], (expected or {}).get(name)) for name in seconds},
         )
         if adjusted is None or self._are_too_long(adjusted.readouts):
             return None
@@ -467,24 +468,13 @@ class RollingShutterModel:
         sigma_s = {name: readout.sigma_s for name, readout in readouts.items()}
         return camera_motions(self._intrinsics, self._poses, self._rotations, seconds, sigma_s, error_scales)
 
-    def _expected(self, name: str, start: Readout, other: Readout | None) -> tuple[float, float]:
-        """Return the expected readout time and its standard deviation, seconds, before an adjustment.
+    def _silent_cameras(self) -> set[str]:
+        """Return the names of the cameras whose motion does not tell their readout times.
 
-        The standard deviation of a constant one is 0. A camera without a trajectory has one, because the
-        rotations from matches are too smooth for an estimate.
-
-        Args:
-            name: Name of the camera.
-            start: The readout time at the start.
-            other: A readout time that does not come from the adjusted model; None if there is none.
+        The motion of a camera without a trajectory is that of matches, which is too smooth.
         """
-        rotation = self._rotations.get(name)
-        is_measured = name in self._trajectories or (rotation is not None and rotation.gyro is not None)
-        if not start.sigma_s or not is_measured:
-            return start.seconds, 0.0
-        if other is None or not other.determined or not other.sigma_s:
-            return start.seconds, _MAX_SIGMA_S
-        return other.best_s, other.sigma_s
+        measured = {name for name, path in self._rotations.items() if path.gyro is not None}
+        return self._intrinsics.keys() - self._trajectories.keys() - measured
 
     def _are_too_long(self, readouts: Mapping[str, AdjustedReadout]) -> bool:
         """Return True if a readout time that was adjusted is longer than a frame interval, or unknown."""
@@ -859,6 +849,20 @@ def map_with_readouts(scene: Map, readouts: Mapping[str, Readout]) -> Map:
         readout_s={name: readout.seconds for name, readout in nonzero.items()},
         readout_sigma_s={name: readout.sigma_s for name, readout in nonzero.items() if readout.sigma_s},
     )
+
+
+def _expected_readout(start: Readout, other: Readout | None) -> tuple[float, float]:
+    """Return the expected readout time and its standard deviation, seconds, before an adjustment.
+
+    Args:
+        start: The readout time at the start.
+        other: A readout time that does not come from the adjusted model; None if there is none.
+    """
+    if not start.sigma_s:
+        return start.seconds, 0.0
+    if other is None or not other.determined or not other.sigma_s or other.sideways != start.sideways:
+        return start.seconds, _MAX_SIGMA_S
+    return other.best_s, other.sigma_s
 
 
 def stated_readout(readout_s: float) -> Readout:

@@ -6,7 +6,7 @@ the observations, and how wrong the velocities of the paths usually are.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -149,6 +149,7 @@ class _Readouts:
         readout_s: Mapping[str, float],
         expected_s: Mapping[str, tuple[float, float]],
         groups: Sequence[Sequence[str]],
+        silent: Collection[str] = (),
     ) -> _Readouts:
         """Return the readout times at the start; see `MotionAdjustment.run`.
 
@@ -156,11 +157,17 @@ class _Readouts:
             readout_s: Readout times by camera name, seconds.
             expected_s: Expected values and standard deviations by camera name, seconds.
             groups: Groups of names of equal cameras.
+            silent: Names of the cameras whose motion does not tell a readout time. They follow an equal
+                camera that starts from the same one.
         """
         group_of = {name: number for number, group in enumerate(groups) for name in group}
         keys: dict[str, tuple[object, ...]] = {
             name: (group_of.get(name, name), readout_s[name], *expected_s[name]) for name in readout_s
         }
+        for name in keys.keys() & set(silent):
+            others = [keys[other] for other in sorted(keys.keys() - set(silent)) if expected_s[other][1]]
+            same = [key for key in others if key[:2] == keys[name][:2]]
+            keys[name] = same[0] if same else (name, *keys[name])
         different = list(dict.fromkeys(keys.values()))
         number = {name: different.index(key) for name, key in keys.items()}
         first = {index: name for name, index in reversed(number.items())}
@@ -183,6 +190,17 @@ class _Readouts:
     def constant(self) -> BoolArray:
         """Mask (R,) of the readout times that are not adjusted."""
         return np.asarray(self.expected_s[:, 1] == 0.0)
+
+    def kept(self, uncertain: BoolArray) -> _Readouts:
+        """Return the readout times with constant values where a mask (R,) is true.
+
+        They stay as they are, or become 0 if a global shutter may have them.
+        """
+        sigma_s = np.where(uncertain & ~self.constant, self.expected_s[:, 1], np.nan)
+        short = replace(self, sigma_s=sigma_s).without_short_ones()
+        none = short.constant & ~self.constant
+        sigma_s = np.where(none, sigma_s, np.nan)
+        return replace(short.held(uncertain, short.seconds), sigma_s=sigma_s)
 
     def held(self, kept: BoolArray, seconds: FloatArray | float) -> _Readouts:
         """Return the readout times with constant values (seconds) where a mask (R,) is true."""
@@ -230,11 +248,15 @@ class _Readouts:
             mean_s = float(np.average(told, weights=1.0 / sigma_s**2))
             if (np.abs(told - mean_s) > _MAX_POOLED_SIGMAS * sigma_s).any():
                 continue
-            seconds, expected = out.seconds.copy(), out.expected_s.copy()
-            seconds[own[0]] = mean_s
+            parts = out.seconds.copy(), out.best_s.copy(), out.sigma_s.copy(), out.expected_s.copy()
+            seconds, best_s, sigmas, expected = parts
+            seconds[own[0]] = best_s[own[0]] = mean_s
+            sigmas[own[0]] = (1.0 / sigma_s**2).sum() ** -0.5
             expected[own[0]] = expected[own[np.argmin(expected[own, 1])]]
             number = {name: int(own[0]) if index in own else index for name, index in out.number.items()}
-            out = replace(out, seconds=seconds, number=number, expected_s=expected)
+            out = replace(
+                out, seconds=seconds, number=number, expected_s=expected, best_s=best_s, sigma_s=sigmas
+            )
         return out
 
 
@@ -254,6 +276,7 @@ class MotionAdjustment:
         point: (M,) observed point.
         px: (M,2) detected pixel.
         equal_cameras: Groups of names of cameras that may be of one model.
+        silent: Names of the cameras whose motion is too smooth to tell a readout time.
     """
 
     lenses: Mapping[str, Camera]
@@ -265,6 +288,7 @@ class MotionAdjustment:
     point: IntArray
     px: FloatArray
     equal_cameras: Sequence[Sequence[str]] = ()
+    silent: Collection[str] = ()
 
     def run(
         self,
@@ -286,7 +310,7 @@ class MotionAdjustment:
             expected_s: Their expected values and standard deviations before the adjustment, seconds. A
                 readout time with a standard deviation of 0 is constant.
         """
-        readouts = _Readouts.create(readout_s, expected_s, self.equal_cameras)
+        readouts = _Readouts.create(readout_s, expected_s, self.equal_cameras, self.silent)
         scales: FloatArray = np.full((len(self.camera), 3), _FIRST_SCALE)
         found = RollingMap(
             cam_from_map=cam_from_map,
@@ -294,12 +318,14 @@ class MotionAdjustment:
             velocities=np.zeros((len(cam_from_map), 9)),
             readout_ratio=np.ones(len(readouts.seconds)),
         )
-        noise_px = _NOISE_PX * self._pixel_scale()
+        noise_px = _NOISE_PX * max(
+            pixel_scale(each.width_px, each.height_px) for each in self.lenses.values()
+        )
         wide_px = _WIDE_LOSS_WIDTH * noise_px
         for passed in range(_PASSES):
             seen, own = self._observations(found.cam_from_map, readouts, noise_px)
             if not passed:
-                readouts = readouts.held(self._uncertain(seen, readouts), readouts.seconds)
+                readouts = readouts.kept(self._uncertain(seen, readouts))
             if not passed and self._is_exact_enough(seen, _motion_errors(own, readouts)):
                 return None
             errors = _motion_errors(own * scales, readouts)
@@ -369,31 +395,29 @@ class MotionAdjustment:
             noise_px=noise_px,
             interval_s=interval_s,
             readout=np.array([readouts.number.get(name, 0) for name in self.camera], dtype=np.int64),
+            tells=np.array([name not in self.silent for name in self.camera], dtype=bool),
         )
         return seen, np.maximum(errors, _NO_MOTION_SIGMA)
-
-    def _pixel_scale(self) -> float:
-        """Return the size of the pixels of the largest image, in px of an image of 640 px."""
-        return max(pixel_scale(each.width_px, each.height_px) for each in self.lenses.values())
 
     def _systematic_errors(self, seen: RowObservations, readouts: _Readouts) -> FloatArray:
         """Return the errors (R,) of the readout times by systematic errors of detected pixels, seconds.
 
         They are large where the camera turns slowly, so that a readout time displaces pixels by little.
         """
-        rolling = seen.delay_s != 0.0
-        of = seen.readout[seen.keyframe[rolling]]
-        focal_px = np.array([lens.focal_px for lens in seen.lenses])[seen.lens[seen.keyframe[rolling]]]
-        squares = (focal_px * np.linalg.norm(seen.turn[rolling], axis=1)) ** 2
-        count, total = (np.bincount(of, each, len(readouts.seconds)) for each in (np.ones(len(of)), squares))
+        k = seen.keyframe[seen.telling]
+        focal = np.array([each.focal_px / pixel_scale(each.width_px, each.height_px) for each in seen.lenses])
+        squares = (focal[seen.lens[k]] * np.linalg.norm(seen.turn[seen.telling], axis=1)) ** 2
+        count, total = (
+            np.bincount(seen.readout[k], each, len(readouts.seconds)) for each in (np.ones(len(k)), squares)
+        )
         px = np.sqrt(total / np.maximum(count, 1.0))
         with np.errstate(divide="ignore"):
-            return np.asarray(np.abs(readouts.scale_s) * _SYSTEMATIC_PX * self._pixel_scale() / px)
+            return np.asarray(np.abs(readouts.scale_s) * _SYSTEMATIC_PX / px)
 
     def _uncertain(self, seen: RowObservations, readouts: _Readouts) -> BoolArray:
         """Return a mask (R,) of the readout times that the adjustment tells less well than they are known."""
-        rolling = np.unique(seen.keyframe[seen.delay_s != 0.0])
-        keyframes = np.bincount(seen.readout[rolling], minlength=len(readouts.seconds))
+        telling = np.unique(seen.keyframe[seen.telling])
+        keyframes = np.bincount(seen.readout[telling], minlength=len(readouts.seconds))
         unsure = self._systematic_errors(seen, readouts) > readouts.expected_s[:, 1]
         return np.asarray(unsure | (keyframes < _MIN_KEYFRAMES))
 
@@ -470,7 +494,7 @@ class MotionAdjustment:
         seen: BoolArray = np.bincount(self.keyframe, minlength=len(self.camera)) >= _MIN_OBSERVATIONS
         information = np.maximum(1.0 / variances - 1.0 / scales**2, 0.0)
         measured = squares / np.maximum(variances * information, _NO_INFORMATION) ** 2
-        out, camera = np.ones_like(squares), np.array(self.camera)
+        out, camera = np.full_like(squares, _FIRST_SCALE), np.array(self.camera)
         for name in np.unique(camera).tolist():
             own = np.flatnonzero(camera == name)
             if not seen[own].any():

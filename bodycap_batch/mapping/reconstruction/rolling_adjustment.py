@@ -67,6 +67,7 @@ class RowObservations:
         interval_s: (K,) frame interval of the camera of each keyframe, seconds.
         readout: (K,) number of the readout time of the camera of each keyframe, one of R. Turns and shifts
             are proportional to it. A camera without a rolling shutter has any number; its delays are 0.
+        tells: (K,) True if the expected motion of the keyframe is exact enough to tell the readout time.
     """
 
     lenses: Sequence[Camera]
@@ -80,6 +81,12 @@ class RowObservations:
     noise_px: float
     interval_s: FloatArray
     readout: IntArray
+    tells: BoolArray
+
+    @property
+    def telling(self) -> BoolArray:
+        """Mask (M,) of the observations that tell a readout time."""
+        return np.asarray((self.delay_s != 0.0) & self.tells[self.keyframe])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -208,7 +215,8 @@ def velocity_squares(
     own = _Normal.create(seen, found, _prior(seen, errors), width_px).own[:, :_UNKNOWNS, :_UNKNOWNS].copy()
     axes = np.arange(_UNKNOWNS)
     own[:, axes, axes] *= 1.0 + _MIN_DAMPING
-    own[:, axes, axes] += _POINT_DAMPING * np.maximum(own[:, axes, axes].max(axis=1, keepdims=True), 1.0)
+    pose = axes[:6]
+    own[:, pose, pose] += _POINT_DAMPING * np.maximum(own[:, pose, pose].max(axis=1, keepdims=True), 1.0)
     variance = seen.noise_px**2 * np.linalg.inv(own)[:, axes, axes][:, 6:]
     square = found.velocities**2
     return square.reshape(-1, 3, 3).mean(axis=2), variance.reshape(-1, 3, 3).mean(axis=2)
@@ -225,7 +233,7 @@ def correction_ratios(seen: RowObservations, found: RollingMap) -> FloatArray:
     turned, corrected = np.linalg.norm(turn, axis=1), np.linalg.norm(correction, axis=1)
     out = np.zeros(len(found.readout_ratio))
     for number in range(len(out)):
-        own = (seen.readout[rows] == number) & (seen.delay_s != 0.0)
+        own = (seen.readout[rows] == number) & seen.telling
         usual = float(np.median(turned[own])) if own.any() else 0.0
         out[number] = float(np.median(corrected[own])) / usual if usual else 0.0
     return out
@@ -297,7 +305,7 @@ def _at_exposure(
         exposure_from_middle (M,3,3).
     """
     k = seen.keyframe
-    ratio = found.readout_ratio[seen.readout[k]][:, None]
+    ratio = _ratios(seen, found)
     delay = seen.delay_s[:, None]
     pose = found.cam_from_map[k]
     at_middle = np.einsum("mij,mj->mi", pose[:, :3, :3], found.points[seen.point]) + pose[:, :3, 3]
@@ -314,7 +322,13 @@ def _turns(seen: RowObservations, found: RollingMap) -> tuple[FloatArray, FloatA
     delay = seen.delay_s[:, None]
     rate, change = np.split(found.velocities[k, :6], 2, axis=1)
     correction = delay * rate + (0.5 / seen.interval_s[k][:, None]) * delay**2 * change
-    return found.readout_ratio[seen.readout[k]][:, None] * seen.turn, correction
+    return _ratios(seen, found) * seen.turn, correction
+
+
+def _ratios(seen: RowObservations, found: RollingMap) -> FloatArray:
+    """Return the ratios (M,1) of the readout times, 1 for keyframes that do not tell their readout time."""
+    k = seen.keyframe
+    return np.asarray(np.where(seen.tells[k], found.readout_ratio[seen.readout[k]], 1.0)[:, None])
 
 
 def _project(seen: RowObservations, rays: FloatArray) -> FloatArray:
@@ -568,6 +582,7 @@ def _derivatives(seen: RowObservations, found: RollingMap, valid: BoolArray) -> 
     k = seen.keyframe
     delay = seen.delay_s[:, None, None]
     by_ratio = np.einsum("mdi,mi->md", by_turn, seen.turn) - np.einsum("mdi,mi->md", by_middle, seen.shift)
+    by_ratio *= seen.tells[k][:, None]
     by_keyframe = np.concatenate(
         [
             -by_middle @ skew(at_middle),

@@ -180,6 +180,8 @@ def test_equal_cameras_whose_readout_times_agree_share_one() -> None:
     assert shared.number["a"] == shared.number["b"]
     assert at_s == pytest.approx({"a": 0.01015, "b": 0.01015, "c": 0.0101, "d": 0.0102, "e": 0.02})
     assert shared.expected_s[shared.number["a"]].tolist() == [0.01, 0.001]
+    assert shared.best_s[shared.number["a"]] == pytest.approx(0.01015)
+    assert shared.sigma_s[shared.number["a"]] == pytest.approx(1e-4 / np.sqrt(2.0))
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -195,6 +197,59 @@ def test_only_equal_cameras_start_with_a_common_readout_time() -> None:
     readouts = _Readouts.create(seconds, expected, [["a", "b", "d"]])
     assert readouts.number == {"a": 0, "b": 0, "c": 1, "d": 2}
     assert readouts.constant.tolist() == [False, False, True]
+
+
+def test_a_camera_whose_motion_is_too_smooth_follows_an_equal_camera() -> None:
+    seconds = {"a": 0.01, "b": 0.01, "c": 0.02, "d": 0.02}
+    expected = dict.fromkeys(seconds, (0.01, 0.001))
+    readouts = _Readouts.create(seconds, {**expected, "d": (0.02, 0.0)}, [["a", "b", "c", "d"]], {"b", "c"})
+    # No unknown readout time begins with that of c.
+    assert readouts.number["a"] == readouts.number["b"]
+    assert len(set(readouts.number.values())) == 3
+
+
+def test_a_camera_whose_motion_is_too_smooth_does_not_change_the_readout_time() -> None:
+    adjustment, truth = hand(120)
+    count = len(KEYFRAMES)
+    slower = replace(
+        adjustment,
+        lenses={"hand": LENS, "other": LENS},
+        # The path of the other hand is wrong: it does not turn.
+        poses={**adjustment.poses, "other": (np.tile(np.eye(4), (FRAMES, 1, 1)), TIMES_NS)},
+        camera=(*adjustment.camera, *("other",) * count),
+        frame=np.tile(adjustment.frame, 2),
+        keyframe=np.concatenate([adjustment.keyframe, adjustment.keyframe + count]),
+        point=np.tile(adjustment.point, 2),
+        px=np.tile(adjustment.px, (2, 1)),
+        equal_cameras=[["hand", "other"]],
+        silent={"other"},
+    )
+    start_s = 0.9 * READOUT_S
+    found = slower.run(
+        np.tile(truth.cam_from_map, (2, 1, 1)),
+        truth.points,
+        {"hand": start_s, "other": start_s},
+        {"hand": (start_s, 0.01), "other": (start_s, 0.01)},
+    )
+    assert found is not None
+    told = found.readouts["hand"]
+    assert told.sigma_s is not None
+    assert found.readouts["other"] == told
+    assert abs(told.seconds - READOUT_S) < 3.0 * told.sigma_s < 0.002
+
+
+@pytest.mark.parametrize(
+    ("seconds", "sigma_s", "left"),
+    [(0.0009, 0.0005, 0.0), (-0.0009, 0.0005, 0.0), (0.0009, 0.0008, 0.0009), (0.018, 0.0005, 0.018)],
+)
+def test_a_short_readout_time_that_the_pictures_do_not_tell_is_none(
+    seconds: float, sigma_s: float, left: float
+) -> None:
+    readouts = _Readouts.create({"a": seconds}, {"a": (seconds, sigma_s)}, []).kept(np.ones(1, bool))
+    assert readouts.constant.all()
+    assert readouts.seconds.tolist() == [left]
+    assert readouts.best_s.tolist() == [seconds]
+    assert np.isnan(readouts.sigma_s[0]) == (left != 0.0)
 
 
 @pytest.mark.parametrize(
@@ -287,7 +342,8 @@ def test_noise_is_no_error_of_a_velocity() -> None:
 
 
 def test_keyframes_with_few_observations_tell_no_errors() -> None:
-    assert (scales_of(np.full((4, 3), 5.0), ("a",) * 4, seen=3) == 1.0).all()
+    scales = scales_of(np.full((4, 3), 5.0), ("a",) * 4, seen=3)
+    assert (scales == scales_of(np.zeros((4, 3)), ("a",) * 4, seen=3)).all()
 
 
 def test_the_errors_of_the_path_follow_from_the_adjustment() -> None:

@@ -88,6 +88,7 @@ def scene(*, shrunk: bool = False) -> tuple[RowObservations, RollingMap, MotionE
         noise_px=0.7,
         interval_s=np.full(len(KEYFRAMES), FRAME_S),
         readout=np.zeros(len(KEYFRAMES), np.int64),
+        tells=np.ones(len(KEYFRAMES), bool),
     )
     truth = RollingMap(
         cam_from_map=invert(poses_at(times_s[KEYFRAMES])),
@@ -223,6 +224,15 @@ def test_a_camera_that_does_not_move_tells_no_readout_time() -> None:
     expected = replace(errors, readout=np.full(1, 0.3))
     assert readout_errors(still, truth, expected, 1.0) == pytest.approx(0.3)
     assert correction_ratios(still, truth) == [0.0]
+
+
+def test_a_keyframe_that_does_not_tell_the_readout_time_does_not_depend_on_it() -> None:
+    seen, truth, _ = scene()
+    part = replace(seen, tells=np.arange(len(KEYFRAMES)) % 2 == 0)
+    longer = replace(truth, readout_ratio=np.full(1, 1.1))
+    changed = np.abs(_residuals(part, longer)[0] - _residuals(part, truth)[0]).max(axis=1) > 1e-9
+    assert (changed == part.telling).mean() > 0.99
+    assert not changed[~part.tells[part.keyframe]].any()
 
 
 def test_without_a_shutter_nothing_but_noise_is_adjusted() -> None:

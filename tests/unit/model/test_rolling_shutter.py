@@ -274,13 +274,11 @@ def test_an_adjustment_weights_readout_times_from_elsewhere() -> None:
     assert both.sigma_s > alone.sigma_s
 
 
-def test_a_camera_without_a_trajectory_keeps_its_readout_time() -> None:
+def test_a_camera_without_a_trajectory_tells_no_readout_time() -> None:
     film = Film(0.02)
-    rolling = model_with_inexact_path(film, 0.005)
-    start = {"head": judged_readout(0.015, 0.003)}
-    elsewhere = RollingShutterModel(the_map(film, range(1, FRAMES, 5)), {}, {"head": camera_of(film)})
-    assert rolling._expected("head", start["head"], None) == (0.015, 0.004)
-    assert elsewhere._expected("head", start["head"], None) == (0.015, 0.0)
+    model, cameras = the_map(film, range(1, FRAMES, 5)), {"head": camera_of(film)}
+    assert RollingShutterModel(model, {"head": film.trajectory()}, cameras)._silent_cameras() == set()
+    assert RollingShutterModel(model, {}, cameras)._silent_cameras() == {"head"}
 
 
 def test_velocities_of_a_smooth_path_are_exact_enough() -> None:
