@@ -499,7 +499,8 @@ class MotionAdjustment:
             own = np.flatnonzero(camera == name)
             if not seen[own].any():
                 continue
-            usual, size = np.ones(3), np.ones((len(own), 3))
+            # Where the pictures say nothing, the errors stay those of the first pass.
+            usual, size = np.full(3, _FIRST_SCALE**2), np.full((len(own), 3), _FIRST_SCALE**2)
             for _ in range(_SCALE_STEPS):
                 variance = 1.0 / (information[own] + 1.0 / size)
                 square = (information[own] * variance) ** 2 * measured[own] + variance
