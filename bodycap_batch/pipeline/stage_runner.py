@@ -98,7 +98,13 @@ class StageRunner:
         Raises:
             BodycapError: The task failed. `NotStored`: the artefact is missing and nothing may be computed.
         """
-        artefact, computed = self._runner.run(replace(task, priority=self._settings.priority), preload)
+        try:
+            artefact, computed = self._runner.run(replace(task, priority=self._settings.priority), preload)
+        except Cancelled:
+            # The task may have stored its artefact before it was stopped.
+            if (stored := self._settings.store.find(task.key)) is not None:
+                self._references.add(stored.path)
+            raise
         self._references.add(artefact.path)
         self.libraries.update(task.key.libraries)
         self.records.append(

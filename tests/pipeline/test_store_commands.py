@@ -18,6 +18,7 @@ from bodycap_batch.core.errors import Cancelled, StoreError
 from bodycap_batch.pipeline import Settings, explain_job, run_job
 from bodycap_batch.pipeline.why import _position, _reason
 from bodycap_batch.runner import Task
+from bodycap_batch.runner.task_runner import Runner
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 from bodycap_batch.store.digests import _entry_text
 from bodycap_batch.store.garbage_collection import collect_garbage
@@ -271,6 +272,25 @@ def test_what_an_unfinished_job_has_done_is_no_garbage(bench: Bench) -> None:
     assert collect_garbage(Store(bench.folder / "store"), delete=True).artefacts == ()
     bench.order()
     assert "keyframes torso" not in bench.executed()
+
+
+def test_what_a_task_has_stored_when_it_is_stopped_is_no_garbage(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Runner.run
+
+    def stopped_after_the_map(self: Runner, task: Task, *rest: Any) -> Any:
+        out = run(self, task, *rest)
+        if task.key.stage == "map":
+            raise Cancelled("stopped on request")
+        return out
+
+    monkeypatch.setattr(Runner, "run", stopped_after_the_map)
+    with pytest.raises(Cancelled):
+        bench.run()
+    assert collect_garbage(Store(bench.folder / "store"), delete=True).artefacts == ()
+    monkeypatch.undo()
+    assert "map" not in bench.executed()
 
 
 def test_a_removed_folder_of_results_claims_nothing(alone: Bench) -> None:
