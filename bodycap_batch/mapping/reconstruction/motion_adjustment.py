@@ -482,7 +482,8 @@ class MotionAdjustment:
 
         The errors of the keyframes of a camera have a Student distribution: each has its own size, near the
         usual size of the camera unless the pictures say otherwise. What the pictures say of a velocity is
-        separated from what was expected of it, so the result hardly depends on the earlier factors.
+        separated from what was expected of it. The earlier factors still matter where the corrections
+        moved the points.
 
         Args:
             squares: (K,3) mean squares of the corrections along an axis, in the expected errors of the path.
