@@ -112,7 +112,9 @@ def test_a_job_is_taken_over_while_it_runs(bench: Bench) -> None:
 
     with pytest.raises(Cancelled, match="another process runs it now"):
         executed(bench, may_commit=until_the_map)
-    assert {name.split("/")[0] for name in artefacts(bench)} == {"check", "keyframes", "sound"}
+    stored = {name.split("/")[0] for name in artefacts(bench)}
+    # The sound is compared beside the other stages, so it is stored only if it ends before the map starts.
+    assert stored - {"sound"} == {"check", "keyframes"}
     assert bench.results() == {}
 
 
