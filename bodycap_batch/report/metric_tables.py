@@ -62,6 +62,7 @@ def make_tables(inputs: ReportInputs) -> dict[str, Table]:
     tables = {
         "frames": _frames_table(metrics),
         "clocks": _clocks_table(metrics),
+        "shutters": _shutters_table(metrics),
         "sensors": _sensors_table(metrics),
         "map": _map_table(metrics),
     }
@@ -161,6 +162,47 @@ def _clocks_table(metrics: Mapping[str, Any]) -> Table:
         rows=tuple(rows) if len(rows) > 1 else (),
         note="Common time = camera time · (1 + drift) + offset. The offset is relative to the reference "
         "camera, whose offset is 0.",
+    )
+
+
+_READOUT_SOURCES = {
+    "stated": "stated in the job or the calibration",
+    "estimated": "estimated from the video",
+    "of the map": "estimated from the video",
+    "none found": "no rolling shutter found",
+}
+"""Text for the user, by the source of a readout time. Any other source is the reason why none is known."""
+
+
+def _shutters_table(metrics: Mapping[str, Any]) -> Table:
+    """Return the readout time of each camera that is not stated to have a global shutter."""
+    mapping = metrics.get("mapping", {})
+    paths: dict[str, tuple[str, ...]] = {}
+    for number, readouts in enumerate(mapping.get("rolling_shutter", ())):
+        for name in readouts:
+            paths.setdefault(name, ("mapping", "rolling_shutter", str(number), name))
+    for name in mapping.get("readouts_from_matches", {}):
+        paths.setdefault(name, ("mapping", "readouts_from_matches", name))
+    rows = []
+    for name in metrics["cameras"]:
+        if name not in paths:
+            continue
+        path = metric_path(*paths[name])
+        source = str(metric_at(metrics, f"{path}.source"))
+        if source == "stated" and not metric_at(metrics, f"{path}.seconds"):
+            continue
+        found = [metric_cell(metrics, f"{path}.{key}", "{:.2f} ms", 1000.0) for key in ("seconds", "sigma_s")]
+        if source not in _READOUT_SOURCES:
+            found = [Cell(text="–"), Cell(text="–")]
+        elif source == "stated":
+            found[1] = Cell(text="–")
+        rows.append((Cell(text=name), *found, Cell(text=_READOUT_SOURCES.get(source, source))))
+    return Table(
+        caption="Rolling shutters of the cameras",
+        heads=("Camera", "Readout time", "Sigma", "Source"),
+        rows=tuple(rows),
+        note="The readout time is the time from the exposure of the first row of the sensor to the exposure "
+        "of the last row. Poses and map are corrected for it. If you know it, state `rolling_shutter_s`.",
     )
 
 

@@ -243,6 +243,31 @@ def test_an_unknown_clock_is_in_the_first_line_and_poor(inputs: ReportInputs, tm
     assert note in page
 
 
+def test_readout_times_are_listed_with_their_sources(inputs: ReportInputs, tmp_path: Path) -> None:
+    caption = "Rolling shutters of the cameras"
+    metrics = json.loads(json.dumps(inputs.metrics))
+    metrics["mapping"]["readouts_from_matches"] = {}
+    metrics["mapping"]["rolling_shutter"] = [
+        {"torso": {"seconds": 0.0, "sigma_s": 0.0, "source": "stated", "best_s": 0.0}}
+    ]
+    assert caption not in written(replace(inputs, metrics=metrics), tmp_path)
+    reason = "not determined: the camera turns too evenly, or too little"
+    metrics["mapping"]["readouts_from_matches"] = {
+        "torso": {"seconds": 0.0, "sigma_s": 0.001, "source": "none found", "best_s": 0.0},
+        "left_palm": {"seconds": 0.0, "sigma_s": None, "source": reason, "best_s": 0.0123},
+    }
+    metrics["mapping"]["rolling_shutter"] = [
+        {"torso": {"seconds": 0.01202, "sigma_s": 0.00003, "source": "estimated", "best_s": 0.01202}}
+    ]
+    page = written(replace(inputs, metrics=metrics), tmp_path)
+    assert caption in page
+    assert 'data-metric="mapping.rolling_shutter.0.torso.seconds" data-value="0.01202">12.02 ms' in page
+    assert "0.03 ms" in page
+    assert "estimated from the video" in page
+    assert reason in page
+    assert "12.30 ms" not in page, "a readout time that is not determined is not shown"
+
+
 def test_sensors_are_listed_and_a_stabilised_video_is_named(inputs: ReportInputs, tmp_path: Path) -> None:
     assert "Inertial sensors" not in written(inputs, tmp_path)
     metrics = json.loads(json.dumps(inputs.metrics))
