@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
 _INITIAL_PAIR_RELAXATIONS = 2
 """Number of times that each of two thresholds for an initial pair is halved before the pair is rejected.
 COLMAP uses the same number."""
+_MIN_REGISTERED_RATIO = 0.5
+"""Minimum ratio of the images of a camera that are registered. If there are fewer, an image of this camera is
+also registered from its matches alone. Evidence: docs/decisions/mapping.md."""
 
 
 def progress_counter(
@@ -265,18 +269,32 @@ class _MapperRun:
     def _register_next(self) -> int | None:
         """Register one more image and return its id; return None if no image fits.
 
-        Among the images that fit, the image that observes most of the map is registered.
+        Among the images that fit, the image that observes most of the map is registered. If none fits, an
+        image is registered from its matches alone. This takes seconds, so it is done only to connect a camera
+        of which the map lacks most images. Single images are found later, by the registration of all frames.
         """
         for image_id in self._mapper.find_next_images(self._options, structure_less=False):
             if self._mapper.register_next_image(self._options, image_id):
                 return int(image_id)
         if not self._settings.structure_less_registration_fallback:
             return None
+        missing = self._missing_cameras()
         for image_id in self._mapper.find_next_images(self._options, structure_less=True):
+            if self._model.image(image_id).camera_id not in missing:
+                continue
             if self._mapper.register_next_structure_less_image(self._options, image_id):
                 self._restore_intrinsics()
                 return int(image_id)
         return None
+
+    def _missing_cameras(self) -> set[int]:
+        """Return the ids of the cameras most of whose images are not registered."""
+        images = self._model.images.values()
+        every = Counter(image.camera_id for image in images)
+        registered = Counter(image.camera_id for image in images if image.has_pose)
+        return {
+            number for number, count in every.items() if registered[number] < _MIN_REGISTERED_RATIO * count
+        }
 
     def _restore_intrinsics(self) -> None:
         """Restore the intrinsics of the constant cameras.

@@ -13,6 +13,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.mapping.reconstruction.camera_motion import camera_motions
+from bodycap_batch.mapping.reconstruction.reduced_system import CommonPoints
 from bodycap_batch.mapping.reconstruction.rolling_adjustment import (
     MotionErrors,
     RollingMap,
@@ -322,8 +323,9 @@ class MotionAdjustment:
             pixel_scale(each.width_px, each.height_px) for each in self.lenses.values()
         )
         wide_px = _WIDE_LOSS_WIDTH * noise_px
+        common_points = CommonPoints.of(self.keyframe, self.point)
         for passed in range(_PASSES):
-            seen, own = self._observations(found.cam_from_map, readouts, noise_px)
+            seen, own = self._observations(found.cam_from_map, readouts, noise_px, common_points)
             if not passed:
                 readouts = readouts.kept(self._uncertain(seen, readouts))
             if not passed and self._is_exact_enough(seen, _motion_errors(own, readouts)):
@@ -360,7 +362,7 @@ class MotionAdjustment:
         )
 
     def _observations(
-        self, cam_from_map: FloatArray, readouts: _Readouts, noise_px: float
+        self, cam_from_map: FloatArray, readouts: _Readouts, noise_px: float, common_points: CommonPoints
     ) -> tuple[RowObservations, FloatArray]:
         """Return all observations, and the expected errors (K,3) of the velocities of the paths.
 
@@ -368,6 +370,7 @@ class MotionAdjustment:
             cam_from_map: (K,4,4) poses of the keyframes so far.
             readouts: The readout times so far.
             noise_px: Standard deviation of an observation, px.
+            common_points: The points that pairs of keyframes have in common.
         """
         names, camera = sorted(self.lenses), np.array(self.camera)
         delay = np.zeros(len(self.px))
@@ -396,6 +399,7 @@ class MotionAdjustment:
             interval_s=interval_s,
             readout=np.array([readouts.number.get(name, 0) for name in self.camera], dtype=np.int64),
             tells=np.array([name not in self.silent for name in self.camera], dtype=bool),
+            common_points=common_points,
         )
         return seen, np.maximum(errors, _NO_MOTION_SIGMA)
 

@@ -8,13 +8,13 @@ wrong readout time: it is an unknown that all keyframes of a camera have in comm
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.mapping.reconstruction.reduced_system import POINT_DAMPING, CommonPoints, NormalEquations
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import make_transform, skew, so3_exp, so3_right_jacobian
 from bodycap_batch.model.reprojection_derivatives import projection_jacobian
@@ -30,12 +30,12 @@ _MAX_DAMPING = 1e3
 """An adjustment ends if no step with this damping reduces the cost. Evidence: none."""
 _DAMPING_FACTOR = 10.0
 """Factor of the damping after a step, or after a step that is not taken. Evidence: none."""
-_CONVERGED = 1e-4
-"""Relative change of the cost at which an adjustment ends. Origin: that of the robust adjustment."""
+_CONVERGED = 1e-3
+"""Relative change of the cost at which an adjustment ends. Evidence: docs/decisions/mapping.md."""
+_LENGTHS = (1.0, 1.5, 2.25, 3.4, 5.0)
+"""Lengths of a step that are tried, one after another. Evidence: docs/decisions/mapping.md."""
 _MAX_ITERATIONS = 8
 """Maximum number of steps with one width of the loss. Evidence: none."""
-_POINT_DAMPING = 1e-9
-"""Damping of a point, as a fraction of the trace of its information. It only prevents a singular matrix."""
 _MIN_NOISE_RATIO = 0.1
 """Smallest noise that residuals can show, as a ratio of the expected noise. It only prevents a division by
 zero."""
@@ -68,6 +68,7 @@ class RowObservations:
         readout: (K,) number of the readout time of the camera of each keyframe, one of R. Turns and shifts
             are proportional to it. A camera without a rolling shutter has any number; its delays are 0.
         tells: (K,) True if the expected motion of the keyframe is exact enough to tell the readout time.
+        common_points: The points that pairs of keyframes have in common.
     """
 
     lenses: Sequence[Camera]
@@ -82,6 +83,7 @@ class RowObservations:
     interval_s: FloatArray
     readout: IntArray
     tells: BoolArray
+    common_points: CommonPoints
 
     @property
     def telling(self) -> BoolArray:
@@ -158,11 +160,9 @@ def adjust_with_velocities(
     found = start
     cost, damping = _cost(seen, found, prior, width_px), _FIRST_DAMPING
     for _ in range(_MAX_ITERATIONS):
-        system = _Normal.create(seen, found, prior, width_px)
+        system = _normal_equations(seen, found, prior, width_px)
         while True:
-            step = system.solve(damping)
-            moved = None if step is None else found.moved(*step)
-            new_cost = np.inf if moved is None else _cost(seen, moved, prior, width_px)
+            moved, new_cost = _moved(found, system, damping, lambda each: _cost(seen, each, prior, width_px))
             if new_cost < cost or damping > _MAX_DAMPING:
                 break
             damping *= _DAMPING_FACTOR
@@ -194,8 +194,33 @@ def readout_errors(
         of an estimate from clusters.
     """
     prior = _prior(seen, errors)
-    normal = _Normal.create(seen, found, prior, width_px, expected=True)
-    return normal.readout_errors(seen, found, prior, width_px)
+    system = _normal_equations(seen, found, prior, width_px, expected=True)
+    count = len(system.by_common)
+    out = np.full(count, np.inf)
+    factored = system.factored(_MIN_DAMPING)
+    if factored is None:
+        return out
+    residual, valid = _residuals(seen, found)
+    by_keyframe, by_point = _derivatives(seen, found, valid)
+    weight = _weights(residual, valid, width_px)
+    force = residual * weight[:, None]
+    # Without common errors, the errors of the observations alone would make this variance.
+    variance = 0.5 * float((force**2).sum()) / max(float((weight**2).sum()), 1e-12)
+    left, places = _left_ratio(system, int(valid.sum())), system.places()
+    for number in range(count):
+        unit = np.zeros(len(system.gradient))
+        unit[number - count] = 1.0
+        own, points = factored.solve(unit, np.zeros_like(system.point_gradient))
+        change = np.einsum("mdi,mi->md", by_keyframe, own[places][seen.keyframe])
+        change += np.einsum("mdi,mi->md", by_point, points[seen.point])
+        influence = np.bincount(seen.keyframe, (change * force).sum(axis=1), minlength=len(places))
+        # An expected velocity is an observation, too. So is an expected readout time.
+        expected = prior.by_keyframe[:, 6:] * found.velocities
+        influence += (own[places[:, 6:_UNKNOWNS]] * expected).sum(axis=1)
+        readout = own[number - count] * seen.noise_px
+        scatter = (influence**2).sum() / left + readout**2 * system.by_common[number]
+        out[number] = np.sqrt(max(scatter, own[number - count] * variance))
+    return out
 
 
 def usual_residual_px(seen: RowObservations, found: RollingMap) -> float:
@@ -212,11 +237,12 @@ def velocity_squares(
     interval, the same; and of velocity. The points are taken as known.
     """
     width_px = usual_residual_px(seen, found)
-    own = _Normal.create(seen, found, _prior(seen, errors), width_px).own[:, :_UNKNOWNS, :_UNKNOWNS].copy()
+    system = _normal_equations(seen, found, _prior(seen, errors), width_px)
+    own = system.own[:, :_UNKNOWNS, :_UNKNOWNS].copy()
     axes = np.arange(_UNKNOWNS)
     own[:, axes, axes] *= 1.0 + _MIN_DAMPING
     pose = axes[:6]
-    own[:, pose, pose] += _POINT_DAMPING * np.maximum(own[:, pose, pose].max(axis=1, keepdims=True), 1.0)
+    own[:, pose, pose] += POINT_DAMPING * np.maximum(own[:, pose, pose].max(axis=1, keepdims=True), 1.0)
     variance = seen.noise_px**2 * np.linalg.inv(own)[:, axes, axes][:, 6:]
     square = found.velocities**2
     return square.reshape(-1, 3, 3).mean(axis=2), variance.reshape(-1, 3, 3).mean(axis=2)
@@ -350,206 +376,88 @@ def _residuals(seen: RowObservations, found: RollingMap) -> tuple[FloatArray, Bo
     return np.where(valid[:, None], residual, _NOT_SEEN_PX), valid
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Factored:
-    """The reduced system of one step, factored.
+def _moved(
+    found: RollingMap, system: NormalEquations, damping: float, cost: Callable[[RollingMap], float]
+) -> tuple[RollingMap | None, float]:
+    """Return the map after a step, and its cost; None and infinity if there is no step with this damping.
 
-    Attributes:
-        factor: Factor of the reduced matrix (15K+R,15K+R), as `scipy.linalg.cho_solve` takes it.
-        coupling: (15K+R,3P) sparse coupling of keyframes and readout times with points, times `half`.
-        half: (P,3,3) roots of the inverse blocks of the points.
+    A robust loss makes steps too short, so the step is made longer as long as this reduces the cost. A cost
+    takes much less time than a step.
     """
+    factored = system.factored(damping)
+    if factored is None:
+        return None, np.inf
+    own, points = factored.solve(-system.gradient, -system.point_gradient)
+    keyframes, ratios = np.split(own, [_UNKNOWNS * len(system.own)])
+    step = keyframes.reshape(-1, _UNKNOWNS), points, ratios
+    best, least = None, np.inf
+    for length in _LENGTHS:
+        moved = found.moved(*(length * each for each in step))
+        current = cost(moved)
+        if not current < least:
+            break
+        best, least = moved, current
+    return best, least
 
-    factor: tuple[FloatArray, bool]
-    coupling: Any
-    half: FloatArray
 
-    def solve(self, keyframes: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the solution (15K+R,) and (P,3) for right sides (15K+R,) and (P,3)."""
-        from scipy.linalg import cho_solve
+def _normal_equations(
+    seen: RowObservations, found: RollingMap, prior: _Prior, width_px: float, *, expected: bool = False
+) -> NormalEquations:
+    """Return the equations of a step. The common unknowns are the ratios of the readout times.
 
-        from_points = np.einsum("pij,pi->pj", self.half, points).ravel()
-        own = cho_solve(self.factor, keyframes - self.coupling @ from_points, check_finite=False)
-        left = (from_points - self.coupling.T @ own).reshape(-1, 3)
-        return np.asarray(own), np.einsum("pij,pj->pi", self.half, left)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Normal:
-    """The weighted normal equations of one step, with the points still to be eliminated.
-
-    Attributes:
-        keyframe: (M,) keyframe of each observation.
-        point: (M,) point of each observation.
-        readout: (K,) number of the readout time of each keyframe.
-        own: (K,16,16) blocks of the keyframes and their readout times, with the prior of the keyframes.
-        gradient: (15K+R,) gradient of half the cost with respect to keyframes and readout times.
-        by_readout: (R,) weights of the prior of the readout times.
-        by_point: (P,3,3) blocks of the points.
-        point_gradient: (P,3) gradient with respect to the points.
-        mixed: (M,16,3) blocks of each observation: of keyframe and readout time with its point.
+    Args:
+        seen: The observations.
+        found: The map so far.
+        prior: The expected motion.
+        width_px: Width of the loss, px.
+        expected: True for blocks of the expected second derivatives of the cost, which an error needs; False
+            for those of the weighted squares. These are larger, and a step with them is safer.
     """
+    residual, valid = _residuals(seen, found)
+    by_keyframe, by_point = _derivatives(seen, found, valid)
+    weight = _weights(residual, valid, width_px)
+    # The derivative of w·r along r is w² - w·(1 - w), and w across it. Their mean is w².
+    curvature = weight**2 if expected else weight
+    count, size = len(prior.by_keyframe), _UNKNOWNS + 1
+    order = np.argsort(seen.keyframe, kind="stable")
+    bounds = np.searchsorted(seen.keyframe[order], np.arange(count + 1))
+    own, sums = np.zeros((count, size, size)), np.zeros((count, size))
+    for number in range(count):
+        rows = order[bounds[number] : bounds[number + 1]]
+        flat = by_keyframe[rows].reshape(-1, size)
+        own[number] = (flat * np.repeat(curvature[rows], 2)[:, None]).T @ flat
+        sums[number] = flat.T @ (residual[rows] * weight[rows, None]).ravel()
+    own[:, np.arange(_UNKNOWNS), np.arange(_UNKNOWNS)] += prior.by_keyframe
+    sums[:, 6:_UNKNOWNS] += prior.by_keyframe[:, 6:] * found.velocities
+    by_readout = prior.by_readout * (found.readout_ratio - prior.readout_ratio)
+    np.add.at(by_readout, seen.readout, sums[:, _UNKNOWNS])
+    weighted = by_point * curvature[:, None, None]
+    blocks, point_gradient = np.zeros((len(found.points), 3, 3)), np.zeros((len(found.points), 3))
+    np.add.at(blocks, seen.point, np.einsum("mdi,mdj->mij", weighted, by_point))
+    np.add.at(point_gradient, seen.point, np.einsum("mdi,md->mi", by_point, residual * weight[:, None]))
+    return NormalEquations(
+        keyframe=seen.keyframe,
+        point=seen.point,
+        common_points=seen.common_points,
+        common=seen.readout,
+        own=own,
+        gradient=np.concatenate([sums[:, :_UNKNOWNS].ravel(), by_readout]),
+        by_common=prior.by_readout,
+        by_point=blocks,
+        point_gradient=point_gradient,
+        mixed=np.swapaxes(weighted, 1, 2) @ by_keyframe,
+    )
 
-    keyframe: IntArray
-    point: IntArray
-    readout: IntArray
-    own: FloatArray
-    gradient: FloatArray
-    by_readout: FloatArray
-    by_point: FloatArray
-    point_gradient: FloatArray
-    mixed: FloatArray
 
-    @staticmethod
-    def create(
-        seen: RowObservations, found: RollingMap, prior: _Prior, width_px: float, *, expected: bool = False
-    ) -> _Normal:
-        """Return the equations of a step.
+def _left_ratio(system: NormalEquations, count: int) -> float:
+    """Return the ratio of the residuals of observations that poses and points do not absorb.
 
-        Args:
-            seen: The observations.
-            found: The map so far.
-            prior: The expected motion.
-            width_px: Width of the loss, px.
-            expected: True for blocks of the expected second derivatives of the cost, which an error needs;
-                False for those of the weighted squares. These are larger, and a step with them is safer.
-        """
-        residual, valid = _residuals(seen, found)
-        by_keyframe, by_point = _derivatives(seen, found, valid)
-        weight = _weights(residual, valid, width_px)
-        # The derivative of w·r along r is w² - w·(1 - w), and w across it. Their mean is w².
-        curvature = weight**2 if expected else weight
-        count, size = len(prior.by_keyframe), _UNKNOWNS + 1
-        order = np.argsort(seen.keyframe, kind="stable")
-        bounds = np.searchsorted(seen.keyframe[order], np.arange(count + 1))
-        own, sums = np.zeros((count, size, size)), np.zeros((count, size))
-        for number in range(count):
-            rows = order[bounds[number] : bounds[number + 1]]
-            flat = by_keyframe[rows].reshape(-1, size)
-            own[number] = (flat * np.repeat(curvature[rows], 2)[:, None]).T @ flat
-            sums[number] = flat.T @ (residual[rows] * weight[rows, None]).ravel()
-        own[:, np.arange(_UNKNOWNS), np.arange(_UNKNOWNS)] += prior.by_keyframe
-        sums[:, 6:_UNKNOWNS] += prior.by_keyframe[:, 6:] * found.velocities
-        by_readout = prior.by_readout * (found.readout_ratio - prior.readout_ratio)
-        np.add.at(by_readout, seen.readout, sums[:, _UNKNOWNS])
-        weighted = by_point * curvature[:, None, None]
-        blocks, point_gradient = np.zeros((len(found.points), 3, 3)), np.zeros((len(found.points), 3))
-        np.add.at(blocks, seen.point, np.einsum("mdi,mdj->mij", weighted, by_point))
-        np.add.at(point_gradient, seen.point, np.einsum("mdi,md->mi", by_point, residual * weight[:, None]))
-        return _Normal(
-            keyframe=seen.keyframe,
-            point=seen.point,
-            readout=seen.readout,
-            own=own,
-            gradient=np.concatenate([sums[:, :_UNKNOWNS].ravel(), by_readout]),
-            by_readout=prior.by_readout,
-            by_point=blocks,
-            point_gradient=point_gradient,
-            mixed=np.einsum("mdi,mdj->mij", by_keyframe, weighted),
-        )
-
-    def solve(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Return the steps of keyframes (K,15), points (P,3) and readouts (R,); None if there is no step."""
-        factored = self.factored(damping)
-        if factored is None:
-            return None
-        step, point_step = factored.solve(-self.gradient, -self.point_gradient)
-        own, readouts = np.split(step, [_UNKNOWNS * len(self.own)])
-        return own.reshape(-1, _UNKNOWNS), point_step, readouts
-
-    def places(self) -> IntArray:
-        """Return the unknowns (K,16) of the reduced system that belong to each keyframe."""
-        count = len(self.own)
-        first = _UNKNOWNS * np.arange(count)[:, None] + np.arange(_UNKNOWNS)
-        return np.concatenate([first, _UNKNOWNS * count + self.readout[:, None]], axis=1)
-
-    def factored(self, damping: float) -> _Factored | None:
-        """Return the reduced system with damping; None if it is singular."""
-        from scipy.linalg import LinAlgError, cho_factor
-        from scipy.sparse import bsr_array, csr_array, vstack
-
-        places, axes = self.places(), np.arange(3)
-        diagonal = self.by_point[:, axes, axes]
-        damped = self.by_point.copy()
-        trace = diagonal.sum(axis=1, keepdims=True)
-        damped[:, axes, axes] += damping * diagonal + _POINT_DAMPING * np.maximum(trace, 1.0)
-        half = np.linalg.cholesky(np.linalg.inv(damped))
-        order = np.argsort(self.keyframe, kind="stable")
-        mixed = self.mixed[order] @ half[self.point[order]]
-        bounds = np.searchsorted(self.keyframe[order], np.arange(len(self.own) + 1))
-        shape = len(self.gradient), 3 * len(half)
-        # The product of blocks is several times faster than that of single numbers.
-        by_keyframe = bsr_array(
-            (np.ascontiguousarray(mixed[:, :_UNKNOWNS]), self.point[order], bounds),
-            shape=(_UNKNOWNS * len(self.own), shape[1]),
-        )
-        readout = np.broadcast_to(self.readout[self.keyframe[order]][:, None], mixed[:, -1].shape)
-        columns = 3 * self.point[order][:, None] + axes
-        by_readout = csr_array(
-            (mixed[:, -1].ravel(), (readout.ravel(), columns.ravel())),
-            shape=(len(self.by_readout), shape[1]),
-        )
-        common = (by_keyframe @ by_readout.T).toarray()
-        reduced = np.empty((shape[0], shape[0]))
-        first = by_keyframe.shape[0]
-        reduced[:first, :first] = (by_keyframe @ by_keyframe.T).toarray()
-        reduced[:first, first:], reduced[first:, :first] = common, common.T
-        reduced[first:, first:] = (by_readout @ by_readout.T).toarray()
-        np.negative(reduced, out=reduced)
-        coupling = vstack([by_keyframe.tocsr(), by_readout], format="csr")
-        for place, block in zip(places, self.own, strict=True):
-            reduced[place[:, None], place] += block
-            own = np.diag(block)[:_UNKNOWNS]
-            reduced[place[:_UNKNOWNS], place[:_UNKNOWNS]] += damping * own + _POINT_DAMPING * max(
-                own.max(), 1.0
-            )
-        last = np.arange(shape[0] - len(self.by_readout), shape[0])
-        reduced[last, last] += self.by_readout
-        try:
-            factor = cho_factor(reduced, overwrite_a=True, check_finite=False)
-        except LinAlgError:
-            return None
-        return _Factored(factor=factor, coupling=coupling, half=half)
-
-    def readout_errors(
-        self, seen: RowObservations, found: RollingMap, prior: _Prior, width_px: float
-    ) -> FloatArray:
-        """Return the standard deviations (R,) of the ratios of the readout times; see `readout_errors`."""
-        count = len(self.by_readout)
-        factored = self.factored(_MIN_DAMPING)
-        if factored is None:
-            return np.full(count, np.inf)
-        residual, valid = _residuals(seen, found)
-        by_keyframe, by_point = _derivatives(seen, found, valid)
-        weight = _weights(residual, valid, width_px)
-        force = residual * weight[:, None]
-        # Without common errors, the errors of the observations alone would make this variance.
-        variance = 0.5 * float((force**2).sum()) / max(float((weight**2).sum()), 1e-12)
-        out = np.empty(count)
-        left = self._left_ratio(int(valid.sum()))
-        for number in range(count):
-            unit = np.zeros(len(self.gradient))
-            unit[number - count] = 1.0
-            own, points = factored.solve(unit, np.zeros_like(self.point_gradient))
-            change = np.einsum("mdi,mi->md", by_keyframe, own[self.places()][self.keyframe])
-            change += np.einsum("mdi,mi->md", by_point, points[self.point])
-            influence = np.bincount(self.keyframe, (change * force).sum(axis=1), minlength=len(self.own))
-            # An expected velocity is an observation, too. So is an expected readout time.
-            expected = prior.by_keyframe[:, 6:] * found.velocities
-            influence += (own[self.places()[:, 6:_UNKNOWNS]] * expected).sum(axis=1)
-            readout = own[number - count] * seen.noise_px
-            scatter = (influence**2).sum() / left + readout**2 * self.by_readout[number]
-            out[number] = np.sqrt(max(scatter, own[number - count] * variance))
-        return out
-
-    def _left_ratio(self, count: int) -> float:
-        """Return the ratio of the residuals of observations that poses and points do not absorb.
-
-        Args:
-            count: Number of observations.
-        """
-        unknowns = 6 * len(self.own) + 3 * len(self.by_point) + len(self.by_readout)
-        return max(1.0 - unknowns / max(2 * count, 1), _MIN_LEFT_RATIO)
+    Args:
+        system: The equations.
+        count: Number of observations.
+    """
+    unknowns = 6 * len(system.own) + 3 * len(system.by_point) + len(system.by_common)
+    return max(1.0 - unknowns / max(2 * count, 1), _MIN_LEFT_RATIO)
 
 
 def _weights(residual: FloatArray, valid: BoolArray, width_px: float) -> FloatArray:

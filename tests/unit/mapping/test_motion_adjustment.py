@@ -13,6 +13,7 @@ from bodycap_batch.mapping.reconstruction.motion_adjustment import (
     MotionAdjustment,
     _Readouts,
 )
+from bodycap_batch.mapping.reconstruction.reduced_system import CommonPoints
 from bodycap_batch.mapping.reconstruction.rolling_adjustment import RollingMap, correction_ratios
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
 from tests.unit.mapping.test_rolling_adjustment import (
@@ -127,7 +128,8 @@ def test_a_camera_without_a_rolling_shutter_does_not_change_the_error_of_a_reado
     errors, ratios = [], []
     for times, each in ((1, adjustment), (3, both)):
         pose = np.tile(truth.cam_from_map, (times, 1, 1))
-        seen, _ = each._observations(pose, readouts, NOISE_PX)
+        common_points = CommonPoints.of(each.keyframe, each.point)
+        seen, _ = each._observations(pose, readouts, NOISE_PX, common_points)
         moved = replace(truth, cam_from_map=pose, velocities=np.full((times * count, 9), 0.1))
         errors.append(each._systematic_errors(seen, readouts))
         ratios.append(correction_ratios(seen, moved))

@@ -670,7 +670,8 @@ def test_an_initial_pair_in_the_unconnected_half_loses_no_keyframes(tmp_path: Pa
 def test_a_camera_that_joins_without_points_of_the_map_keeps_its_calibration() -> None:
     model = pycolmap.Reconstruction()
     for number in (1, 2):
-        model.add_camera(pycolmap.Camera(model="PINHOLE", params=_CAMERA.params, camera_id=number))
+        model.add_camera_with_trivial_rig(pycolmap.Camera(model="PINHOLE", params=_CAMERA.params, camera_id=number))
+    _add_unregistered_image(model, camera_id=1, image_id=7)
 
     class Mapper:
         """Registers one image without points, and refines the intrinsics as COLMAP does."""
@@ -689,6 +690,39 @@ def test_a_camera_that_joins_without_points_of_the_map_keeps_its_calibration() -
     assert run._register_next() == 7
     assert model.camera(2).params.tolist() == _CAMERA.params.tolist()
     assert model.camera(1).params[0] == 394.0, "an unknown lens is refined"
+
+
+def test_images_of_a_camera_that_is_in_the_map_do_not_join_without_points() -> None:
+    model = pycolmap.Reconstruction()
+    for number in (1, 2):
+        model.add_camera_with_trivial_rig(pycolmap.Camera(model="PINHOLE", params=_CAMERA.params, camera_id=number))
+    tried: list[int] = []
+    for image_id in (1, 2):
+        image = pycolmap.Image(name=f"cam/{image_id}", camera_id=1, image_id=image_id)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    for camera_id, image_id in ((1, 3), (2, 4), (2, 5), (2, 6)):
+        _add_unregistered_image(model, camera_id=camera_id, image_id=image_id)
+
+    class Mapper:
+        """Registers no image, and notes which were tried without points."""
+
+        reconstruction = model
+
+        def find_next_images(self, _: object, *, structure_less: bool) -> list[int]:
+            return [3, 4, 6] if structure_less else []
+
+        def register_next_structure_less_image(self, _: object, image_id: int) -> bool:
+            tried.append(image_id)
+            return False
+
+    run = _MapperRun(cast("Any", Mapper()), make_mapper_options(MapOptions(), [], 1.0))
+    assert run._register_next() is None
+    assert tried == [4, 6], "most images of camera 1 are in the map"
+
+
+def _add_unregistered_image(model: Any, *, camera_id: int, image_id: int) -> None:
+    image = pycolmap.Image(name=f"cam/{image_id}", camera_id=camera_id, image_id=image_id)
+    model.add_image_with_trivial_frame(image)
 
 
 def test_colmaps_own_pipeline_registers_no_image_without_points(

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.mapping.reconstruction.reduced_system import CommonPoints
 from bodycap_batch.mapping.reconstruction.rolling_adjustment import (
     MotionErrors,
     RollingMap,
@@ -89,6 +90,7 @@ def scene(*, shrunk: bool = False) -> tuple[RowObservations, RollingMap, MotionE
         interval_s=np.full(len(KEYFRAMES), FRAME_S),
         readout=np.zeros(len(KEYFRAMES), np.int64),
         tells=np.ones(len(KEYFRAMES), bool),
+        common_points=CommonPoints.of(k, np.concatenate(point)),
     )
     truth = RollingMap(
         cam_from_map=invert(poses_at(times_s[KEYFRAMES])),
@@ -189,7 +191,8 @@ def test_the_error_of_a_readout_time_is_the_stated_one() -> None:
     seen, truth, errors = scene()
     some = seen.point < 100
     rows = {name: getattr(seen, name)[some] for name in ("keyframe", "point", "px", "delay_s")}
-    seen = replace(seen, **rows, turn=seen.turn[some], shift=seen.shift[some])
+    common_points = CommonPoints.of(rows["keyframe"], rows["point"])
+    seen = replace(seen, **rows, turn=seen.turn[some], shift=seen.shift[some], common_points=common_points)
     truth = replace(truth, points=truth.points[:100])
     times_s = KEYFRAMES[seen.keyframe] * FRAME_S
     moved = truth.cam_from_map[seen.keyframe] @ poses_at(times_s + seen.delay_s)
