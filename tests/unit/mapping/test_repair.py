@@ -670,7 +670,8 @@ def test_an_initial_pair_in_the_unconnected_half_loses_no_keyframes(tmp_path: Pa
 def test_a_camera_that_joins_without_points_of_the_map_keeps_its_calibration() -> None:
     model = pycolmap.Reconstruction()
     for number in (1, 2):
-        model.add_camera_with_trivial_rig(pycolmap.Camera(model="PINHOLE", params=_CAMERA.params, camera_id=number))
+        camera = pycolmap.Camera(model="PINHOLE", params=_CAMERA.params, camera_id=number)
+        model.add_camera_with_trivial_rig(camera)
     _add_unregistered_image(model, camera_id=1, image_id=7)
 
     class Mapper:
@@ -695,7 +696,8 @@ def test_a_camera_that_joins_without_points_of_the_map_keeps_its_calibration() -
 def test_images_of_a_camera_that_is_in_the_map_do_not_join_without_points() -> None:
     model = pycolmap.Reconstruction()
     for number in (1, 2):
-        model.add_camera_with_trivial_rig(pycolmap.Camera(model="PINHOLE", params=_CAMERA.params, camera_id=number))
+        camera = pycolmap.Camera(model="PINHOLE", params=_CAMERA.params, camera_id=number)
+        model.add_camera_with_trivial_rig(camera)
     tried: list[int] = []
     for image_id in (1, 2):
         image = pycolmap.Image(name=f"cam/{image_id}", camera_id=1, image_id=image_id)
