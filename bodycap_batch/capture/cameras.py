@@ -71,6 +71,7 @@ class CaptureCamera:
             it covers little of the pictures.
         threads: Number of threads of the decoder. For 0, the number is taken from the environment variable
             OMP_NUM_THREADS. If this variable is not set, all processors are used.
+        given: Intrinsics that were given, if the map contradicted them and `camera` replaces them; else None.
     """
 
     name: str
@@ -91,6 +92,7 @@ class CaptureCamera:
     kept: KeptFrames | None = field(default=None, repr=False)
     wearer: WearerView | None = field(default=None, repr=False)
     threads: int = 0
+    given: Camera | None = None
 
     def __post_init__(self) -> None:
         count = len(self.frame_numbers)

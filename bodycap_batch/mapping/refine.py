@@ -86,14 +86,13 @@ def refine_map(
 
     Source: Hedborg et al., "Rolling shutter bundle adjustment", CVPR 2012, for the idea.
     """
-    # A check may have changed the intrinsics of some of the cameras of one model.
-    equal_cameras = groups_of_equal_cameras(capture.cameras)
     capture = with_map_intrinsics(capture, previous)
     workspace = context.work_dir / "workspace"
     shutil.copytree(previous.workspace, workspace)
     calibrated_ids = calibrated_camera_ids(capture, read_camera_ids(workspace))
     mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, skeletal_above)
     cameras = {camera.name: camera for camera in capture.cameras}
+    equal_cameras = groups_of_equal_cameras(capture.cameras)
     entries = previous.log.get("readouts_from_matches", {})
     from_matches = {name: _readout_of(entry) for name, entry in entries.items()}
     models, all_readouts, adjusted_px, motions = [], [], [], []

@@ -66,6 +66,9 @@ of poses. Evidence: docs/decisions/registration.md."""
 _EXTRAPOLATION_RATIO = 0.5
 """Expected error of an extrapolated angular velocity, as a ratio of the largest velocity around the frame.
 Evidence: docs/decisions/registration.md."""
+_RATE_TOLERANCE = 1e-4
+"""Relative change of the angular velocities of a smoothest path at which its computation ends. It takes half
+the time of the default, 1e-9. Origin: noise makes errors that are a hundred times larger."""
 _ROW_ROUNDS = 4
 """Number of times that the row in which a point is exposed is computed again. Origin: a camera that turns by
 50 degrees a frame moves a point by the height of a picture in one frame interval; with a readout of half an
@@ -312,12 +315,15 @@ def _spline_rates(times_ns: IntArray, rotation: FloatArray, segment: IntArray) -
     """Return the angular velocities (N,3) of the smoothest paths through the orientations of segments."""
     from scipy.spatial.transform import Rotation, RotationSpline
 
+    class Smoothest(RotationSpline):
+        TOL = _RATE_TOLERANCE
+
     rate = np.zeros((len(times_ns), 3))
     bounds = np.flatnonzero(np.diff(segment, prepend=-1, append=-1))
     for first, stop in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
         if stop - first > 1:
             seconds = (times_ns[first:stop] - times_ns[first]) * 1e-9
-            spline = RotationSpline(seconds, Rotation.from_matrix(rotation[first:stop]))
+            spline = Smoothest(seconds, Rotation.from_matrix(rotation[first:stop]))
             rate[first:stop] = spline(seconds, 1)
         if stop - first > 2:
             # The spline has no acceleration at its ends. The velocity is extrapolated from two steps instead.

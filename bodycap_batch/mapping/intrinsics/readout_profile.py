@@ -226,11 +226,30 @@ def _estimate(profiles: Sequence[_Profile]) -> _Estimate:
         if nearest == centre and step_s == _LAST_STEP_S:
             break
         centre, step_s = nearest, _LAST_STEP_S
-    grid = [centre - step_s, centre, centre + step_s]
+    sigma_s = _sigma_s(profiles, centre, best, step_s)
+    if sigma_s > _MAX_SIGMA_S:
+        # The cost is rough where rotations of pairs are uncertain. Then a wider parabola tells more.
+        wide = np.array([cost(centre + step * _STEP_S) for step in (-1, 0, 1)])
+        wide_best = centre + _STEP_S * _parabola_minimum(wide)
+        wide_sigma_s = _sigma_s(profiles, centre, wide_best, _STEP_S)
+        if wide_sigma_s < sigma_s:
+            best, sigma_s = wide_best, wide_sigma_s
+    return _Estimate(best, sigma_s if abs(best) <= limit_s else float("inf"), cost(centre))
+
+
+def _sigma_s(profiles: Sequence[_Profile], centre_s: float, best_s: float, step_s: float) -> float:
+    """Return the standard deviation (seconds) of a readout time from a parabola; infinity if it is unknown.
+
+    Args:
+        profiles: The cameras.
+        centre_s: Readout time in the middle of the parabola, seconds.
+        best_s: Readout time with the least cost, seconds.
+        step_s: Distance of the readout times of the parabola, seconds.
+    """
+    grid = [centre_s - step_s, centre_s, centre_s + step_s]
     costs = [np.stack([item.pair_costs(value) for value in grid]) for item in profiles]
     sigma_s = _standard_deviation(costs, [item.speeds() for item in profiles], step_s)
-    sigma_s = float(np.hypot(sigma_s, _MODEL_SIGMA_RATIO * best)) if abs(best) <= limit_s else float("inf")
-    return _Estimate(best, sigma_s, cost(centre))
+    return float(np.hypot(sigma_s, _MODEL_SIGMA_RATIO * best_s))
 
 
 def _bracketed_minimum(cost: Callable[[float], float], limit_s: float) -> float:

@@ -233,13 +233,13 @@ def few_blocks_factor(blocks: int) -> float:
 
 
 def groups_of_equal_cameras(cameras: Iterable[CaptureCamera]) -> list[list[str]]:
-    """Return groups of names of cameras with equal intrinsics, image size and frame rate.
+    """Return groups of names of cameras with equal given intrinsics, image size and frame rate.
 
     These cameras may be of one model.
     """
     groups: dict[object, list[str]] = {}
     for camera in cameras:
-        lens = camera.camera
+        lens = camera.given or camera.camera
         key = (lens.model, lens.width_px, lens.height_px, round(camera.nominal_fps, 2), lens.params.tobytes())
         groups.setdefault(key, []).append(camera.name)
     return list(groups.values())

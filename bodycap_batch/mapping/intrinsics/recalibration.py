@@ -121,7 +121,12 @@ def with_intrinsics_to_refine(capture: Capture, cameras: Mapping[str, Camera]) -
     return replace(
         capture,
         cameras=tuple(
-            replace(item, camera=replace(cameras[item.name], sideways=item.camera.sideways), calibrated=False)
+            replace(
+                item,
+                camera=replace(cameras[item.name], sideways=item.camera.sideways),
+                calibrated=False,
+                given=item.given or item.camera,
+            )
             if item.name in cameras
             else item
             for item in capture.cameras

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.mapping.intrinsics.readout_profile import estimate_from_matches
+from bodycap_batch.mapping.intrinsics.readout_profile import _estimate, estimate_from_matches
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.frame_matches import FrameMatches
 from bodycap_batch.model.geometry import so3_exp
@@ -82,6 +82,7 @@ def estimated(matches: dict[str, FrameMatches], *, known: bool = False) -> Any:
         rolling_shutter_known=known,
         may_be_sideways=False,
         nominal_fps=30.0,
+        given=None,
     )
     cameras = {name: SimpleNamespace(**vars(camera), name=name) for name in matches}
     capture: Any = SimpleNamespace(camera=lambda name: cameras[name])
@@ -144,3 +145,24 @@ def test_few_and_even_turns_of_a_global_shutter_are_not_determined() -> None:
 
 def test_a_stated_readout_is_not_estimated() -> None:
     assert estimated({"head": film(wobble, 0.01)}, known=True) == {}
+
+
+def test_a_cost_that_is_flat_around_its_minimum_still_tells_the_readout() -> None:
+    rng = np.random.default_rng(2)
+    best_s = 0.020 + 0.0005 * rng.standard_normal(90)
+
+    class Profile:
+        """Within 2 ms of the best readout time, the cost of each pair of frames is the same."""
+
+        times_ns = np.arange(91) * 33_333_333
+
+        def pair_costs(self, readout_s: float) -> FloatArray:
+            return 10.0 + np.maximum(1e3 * np.abs(readout_s - best_s) - 2.0, 0.0) ** 2
+
+        def speeds(self) -> FloatArray:
+            return np.arange(90) % 7.0
+
+    profile: Any = Profile()
+    found = _estimate([profile])
+    assert found.seconds == pytest.approx(0.020, abs=0.001)
+    assert 0.0005 < found.sigma_s < 0.004

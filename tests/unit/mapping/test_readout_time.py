@@ -102,9 +102,12 @@ def test_cameras_of_other_lenses_are_in_other_groups() -> None:
         lens = Camera(
             model="PINHOLE", width_px=640, height_px=480, params=np.array([focal_px, focal_px, 320.0, 240.0])
         )
-        return SimpleNamespace(name=name, camera=lens, nominal_fps=fps)
+        return SimpleNamespace(name=name, camera=lens, nominal_fps=fps, given=None)
 
     cameras = [camera("a"), camera("b", 500.0), camera("c"), camera("d", fps=60.0)]
+    assert groups_of_equal_cameras(cameras) == [["a", "c"], ["b"], ["d"]]
+    # A map contradicted the given intrinsics of one camera. It may still be of the same model.
+    cameras[2].given, cameras[2].camera = cameras[2].camera, camera("c", 410.0).camera
     assert groups_of_equal_cameras(cameras) == [["a", "c"], ["b"], ["d"]]
 
 

@@ -119,6 +119,7 @@ def camera_of(
     return SimpleNamespace(
         name="head",
         nominal_fps=1.0 / FRAME_S,
+        given=None,
         camera=replace(LENS, sideways=film.sideways and known),
         may_be_sideways=may_be_sideways,
         rolling_shutter_known=known,
