@@ -42,21 +42,24 @@ class CommonPoints:
         order = np.lexsort((keyframe, point))
         sizes = np.bincount(point, minlength=1)
         starts = np.cumsum(sizes) - sizes
-        # Each observation is paired with all observations of its point.
-        partners = sizes[point[order]]
-        left = np.repeat(np.arange(len(order)), partners)
-        offset = np.arange(len(left)) - np.repeat(np.cumsum(partners) - partners, partners)
-        first, second = order[left], order[starts[point[order[left]]] + offset]
-        kept = keyframe[first] <= keyframe[second]
-        first, second = first[kept], second[kept]
-        by_pair = np.lexsort((keyframe[second], keyframe[first]))
-        first, second = first[by_pair], second[by_pair]
-        pairs = np.stack([keyframe[first], keyframe[second]], axis=1)
-        new = np.ones(len(pairs), dtype=bool)
-        new[1:] = (pairs[1:] != pairs[:-1]).any(axis=1)
-        begin = np.flatnonzero(new)
+        # Each observation is paired with itself and with the later observations of its point.
+        place = np.arange(len(order))
+        partners = sizes[point[order]] - (place - starts[point[order]])
+        left = np.repeat(place, partners)
+        right = left + np.arange(len(left)) - np.repeat(np.cumsum(partners) - partners, partners)
+        first, second = order[left], order[right]
+        # A keyframe that observes a point twice needs the pair in both orders.
+        twice = (keyframe[first] == keyframe[second]) & (first != second)
+        first, second = np.append(first, second[twice]), np.append(second, first[twice])
+        number = keyframe[first] * (int(keyframe.max(initial=0)) + 1) + keyframe[second]
+        by_pair = np.argsort(number, kind="stable")
+        first, second, number = first[by_pair], second[by_pair], number[by_pair]
+        begin = np.flatnonzero(np.diff(number, prepend=-1))
         return CommonPoints(
-            first=first, second=second, pairs=pairs[begin], bounds=np.append(begin, len(pairs))
+            first=first,
+            second=second,
+            pairs=np.stack([keyframe[first[begin]], keyframe[second[begin]]], axis=1),
+            bounds=np.append(begin, len(first)),
         )
 
 
