@@ -189,19 +189,23 @@ def _cameras(
 
 
 _VIEW_WORDS = {
-    LostView.MAP: "should see a part of the map",
-    LostView.WEARER: "see mostly the wearer",
-    LostView.NOTHING: "see nothing of the map",
-    LostView.UNKNOWN: "have no reliable predicted pose",
+    LostView.MAP: ("should see a part of the map", "should see a part of the map"),
+    LostView.WEARER: ("sees mostly the wearer", "see mostly the wearer"),
+    LostView.NOTHING: ("sees nothing of the map", "see nothing of the map"),
+    LostView.UNKNOWN: ("has no reliable predicted pose", "have no reliable predicted pose"),
 }
-"""Words for what lost frames see."""
+"""Words for what one lost frame sees, and for what several see."""
 
 
 def _lost_frames_see(inputs: ReportInputs, camera: str) -> list[tuple[int, str]]:
     """Return the number of lost frames of a camera, and what they see, for each kind that occurs."""
     views = inputs.lost_views.get(camera)
     counts = Counter(() if views is None else views.view)
-    return [(counts[view], words) for view, words in _VIEW_WORDS.items() if counts[view]]
+    return [
+        (counts[view], words[0] if counts[view] == 1 else words[1])
+        for view, words in _VIEW_WORDS.items()
+        if counts[view]
+    ]
 
 
 def _time_span(inputs: ReportInputs) -> tuple[float, float]:

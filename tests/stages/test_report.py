@@ -261,6 +261,7 @@ def test_readout_times_are_listed_with_their_sources(inputs: ReportInputs, tmp_p
     ]
     page = written(replace(inputs, metrics=metrics), tmp_path)
     assert caption in page
+    assert "<code>rolling_shutter_s</code>" in page
     assert 'data-metric="mapping.rolling_shutter.0.torso.seconds" data-value="0.01202">12.02 ms' in page
     assert "0.03 ms" in page
     assert "estimated from the video" in page
@@ -722,6 +723,8 @@ def test_lost_frames_that_see_the_map_are_separated_from_those_that_see_nothing(
         (LostView.UNKNOWN, "30 lost frames have no reliable predicted pose"),
     ):
         assert words in written(_seeing(inputs, "torso", view), tmp_path)
+    single = _seeing(report_inputs(lost=slice(20, 21)), "torso", LostView.NOTHING)
+    assert "1 lost frame sees nothing of the map" in written(single, tmp_path)
 
 
 @pytest.mark.parametrize(
