@@ -271,7 +271,7 @@ class _MapperRun:
 
         Among the images that fit, the image that observes most of the map is registered. If none fits, an
         image is registered from its matches alone. This takes seconds, so it is done only to connect a camera
-        of which the map lacks most images. Single images are found later, by the registration of all frames.
+        of which the map lacks most images. Single images can be found later, when all frames are registered.
         """
         for image_id in self._mapper.find_next_images(self._options, structure_less=False):
             if self._mapper.register_next_image(self._options, image_id):

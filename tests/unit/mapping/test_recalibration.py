@@ -67,6 +67,7 @@ def test_misfit_intrinsics_start_from_the_focal_length_that_fits() -> None:
     found = recalibrate_if_misfit(_mapped(0.9, {"left_palm": 1.31}), CAPTURE, build)
     (capture,) = seen
     assert not capture.camera("left_palm").calibrated
+    assert capture.camera("left_palm").given is CAPTURE.camera("left_palm").camera
     start = capture.camera("left_palm").camera
     # As for an uncalibrated camera: mapping selects the camera model, too.
     assert (start.model, start.refine) == ("SIMPLE_RADIAL", True)

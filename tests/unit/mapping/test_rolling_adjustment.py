@@ -15,6 +15,9 @@ from bodycap_batch.mapping.reconstruction.rolling_adjustment import (
     RollingMap,
     RowObservations,
     _derivatives,
+    _moved,
+    _normal_equations,
+    _prior,
     _residuals,
     adjust_with_velocities,
     correction_ratios,
@@ -210,6 +213,22 @@ def test_the_error_of_a_readout_time_is_the_stated_one() -> None:
         deviations.append((found.readout_ratio[0] - 1.0) / readout_errors(noisy, found, loose, width_px)[0])
     # The mean of twelve squares with an expected value of 1 has a standard deviation of 0.4.
     assert 0.3 < float(np.mean(np.square(deviations))) < 2.0
+
+
+def test_a_step_is_made_longer_while_the_cost_falls() -> None:
+    seen, truth, errors = scene()
+    system = _normal_equations(seen, truth, _prior(seen, errors), 1.0)
+
+    def after_step(costs: list[float]) -> tuple[FloatArray, float]:
+        each = iter(costs)
+        moved, cost = _moved(truth, system, 1e-4, lambda _: next(each))
+        assert moved is not None
+        return moved.points - truth.points, cost
+
+    single, _ = after_step([1.0, 2.0])
+    longest, cost = after_step([5.0, 4.0, 3.0, 3.5])
+    assert cost == 3.0
+    assert longest == pytest.approx(2.25 * single)
 
 
 def test_a_readout_time_that_is_known_otherwise_counts_as_an_observation() -> None:
