@@ -40,12 +40,10 @@ _NOISE_PX = 0.7
 """Standard deviation of an observation in the first pass, px of an image with a long side of 640 px. Origin:
 the same as for angular velocities in `model.rotation_path`."""
 _WIDE_LOSS_WIDTH = 4.0
-"""Width of the loss in the first passes, in standard deviations of an observation in the first pass. It keeps
-observations that disagree because the velocities of the path are wrong. The later width is the median
-residual at the start of the pass. Evidence: docs/decisions/mapping.md."""
-_WIDE_PASSES = 2
-"""Number of passes with this width. Evidence: docs/decisions/mapping.md."""
-_PASSES = 4
+"""Width of the loss in the first pass, in standard deviations of an observation. It keeps observations that
+disagree because the velocities of the path are wrong. The later width is the median residual at the start of
+the pass. Evidence: docs/decisions/mapping.md."""
+_PASSES = 3
 """Number of passes. Evidence: docs/decisions/mapping.md."""
 _FIRST_SCALE = 1.0 / 3.0
 """Factor of the expected errors of the velocities in the first pass. With few keyframes, larger errors let
@@ -79,12 +77,10 @@ _MIN_KEYFRAMES = 4
 """Minimum number of keyframes that tell a readout time. With fewer, the scatter of single keyframes is
 unknown. Evidence: docs/decisions/mapping.md."""
 _SCALE_STEPS = 200
-"""Number of steps in which the usual size of the errors is computed. It converges slowly where the pictures
-say little about the velocities. A step takes microseconds."""
+"""Number of steps in which the usual size of the errors is computed. It only bounds the computing time: a
+step takes microseconds, and most cameras need fewer than 50."""
 _MIN_OBSERVATIONS = 12
 """Minimum number of observations of a keyframe that tells how wrong velocities are. Evidence: none."""
-_NO_INFORMATION = 1e-9
-"""Ratio of information, from pictures to all, that says nothing. It only prevents a division by zero."""
 _MIN_SCALE = 0.05
 """Smallest factor of the expected errors of velocities. It only prevents that an exact path leaves no
 freedom."""
@@ -336,7 +332,7 @@ class MotionAdjustment:
                 velocities=np.zeros_like(found.velocities),
                 readout_ratio=readouts.seconds / readouts.scale_s,
             )
-            width_px = wide_px if passed < _WIDE_PASSES else usual_residual_px(seen, found)
+            width_px = usual_residual_px(seen, found) if passed else wide_px
             found = adjust_with_velocities(seen, found, errors, width_px)
             readouts = self._after_pass(seen, found, errors, readouts, width_px)
             if passed < _PASSES - 1:
@@ -345,7 +341,7 @@ class MotionAdjustment:
                 readouts = readouts.without_short_ones()
             noise_px = usual_residual_px(seen, found) / _MEDIAN_OF_NORMAL
             squares, variances = velocity_squares(replace(seen, noise_px=noise_px), found, errors)
-            scales = self._error_scales(squares / own**2, variances / own**2, scales)
+            scales = self._error_scales((squares + variances) / own**2)
         return AdjustedMap(
             cam_from_map=found.cam_from_map,
             points=found.points,
@@ -481,38 +477,31 @@ class MotionAdjustment:
         moved = make_transform(between[:, :3, :3] @ poses[:, :3, :3], between[:, :3, 3] + poses[:, :3, 3])
         return moved, times_ns
 
-    def _error_scales(self, squares: FloatArray, variances: FloatArray, scales: FloatArray) -> FloatArray:
+    def _error_scales(self, squares: FloatArray) -> FloatArray:
         """Return factors (K,3) of the expected errors of velocities.
 
         The errors of the keyframes of a camera have a Student distribution: each has its own size, near the
-        usual size of the camera unless the pictures say otherwise. What the pictures say of a velocity is
-        separated from what was expected of it. The earlier factors still matter where the corrections
-        moved the points.
+        usual size of the camera unless the pictures say otherwise. This is one step of an expectation
+        maximisation in each pass. Where the pictures say nothing of a velocity, its correction is 0, its
+        variance is what was expected, and the factor stays.
 
         Args:
-            squares: (K,3) mean squares of the corrections along an axis, in the expected errors of the path.
-            variances: (K,3) their variances, in the same unit.
-            scales: (K,3) factors with which the corrections were estimated.
+            squares: (K,3) expected squares of the errors along an axis: squared correction and variance, in
+                the expected errors of the path.
 
         Source: Lange, Little, Taylor, "Robust statistical modeling using the t distribution", 1989.
         """
         seen: BoolArray = np.bincount(self.keyframe, minlength=len(self.camera)) >= _MIN_OBSERVATIONS
-        information = np.maximum(1.0 / variances - 1.0 / scales**2, 0.0)
-        measured = squares / np.maximum(variances * information, _NO_INFORMATION) ** 2
         out, camera = np.full_like(squares, _FIRST_SCALE), np.array(self.camera)
         for name in np.unique(camera).tolist():
             own = np.flatnonzero(camera == name)
             if not seen[own].any():
                 continue
-            # Where the pictures say nothing, the errors stay those of the first pass.
-            usual, size = np.full(3, _FIRST_SCALE**2), np.full((len(own), 3), _FIRST_SCALE**2)
+            usual, weight = squares[own][seen[own]].mean(axis=0), np.ones((len(own), 3))
             for _ in range(_SCALE_STEPS):
-                variance = 1.0 / (information[own] + 1.0 / size)
-                square = (information[own] * variance) ** 2 * measured[own] + variance
-                weight = (_FREEDOM + 3.0) / (_FREEDOM + 3.0 * square / usual)
-                usual = np.maximum((weight * square)[seen[own]].mean(axis=0), _MIN_SCALE**2)
-                size = usual / weight
-            out[own] = np.sqrt(size)
+                weight = (_FREEDOM + 3.0) / (_FREEDOM + 3.0 * squares[own] / usual)
+                usual = np.maximum((weight * squares[own])[seen[own]].mean(axis=0), _MIN_SCALE**2)
+            out[own] = np.sqrt(usual / weight)
         return out
 
     def _scales_of_frames(self, scales: FloatArray) -> dict[str, FloatArray]:

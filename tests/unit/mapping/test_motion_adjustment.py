@@ -9,6 +9,7 @@ import pytest
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.mapping.reconstruction.motion_adjustment import (
+    _PASSES,
     AdjustedReadout,
     MotionAdjustment,
     _Readouts,
@@ -305,7 +306,7 @@ def scales_of(
         corrections: (K,3) velocities that the pictures tell, in the expected errors.
         cameras: Camera of each keyframe.
         seen: Number of observations of each keyframe.
-        before: Factor with which the corrections were estimated.
+        before: Factor with which the corrections of the first pass are estimated.
         noise: Standard deviation of what the pictures tell.
     """
     adjustment = MotionAdjustment(
@@ -318,9 +319,11 @@ def scales_of(
         point=np.zeros(seen * len(cameras), np.int64),
         px=np.zeros((seen * len(cameras), 2)),
     )
-    variance = 1.0 / (noise**-2 + before**-2)
-    squares = (corrections * variance / noise**2) ** 2
-    return adjustment._error_scales(squares, np.full(squares.shape, variance), np.full(squares.shape, before))
+    scales = np.full(corrections.shape, before)
+    for _ in range(_PASSES):
+        variance = 1.0 / (noise**-2 + scales**-2)
+        scales = adjustment._error_scales((corrections * variance / noise**2) ** 2 + variance)
+    return scales
 
 
 @pytest.mark.parametrize("before", [0.3, 1.0, 3.0])
@@ -339,8 +342,17 @@ def test_each_camera_has_its_own_usual_error_and_a_violent_keyframe_a_larger_one
 def test_noise_is_no_error_of_a_velocity() -> None:
     rng = np.random.default_rng(8)
     # Without errors, the pictures tell only their noise.
-    scales = scales_of(rng.normal(0.0, 0.5, (200, 3)), ("a",) * 200, noise=0.5)
-    assert np.median(scales) < 0.25
+    scales = scales_of(rng.normal(0.0, 0.1, (200, 3)), ("a",) * 200, before=0.3, noise=0.1)
+    assert np.median(scales) < 0.15
+
+
+@pytest.mark.parametrize("noise", [1.0, 10.0, 100.0])
+def test_pictures_that_say_little_hardly_change_what_is_expected(noise: float) -> None:
+    rng = np.random.default_rng(9)
+    # The noise is twice what the adjustment assumes: its residuals do not show the errors that all of the
+    # observations of a keyframe have in common.
+    scales = scales_of(rng.normal(0.0, 2.0 * noise, (200, 3)), ("a",) * 200, before=0.3, noise=noise)
+    assert np.median(scales) == pytest.approx(0.3, abs=0.1)
 
 
 def test_keyframes_with_few_observations_tell_no_errors() -> None:
