@@ -106,6 +106,8 @@ class BodyCalibration:
             among these cameras.
         off_hinge_m: Size of each hinge violation. The key is the role of the bone below the hinge. The value
             is the sigma of the distance between the bone's far end and the plane of the hinge, metres.
+        implausible_ticks: Number of sampled ticks that were left out, because no plausible posture fits their
+            camera poses.
     """
 
     scale: MetricScale
@@ -119,6 +121,7 @@ class BodyCalibration:
     t_pose_ns: tuple[int, int] | None
     rolls: tuple[RollSearch, ...]
     off_hinge_m: Mapping[str, float] = field(default_factory=dict)
+    implausible_ticks: int = 0
 
 
 class ReferenceCameraRoll(NamedTuple):
@@ -173,7 +176,7 @@ def calibrate_body(
     priors = inputs.mount_by_camera()
     samples = take_samples(tracks, provisional, _SAMPLES, hints.vertical, t_pose_ns)
     graph = CalibrationGraph(inputs.skeleton, bones, samples, priors, provisional, step)
-    graph.solve(provisional)
+    implausible = graph.solve_without_implausible_ticks(provisional)
     graph.widen_joint_priors()
     estimate = estimate_scale(graph, provisional)
     if graph.test_hinges():
@@ -188,7 +191,7 @@ def calibrate_body(
     up = estimate_vertical(
         trunk_orientation(inputs.skeleton, bones, poses), scene, np.random.default_rng(0), verticals
     )
-    walking = samples.posture.walking
+    walking = graph.samples.posture.walking
     # A person who bends or sits lowers the trunk. Only walking gives the trunk's height over the floor.
     upright = poses[walking] if walking.sum() >= MIN_WALKING_SAMPLES else poses
     height_m = _height_over_floor(bones[0], upright, up, scene)
@@ -226,6 +229,7 @@ def calibrate_body(
         t_pose_ns=t_pose_ns,
         rolls=rolls,
         off_hinge_m=graph.hinge_violation_m(),
+        implausible_ticks=implausible,
     )
 
 
