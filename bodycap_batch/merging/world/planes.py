@@ -133,11 +133,15 @@ def _largest_plane(points: FloatArray, thickness_m: float, rng: np.random.Genera
     """
     tree = cKDTree(points)
     seeds = rng.integers(len(points), size=_HYPOTHESES)
-    groups = (tree.query_ball_point(point, _NEIGHBOUR_RADIUS_M) for point in points[seeds])
+    groups = tree.query_ball_point(points[seeds], _NEIGHBOUR_RADIUS_M)
+    count = np.array([len(near) for near in groups])
+    # Two different neighbours of each point.
+    one = rng.integers(count)
+    other = (one + rng.integers(1, np.maximum(count, 2))) % count
     triples = np.array(
         [
-            [seed, *(near[each] for each in rng.choice(len(near), 2, replace=False))]
-            for seed, near in zip(seeds.tolist(), groups, strict=True)
+            [seed, near[a], near[b]]
+            for seed, near, a, b in zip(seeds.tolist(), groups, one.tolist(), other.tolist(), strict=True)
             if len(near) > 3
         ],
         dtype=np.int64,
