@@ -117,7 +117,7 @@ class MapOptions(Options):
         0.1,
         ge=0,
         le=1,
-        description="the job stops if the map contains a smaller share of the keyframes than this",
+        description="the job stops if the map contains a smaller share of the keyframes with texture",
     )
 
 

@@ -44,12 +44,14 @@ from bodycap_batch.mapping.matching.database import (
     ImageRef,
     add_camera,
     add_keyframes,
+    count_with_features,
     read_camera_ids,
 )
 from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint, exclude_flipped_cameras
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.model_joining import join_models
+from bodycap_batch.mapping.reconstruction.mapper_options import MIN_RESECTION_INLIERS
 from bodycap_batch.mapping.reconstruction.model_files import write_models
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
@@ -241,7 +243,9 @@ def build_map_once(
         # A removed keyframe may have connected others with the room.
         log["unconfirmed_points"] += sum(map(remove_points_on_wearer, models))
     attempts = log.get("initial_candidates", log["initial_pair_ladder"])
-    refused = add_flip_hint(check_coverage(models, len(refs), attempts, options), flips)
+    # A keyframe of a covered lens shows nothing, so it cannot be part of a map.
+    textured = count_with_features(workspace, refs, MIN_RESECTION_INLIERS)
+    refused = add_flip_hint(check_coverage(models, textured, attempts, options), flips)
     if refused is not None and not models:
         raise refused
     write_models(workspace, models)

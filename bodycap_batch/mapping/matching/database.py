@@ -94,6 +94,15 @@ def read_camera_ids(workspace: Path) -> dict[str, int]:
     return {ImageRef.parse(image.name).camera: int(image.camera_id) for image in images}
 
 
+def count_with_features(workspace: Path, refs: Collection[ImageRef], least: int) -> int:
+    """Return how many of some keyframes have at least a number of features."""
+    import pycolmap
+
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        ids = read_image_ids(database)
+        return sum(int(database.num_keypoints_for_image(ids[ref])) >= least for ref in refs)
+
+
 def read_matched_names(database: pycolmap.Database) -> set[str]:
     """Return the image names of all keyframes that belong to at least one verified pair."""
     import pycolmap

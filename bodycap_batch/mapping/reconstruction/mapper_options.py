@@ -25,7 +25,7 @@ Evidence: docs/decisions/mapping.md."""
 _LOCAL_REFINEMENTS = 1
 """Maximum number of rounds of a local adjustment. COLMAP's default is 2.
 Evidence: docs/decisions/mapping.md."""
-_MIN_RESECTION_INLIERS = 20
+MIN_RESECTION_INLIERS = 20
 """Minimum number of map points that must agree with the pose of a keyframe to register the keyframe. COLMAP's
 default is 30. Evidence: docs/decisions/mapping.md."""
 _MAX_RESECTION_ERROR_PX = 4.0
@@ -68,7 +68,7 @@ def make_mapper_options(
     settings.ba_refine_sensor_from_rig = False
     for part in (settings, settings.mapper, settings.triangulation):
         part.max_extra_param = _MAX_EXTRA_PARAM
-    settings.mapper.abs_pose_min_num_inliers = _MIN_RESECTION_INLIERS
+    settings.mapper.abs_pose_min_num_inliers = MIN_RESECTION_INLIERS
     settings.mapper.abs_pose_max_error = _MAX_RESECTION_ERROR_PX * scale
     settings.mapper.init_max_error *= scale
     settings.mapper.filter_max_reproj_error *= scale

@@ -187,7 +187,7 @@ def check_coverage(
 
     Args:
         models: The models, largest first.
-        keyframes: Number of keyframes of all cameras.
+        keyframes: Number of keyframes of all cameras with enough features to be part of a map.
         attempts: The initial pairs that were tried, for the message.
         options: The stage's options. ``min_coverage`` is the minimum fraction of the keyframes that the
             largest model must hold.
@@ -199,7 +199,7 @@ def check_coverage(
     if registered >= max(2, options.min_coverage * keyframes):
         return None
     return EstimationError(
-        f"the map contains only {registered} of {keyframes} keyframes, which is fewer than "
+        f"the map contains only {registered} of the {keyframes} keyframes with texture, which is fewer than "
         f"{options.min_coverage:.0%}; the map was started from these pairs of keyframes: {attempts}",
         hint="move the cameras sideways past bright surfaces with texture; check the calibration",
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -133,7 +134,7 @@ def _largest_plane(points: FloatArray, thickness_m: float, rng: np.random.Genera
     """
     tree = cKDTree(points)
     seeds = rng.integers(len(points), size=_HYPOTHESES)
-    groups = tree.query_ball_point(points[seeds], _NEIGHBOUR_RADIUS_M)
+    groups = cast("list[list[int]]", tree.query_ball_point(points[seeds], _NEIGHBOUR_RADIUS_M))
     count = np.array([len(near) for near in groups])
     # Two different neighbours of each point.
     one = rng.integers(count)

@@ -1,0 +1,56 @@
+"""A map must contain a part of the keyframes. Keyframes of a covered lens show nothing and do not count."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from bodycap_batch.config import MapOptions
+from bodycap_batch.mapping.matching.database import (
+    DATABASE_NAME,
+    ImageRef,
+    _write_camera,
+    count_with_features,
+    write_image,
+)
+from bodycap_batch.mapping.validation.epipolar_consistency import check_coverage
+from bodycap_batch.model.camera import Camera
+
+LENS = Camera(model="PINHOLE", width_px=64, height_px=48, params=np.array([50.0, 50.0, 32.0, 24.0]))
+
+
+def _model(keyframes: int) -> SimpleNamespace:
+    return SimpleNamespace(num_reg_images=lambda: keyframes)
+
+
+def test_keyframes_without_features_are_not_counted(tmp_path: Path) -> None:
+    features = {0: 500, 1: 0, 2: 19, 3: 20}
+    with pycolmap.Database.open(str(tmp_path / DATABASE_NAME)) as database:
+        camera = _write_camera(database, LENS.to_pycolmap())
+        for frame, count in features.items():
+            image = write_image(database, ImageRef("torso", frame), camera)
+            database.write_keypoints(image, np.ones((count, 2), np.float32))
+    refs = [ImageRef("torso", frame) for frame in features]
+    assert count_with_features(tmp_path, refs, 20) == 2
+    assert count_with_features(tmp_path, refs[1:3], 20) == 0
+
+
+@pytest.mark.parametrize(
+    ("registered", "textured", "is_refused"),
+    [(14, 140, False), (13, 140, True), (14, 25, False), (1, 2, True)],
+)
+def test_a_map_must_contain_a_tenth_of_the_keyframes_with_texture(
+    registered: int, textured: int, is_refused: bool
+) -> None:
+    error = check_coverage([_model(registered)], textured, [], MapOptions())
+    assert (error is not None) == is_refused
+    if error is not None:
+        assert f"{registered} of the {textured} keyframes with texture" in str(error)
+
+
+def test_no_model_is_refused_even_if_no_keyframe_has_texture() -> None:
+    assert check_coverage([], 0, [], MapOptions()) is not None
