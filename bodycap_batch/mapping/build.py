@@ -245,7 +245,7 @@ def build_map_once(
     attempts = log.get("initial_candidates", log["initial_pair_ladder"])
     # A keyframe of a covered lens shows nothing, so it cannot be part of a map.
     textured = count_with_features(workspace, refs, MIN_RESECTION_INLIERS)
-    refused = add_flip_hint(check_coverage(models, textured, attempts, options), flips)
+    refused = add_flip_hint(check_coverage(models, len(refs), textured, attempts, options), flips)
     if refused is not None and not models:
         raise refused
     write_models(workspace, models)

@@ -181,25 +181,27 @@ def check_consistency(ratio: float) -> EstimationError | None:
 
 
 def check_coverage(
-    models: Sequence[Any], keyframes: int, attempts: object, options: MapOptions
+    models: Sequence[Any], keyframes: int, textured: int, attempts: object, options: MapOptions
 ) -> EstimationError | None:
     """Return an error if the largest model holds too few keyframes.
 
     Args:
         models: The models, largest first.
-        keyframes: Number of keyframes of all cameras with enough features to be part of a map.
+        keyframes: Number of keyframes of all cameras.
+        textured: Number of these keyframes with enough features to be part of a map.
         attempts: The initial pairs that were tried, for the message.
-        options: The stage's options. ``min_coverage`` is the minimum fraction of the keyframes that the
-            largest model must hold.
+        options: The stage's options. ``min_coverage`` is the minimum fraction of the keyframes with texture
+            that the largest model must hold.
 
     Returns:
         The error; None if the largest model holds enough keyframes.
     """
     registered = models[0].num_reg_images() if models else 0
-    if registered >= max(2, options.min_coverage * keyframes):
+    if registered >= max(2, options.min_coverage * textured):
         return None
     return EstimationError(
-        f"the map contains only {registered} of the {keyframes} keyframes with texture, which is fewer than "
-        f"{options.min_coverage:.0%}; the map was started from these pairs of keyframes: {attempts}",
+        f"the map contains only {registered} of {keyframes} keyframes, {textured} of which show texture; it "
+        f"must contain at least {options.min_coverage:.0%} of these; the map was started from these pairs of "
+        f"keyframes: {attempts}",
         hint="move the cameras sideways past bright surfaces with texture; check the calibration",
     )

@@ -46,11 +46,11 @@ def test_keyframes_without_features_are_not_counted(tmp_path: Path) -> None:
 def test_a_map_must_contain_a_tenth_of_the_keyframes_with_texture(
     registered: int, textured: int, is_refused: bool
 ) -> None:
-    error = check_coverage([_model(registered)], textured, [], MapOptions())
+    error = check_coverage([_model(registered)], 150, textured, [], MapOptions())
     assert (error is not None) == is_refused
     if error is not None:
-        assert f"{registered} of the {textured} keyframes with texture" in str(error)
+        assert f"{registered} of 150 keyframes, {textured} of which show texture" in str(error)
 
 
 def test_no_model_is_refused_even_if_no_keyframe_has_texture() -> None:
-    assert check_coverage([], 0, [], MapOptions()) is not None
+    assert check_coverage([], 5, 0, [], MapOptions()) is not None
