@@ -73,14 +73,20 @@ def camera_digests(
 
     def on_bytes(count: int) -> None:
         nonlocal read
-        read += count
+        read = min(read + count, total)
         if cancelled():
             raise Cancelled("the job stopped on request", hint="run the job again to continue")
-        listener(
-            Event(kind="progress", stage="reading videos", done=read >> 20, total=total >> 20, what="MB")
-        )
+        report()
 
-    return {camera.name: camera_digest(capture, camera, digests, on_bytes) for camera in capture.cameras}
+    def report() -> None:
+        done, all_mb = round(read / 2**20), round(total / 2**20)
+        listener(Event(kind="progress", stage="reading videos", done=done, total=all_mb, what="MB"))
+
+    found = {camera.name: camera_digest(capture, camera, digests, on_bytes) for camera in capture.cameras}
+    if read:  # the digests of some videos may have been known
+        read = total
+        report()
+    return found
 
 
 def _footage_digest(path: Path, digests: FileDigests, on_bytes: Callable[[int], None] | None) -> str:

@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from bodycap_batch.core.errors import CaptureError, StoreError
+from bodycap_batch.pipeline.results import publish
 from bodycap_batch.store.artefacts import MANIFEST, Artefact, ArtefactKey, Store
 from bodycap_batch.store.digests import (
     FileDigests,
@@ -362,6 +363,37 @@ def test_a_broken_entry_of_the_digests_is_not_believed(
     for entry in (tmp_path / "digests").iterdir():
         entry.write_text("")
     assert digests.sha256(video) == first
+
+
+def test_another_link_to_a_file_while_it_is_read_is_no_change_of_the_file(tmp_path: Path) -> None:
+    video = tmp_path / "video.mp4"
+    video.write_bytes(b"0" * 100)
+    links = iter(range(9))
+    found = FileDigests(tmp_path / "digests").sha256(
+        video, lambda _: os.link(video, tmp_path / f"{next(links)}.mp4")
+    )
+    assert found == file_sha256(video)
+    assert next(links) == 2, "the file is read twice"
+
+
+def test_results_are_published_while_another_job_verifies_them(tmp_path: Path) -> None:
+    store = Store(tmp_path / "store")
+    made = make(store, key(), {"preview.mp4": bytes(4 << 20)})
+    stop = threading.Event()
+
+    def publish_again_and_again() -> None:
+        number = 0
+        while not stop.is_set():
+            publish({"preview.mp4": made.path / "preview.mp4"}, tmp_path / f"out{number}")
+            number += 1
+
+    with ThreadPoolExecutor() as pool:
+        publishing = pool.submit(publish_again_and_again)
+        try:
+            assert all(store.find(key()) == made for _ in range(20))
+        finally:
+            stop.set()
+        publishing.result()
 
 
 def test_a_file_that_grows_while_it_is_read_is_refused(tmp_path: Path) -> None:
