@@ -15,6 +15,9 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Literal
 
+from bodycap_batch.core.errors import JobError
+from bodycap_batch.formats.fbx import require_blender
+
 State = Literal["ok", "note", "problem"]
 
 _PYTHON_VERSIONS = ((3, 11), (3, 14))
@@ -90,11 +93,7 @@ def examine_machine(folder: Path) -> Iterator[MachineFinding]:
     yield _writing_finding(folder)
     for extra in _EXTRAS:
         yield _extra_finding(extra)
-    yield _program_finding(
-        "Blender",
-        ("blender",),
-        "install Blender if you want to open the results with it; jobs do not need Blender",
-    )
+    yield _blender_finding()
     yield _program_finding(
         "a browser",
         _BROWSERS,
@@ -263,6 +262,17 @@ def _extra_finding(name: str) -> MachineFinding:
     return MachineFinding(
         what=f"extra [{name}]", state="note", found=f"not installed: {', '.join(missing)}", remedy=remedy
     )
+
+
+def _blender_finding() -> MachineFinding:
+    """Look for Blender with the search of the exporter, and start it as the exporter does."""
+    try:
+        found = f"{require_blender()} (writes FBX and .blend files)"
+        return MachineFinding(what="Blender", state="ok", found=found)
+    except JobError as error:
+        place = "" if error.path is None else f"{error.path}: "
+        remedy = f"if you need FBX files (Maya, MotionBuilder, Unreal, Unity) or .blend files, {error.hint}"
+        return MachineFinding(what="Blender", state="note", found=place + error.message, remedy=remedy)
 
 
 def _program_finding(what: str, names: Sequence[str], purpose: str) -> MachineFinding:

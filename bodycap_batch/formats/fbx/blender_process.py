@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -16,20 +17,22 @@ BLENDER_VARIABLE = "BODYCAP_BLENDER"
 
 _HINT = (
     f"install Blender as a Python module with `make blender` (Python 3.11), or set {BLENDER_VARIABLE} to a "
-    "Python that has the module bpy or to a blender executable"
+    "Python that has the module bpy or to a blender executable (4.2 or later)"
 )
 _TIMEOUT_S = 3600.0
 """Maximum duration of a run of Blender, seconds. Evidence: none; it only ends a process that hangs."""
 
-_START_TEST = "import bpy"
-"""Python statement that fails if Blender does not start."""
+_START_TEST = (
+    "import bpy, sys; bpy.app.version < (4, 2) and sys.exit(f'{bpy.app.version_string} is older than 4.2')"
+)
+"""Python statement that fails if Blender does not start, or is too old for the scripts."""
 
 
 def find_blender() -> Path:
     """Return the path of a Python that has the module ``bpy``, or of a Blender executable.
 
-    The search order is: ``BODYCAP_BLENDER``, the running Python, ``.venv-blender`` in the working folder, and
-    ``.venv-blender`` in the folder that contains this package.
+    The search order is: ``BODYCAP_BLENDER``, the running Python, ``.venv-blender`` in the working folder,
+    ``.venv-blender`` in the folder that contains this package, and ``blender`` on the search path (``PATH``).
 
     Raises:
         JobError: Blender was not found, or the value of ``BODYCAP_BLENDER`` is not a program.
@@ -46,23 +49,26 @@ def find_blender() -> Path:
         python = folder / ".venv-blender" / "bin" / "python"
         if python.is_file():
             return python
+    if (installed := shutil.which("blender")) is not None:
+        return Path(installed)
     raise JobError(
         "FBX and .blend files need Blender, which was not found", field="export.formats", hint=_HINT
     )
 
 
-def require_blender() -> None:
-    """Check that Blender is installed and starts.
+def require_blender() -> Path:
+    """Check that Blender is installed and starts, and return its path.
 
     Raises:
-        JobError: Blender was not found or does not start.
+        JobError: Blender was not found, does not start or is older than 4.2.
     """
     blender = find_blender()
     script = ["--python-expr", _START_TEST] if is_blender_executable(blender) else ["-c", _START_TEST]
     done = _run([str(blender), *_flags(blender), *script])
     if done.returncode != 0:
         last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-        raise JobError(f"Blender cannot be started: {last}", path=blender, hint=_HINT)
+        raise JobError(f"Blender cannot be used: {last}", path=blender, hint=_HINT)
+    return blender
 
 
 def run_script(script: Path, arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:

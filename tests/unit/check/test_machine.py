@@ -10,6 +10,7 @@ import pytest
 from bodycap_batch.check import machine
 from bodycap_batch.check.machine import MachineFinding, examine_machine
 from bodycap_batch.cli import main
+from bodycap_batch.formats.fbx import blender_process, find_blender
 
 
 def finding(name: str, folder: Path) -> MachineFinding:
@@ -90,3 +91,32 @@ def test_memory_and_disk_are_compared_in_megabytes(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(machine.shutil, "disk_usage", lambda _: usage)
     assert finding("disk", tmp_path).state == "ok"
     assert "5.1 GB free" in finding("disk", tmp_path).found
+
+
+def program(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return path
+
+
+def test_blender_is_where_the_exporter_finds_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("BODYCAP_BLENDER", raising=False)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(blender_process, "__file__", str(tmp_path / "a" / "b" / "c" / "blender.py"))
+    monkeypatch.setenv("PATH", str(tmp_path / "programs"))
+    missing = finding("Blender", tmp_path)
+    assert missing.state == "note"
+    assert "not found" in missing.found
+    assert "FBX" in missing.remedy
+    assert "make blender" in missing.remedy
+    places = [tmp_path / "programs" / "blender", tmp_path / ".venv-blender" / "bin" / "python"]
+    for place in places:
+        program(place, "exit 0")
+        assert (finding("Blender", tmp_path).state, find_blender()) == ("ok", place)
+        assert str(place) in finding("Blender", tmp_path).found
+    monkeypatch.setenv(
+        "BODYCAP_BLENDER", str(program(tmp_path / "old" / "blender", "echo 3.4 is old >&2; exit 1"))
+    )
+    assert finding("Blender", tmp_path).state == "note"
+    assert "3.4 is old" in finding("Blender", tmp_path).found

@@ -151,6 +151,7 @@ def test_blender_is_not_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     with pytest.raises(JobError, match="is not the path of a program"):
         blender_process.find_blender()
     monkeypatch.delenv("BODYCAP_BLENDER")
+    monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(blender_process, "__file__", str(tmp_path / "a" / "b" / "c" / "blender.py"))
     monkeypatch.setattr(blender_process.importlib.util, "find_spec", lambda name: None)
@@ -164,7 +165,7 @@ def test_blender_does_not_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     program.write_text("#!/bin/sh\necho 'libX11.so.6: not found' >&2\nexit 127\n")
     program.chmod(0o755)
     monkeypatch.setenv("BODYCAP_BLENDER", str(program))
-    with pytest.raises(JobError, match=r"cannot be started: libX11"):
+    with pytest.raises(JobError, match=r"cannot be used: libX11"):
         blender_process.require_blender()
 
 
