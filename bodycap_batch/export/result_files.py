@@ -41,6 +41,9 @@ from bodycap_batch.model.bone_axes import align_axes_with_bones
 from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.skeleton import Motion, with_file_zero_pose
 
+LEFT_OUT = "left_out"
+"""Name of the list in ``metrics.json`` with a sentence about each empty part that the files leave out."""
+
 
 def export_results(inputs: ExportInputs, options: ExportOptions, context: StageContext) -> tuple[Path, ...]:
     """Write the result files of a job to ``inputs.out_dir``. Each file is written atomically.
@@ -48,7 +51,8 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
     The options select among ``map.ply``, ``trajectories/<camera>.tum``, ``colmap/<n>/``, ``frames.csv``,
     ``joints.csv``, ``motion.bvh``, ``motion.glb`` and further formats. ``metrics.json`` is always written.
     With a body, the poses and points in the files are in the world. Maps and cameras that merging did not
-    place in the world are the exception.
+    place in the world are the exception. An empty part of the results, such as a map without points, is left
+    out, and ``metrics.json`` says so (`LEFT_OUT`).
 
     Args:
         inputs: The results of the earlier stages.
@@ -63,14 +67,15 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
         StoreError: A file cannot be written, or it differs from the motion when it is read back.
     """
     require_libraries(options.formats)
-    motion, gap = _exported_motion(inputs, options)
+    left_out: list[str] = []
+    motion, gap = _exported_motion(inputs, options, left_out)
     sigma_m = None if inputs.merge is None or motion is None else _exported_sigma_m(inputs.merge, motion)
-    steps: dict[str, Callable[[], list[Path]]] = {"tum": lambda: write_trajectories(inputs)}
+    steps: dict[str, Callable[[], list[Path]]] = {"tum": lambda: write_trajectories(inputs, left_out)}
     if inputs.maps:
-        steps |= {"ply": lambda: write_maps(inputs), "colmap": lambda: write_colmap(inputs)}
+        steps |= {"ply": lambda: write_maps(inputs, left_out), "colmap": lambda: write_colmap(inputs)}
     steps["csv"] = lambda: [write_frame_table(inputs.out_dir / "frames.csv", inputs)]
     if motion is not None:
-        steps |= _motion_writers(inputs, motion, options, sigma_m)
+        steps |= _motion_writers(inputs, motion, options, sigma_m, left_out)
         steps["csv"] = lambda: [
             write_frame_table(inputs.out_dir / "frames.csv", inputs),
             write_joint_table(inputs.out_dir / "joints.csv", motion, sigma_m),
@@ -79,7 +84,7 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
     merge = inputs.merge
     if merge is not None and merge.fill is not None:
         steps["fill"] = lambda: [write_fill_report(inputs.out_dir / FILL_FILE, merge)]
-    steps["metrics"] = lambda: [_write_metrics(inputs, motion, gap)]
+    steps["metrics"] = lambda: [_write_metrics(inputs, motion, gap, left_out)]
     written: list[Path] = []
     for number, (name, write) in enumerate(steps.items()):
         context.check_cancelled()
@@ -90,7 +95,11 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
 
 
 def _motion_writers(
-    inputs: ExportInputs, motion: Motion, options: ExportOptions, sigma_m: FloatArray | None
+    inputs: ExportInputs,
+    motion: Motion,
+    options: ExportOptions,
+    sigma_m: FloatArray | None,
+    left_out: list[str],
 ) -> dict[str, Callable[[], list[Path]]]:
     """Return, for each motion format, a function that writes its file.
 
@@ -103,13 +112,20 @@ def _motion_writers(
     aligned, place = align_axes_with_bones(animated), earth_of_world(inputs)
     earth = None if place is None else place.figures()
     markers = points_from_motion(motion, None if options.filled_markers else measured)
+
+    def trc() -> list[Path]:
+        if markers.measured_points().any():
+            return [write_trc(folder / "joints.trc", markers)]
+        left_out.append("joints.trc is not written: no exported joint was measured")
+        return []
+
     return {
         "bvh": lambda: [write_verified_bvh(folder / "motion.bvh", animated, options)],
         "glb": lambda: [write_verified_glb(folder / "motion.glb", aligned, earth)],
         "fbx": lambda: [write_fbx(folder / "motion.fbx", aligned)],
         "usd": lambda: [write_verified_usd(folder / "motion.usd", animated, earth)],
         "c3d": lambda: [write_c3d(folder / "joints.c3d", centres)],
-        "trc": lambda: [write_trc(folder / "joints.trc", markers)],
+        "trc": trc,
         "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m)],
         "blender": lambda: write_blender_files(folder, collect_blender_scene(inputs, aligned, options)),
     }
@@ -129,20 +145,27 @@ def _exported_sigma_m(merge: MergeResult, motion: Motion) -> FloatArray:
     return merge.joint_sigma_m()[:, kept]
 
 
-def _write_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str, Any]) -> Path:
+def _write_metrics(
+    inputs: ExportInputs, motion: Motion | None, gap: Mapping[str, Any], left_out: list[str]
+) -> Path:
     """Write ``metrics.json``, and return the path of the file."""
     path = inputs.out_dir / "metrics.json"
-    metrics = collect_metrics(inputs, motion, gap)
+    metrics = {**collect_metrics(inputs, motion, gap), LEFT_OUT: left_out}
     write_text(path, json.dumps(metrics, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
     return path
 
 
-def _exported_motion(inputs: ExportInputs, options: ExportOptions) -> tuple[Motion | None, dict[str, Any]]:
+def _exported_motion(
+    inputs: ExportInputs, options: ExportOptions, left_out: list[str]
+) -> tuple[Motion | None, dict[str, Any]]:
     """Return the motion to export, and its difference from the motion graph and the cameras.
 
     The difference is `Projection.gap`. Without a body, the motion is None and the difference is empty.
     """
     if inputs.merge is None:
+        return None, {}
+    if not len(inputs.merge.motion.root_in_world_m):
+        left_out.append("the files of the motion are not written: the motion has no frames")
         return None, {}
     motion = with_file_zero_pose(inputs.merge.motion)
     fill = inputs.merge.fill

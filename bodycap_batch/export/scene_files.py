@@ -34,10 +34,15 @@ It is a ratio to the extent of the map's points. Derivation: 1 cm in a room of 1
 """
 
 
-def write_maps(inputs: ExportInputs) -> list[Path]:
+def write_maps(inputs: ExportInputs, left_out: list[str]) -> list[Path]:
     """Write one point cloud for each target frame, with the maps and the camera paths in this frame.
 
     The file of the main target frame is ``map.ply``. The file of each other target frame is ``map_<n>.ply``.
+    A cloud without points is left out.
+
+    Args:
+        inputs: The results of the earlier stages.
+        left_out: Receives a sentence for the user about each part that is left out, because it is empty.
 
     Returns:
         The paths of the written files.
@@ -63,16 +68,26 @@ def write_maps(inputs: ExportInputs) -> list[Path]:
         }
         spacing = PATH_SPACING_M if name == WORLD else _PATH_SPACING_RATIO * _extent(cloud.points)
         file = inputs.out_dir / ("map.ply" if name == main_target else f"map_{number}.ply")
-        write_ply(file, add_camera_paths(cloud, paths, spacing, colours) if paths else cloud)
-        written.append(file)
+        drawn = add_camera_paths(cloud, paths, spacing, colours) if paths else cloud
+        if not len(cloud.points):
+            rest = "shows camera paths only" if len(drawn.points) else "is not written"
+            left_out.append(f"{file.name} {rest}: its map has no points")
+        if len(drawn.points):
+            write_ply(file, drawn)
+            written.append(file)
     return written
 
 
-def write_trajectories(inputs: ExportInputs) -> list[Path]:
+def write_trajectories(inputs: ExportInputs, left_out: list[str]) -> list[Path]:
     """Write one TUM file for each camera, with the camera's localised frames and own timestamps.
 
     The files are in ``trajectories/``. If the poses of a camera are not in the main target frame, the file is
-    in ``trajectories/unplaced/``.
+    in ``trajectories/unplaced/``. A camera without localised frames has a file without poses, because an
+    evaluation counts this camera, too.
+
+    Args:
+        inputs: The results of the earlier stages.
+        left_out: Receives a sentence for the user about each camera without localised frames.
 
     Returns:
         The paths of the written files.
@@ -92,6 +107,8 @@ def write_trajectories(inputs: ExportInputs) -> list[Path]:
         )
         write_tum(file, poses, _header_comments(trajectory))
         written.append(file)
+        if not localised.any():
+            left_out.append(f"trajectories/{file.name} has no poses: no frame of this camera was localised")
     return written
 
 

@@ -467,7 +467,7 @@ class Flow:
         """
         assert results.map is not None
         assert results.clocks is not None
-        segments = self._capture.segments()
+        segments = (results.job or self._job).capture.segments()
         task = ExportTask(
             options=self._job.export,
             map=artefact_ref(results.map),
@@ -478,7 +478,9 @@ class Flow:
             failure=None if results.failure is None else results.failure.message,
             segments=tuple(tuple(camera.name for camera in cameras) for cameras in segments),
         )
-        return self.runner.run(make_task(EXPORT, task, threads=self._threads))
+        artefact = self.runner.run(make_task(EXPORT, task, threads=self._threads))
+        self.runner.report_notes(artefact, "export")
+        return artefact
 
     def start_preview(self, results: StageResults) -> Future[Artefact] | None:
         """Start to render the video of the results while later stages run.
@@ -577,11 +579,18 @@ class Flow:
         if has_body(self._job):
             # Each run checks the installed libraries: they can change after the check stage is stored.
             require_libraries(self._job.export.formats)
+        # Places that an earlier run found are not part of the key: the check of that run did not know them.
+        found = {camera.name for camera in self._capture.cameras if camera.mount_source is not None}
+        clocks, body = stated_clocks(self._job.capture), self._body
+        if body is not None:
+            body = replace(body, mounts=tuple(item for item in body.mounts if item.camera not in found))
         task = CheckTask(
             job=self._job,
             cameras=self._cameras,
-            clocks=stated_clocks(self._job.capture),
-            body=self._body,
+            clocks={
+                name: replace(each, role=None) if name in found else each for name, each in clocks.items()
+            },
+            body=body,
             formats=self._job.export.formats,
             names=self._job.export.names,
             limits=self._settings.limits,

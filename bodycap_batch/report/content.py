@@ -69,6 +69,7 @@ def page_content(
         "person": None if inputs.merge is None else _person(inputs.merge),
         "curves": _motion_curves(inputs, budget),
         "files": describe_files(inputs.files),
+        "left_out": (inputs.metrics or {}).get("left_out", ()),
         "verdict": verdict,
         "grades": Grade,
         "failure": inputs.failure,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +12,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, paths_of
 from bodycap_batch.tasks.loading import load_clocks, load_keyframes, load_map
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
-from bodycap_batch.tasks.stage import RESULTS_FOLDER, Stage, read_summary
+from bodycap_batch.tasks.stage import RESULTS_FOLDER, Stage, read_summary, write_summary
 from bodycap_batch.tasks.typed_json import omitted_from_key
 
 
@@ -42,8 +43,8 @@ class ExportTask:
 
 
 def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
-    """Write the result files."""
-    from bodycap_batch.export import ExportInputs, export_results
+    """Write the result files; the notes in the summary say which parts are empty and left out."""
+    from bodycap_batch.export import LEFT_OUT, ExportInputs, export_results
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.merge_data import MergeResult
     from bodycap_batch.overlay.lost_frame_views import predict_lost_views
@@ -69,6 +70,8 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
         log={**scene.log, "reach": read_summary(task.clocks.path)["distances"]},
     )
     export_results(inputs, task.options, context)
+    metrics = json.loads((inputs.out_dir / "metrics.json").read_text(encoding="utf-8"))
+    write_summary(files, notes=metrics[LEFT_OUT])
 
 
 EXPORT = Stage(

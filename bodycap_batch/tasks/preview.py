@@ -76,8 +76,8 @@ def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInput
         capture=_trunk_first(capture, merge),
         views=make_camera_views(registrations, scene.maps, found.clocks, merge),
         reference_frame="world" if merge is not None else scene.maps[0].gauge,
-        points=np.concatenate(points),
-        colours=np.concatenate(colours),
+        points=np.concatenate([np.zeros((0, 3)), *points]),
+        colours=np.concatenate([np.zeros((0, 3), np.uint8), *colours]),
         bone_motion=None if merge is None else bones_from_motion(merge.motion),
         note=task.failure or "",
     )

@@ -44,9 +44,9 @@ def draw_camera_landmark_matrix(inputs: ReportInputs, colours: dict[str, str], d
         detail: Fraction of the pixels that may be used, 0 to 1.
 
     Returns:
-        The drawing as SVG; "" if no camera is registered in the largest map.
+        The drawing as SVG; "" if no camera is registered in the largest map, or if this map has no points.
     """
-    if not inputs.maps or not inputs.registrations:
+    if not inputs.maps or not inputs.registrations or not len(inputs.maps[0].points):
         return ""
     scene = inputs.maps[0]
     observations = {
