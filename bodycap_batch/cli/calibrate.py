@@ -15,7 +15,7 @@ from bodycap_batch.cli.progress_display import make_progress_display
 from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.core.progress import Event
+from bodycap_batch.core.progress import Event, StepProgress
 
 if TYPE_CHECKING:
     from bodycap_batch.calibration import CalibrationBoard
@@ -128,11 +128,13 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
         tempfile.TemporaryDirectory() as work,
     ):
 
-        def progress(done: int, total: int, what: str = "") -> None:
+        def report(done: int, total: int, what: str) -> None:
             display(Event(kind="progress", stage="calibrate", done=done, total=total, what=what))
 
+        progress = StepProgress(report)
         context = StageContext(work_dir=Path(work), progress=progress, cancelled=stop.is_set)
         result = calibrate_clip(video, stated or find_board(video, context), lens.value, context)
+        progress.complete()
     preview = target.with_name(f"{target.stem}{f'_{camera}' if camera else ''}.png")
     write_calibration(result, target, camera)
     write_preview(result, preview)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from types import TracebackType
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from bodycap_batch.cli.terminal import print_json, print_timed_message
 from bodycap_batch.core.percent import format_percent
@@ -23,6 +25,16 @@ _LINE_PAUSE_S = 1.0
 _LINE_PROGRESS = 0.1
 """A stage prints its next progress line before `_LINE_PERIOD_S` if it has advanced at least by this fraction
 since the last line. Unit: 1 (the whole stage). Evidence: none."""
+
+
+_SCHEMA = 1
+"""Number of the form of the JSON lines. It changes if a field changes its meaning or is removed."""
+
+
+def print_event(values: Mapping[str, Any]) -> None:
+    """Print one JSON line for other programs: the number of its form, the time (UTC), and the values."""
+    time_text = dt.datetime.now(dt.UTC).isoformat(timespec="milliseconds")
+    print_json({"schema": _SCHEMA, "time": time_text, **values})
 
 
 class ProgressDisplay(Protocol):
@@ -60,7 +72,7 @@ class JsonLines:
     def __call__(self, event: Event) -> None:
         """Print one event."""
         with self._lock:
-            print_json(event.to_dict())
+            print_event(event.to_dict())
 
 
 class ProgressLines:

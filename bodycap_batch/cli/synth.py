@@ -15,7 +15,7 @@ from bodycap_batch.cli.shared_options import ThreadsOption, cores
 from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.core.progress import Event
+from bodycap_batch.core.progress import Event, StepProgress
 
 
 @app.command()
@@ -91,13 +91,15 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
         tempfile.TemporaryDirectory() as work,
     ):
 
-        def progress(done: int, total: int, what: str = "") -> None:
+        def report(done: int, total: int, what: str) -> None:
             display(Event(kind="progress", stage="synth", done=done, total=total, what=what))
 
+        progress = StepProgress(report)
         context = StageContext(
             work_dir=Path(work), threads=threads or cores(), progress=progress, cancelled=stop.is_set
         )
         synthesise(options, out, context)
+        progress.complete()
     if not json_progress:
         print_line(f"capture: {out.resolve()}")
 

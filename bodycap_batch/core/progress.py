@@ -53,5 +53,34 @@ def task_label(stage: str, camera: str = "", map_round: int = 0) -> str:
     return " ".join(part for part in (stage, camera, round_text) if part)
 
 
+class StepProgress:
+    """Passes the progress of a task on, and completes each step when the next one begins, or the task ends.
+
+    A step ends before it reports its last unit if the other units need no work.
+
+    Args:
+        report: Called as ``report(done, total, what)``.
+    """
+
+    def __init__(self, report: Callable[[int, int, str], None]) -> None:
+        self._report = report
+        self._last = (0, 0, "")
+
+    def __call__(self, done: int, total: int, what: str = "") -> None:
+        """Report that `done` of `total` units are done. A smaller number than before begins another step."""
+        before, total_before, what_before = self._last
+        if done < before or (done == before and total != total_before and what != what_before):
+            self.complete()
+        self._last = (done, total, what)
+        self._report(done, total, what)
+
+    def complete(self) -> None:
+        """Report that all units of the last step are done."""
+        done, total, what = self._last
+        if done < total:
+            self._report(total, total, what)
+        self._last = (0, 0, "")
+
+
 Listener = Callable[[Event], None]
 """A function that is called with every event."""

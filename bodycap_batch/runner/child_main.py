@@ -30,6 +30,7 @@ from bodycap_batch.core.errors import (
     StoreError,
 )
 from bodycap_batch.core.memory import exempt_from_collection, release_memory
+from bodycap_batch.core.progress import StepProgress
 from bodycap_batch.runner.memory_limit import (
     is_out_of_memory,
     lift_own_limit,
@@ -166,13 +167,15 @@ def _run(task: Task, store: Store, function: TaskFunction, parent: _Parent) -> N
     for artefact in dict.fromkeys(store.artefacts_in(task.arguments)):
         store.verify(artefact)
     with store.draft(task.key) as draft, DiskFailures(store):
+        progress = StepReporter(parent.messages.send_progress)
         context = StageContext(
             work_dir=draft.work,
             threads=task.threads,
-            progress=StepReporter(parent.messages.send_progress),
+            progress=progress,
             cancelled=parent.orders.closed.is_set,
         )
         function(task.arguments, context, draft.files)
+        progress.complete()
         made = {
             "seconds": round(time.monotonic() - started, 3),
             "cpu_seconds": round(time.process_time() - cpu_before, 3),
@@ -319,7 +322,7 @@ class StepReporter:
         release: Callable[[], None] = release_memory,
         period_s: float = RELEASE_PERIOD_S,
     ) -> None:
-        self._report = report
+        self._report = StepProgress(report)
         self._release = release
         self._period_s = period_s
         self._step = ""
@@ -333,6 +336,10 @@ class StepReporter:
                 self._release()
                 self._last = time.monotonic()
         self._report(done, total, what)
+
+    def complete(self) -> None:
+        """Report that all units of the last step are done."""
+        self._report.complete()
 
 
 class _OrderReader:

@@ -268,7 +268,7 @@ def _on_worker(order: Mapping[str, Any], topic: str) -> dict[str, Any]:
 
     def progress(done: int, total: int, what: str) -> None:
         nonlocal last_report
-        if (now := time.monotonic()) - last_report >= _PROGRESS_PERIOD_S:
+        if (now := time.monotonic()) - last_report >= _PROGRESS_PERIOD_S or done >= total:
             last_report = now
             worker.log_event(topic, {"key": key, "done": done, "total": total, "what": what})
 

@@ -38,7 +38,7 @@ def progress_counter(
     def count_one() -> None:
         nonlocal done
         done += 1
-        context.progress(min(done, total), total, "keyframes in the map")
+        context.progress(min(done, total), total, "keyframes")
         if context.cancelled():
             stop()
 
