@@ -20,7 +20,7 @@ from bodycap_batch.check.picture_quality import PictureQuality, check_picture_qu
 from bodycap_batch.check.recording_advice import advise
 from bodycap_batch.config.bounds import MAX_TICKS
 from bodycap_batch.config.export_targets import export_target
-from bodycap_batch.config.job import Overrides, load_job_with_origins
+from bodycap_batch.config.job import load_job_with_origins
 from bodycap_batch.config.models import (
     NO_SKELETON,
     SKELETON_PRESETS,
@@ -30,6 +30,7 @@ from bodycap_batch.config.models import (
 )
 from bodycap_batch.config.mounts import TRUNK_ROLES
 from bodycap_batch.config.origins import CameraOrigins
+from bodycap_batch.config.overrides import Overrides
 from bodycap_batch.config.rules import named_frames
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import (

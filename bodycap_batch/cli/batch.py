@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,22 +16,22 @@ import typer
 
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.job_places import find_job, find_store
-from bodycap_batch.cli.progress_display import text_from_event
+from bodycap_batch.cli.progress_display import print_event, text_from_event
 from bodycap_batch.cli.shared_options import (
     BatchOutOption,
+    HeightOption,
     MemoryOption,
     StoreOption,
     cores,
-    results_folder,
+    make_overrides,
 )
 from bodycap_batch.cli.signals import event_on_signal
-from bodycap_batch.cli.terminal import print_json, print_line, print_message, print_messages
+from bodycap_batch.cli.terminal import print_line, print_message, print_messages
 from bodycap_batch.core.errors import Cancelled, JobError
 from bodycap_batch.core.printable import printable
 from bodycap_batch.core.progress import Event
 
 if TYPE_CHECKING:
-    from bodycap_batch.config.origins import LoadedJob
     from bodycap_batch.pipeline import BatchJob, Outcome, Settings
     from bodycap_batch.runner import Executor
     from bodycap_batch.runner.dask_cluster import Cluster
@@ -57,6 +58,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
     jobs: Annotated[list[Path], typer.Argument(metavar="JOBS...", help="Job files and folders of videos.")],
     executor: _ExecutorOption = "local",
     out: BatchOutOption = None,
+    height: HeightOption = None,
     store: StoreOption = None,
     memory_mb: MemoryOption = None,
     max_jobs: Annotated[
@@ -80,13 +82,15 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
 ) -> None:
     """Run many jobs, on one machine or on several.
 
-    A failed job does not stop the others. The exit code is the highest exit code of all jobs. If the batch is
-    started again, it continues after the finished stages. On a cluster, the jobs, their videos, the store and
-    the results must be on a disk that all machines mount under the same path.
+    A failed job does not stop the others. Each job keeps the height and the other settings with which
+    `bodycap run` computed it last; --height replaces the height of all jobs. The exit code is the highest
+    exit code of all jobs. If the batch is started again, it continues after the finished stages. On a
+    cluster, the jobs, their videos, the store and the results must be on a disk that all machines mount under
+    the same path.
 
     \b
     Examples:
-      bodycap batch monday/*/ tuesday/*/
+      bodycap batch monday/*/ tuesday/*/ --height 1.75
       bodycap batch jobs/*.yaml --priority jobs/urgent.yaml=1 --max-jobs 4
       bodycap batch jobs/*.yaml --executor tcp://scheduler:8786
     """  # noqa: D301 - \b keeps lines as they are
@@ -94,6 +98,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.store.artefacts import Store
 
     batch_jobs = _batch_jobs(_without_results(list(dict.fromkeys(jobs))), priority or [])
+    overrides = replace(make_overrides(height=height), out_parent=out)
     reporter = _BatchReporter(as_json=as_json)
     with (
         event_on_signal() as stop,
@@ -111,9 +116,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
                 memory_mb=memory_mb,
             )
 
-        work = Batch(
-            settings, lambda loaded: _batch_results_folder(loaded, out), max_jobs or busy_jobs, stop.is_set
-        )
+        work = Batch(settings, overrides, max_jobs or busy_jobs, stop.is_set)
         outcomes = [reporter.report_outcome(outcome) for outcome in work.run(batch_jobs)]
         if stop.is_set():
             raise Cancelled(
@@ -170,17 +173,6 @@ def _with_worker_note(cluster: Cluster) -> Cluster:
     return cluster
 
 
-def _batch_results_folder(loaded: LoadedJob, folder: Path | None) -> Path:
-    """Return the results folder of a job.
-
-    If the command line gives a folder for the whole batch, it is a subfolder of it, unless the job file names
-    its own folder.
-    """
-    if folder is None or loaded.states_out:
-        return results_folder(loaded.job)
-    return folder.resolve() / loaded.job.name
-
-
 def _without_results(paths: list[Path]) -> list[Path]:
     """Return the jobs without folders that only hold folders of results.
 
@@ -216,7 +208,11 @@ def _batch_jobs(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJo
                 hint="write the job as on the command line, for example --priority monday.yaml=5",
             )
         priority_of_job[Path(name)] = int(number)
-    return [BatchJob(path=find_job(path).file, priority=priority_of_job.get(path, 0)) for path in jobs]
+    places = [find_job(path) for path in jobs]
+    return [
+        BatchJob(path=place.file, priority=priority_of_job.get(path, 0), out=place.results)
+        for path, place in zip(jobs, places, strict=True)
+    ]
 
 
 class _BatchReporter:
@@ -265,7 +261,7 @@ class _BatchReporter:
 
     def _write_json(self, values: dict[str, Any]) -> None:
         with self._lock:
-            print_json(values)
+            print_event(values)
 
 
 def _shown_name(job: Path) -> str:

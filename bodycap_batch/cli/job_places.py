@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bodycap_batch.config.folder import RUN_FILE, is_video
+from bodycap_batch.config.folder import PARTIAL, RUN_FILE, is_video
 
 if TYPE_CHECKING:
-    from bodycap_batch.config.job import Overrides
     from bodycap_batch.config.models import Job
+    from bodycap_batch.config.overrides import Overrides
 
 _JOB_FILE, _STATUS_FILE = "job.yaml", "status.json"
-_PARTIAL, _RESULT = "partial", "result"
-"""Names of the subfolders that can hold results: of a job that stopped early, and of a watched job."""
+_RESULT = "result"
+"""Name of the subfolder with the results of a watched job."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,10 +51,10 @@ def _place_of(path: Path) -> JobPlace:
     if (path / _STATUS_FILE).is_file() and (path / _RESULT).is_dir():
         path = path / _RESULT
     if _is_run(path):
-        results = path.parent if path.name == _PARTIAL else path
+        results = path.parent if path.name == PARTIAL else path
         return JobPlace(file=path / _JOB_FILE, results=results.resolve())
-    if _is_run(path / _PARTIAL) and not any(map(is_video, path.iterdir())):
-        return JobPlace(file=path / _PARTIAL / _JOB_FILE, results=path.resolve())
+    if _is_run(path / PARTIAL) and not any(map(is_video, path.iterdir())):
+        return JobPlace(file=path / PARTIAL / _JOB_FILE, results=path.resolve())
     return JobPlace(file=path)
 
 
@@ -99,7 +99,7 @@ def find_store(out_dir: Path) -> Path:
     """
     from bodycap_batch.pipeline.results import store_of_last_run
 
-    named = store_of_last_run(out_dir) or store_of_last_run(out_dir / _PARTIAL)
+    named = store_of_last_run(out_dir) or store_of_last_run(out_dir / PARTIAL)
     inside = out_dir / ".store"
     known = [store for store in (named, inside) if store is not None and is_store(store)]
     return known[0] if known else out_dir.parent / ".store"

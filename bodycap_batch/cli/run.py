@@ -11,7 +11,7 @@ import typer
 
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.job_places import find_job, find_store
-from bodycap_batch.cli.progress_display import JsonLines, ProgressDisplay, make_progress_display
+from bodycap_batch.cli.progress_display import JsonLines, ProgressDisplay, make_progress_display, print_event
 from bodycap_batch.cli.shared_options import (
     ActivityOption,
     CamerasOption,
@@ -28,7 +28,7 @@ from bodycap_batch.cli.shared_options import (
     results_folder,
 )
 from bodycap_batch.cli.signals import event_on_signal
-from bodycap_batch.cli.terminal import print_json, print_line
+from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.core.errors import BodycapError, JobError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.tasks.order import STAGE_ORDER, StageName, stages_from
@@ -100,7 +100,8 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         make_progress_display(as_json=json_progress) as display,
         _report_errors_as_json(display),
     ):
-        children = Children()
+        children, place = Children(), find_job(job)
+        overrides = make_overrides(out or place.results, skeleton, height, camera, activity, places)
 
         def settings(out_dir: Path) -> Settings:
             from bodycap_batch.pipeline import Settings
@@ -116,6 +117,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
                 until=until or "",
                 memory_mb=memory_mb,
                 results_ready=announce_results,
+                overrides=overrides,
             )
 
         def announce_results(folder: Path) -> None:
@@ -132,14 +134,12 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
 
             prepare_capture(options, folder, settings(out_dir))
 
-        place = find_job(job)
         job_file = place.file if place.results else job_file_in(job) if job.is_dir() else None
         if job_file is not None:
             display(Event(kind="note", stage="", what=f"the settings are taken from {job_file}"))
-        overrides = make_overrides(out or place.results, skeleton, height, camera, activity, places)
         loaded = load_job_with_origins(place.file, overrides, prepare=prepare)
-        if height is not None:
-            shown = describe_height(loaded.job.height_m or 0.0)
+        if height is not None and loaded.job.height_m is not None:
+            shown = describe_height(loaded.job.height_m)
             display(Event(kind="note", stage="", what=f"height of the subject: {shown}"))
         for text in loaded.warnings_of_run():
             display(Event(kind="note", stage="", what=text))
@@ -161,7 +161,7 @@ def _report_errors_as_json(display: ProgressDisplay) -> Iterator[None]:
         yield
     except BodycapError as error:
         if isinstance(display, JsonLines):
-            print_json({"kind": "error", **error.to_dict()})
+            print_event({"kind": "error", **error.to_dict()})
         raise
 
 
@@ -169,7 +169,7 @@ def _print_summary(summary: RunSummary, job: Job, display: ProgressDisplay, *, v
     if isinstance(display, JsonLines):
         last = {"kind": "done", "out_dir": str(summary.out_dir), "files": list(summary.files)}
         verdict = None if summary.verdict is None else summary.verdict.to_dict()
-        print_json({**last, "executed": summary.executed, "verdict": verdict})
+        print_event({**last, "executed": summary.executed, "verdict": verdict})
         return
     if verbose:
         for stage in summary.stages:

@@ -11,8 +11,8 @@ import typer
 from bodycap_batch.core.errors import JobError
 
 if TYPE_CHECKING:
-    from bodycap_batch.config.job import Overrides
     from bodycap_batch.config.models import Job
+    from bodycap_batch.config.overrides import Overrides
 
 STORE_VARIABLE = "BODYCAP_STORE"
 
@@ -57,7 +57,8 @@ HeightOption = Annotated[
     typer.Option(
         "--height",
         metavar="HEIGHT",
-        help="Height of the subject: in metres (1.75), centimetres (175), or feet and inches (5'9\").",
+        help="Height of the subject: in metres (1.75), centimetres (175), or feet and inches (5'9\"); none: "
+        "the height of a mean adult (default: that of the last run).",
     ),
 ]
 CamerasOption = Annotated[
@@ -116,12 +117,12 @@ def make_overrides(
         JobError: The height, a camera or the activity cannot be understood.
     """
     from bodycap_batch.config.body_height import height_from_text
-    from bodycap_batch.config.job import Overrides
+    from bodycap_batch.config.overrides import NO_HEIGHT, Overrides
 
     return Overrides(
         out=out,
         skeleton=skeleton,
-        height_m=None if height is None else height_from_text(height),
+        height_m=None if height is None else "none" if height == NO_HEIGHT else height_from_text(height),
         mounts=_mounts(cameras or []),
         activity=activity,
         places=tuple(word.strip() for word in (places or "").split(",") if word.strip()),

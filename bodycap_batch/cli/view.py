@@ -55,7 +55,7 @@ def view(
       bodycap view out/my_walk --rerun my_walk.rrd
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.capture import open_capture
-    from bodycap_batch.config.job import Overrides
+    from bodycap_batch.config.overrides import Overrides
     from bodycap_batch.report.recording import write_recording
     from bodycap_batch.report.serving import LOOPBACK, make_served_content, make_server
 

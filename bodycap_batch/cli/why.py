@@ -82,8 +82,8 @@ def gc(
         Path | None,
         typer.Argument(
             metavar="STORE",
-            help="Folder of the store, a folder of results, or a folder that holds one of them (default: "
-            "BODYCAP_STORE, else the store below the working folder).",
+            help="Folder of the store, a folder that holds it, a folder of results, a folder of videos or a "
+            "job file (default: BODYCAP_STORE, else the store below the working folder).",
         ),
     ] = None,
     delete: Annotated[bool, typer.Option("--delete", help="Remove the artefacts that no job uses.")] = False,
@@ -91,29 +91,29 @@ def gc(
 ) -> None:
     """List the artefacts that no job uses, or remove them.
 
-    The artefacts of each job's last run stay in the store as long as the job's results folder exists. Results
-    are never removed.
+    A job means the store of its results, which other jobs may share. The artefacts of each job's last run
+    stay in the store as long as the job's results folder exists. Results are never removed.
 
     \b
-    Example:
+    Examples:
+      bodycap gc my_walk/
       bodycap gc out/.store --delete
     """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.config.job import results_of_job
     from bodycap_batch.store.artefacts import Store
     from bodycap_batch.store.garbage_collection import collect_garbage
 
     folder = store or Path(os.environ.get(STORE_VARIABLE) or ".")
-    nearby = (
-        folder,
-        find_store(find_job(folder).results or folder),
-        folder / ".store",
-        folder / "out/.store",
-    )
+    results = find_job(folder).results
+    nearby = [folder, find_store(results or folder), folder / ".store", folder / "out/.store"]
+    if results is None:
+        nearby.append(find_store(results_of_job(folder)))
     store_dir = next((place for place in nearby if is_store(place)), None)
     if store_dir is None:
         raise StoreError(
             "there is no store in this folder",
             path=folder.resolve(),
-            hint="give the folder of the store, or a folder of results: bodycap gc FOLDER",
+            hint="give the folder of the store, of results, or of a job that has run: bodycap gc FOLDER",
         )
     garbage = collect_garbage(Store(store_dir), delete=delete)
     if as_json:

@@ -53,6 +53,9 @@ CALIBRATION_FILE = "calib.json"
 RUN_FILE = "run.json"
 """Name of the file that records a run. A folder with this file holds results. A ``job.yaml`` in such a folder
 belongs to the results; it is not a job to run."""
+PARTIAL = "partial"
+"""Name of the subfolder for the results of a job that did not finish. The subfolder holds the results without
+the skeleton that the job asks for, or only the report of a job without results."""
 Recording = tuple[str, tuple[Path, ...]]
 """The name of a recording, and its videos in order."""
 _GOPRO = re.compile(r"^(G[HXPSLOT])(PR|[0-9]{2})([0-9]{4})$", re.IGNORECASE)

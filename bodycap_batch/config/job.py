@@ -36,7 +36,8 @@ from bodycap_batch.config.models import (
     Job,
 )
 from bodycap_batch.config.mounts import TRUNK_ROLES, mount_of, place_of_role
-from bodycap_batch.config.origins import LoadedJob
+from bodycap_batch.config.origins import LoadedJob, Source
+from bodycap_batch.config.overrides import NO_HEIGHT, Overrides
 from bodycap_batch.config.places import Places
 from bodycap_batch.config.resolved_camera import ResolvedCamera, resolved_camera, with_found_calibrations
 from bodycap_batch.config.rules import missing_files, problems_in, skeleton_of
@@ -61,25 +62,18 @@ Prepare = Callable[[Mapping[str, Any], Path, Path], None]
 for the videos, and the folder for the results of the job."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Overrides:
-    """Values of the command line that replace values of the job. Paths are relative to the working folder.
+def results_of_job(path: Path, overrides: Overrides | None = None) -> Path:
+    """Return the folder for the results of a job. Of a job file, only the name and the folder are read.
 
-    Attributes:
-        out: Folder for the results.
-        skeleton: Name of a skeleton, or path of a skeleton file.
-        height_m: Height of the subject, metres.
-        mounts: Place on the body of each named camera, by the name of the camera or of its video.
-        activity: What the subject does.
-        places: The places where the cameras were, in any order, if it is unknown which camera was where.
+    Args:
+        path: Path of a YAML file or of a folder of videos.
+        overrides: Values of the command line.
+
+    Raises:
+        JobError: The file is no YAML file, or there is none.
     """
-
-    out: Path | None = None
-    skeleton: str | None = None
-    height_m: float | None = None
-    mounts: Mapping[str, str] = field(default_factory=dict)
-    activity: str | None = None
-    places: tuple[str, ...] = ()
+    full = _job_source(path.resolve(), None)
+    return _stated_results(full, _read_source(full, Limits()), overrides or Overrides())
 
 
 def load_job(
@@ -114,7 +108,8 @@ def load_job_with_origins(
             link, they are relative to the folder of the link's target. A ``job.yaml`` (or ``job.yml``)
             belongs to its folder: videos that it does not list become cameras, and ``calib.json`` is used as
             in a folder without a job file.
-        overrides: Values of the command line.
+        overrides: Values of the command line. Values of the last run's command line are used for what neither
+            they nor the job file give (`Overrides.with_last_run`), but not with a `policy`.
         prepare: Function that renders the videos of a job with `capture.synthetic`. It is called before the
             videos are opened.
         policy: The rules for the files that the job may name. None allows any file, for the user's own job.
@@ -136,10 +131,14 @@ def load_job_with_origins(
     try:
         full = _job_source(full, policy)
         source = _read_source(full, limits or Limits())
-        overrides = overrides or Overrides()
-        places = Places(overrides.mounts, overrides.places)
+        overrides, kept = overrides or Overrides(), ""
+        if policy is None:
+            results = _stated_results(full, source, overrides)
+            overrides, kept = overrides.with_last_run(_mapping(source), results)
+        places = Places(overrides.mounts, overrides.places, overrides.last_mounts)
         stated = _stated_job(full, source, places, alone=alone)
-        return _resolved_job(stated, overrides, prepare, policy, is_draft=is_draft)
+        loaded = _resolved_job(stated, overrides, prepare, policy, is_draft=is_draft)
+        return replace(loaded, warnings=(*loaded.warnings, kept)) if kept else loaded
     except PermissionError as error:
         kind = JobError if error.filename == str(full) else CaptureError
         raise kind(
@@ -209,6 +208,7 @@ class _StatedJob:
         uses_folder: True if the job uses the videos and the calibration in its folder.
         is_alone: True for a job file that another user submitted without a folder.
         beside: The videos in the folder that the job file does not list.
+        placed: Where the place of a camera comes from if not from the job file, by camera name.
     """
 
     path: Path
@@ -218,29 +218,12 @@ class _StatedJob:
     uses_folder: bool
     is_alone: bool = False
     beside: VideosBeside = field(default_factory=VideosBeside)
+    placed: Mapping[str, Source] = field(default_factory=dict)
 
     @property
     def folder(self) -> Path:
         """Folder to which the paths of the job are relative."""
         return self.path if self.source is None else self.path.parent
-
-    @property
-    def name(self) -> str:
-        """Name of the job if the job file gives none."""
-        return self.folder.name if self._is_folder else self.path.stem
-
-    @property
-    def default_results(self) -> Path:
-        """Folder that holds the results of the job if the job names none: ``out`` beside the job.
-
-        It does not depend on the working folder.
-        """
-        return (self.folder.parent if self._is_folder else self.folder) / RESULTS
-
-    @property
-    def _is_folder(self) -> bool:
-        """True for a folder of videos, also with a ``job.yaml`` in it."""
-        return self.source is None or self.path.name in JOB_FILES
 
 
 def _stated_job(full: Path, source: YamlSource | None, places: Places, *, alone: bool) -> _StatedJob:
@@ -253,10 +236,12 @@ def _stated_job(full: Path, source: YamlSource | None, places: Places, *, alone:
         alone: True for a job file that another user submitted without a folder.
     """
     stated = _stated_without_places(full, source, places, alone=alone)
-    cameras = tuple(map(places.mounted, stated.job.capture.cameras))
-    places.require_used(stated.job.capture.cameras)
+    listed = stated.job.capture.cameras
+    placed = {camera.name: given[1] for camera in listed if (given := places.given_to(camera)) is not None}
+    cameras = tuple(map(places.mounted, listed))
+    places.require_used(listed)
     capture = stated.job.capture.model_copy(update={"cameras": cameras})
-    return replace(stated, job=stated.job.model_copy(update={"capture": capture}))
+    return replace(stated, job=stated.job.model_copy(update={"capture": capture}), placed=placed)
 
 
 def _stated_without_places(
@@ -318,16 +303,17 @@ def _resolved_job(
     if policy is not None:
         policy.require_named(job, base)
     if job.capture.synthetic is not None:
-        _prepare_synthetic(job, stated, prepare)
+        _prepare_synthetic(job, stated, overrides, prepare)
     _require_plausible_calibrations(job, full, source)
     if stated.uses_folder:
         job = job.model_copy(update={"capture": with_found_calibrations(job.capture, base)})
         if policy is not None:  # before a calibration is read
             policy.require_named(job, base)
     cameras = [
-        resolved_camera(index, job.capture, stated.stated, base) for index in range(len(job.capture.cameras))
+        resolved_camera(index, job.capture, stated.stated, base, stated.placed)
+        for index in range(len(job.capture.cameras))
     ]
-    resolved = _with_resolved(job, cameras, stated)
+    resolved = _with_resolved(job, cameras, stated, overrides)
     if policy is None:
         _require_apart(resolved, full)
     else:  # the folder of the results is not checked, because the operator chooses it
@@ -348,7 +334,6 @@ def _resolved_job(
             *_wrist_warnings([camera.config for camera in cameras]),
         ),
         no_body=_no_body(job, resolved),
-        states_out=job.out is not None,
     )
 
 
@@ -505,7 +490,8 @@ def _with_overrides(job: Job, overrides: Overrides) -> Job:
         preset = overrides.skeleton in SKELETON_PRESETS or not overrides.skeleton.lower().endswith(".bvh")
         update["skeleton"] = overrides.skeleton if preset else str(Path(overrides.skeleton).resolve())
     if overrides.height_m is not None:
-        update["height_m"] = height_from_text(overrides.height_m)
+        height_m = overrides.height_m
+        update["height_m"] = None if height_m == NO_HEIGHT else height_from_text(height_m)
     if overrides.activity is not None:
         update["activity"] = _known_activity(overrides.activity)
     if overrides.places:
@@ -523,14 +509,14 @@ def _known_activity(text: str) -> Activity:
     )
 
 
-def _prepare_synthetic(job: Job, stated: _StatedJob, prepare: Prepare | None) -> None:
+def _prepare_synthetic(job: Job, stated: _StatedJob, overrides: Overrides, prepare: Prepare | None) -> None:
     base, path = stated.folder, stated.path
     folder = synthetic_folder(job, base)
     if prepare is not None:
         options = dict(job.capture.synthetic or {})
         if isinstance(options.get("motion"), str):
             options["motion"] = str((base / options["motion"]).resolve())
-        prepare(options, folder, _out(job, stated))
+        prepare(options, folder, _out(path, stated.source, job.name, job.out, overrides))
     missing = [v for camera in job.capture.cameras for v in camera.video if not (base / v).is_file()]
     if missing:
         raise CaptureError(
@@ -559,7 +545,9 @@ def _require_plausible_calibrations(job: Job, path: Path, source: YamlSource | N
             raise implausible_calibration(found, path, dotted(location), line)
 
 
-def _with_resolved(job: Job, cameras: Sequence[ResolvedCamera], stated: _StatedJob) -> Job:
+def _with_resolved(
+    job: Job, cameras: Sequence[ResolvedCamera], stated: _StatedJob, overrides: Overrides
+) -> Job:
     skeleton, base = skeleton_of(job), stated.folder
     if skeleton not in SKELETON_PRESETS:
         skeleton = str((base / skeleton).resolve())
@@ -578,16 +566,51 @@ def _with_resolved(job: Job, cameras: Sequence[ResolvedCamera], stated: _StatedJ
             )
     configs = tuple(camera.config for camera in cameras)
     capture = job.capture.model_copy(update={"cameras": configs, "cameras_only": True, "calibration": None})
-    name = job.name or safe_name(stated.name)
-    out = _out(job, stated)
+    name = job.name or safe_name(_name(stated.path, stated.source))
+    out = _out(stated.path, stated.source, job.name, job.out, overrides)
     return job.model_copy(update={"capture": capture, "name": name, "skeleton": skeleton, "out": out})
 
 
-def _out(job: Job, stated: _StatedJob) -> Path:
-    """Return the folder for the results of a job."""
-    if job.out is not None:
-        return (stated.folder / job.out).resolve()
-    return (stated.default_results / (job.name or safe_name(stated.name))).resolve()
+def _mapping(source: YamlSource | None) -> Mapping[str, Any]:
+    """Return the data of a job file; empty if there is none, or if the data are no mapping."""
+    return source.data if source is not None and isinstance(source.data, dict) else {}
+
+
+def _stated_results(path: Path, source: YamlSource | None, overrides: Overrides) -> Path:
+    """Return the folder for the results of a job that is not validated yet."""
+    data = _mapping(source)
+    return _out(path, source, data.get("name"), data.get("out"), overrides)
+
+
+def _is_folder(path: Path, source: YamlSource | None) -> bool:
+    """Return True for a folder of videos, also with a ``job.yaml`` in it."""
+    return source is None or path.name in JOB_FILES
+
+
+def _name(path: Path, source: YamlSource | None) -> str:
+    """Return the name of a job if its job file gives none."""
+    folder = path if source is None else path.parent
+    return folder.name if _is_folder(path, source) else path.stem
+
+
+def _out(path: Path, source: YamlSource | None, name: Any, out: Any, overrides: Overrides) -> Path:
+    """Return the folder for the results of a job. It does not depend on the working folder.
+
+    Args:
+        path: The job file, or the folder of videos.
+        source: The parsed job file; None for a folder of videos.
+        name: Name of the job in the job file; of another type or empty if it gives none.
+        out: Folder for the results in the job file; of another type if it gives none.
+        overrides: Values of the command line.
+    """
+    folder = path if source is None else path.parent
+    if overrides.out is not None:
+        return overrides.out.resolve()
+    if isinstance(out, str | Path):
+        return (folder / out).resolve()
+    own = (folder.parent if _is_folder(path, source) else folder) / RESULTS
+    named = name if isinstance(name, str) and name else safe_name(_name(path, source))
+    return ((overrides.out_parent or own) / named).resolve()
 
 
 def _require_apart(job: Job, full: Path) -> None:

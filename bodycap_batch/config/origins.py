@@ -19,6 +19,8 @@ from bodycap_batch.config.folder import (
 from bodycap_batch.config.models import Job
 
 Source = Literal[
+    "command line",
+    "last run",
     "job file",
     "folder",
     "sidecar file",
@@ -29,9 +31,10 @@ Source = Literal[
     "motion",
     "default",
 ]
-"""Kind of place that a setting comes from. "folder" means a video that the job file does not list, in the
-capture's folder; "sidecar file" means a file of timestamps beside the video; "lens profile" means the table
-of lenses, with the camera model that the video's metadata name; "motion" means the motion of the cameras."""
+"""Kind of place that a setting comes from. "last run" means the command line of the last run; "folder" means
+a video that the job file does not list, in the capture's folder; "sidecar file" means a file of timestamps
+beside the video; "lens profile" means the table of lenses, with the camera model that the video's metadata
+name; "motion" means the motion of the cameras."""
 
 _NOT_NAMED = "not a video, and no setting names it"
 
@@ -124,7 +127,6 @@ class LoadedJob:
         warnings: Sentences about what the user probably did not intend.
         no_body: Sentence that explains why no body is computed although the job does not say
             `skeleton: none`; "" otherwise.
-        states_out: True if the job file or the command line names the folder for the results.
     """
 
     job: Job
@@ -136,7 +138,6 @@ class LoadedJob:
     unlisted: str
     warnings: tuple[str, ...]
     no_body: str
-    states_out: bool = False
 
     def warnings_of_run(self) -> tuple[str, ...]:
         """Return the warnings for a run. The missing body is one of them if the job gives the height."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,9 @@ def with_found_calibrations(capture: CaptureConfig, folder: Path) -> CaptureConf
     return capture.model_copy(update={"cameras": tuple(cameras), "calibration": found})
 
 
-def resolved_camera(index: int, capture: CaptureConfig, stated: CaptureConfig, base: Path) -> ResolvedCamera:
+def resolved_camera(
+    index: int, capture: CaptureConfig, stated: CaptureConfig, base: Path, placed: Mapping[str, Source]
+) -> ResolvedCamera:
     """Resolve one camera.
 
     Args:
@@ -67,6 +69,7 @@ def resolved_camera(index: int, capture: CaptureConfig, stated: CaptureConfig, b
         stated: The capture as the job file states it. It has fewer cameras if videos beside the job file were
             added. If there is no job file, it has no cameras.
         base: Folder to which the paths of the capture are relative.
+        placed: Where the place of a camera comes from if not from the job file, by camera name.
 
     Raises:
         CaptureError: A calibration cannot be used, a folder holds no video, or the number of timestamp files
@@ -110,7 +113,7 @@ def resolved_camera(index: int, capture: CaptureConfig, stated: CaptureConfig, b
         if camera.offset_s is not None
         else _offset_origin(camera, entry, file, capture, is_stated=is_stated),
         clock_drift=_drift_origin(camera, capture),
-        mount=_mount_origin(config, capture.places),
+        mount=_mount_origin(config, capture.places, placed.get(config.name, "job file")),
         mount_pose=Origin(source="default", value="typical of the place")
         if camera.joint_from_cam is None
         else Origin(source="job file", value="measured"),
@@ -181,11 +184,11 @@ def _drift_origin(camera: CameraConfig, capture: CaptureConfig) -> Origin:
     return Origin(source="default", value="0 ppm" if is_reference else "auto")
 
 
-def _mount_origin(config: CameraConfig, places: Sequence[str]) -> Origin:
+def _mount_origin(config: CameraConfig, places: Sequence[str], stated_in: Source) -> Origin:
     if config.mount_source is not None:
         return Origin(source=config.mount_source, value=str(config.mount))
     if config.segment is not None or config.mount is not None:
-        return Origin(source="job file", value=str(config.segment or config.mount))
+        return Origin(source=stated_in, value=str(config.segment or config.mount))
     if config.role is None and places:
         return Origin(source="motion", value=f"found by the run, one of {', '.join(places)}")
     if config.role is None:

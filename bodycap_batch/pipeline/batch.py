@@ -7,12 +7,12 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.config.job import Overrides, load_job_with_origins
-from bodycap_batch.config.origins import LoadedJob
+from bodycap_batch.config.job import load_job_with_origins
+from bodycap_batch.config.overrides import Overrides
 from bodycap_batch.core.errors import EXIT_BUG, BodycapError, Cancelled, JobError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.pipeline.run import RunSummary, run_job
@@ -28,10 +28,12 @@ class BatchJob:
     Attributes:
         path: Path of a job file or of a folder of videos.
         priority: Priority of the job; jobs with a higher number run first.
+        out: Folder for the results, if the job is given by its results; else None.
     """
 
     path: Path
     priority: int = 0
+    out: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +77,7 @@ class Batch:
     Args:
         settings: Function that returns the settings of a job. Its arguments are the job and the folder of the
             job's results. The settings of all jobs must share one executor.
-        results: Function that returns the folder for the results of a loaded job.
+        overrides: Values of the command line for all jobs.
         max_jobs: Maximum number of jobs that run at the same time.
         cancelled: Function that returns True if no further job may start.
     """
@@ -83,13 +85,13 @@ class Batch:
     def __init__(
         self,
         settings: Callable[[BatchJob, Path], Settings],
-        results: Callable[[LoadedJob], Path],
+        overrides: Overrides,
         max_jobs: int,
         cancelled: Callable[[], bool],
     ) -> None:
         self._settings = settings
         self._cancelled = cancelled
-        self._results = results
+        self._overrides = overrides
         self._max_jobs = max_jobs
         self._owners: dict[Path, Path] = {}
         """For each folder of results, the path of the job that writes into this folder."""
@@ -118,13 +120,15 @@ class Batch:
         def prepare(options: Mapping[str, Any], folder: Path, out_dir: Path) -> None:
             prepare_capture(options, folder, self._settings(job, out_dir))
 
-        loaded = load_job_with_origins(job.path, Overrides(), prepare=prepare)
-        out_dir = self._results(loaded)
+        overrides = replace(self._overrides, out=job.out)
+        loaded = load_job_with_origins(job.path, overrides, prepare=prepare)
+        out_dir = loaded.job.out
+        assert out_dir is not None  # every loaded job has a folder for its results
         self._claim_folder(out_dir, job.path)
         for text in loaded.warnings_of_run():
             self._settings(job, out_dir).listener(Event(kind="note", stage="", what=text))
-        resolved = loaded.job.model_copy(update={"out": out_dir})
-        return run_job(resolved, out_dir=out_dir, settings=self._settings(job, out_dir))
+        settings = replace(self._settings(job, out_dir), overrides=overrides)
+        return run_job(loaded.job, out_dir=out_dir, settings=settings)
 
     def _claim_folder(self, out_dir: Path, path: Path) -> None:
         """Refuse a job if another job of the batch already writes its results into the same folder."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from bodycap_batch.config.folder import PARTIAL
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import BodycapError
 from bodycap_batch.pipeline.flow import Flow
-from bodycap_batch.pipeline.results import PARTIAL, publish
+from bodycap_batch.pipeline.results import publish
 from bodycap_batch.pipeline.run import files_of, run_stages
 from bodycap_batch.pipeline.settings import Settings
 from bodycap_batch.pipeline.stage_results import StageResults, report_task

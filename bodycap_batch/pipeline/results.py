@@ -8,14 +8,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.config.folder import RUN_FILE
+from bodycap_batch.config.folder import PARTIAL, RUN_FILE
 from bodycap_batch.store.artefacts import disk_errors, sync_folder
 from bodycap_batch.store.checked_json import parse_checked_json
 from bodycap_batch.store.digests import remove_abandoned, temporary_beside, write_atomically
-
-PARTIAL = "partial"
-"""Name of the subfolder for the results of a job that did not finish. The subfolder holds the results without
-the skeleton that the job asks for, or only the report of a job without results."""
 
 
 def publish(files: Mapping[str, Path], folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -11,13 +12,13 @@ from pathlib import Path
 import yaml
 
 import bodycap_batch
-from bodycap_batch.config.folder import RUN_FILE
+from bodycap_batch.config.folder import PARTIAL, RUN_FILE
 from bodycap_batch.config.models import Job
+from bodycap_batch.config.overrides import COMMAND_LINE, values_to_record
 from bodycap_batch.core.errors import BodycapError, Cancelled, CaptureError, EstimationError, JobError
 from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.pipeline.inputs import has_body
 from bodycap_batch.pipeline.results import (
-    PARTIAL,
     clear_partial,
     publish,
     remove_outdated,
@@ -278,14 +279,24 @@ def _write_results(job: Job, results: StageResults, summary: RunSummary, setting
     record = {
         "versions": dict(summary.versions),
         "store": stored_name(settings.store.root, out_dir),
+        COMMAND_LINE: values_to_record(job, settings.overrides, out_dir),
         "threads": settings.threads,
         "seconds": round(sum(stage.seconds for stage in summary.stages), 3),
         "peak_memory_mb": max((stage.peak_memory_mb for stage in summary.stages), default=0.0),
         "stages": [asdict(stage) for stage in summary.stages],
         "files": list(summary.files),
-        "videos": {camera.name: [str(path) for path in camera.video] for camera in job.capture.cameras},
+        "videos": {
+            camera.name: [_recorded_path(path, out_dir) for path in camera.video]
+            for camera in job.capture.cameras
+        },
     }
     write_results_file(out_dir, RUN_FILE, checked_json(record))
+
+
+def _recorded_path(path: Path, out_dir: Path) -> str:
+    """Return a path for the record of a run: relative if it is beside the results, because both can move."""
+    beside = path.is_relative_to(out_dir.parent)
+    return os.path.relpath(path, out_dir) if beside else str(path)
 
 
 def _versions(flow: Flow) -> dict[str, str]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from bodycap_batch.config.limits import Limits
+from bodycap_batch.config.overrides import Overrides
 from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.core.progress import Listener
 from bodycap_batch.runner import CHILD_COMMAND, Children, Executor, Rules, Runner, Task
@@ -49,6 +50,7 @@ class Settings:
             is ready.
         limits: Maximum sizes of the videos; None (no limits) for a job that the user runs directly.
         memory_mb: Memory limit (MB) of one task; None for four fifths of the machine's memory.
+        overrides: Values of the command line, for the record of the run. The next run of the job keeps them.
         turns: Object that lets only one job of this process compute an artefact at a time; None if the
             process runs only this job.
     """
@@ -68,6 +70,7 @@ class Settings:
     results_ready: Callable[[Path], None] = _ignore
     limits: Limits | None = None
     memory_mb: int | None = None
+    overrides: Overrides = field(default_factory=Overrides)
     turns: Turns | None = None
 
     def runner(
