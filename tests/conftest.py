@@ -19,6 +19,7 @@ LONGEST = (
     "pipeline/test_watch.py",
     "pipeline/test_watch_disk.py",
     "pipeline/test_permissions.py",
+    "pipeline/test_commands.py",
     "pipeline/test_end_to_end.py",
     "unit/test_fuzz.py",
     "test_imports.py",

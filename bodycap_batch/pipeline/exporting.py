@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 from bodycap_batch.config.export_targets import ExportTarget, export_target
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.core.errors import JobError
+from bodycap_batch.core.errors import EstimationError, JobError
+from bodycap_batch.core.progress import Event
+from bodycap_batch.export.fill_report import FILL_FILE
 from bodycap_batch.formats.blender import write_blend
-from bodycap_batch.formats.fbx import find_blender
+from bodycap_batch.formats.blender.scene_script import SCENE_FILE, SCRIPT_FILE
+from bodycap_batch.formats.fbx import require_blender
 from bodycap_batch.formats.optional_libraries import require_formats
 from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.pipeline.inputs import has_body
@@ -22,7 +26,7 @@ from bodycap_batch.tasks.order import STAGE_ORDER
 
 GUIDE_FILE = "HOW_TO_IMPORT.txt"
 BLEND_FILE = "scene.blend"
-_NOT_FOR_PROGRAMS = ("metrics.json",)
+_NOT_FOR_PROGRAMS = ("metrics.json", FILL_FILE)
 
 
 def export_for(
@@ -42,8 +46,9 @@ def export_for(
         The paths of the files. ``HOW_TO_IMPORT.txt`` is the last one.
 
     Raises:
-        BodycapError: There is no such program, the job has no body, Blender is missing, the disk fails, or
-            the store does not hold the results.
+        BodycapError: There is no such program, the job has no body, Blender is missing, the disk fails, the
+            store does not hold the results, or they do not give the program's main file. Then the folder is
+            unchanged.
     """
     program = export_target(target)
     if not has_body(job):
@@ -56,31 +61,51 @@ def export_for(
         {"target": target, "fps": fps or job.export.fps, "smoothing_hz": job.export.smoothing_hz}
     )
     require_formats(options.formats)
-    results, stopped_by = find_stored(job, out_dir, settings, last="merge")
-    if results.merged is None or results.clocks is None:
+    results, stopped_by = find_stored(job, out_dir, settings, last="fill")
+    if results.filled is None:
         error = results.failure or stopped_by
         assert error is not None
         raise error
     asked = job.model_copy(update={"export": options})
     with Flow(asked, replace(settings, until=STAGE_ORDER[-1]), logs=out_dir / "logs") as flow:
         exported = flow.export(results)
-    settings.require_owner()
     files = {name: path for name, path in files_of(exported) if name not in _NOT_FOR_PROGRAMS}
+    if program.file not in files:
+        raise EstimationError(
+            f"the results contain no motion for {program.title}, so {program.file} was not written",
+            path=out_dir,
+            hint="look at the report: it says what is missing and why",
+        )
+    settings.require_owner()
     publish(files, folder)
+    if SCENE_FILE in files:
+        _name_videos(folder, results.job or job)
     written = [folder / name for name in files]
-    if target == "blender" and _has_blender():
-        written.append(write_blend(folder / BLEND_FILE))
+    if target == "blender":
+        written += _blend_file(folder, settings)
     write_results_file(folder, GUIDE_FILE, _guide(job, program, options))
     return [*written, folder / GUIDE_FILE]
 
 
-def _has_blender() -> bool:
-    """Return True if Blender, or a Python with the module ``bpy``, is installed."""
+def _name_videos(folder: Path, job: Job) -> None:
+    """Add the videos to the data of the Blender scene, because the folder may lie anywhere.
+
+    The export stage does not know them: its results do not depend on where the videos are.
+    """
+    scene = json.loads((folder / SCENE_FILE).read_text(encoding="utf-8"))
+    scene["videos"] = {camera.name: [str(path) for path in camera.video] for camera in job.capture.cameras}
+    write_results_file(folder, SCENE_FILE, json.dumps(scene, indent=1, ensure_ascii=False) + "\n")
+
+
+def _blend_file(folder: Path, settings: Settings) -> list[Path]:
+    """Write the scene as a .blend file, if Blender can be used; otherwise a note says why not."""
     try:
-        find_blender()
-    except JobError:
-        return False
-    return True
+        require_blender()
+    except JobError as error:
+        text = f"note: {BLEND_FILE} is not written ({error.message}); {SCRIPT_FILE} builds it in Blender"
+        settings.listener(Event(kind="note", stage="export", what=text))
+        return []
+    return [write_blend(folder / BLEND_FILE)]
 
 
 def _guide(job: Job, program: ExportTarget, options: ExportOptions) -> str:

@@ -81,6 +81,7 @@ def report_task(
         digests: Cache of the digests of files.
         failure: The error that stopped the job, from `StageResults.describe_failure`; None without an error.
     """
+    job = results.job or job
     with_body = has_body(job) and results.filled is not None
     return ReportTask(
         name=job.name,
@@ -114,6 +115,7 @@ def preview_task(
         clocks: The artefact of the clocks of all cameras.
         cameras: The digest of each camera, by camera name.
     """
+    job = results.job or job
     return PreviewTask(
         capture=capture_ref(job.capture, cameras),
         keyframes=refs_by_camera(results.keyframes),

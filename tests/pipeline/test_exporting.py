@@ -1,56 +1,78 @@
-"""Files for one program, from the stored results of a job."""
+"""Files for one program, from the stored results of a job. `test_commands.py` looks into the files."""
 
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 
-from bodycap_batch.core.errors import JobError, StoreError
-from bodycap_batch.pipeline import exporting
+from bodycap_batch.config.job import load_job
+from bodycap_batch.config.models import Job
+from bodycap_batch.core.errors import EstimationError, JobError, StoreError
+from bodycap_batch.core.progress import Event
+from bodycap_batch.pipeline import Settings
 from bodycap_batch.pipeline.exporting import GUIDE_FILE, export_for
+from bodycap_batch.pipeline.reporting import find_stored
+from bodycap_batch.pipeline.run import run_job
 from bodycap_batch.store.artefacts import Store
-from tests.pipeline.test_run import Bench
+from tests.pipeline.test_run import FOUND, Bench, unplaced_job
+from tests.pipeline.tiny_job import Place
+from tests.results import results_of
 
 
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
-    monkeypatch.setattr(exporting, "_has_blender", lambda: False)
     return Bench(tmp_path, monkeypatch)
 
 
-def test_only_the_export_is_computed_and_the_results_stay(bench: Bench) -> None:
-    bench.run()
-    before = bench.results()
-    bench.events.clear()
-    folder = bench.out / "blender"
+def in_store(place: Place, events: list[Event]) -> Settings:
+    return Settings(store=Store(place.store), threads=1, listener=events.append, cancelled=lambda: False)
+
+
+@pytest.mark.slow
+def test_only_the_export_is_computed_and_the_results_stay(reference: Place, tmp_path: Path) -> None:
+    folder = tmp_path / "job"
+    shutil.copytree(reference.folder, folder, copy_function=os.link, symlinks=True)
+    place, events = Place.existing(folder), list[Event]()
+    before = results_of(place.out)
+    job = load_job(place.out / "job.yaml")
+    made = place.out / "blender"
     written = export_for(
-        bench.job(), "blender", out_dir=bench.out, folder=folder, fps=None, settings=bench.settings()
+        job, "blender", out_dir=place.out, folder=made, fps=None, settings=in_store(place, events)
     )
-    started = {event.stage for event in bench.events if event.kind == "started"}
-    assert started == {"export"}
-    names = {str(path.relative_to(folder)) for path in written}
-    formats = ("bvh", "glb", "ply", "tum", "blender")
-    assert names == {*(f"result.{kind}" for kind in formats), "trajectories/torso.tum", GUIDE_FILE}
-    assert all(path.is_file() for path in written)
-    guide = (folder / GUIDE_FILE).read_text()
+    assert {event.stage for event in events if event.kind == "started"} == {"export"}
+    names = {"motion.bvh", "motion.glb", "map.ply", "blender_scene.py", "blender_scene.json", GUIDE_FILE}
+    assert {path.relative_to(made).as_posix() for path in written} >= {*names, "trajectories/torso.tum"}
+    assert all(path.stat().st_size > 0 for path in written)
+    guide = (made / GUIDE_FILE).read_text()
     assert "made for Blender" in guide
     assert "1. " in guide
-    for path in written:
-        path.unlink()
-    assert bench.results() == before
+    shutil.rmtree(made)
+    assert results_of(place.out) == before
 
 
-def test_an_empty_store_is_reported(bench: Bench) -> None:
-    bench.run()
-    other = replace(bench.settings(), store=Store(bench.folder / "nothing"))
+@pytest.mark.slow
+def test_an_empty_store_is_reported(reference: Place, tmp_path: Path) -> None:
+    job, settings = load_job(reference.out / "job.yaml"), in_store(Place.existing(tmp_path), [])
     with pytest.raises(StoreError, match="have not been computed yet"):
+        export_for(job, "blender", out_dir=tmp_path, folder=tmp_path / "b", fps=None, settings=settings)
+    assert not (tmp_path / "b").exists()
+
+
+def test_without_the_main_file_of_the_program_nothing_is_written(bench: Bench) -> None:
+    """The stand-in for the export writes files of other names."""
+    bench.run()
+    made = bench.out / "b"
+    with pytest.raises(EstimationError, match=r"blender_scene\.py was not written"):
         export_for(
-            bench.job(), "blender", out_dir=bench.out, folder=bench.out / "b", fps=None, settings=other
+            bench.job(), "blender", out_dir=bench.out, folder=made, fps=None, settings=bench.settings()
         )
-    assert not (bench.out / "b").exists()
+    assert not made.exists()
 
 
 def test_a_job_without_a_body_has_no_motion_to_export(bench: Bench) -> None:
@@ -62,8 +84,64 @@ def test_a_job_without_a_body_has_no_motion_to_export(bench: Bench) -> None:
     assert caught.value.exit_code == 2
 
 
-def test_the_videos_are_in_the_record_of_the_run(bench: Bench) -> None:
-
-    bench.run()
+def stages_of_last_run(bench: Bench) -> dict[str, str]:
+    """Return the last artefact of each stage that the record of the run names."""
     record = json.loads((bench.out / "run.json").read_text())
-    assert record["videos"]["torso"] == [str(bench.folder / "torso.mp4")]
+    return {stage["stage"]: stage["artefact"] for stage in record["stages"]}
+
+
+def found_again(bench: Bench, job: Job) -> dict[str, str]:
+    results, stopped_by = find_stored(job, bench.out, bench.settings(), last="fill")
+    assert stopped_by is None
+    found = {"map": results.map, "clocks": results.clocks, "merge": results.merged, "fill": results.filled}
+    return {
+        name: artefact.path.relative_to(bench.folder / "store").as_posix()
+        for name, artefact in found.items()
+        if artefact is not None
+    }
+
+
+def test_the_stored_results_are_those_of_the_last_run(bench: Bench) -> None:
+    bench.run()
+    last = stages_of_last_run(bench)
+    assert found_again(bench, bench.job()) == {
+        name: last[name] for name in ("map", "clocks", "merge", "fill")
+    }
+
+
+def test_the_stored_results_are_those_without_the_wearer_if_they_are_better(bench: Bench) -> None:
+    bench.order(lost={"torso": 10}, localised=[30], masked=["torso"], without_wearer=40)
+    bench.run()
+    last = stages_of_last_run(bench)
+    assert found_again(bench, bench.job()) == {
+        name: last[name] for name in ("map", "clocks", "merge", "fill")
+    }
+
+
+def test_the_results_of_a_job_whose_places_were_found_are_stored_for_both_jobs(bench: Bench) -> None:
+    bench.order(places=FOUND)
+    job = unplaced_job(bench)
+    run_job(job, out_dir=bench.out, settings=bench.settings())
+    last = stages_of_last_run(bench)
+    with_places = Job.model_validate(yaml.safe_load((bench.out / "job.yaml").read_text()))
+    for asked in (job, with_places):
+        assert found_again(bench, asked)["fill"] == last["fill"]
+    results, _ = find_stored(job, bench.out, bench.settings(), last="fill")
+    assert results.job is not None
+    assert {camera.name: camera.mount for camera in results.job.capture.cameras} == FOUND
+
+
+def test_the_videos_are_in_the_record_of_the_run(bench: Bench) -> None:
+    bench.run()
+    assert videos_of_torso(bench) == [str(bench.folder / "torso.mp4")]
+
+
+def test_videos_beside_the_results_are_found_after_both_were_moved(bench: Bench) -> None:
+    """The folder of a watched job moves from running/ to done/."""
+    bench.out = bench.folder / "result"
+    run_job(bench.job(), out_dir=bench.out, settings=replace(bench.settings()))
+    assert videos_of_torso(bench) == ["../torso.mp4"]
+
+
+def videos_of_torso(bench: Bench) -> list[str]:
+    return list(json.loads((bench.out / "run.json").read_text())["videos"]["torso"])

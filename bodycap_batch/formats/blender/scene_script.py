@@ -7,7 +7,8 @@ Blender 4.2 LTS to 5.x. There are three ways to run this file:
 - as an extension (``bodycap_blender.zip``): File > Import > bodycap results (.json).
 
 It reads the files beside it: ``blender_scene.json``, ``motion.glb`` or ``motion.bvh``, ``map.ply``,
-``trajectories/*.tum``, and the videos that ``run.json`` names. Files that are missing are left out.
+``trajectories/*.tum``, and the videos that ``blender_scene.json`` or ``run.json`` names. Files that are
+missing are left out.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def build_scene(folder: Path) -> list[str]:
     notes = [_add_body(folder, data, collection), _add_room(folder, collection)]
     _set_time(scene, data["fps"], data["frames"])
     scene.unit_settings.system = "METRIC"
-    videos = _videos(folder)
+    videos = _videos(folder, data)
     for name, camera in data["cameras"].items():
         notes.append(_add_camera(folder, name, camera, data, collection, videos.get(name, [])))
     notes.append(_add_markers(scene, data["spans"]))
@@ -329,12 +330,14 @@ def _add_background(lens: Any, video: Path, facts: dict[str, Any], data: dict[st
     _fill_curve(curve, [float(FIRST_FRAME + tick) for tick in ticks], offsets, constant=True)
 
 
-def _videos(folder: Path) -> dict[str, list[Path]]:
-    """Return the videos of each camera, from the record of the run in the folder or in the one above."""
+def _videos(folder: Path, data: dict[str, Any]) -> dict[str, list[Path]]:
+    """Return the videos of each camera, from the data of the scene or the record of the run nearby."""
+    if "videos" in data:
+        return {name: [Path(each) for each in files] for name, files in data["videos"].items()}
     for parent in (folder, folder.parent):
         try:
             record = json.loads((parent / RUN_FILE).read_text(encoding="utf-8"))
-            return {name: [Path(each) for each in files] for name, files in record["videos"].items()}
+            return {name: [parent / each for each in files] for name, files in record["videos"].items()}
         except (OSError, ValueError, KeyError, AttributeError, TypeError):
             continue
     return {}
@@ -374,7 +377,7 @@ def main(arguments: list[str]) -> None:
     notes = build_scene(folder)
     sys.stdout.write("".join(f"bodycap: {note}\n" for note in notes))
     if target is not None:
-        bpy.ops.wm.save_as_mainfile(filepath=str(Path(target).resolve()), compress=True)
+        bpy.ops.wm.save_as_mainfile(filepath=str(Path(target).resolve()), compress=True, relative_remap=False)
 
 
 _registered: list[Any] = []
