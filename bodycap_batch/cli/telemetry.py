@@ -59,13 +59,14 @@ def telemetry(
     from bodycap_batch.capture.timeline import join_chapters
     from bodycap_batch.cli.telemetry_picture import draw_telemetry
     from bodycap_batch.config.folder import chapters_in
+    from bodycap_batch.config.sample_files import samples_beside
     from bodycap_batch.formats.atomic_files import write_text
     from bodycap_batch.telemetry import read_telemetry
 
     paths = chapters_in(file) if file.is_dir() else (file,)
     videos = tuple(index_video(path) for path in paths)
     times_ns = join_chapters(videos, ()).times_ns
-    found = read_telemetry(videos, times_ns, file.stem)
+    found = read_telemetry(videos, times_ns, samples_beside(paths, file.stem, (file,)))
     if picture is not None:
         write_text(picture, draw_telemetry(found))
     compared = _compared(paths, file.stem, found) if with_comparison else None

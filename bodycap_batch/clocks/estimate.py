@@ -244,7 +244,7 @@ def _read_sensor(config: CameraConfig) -> SensorTrack:
     videos = tuple(index_video(path, 1) for path in config.video)
     times_ns = join_chapters(videos, config.timestamps).times_ns
     try:
-        telemetry = read_telemetry(videos, times_ns, config.name)
+        telemetry = read_telemetry(videos, times_ns, config.samples)
     except CaptureError as error:
         return SensorTrack(camera=config.name, problem=str(error))
     return sensor_track(config.name, telemetry)

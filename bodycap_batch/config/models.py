@@ -169,6 +169,11 @@ class CameraConfig(_Block):
         description="file with one time in seconds for each frame; one file for all chapters, or one "
         "file for each chapter",
     )
+    samples: Path | None = Field(
+        None,
+        description="file with the samples of an inertial sensor (.imu.csv or .gcsv); default: the one "
+        "beside the video, with the name of the video or of the camera",
+    )
     mask: Path | None = Field(
         None,
         description="PNG picture with the aspect ratio of the video: white where the room is visible, "

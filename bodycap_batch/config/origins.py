@@ -17,6 +17,7 @@ from bodycap_batch.config.folder import (
     shown_name,
 )
 from bodycap_batch.config.models import Job
+from bodycap_batch.config.sample_files import SAMPLE_SUFFIXES
 
 Source = Literal[
     "command line",
@@ -32,9 +33,9 @@ Source = Literal[
     "default",
 ]
 """Kind of place that a setting comes from. "last run" means the command line of the last run; "folder" means
-a video that the job file does not list, in the capture's folder; "sidecar file" means a file of timestamps
-beside the video; "lens profile" means the table of lenses, with the camera model that the video's metadata
-name; "motion" means the motion of the cameras."""
+a video that the job file does not list, in the capture's folder; "sidecar file" means a file of timestamps or
+samples beside the video; "lens profile" means the table of lenses, with the camera model that the video's
+metadata name; "motion" means the motion of the cameras."""
 
 _NOT_NAMED = "not a video, and no setting names it"
 
@@ -71,6 +72,7 @@ class CameraOrigins:
         the camera is
             calibrated, or if the videos have not been opened.
         timestamps: Origin of the frame times.
+        samples: Origin of the file with the samples of an inertial sensor; None if there is none.
         clock_offset: Origin of `offset_s`.
         clock_drift: Origin of the drift of the camera's clock.
         mount: Origin of the place on the body.
@@ -81,6 +83,7 @@ class CameraOrigins:
     calibration: Origin
     first_guess: Origin | None = None
     timestamps: Origin
+    samples: Origin | None = None
     clock_offset: Origin
     clock_drift: Origin
     mount: Origin
@@ -93,6 +96,7 @@ class CameraOrigins:
             f"video: {self.video.text()}",
             f"calibration: {self.calibration.text()}{guess}",
             f"timestamps: {self.timestamps.text()}",
+            *([] if self.samples is None else [f"inertial samples: {self.samples.text()}"]),
             f"clock: offset {self.clock_offset.text()}; drift {self.clock_drift.text()}",
             f"mount: {self.mount.text()}; pose on the bone: {self.mount_pose.text()}",
         ]
@@ -158,7 +162,9 @@ class LoadedJob:
         return tuple(found)
 
     def _used_files(self) -> frozenset[Path]:
-        files = {real_path(path) for camera in self.job.capture.cameras for path in camera.input_files()}
+        cameras = self.job.capture.cameras
+        files = {real_path(path) for camera in cameras for path in camera.input_files()}
+        files |= {real_path(camera.samples) for camera in cameras if camera.samples is not None}
         if self.job.skeleton is not None:
             files.add(real_path(Path(self.job.skeleton)))
         if self.job_file is not None:
@@ -210,8 +216,10 @@ class LoadedJob:
             if any(origins.calibration.source == "default" for origins in self.origins.values()):
                 return f"only a {JOB_FILES[0]} uses it without `calibration:`"
             return "the calibration of every camera comes from elsewhere"
-        if name.endswith(".timestamps.txt"):
-            return "the part before .timestamps.txt is not the name of a camera or a video"
+        for suffix in (".timestamps.txt", *SAMPLE_SUFFIXES):
+            if name.endswith(suffix):
+                other = "" if suffix not in SAMPLE_SUFFIXES else ", or the camera has another file of samples"
+                return f"the part before {suffix} is not the name of a camera or a video{other}"
         return _NOT_NAMED
 
     def _folder_reason(self, folder: Path) -> str:

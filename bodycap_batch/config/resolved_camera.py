@@ -12,6 +12,7 @@ from bodycap_batch.config.folder import calibration_in, chapters_in, real_path, 
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.config.mounts import place_of_role
 from bodycap_batch.config.origins import CameraOrigins, Origin, Source
+from bodycap_batch.config.sample_files import samples_beside
 from bodycap_batch.core.errors import CaptureError
 
 
@@ -95,6 +96,10 @@ def resolved_camera(
         entry = read_calibration(file, camera.name)
         calibration = entry.calibration
     update: dict[str, Any] = {"video": videos, "timestamps": sidecars, "calibration": calibration or "auto"}
+    places = [base / video for video in camera.video]
+    update["samples"] = (
+        samples_beside(videos, camera.name, places) if camera.samples is None else base / camera.samples
+    )
     if camera.mask is not None:
         update["mask"] = real_path(base / camera.mask)
     if camera.offset_s is None:
@@ -109,6 +114,12 @@ def resolved_camera(
         video=Origin(source="folder" if listed is None else "job file", value=_file_names(videos)),
         calibration=_calibration_origin(config, file, base, is_stated=is_stated),
         timestamps=_timestamps_origin(config, is_stated=bool(camera.timestamps)),
+        samples=None
+        if config.samples is None
+        else Origin(
+            source="sidecar file" if camera.samples is None else "job file",
+            value=_file_names((config.samples,)),
+        ),
         clock_offset=Origin(source="job file", value=f"{camera.offset_s:g} s")
         if camera.offset_s is not None
         else _offset_origin(camera, entry, file, capture, is_stated=is_stated),

@@ -146,6 +146,8 @@ def _paths(camera: CameraConfig) -> Iterator[Problem]:
         yield from _unusable("timestamps", path)
     if isinstance(camera.calibration, Path):
         yield from _unusable("calibration", camera.calibration)
+    if camera.samples is not None:
+        yield from _unusable("samples", camera.samples)
     if camera.mask is not None:
         yield from _unusable("mask", camera.mask)
     if len(set(camera.video)) < len(camera.video):
@@ -268,6 +270,7 @@ def missing_files(job: Job, base: Path) -> list[Problem]:
         named = [("video", path) for path in camera.video] + [
             ("timestamps", path) for path in camera.timestamps
         ]
+        named += [("samples", camera.samples)] if camera.samples is not None else []
         named += [("mask", camera.mask)] if camera.mask is not None else []
         named += [("calibration", camera.calibration)] if isinstance(camera.calibration, Path) else []
         for field, path in named:

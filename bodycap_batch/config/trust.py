@@ -107,5 +107,7 @@ def _paths_of_capture(capture: CaptureConfig) -> Iterator[tuple[str, Path]]:
         yield from ((f"{here}.timestamps", path) for path in camera.timestamps)
         if isinstance(camera.calibration, Path):
             yield f"{here}.calibration", camera.calibration
+        if camera.samples is not None:
+            yield f"{here}.samples", camera.samples
         if camera.mask is not None:
             yield f"{here}.mask", camera.mask

@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from bodycap_batch.capture.video import MAY_READ
+from bodycap_batch.config.folder import VIDEO_SUFFIXES
 from bodycap_batch.config.models import CameraConfig, CaptureConfig, Job
-from bodycap_batch.config.sample_files import samples_beside
 from bodycap_batch.core.errors import Cancelled, CaptureError, JobError
 from bodycap_batch.core.progress import Event, Listener
 from bodycap_batch.store.artefacts import DISK_ERRORS, Artefact, store_error
 from bodycap_batch.store.digests import FileDigests, json_digest
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, FileRef, MountInput
 
-_FILE_FIELDS = ("video", "timestamps", "mask")
+_FILE_FIELDS = ("video", "timestamps", "samples", "mask")
 _CLOCK_FIELDS = ("offset_s", "drift_ppm")
 """Fields that describe a camera's clock. The frames of a camera depend on them only if start_s or end_s
 selects frames; a new offset then changes the selected frames."""
@@ -93,8 +93,9 @@ def _footage_digest(path: Path, digests: FileDigests, on_bytes: Callable[[int], 
     try:
         return digests.sha256(path, on_bytes)
     except FileNotFoundError as error:
+        what = "video file" if path.suffix.lower() in VIDEO_SUFFIXES else "file"
         raise CaptureError(
-            "there is no such video file", path=path, hint="correct the path of the video"
+            f"there is no such {what}", path=path, hint=f"correct the path of the {what}"
         ) from error
     except OSError as error:
         if error.errno in DISK_ERRORS:
@@ -136,7 +137,7 @@ def refs_by_camera(artefacts: Mapping[str, Artefact]) -> dict[str, ArtefactRef]:
 
 
 def samples_input(camera: CameraConfig, digests: FileDigests) -> FileRef | None:
-    """Return the file with inertial samples beside a camera's videos, as input of a task.
+    """Return the file with the inertial samples of a camera, as input of a task.
 
     Returns:
         The file; None if there is none.
@@ -145,7 +146,7 @@ def samples_input(camera: CameraConfig, digests: FileDigests) -> FileRef | None:
         CaptureError: The file cannot be read.
         StoreError: The disk fails.
     """
-    path = samples_beside(camera.video, camera.name)
+    path = camera.samples
     return None if path is None else FileRef(path=path, digest=_footage_digest(path, digests, None))
 
 

@@ -50,11 +50,15 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
     from bodycap_batch.model.relative_pose import RigPoses
     from bodycap_batch.telemetry import read_telemetry
     from bodycap_batch.telemetry.comparison import all_times_ns
+    from bodycap_batch.telemetry.streams import CameraTelemetry
 
     context.check_cancelled()
     capture, configs = open_capture(task.capture.config, context.threads), task.capture.config.cameras
     camera = capture.cameras[0]
-    telemetry = read_telemetry(camera.videos, all_times_ns(camera, configs[0]), camera.name)
+    try:
+        telemetry = read_telemetry(camera.videos, all_times_ns(camera, configs[0]), configs[0].samples)
+    except CaptureError as error:
+        telemetry = CameraTelemetry(notes=(f"{error.one_line}; its samples are not used",))
     before = task.registrations[camera.name].path
     registration = load_registration(before)
 
@@ -62,7 +66,7 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
         for other, config in zip(capture.cameras[1:], configs[1:], strict=True):
             context.check_cancelled()
             try:
-                read = read_telemetry(other.videos, all_times_ns(other, config), other.name)
+                read = read_telemetry(other.videos, all_times_ns(other, config), config.samples)
             except CaptureError:  # the task of that camera reports it
                 continue
             yield load_registration(task.registrations[other.name].path).trajectory, read

@@ -88,8 +88,8 @@ def _telemetry(camera: CaptureCamera, task: KeyframesTask) -> tuple[CameraTeleme
     if not (task.with_gyro or task.with_blur):
         return None, []
     try:
-        times_ns = all_times_ns(camera, task.capture.config.cameras[0])
-        return read_telemetry(camera.videos, times_ns, camera.name), []
+        config = task.capture.config.cameras[0]
+        return read_telemetry(camera.videos, all_times_ns(camera, config), config.samples), []
     except CaptureError as error:
         return None, [f"{camera.name}: {error.one_line}; its samples are not used"]
 

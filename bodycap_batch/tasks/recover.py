@@ -74,7 +74,7 @@ def _telemetry(camera: CaptureCamera, config: CameraConfig) -> CameraTelemetry:
     from bodycap_batch.telemetry.streams import CameraTelemetry
 
     try:
-        return read_telemetry(camera.videos, all_times_ns(camera, config), camera.name)
+        return read_telemetry(camera.videos, all_times_ns(camera, config), config.samples)
     except CaptureError:  # the stage that uses the sensors reports it
         return CameraTelemetry()
 

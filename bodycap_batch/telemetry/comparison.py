@@ -220,7 +220,7 @@ def telemetry_notes(spec: CaptureConfig, threads: int = 1) -> list[str]:
     for config in spec.cameras:
         try:
             camera = open_camera(small, config.model_copy(update={"mask": None}), threads)
-            telemetry = read_telemetry(camera.videos, all_times_ns(camera, config), camera.name)
+            telemetry = read_telemetry(camera.videos, all_times_ns(camera, config), config.samples)
             notes += [f"{config.name}: {note}" for note in telemetry.notes]
             compared = compare_picture_and_gyro(camera, telemetry)
         except CaptureError as error:  # a video that cannot be read is reported by the other checks

@@ -10,7 +10,6 @@ import numpy as np
 
 from bodycap_batch.capture.timeline import ChapterClock, clock_of_chapter
 from bodycap_batch.capture.video import VideoFile
-from bodycap_batch.config.sample_files import samples_beside
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.telemetry.gopro import gaps_of, read_gopro_file
 from bodycap_batch.telemetry.saturation import saturated_stretches
@@ -27,17 +26,18 @@ from bodycap_batch.telemetry.text_files import read_imu_file
 _TURNED = (GYROSCOPE, ACCELEROMETER, GRAVITY)
 
 
-def read_telemetry(videos: Sequence[VideoFile], times_ns: IntArray, camera: str = "") -> CameraTelemetry:
+def read_telemetry(
+    videos: Sequence[VideoFile], times_ns: IntArray, samples: Path | None = None
+) -> CameraTelemetry:
     """Read the telemetry of all chapters of a camera.
 
-    A file ``<camera>.imu.csv`` or ``<camera>.gcsv`` beside the first video replaces the inertial samples of
-    the videos.
+    A file of samples (``.imu.csv`` or ``.gcsv``) replaces the inertial samples of the videos.
 
     Args:
         videos: The chapters in the order of the recording.
         times_ns: (N,) time of every frame of the chapters on the clock of the camera, nanoseconds: see
             `join_chapters`.
-        camera: Name of the camera; "" if it is unknown.
+        samples: The file with inertial samples; None if there is none.
 
     Raises:
         CaptureError: A video cannot be opened, or the file of samples is wrong.
@@ -50,8 +50,10 @@ def read_telemetry(videos: Sequence[VideoFile], times_ns: IntArray, camera: str 
         chapter = _on_camera_clock(read_gopro_file(video.path, video.fps), clock)
         chapters.append(_turned(chapter, video))
     joined = _joined(chapters)
-    sidecar = samples_beside([video.path for video in videos], camera)
-    return joined if sidecar is None else _with_samples(joined, read_imu_file(sidecar), sidecar)
+    if samples is None:
+        return joined
+    span_s = (1e-9 * float(times_ns[0]), 1e-9 * float(times_ns[-1]))
+    return _with_samples(joined, read_imu_file(samples, span_s), samples)
 
 
 def _with_samples(video: CameraTelemetry, samples: CameraTelemetry, path: Path) -> CameraTelemetry:

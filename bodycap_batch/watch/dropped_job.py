@@ -200,6 +200,7 @@ def with_changed_paths(job: Job, change: Callable[[Path], Path]) -> Job:
             update={
                 "video": tuple(map(change, config.video)),
                 "timestamps": tuple(map(change, config.timestamps)),
+                "samples": None if config.samples is None else change(config.samples),
                 "mask": None if config.mask is None else change(config.mask),
             }
         )

@@ -9,6 +9,7 @@ import pytest
 from bodycap_batch.capture import open_camera
 from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from bodycap_batch.config.sample_files import samples_beside
 from bodycap_batch.telemetry import compare_picture_and_gyro, read_telemetry
 from bodycap_batch.telemetry.gopro import gopro_telemetry, read_gpmf_payloads
 from bodycap_batch.telemetry.picture_rotation import WORK_PX
@@ -18,7 +19,7 @@ pytestmark = pytest.mark.data
 
 def _read(path: Path):
     video = index_video(path)
-    return read_telemetry([video], video.times_ns())
+    return read_telemetry([video], video.times_ns(), samples_beside([path]))
 
 
 def test_a_drone_clip_without_stabilisation(data_root):

@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from bodycap_batch.config.models import Job
+from bodycap_batch.config.sample_files import samples_beside
 from bodycap_batch.core.errors import BodycapError, Cancelled, CaptureError, EstimationError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.pipeline import RunSummary, Settings, run_job
@@ -49,6 +50,7 @@ class Bench:
             {
                 "name": name,
                 "video": [str(self.folder / f"{name}.mp4")],
+                "samples": samples_beside([self.folder / f"{name}.mp4"], name),
                 "calibration": "auto",
                 "offset_s": 0.0,
                 "rolling_shutter_s": 0.0,

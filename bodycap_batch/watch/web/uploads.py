@@ -15,6 +15,7 @@ from typing import Any
 
 from bodycap_batch.config.folder import JOB_FILES, VIDEO_SUFFIXES
 from bodycap_batch.config.limits import Limits
+from bodycap_batch.config.sample_files import SAMPLE_SUFFIXES
 from bodycap_batch.core.errors import CaptureError, JobError, StoreError
 from bodycap_batch.store.artefacts import disk_errors
 from bodycap_batch.watch.inbox_entries import READY
@@ -26,7 +27,7 @@ _PREFIX = ".upload-"
 _OTHER_FILES = ("calib.json", *JOB_FILES)
 _RESERVED_NAMES = frozenset(name.lower() for name in (*_OTHER_FILES, READY))
 """Names, in lower case, that a folder must not have, because the watcher expects a file."""
-_OTHER_SUFFIXES = (".timestamps.txt", ".bvh", ".png")
+_OTHER_SUFFIXES = (".timestamps.txt", ".bvh", ".png", *SAMPLE_SUFFIXES)
 _MAX_OTHER_BYTES = 64 << 20
 """Maximum size (bytes) of a file that is not a video: job, calibration, timestamps, mask, skeleton. Evidence:
 none."""

@@ -12,6 +12,7 @@ import pytest
 from bodycap_batch.cli import main
 from bodycap_batch.clocks import decide_clocks, describe_clocks, estimate_clocks
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
+from bodycap_batch.config.sample_files import samples_beside
 from tests.shaken import write_samples
 from tests.sounds import heard, scene, write_video_with_sound
 
@@ -47,8 +48,12 @@ def folder(tmp_path_factory):
 
 
 def capture(folder, *names, **offsets):
+    paths = {name: folder / f"{name}.mp4" for name in names}
     cameras = [
-        CameraConfig(name=name, video=(folder / f"{name}.mp4",), offset_s=offsets.get(name)) for name in names
+        CameraConfig(
+            name=name, video=(path,), offset_s=offsets.get(name), samples=samples_beside([path], name)
+        )
+        for name, path in paths.items()
     ]
     return CaptureConfig(cameras=tuple(cameras))
 

@@ -108,7 +108,7 @@ def test_every_path_a_job_can_name_is_known_to_the_policy() -> None:
                     found |= paths(kind, f"{prefix}{name}.")
         return found
 
-    camera = {f"capture.cameras.{name}" for name in ("video", "timestamps", "calibration", "mask")}
+    camera = {f"capture.cameras.{name}" for name in ("video", "timestamps", "samples", "calibration", "mask")}
     # `out` is replaced; `skeleton` is a text. A new path must be checked in `trust` and moved in `intake`.
     assert paths(Job) == {"out", "capture.calibration", *camera}
 

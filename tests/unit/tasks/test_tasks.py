@@ -151,7 +151,7 @@ def test_the_content_of_a_sidecar_counts_and_a_missing_one_is_reported(tmp_path:
     sidecar.write_text("0.0\n0.2\n")
     assert camera_digest(job.capture, job.capture.cameras[0], digests) != first
     sidecar.unlink()
-    with pytest.raises(CaptureError, match="no such video file") as caught:
+    with pytest.raises(CaptureError, match="no such file") as caught:
         camera_digest(job.capture, job.capture.cameras[0], digests)
     assert caught.value.path == str(sidecar)
 
