@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from dataclasses import dataclass
 from fractions import Fraction
@@ -28,6 +29,15 @@ MAY_READ = (
     "give the user who runs this program the permission to read the file and to enter its folders (chmod)"
 )
 """Hint of the error about a file that the user has no permission to read."""
+
+_COUNTED_PACKETS = 100
+"""Number of pictures of a stream that are counted, if a file has several video streams. Origin: more than the
+pictures between two parts of an interleaved file, some seconds."""
+_MIN_PREVIEW_SHARE = 0.1
+"""Least number of pictures of a video, relative to the stream with most of them. Fewer are a preview."""
+_MIN_AREA_SHARE = 0.3
+"""Least number of pixels of a video, relative to the largest one. A smaller one is a copy of it. Origin:
+copies have at most half the width and the height."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,10 +134,11 @@ def open_container(path: Path) -> InputContainer:
 
 
 def video_stream(container: InputContainer, path: Path) -> VideoStream:
-    """Return the stream with the camera's pictures. Streams that contain only a cover picture are ignored.
+    """Return the stream with the camera's pictures. Cover pictures and small previews are ignored.
 
     Raises:
-        CaptureError: There is no stream with the camera's pictures, or there is no decoder for this stream.
+        CaptureError: There is no stream with the camera's pictures, there are several, or there is no decoder
+            for the stream.
     """
     import av
 
@@ -140,12 +151,37 @@ def video_stream(container: InputContainer, path: Path) -> VideoStream:
             else "the video contains no frame"
         )
         raise CaptureError(what, path=path, hint="give the file that contains the pictures of the camera")
-    for stream in streams:
-        if stream.codec_context is not None:
-            return stream
-    raise CaptureError(
-        "the program cannot decode this kind of video", path=path, hint="convert the video to H.264"
-    )
+    streams = [stream for stream in streams if stream.codec_context is not None]
+    if not streams:
+        raise CaptureError(
+            "the program cannot decode this kind of video", path=path, hint="convert the video to H.264"
+        )
+    if len(streams) > 1:
+        streams = _without_previews(streams, path)
+    if len(streams) > 1:
+        sizes = ", ".join(f"{each.width}×{each.height}" for each in streams)
+        raise CaptureError(
+            f"the file contains {len(streams)} videos ({sizes}), for example those of two lenses",
+            path=path,
+            hint="export the video of one lens as a file of its own (ffmpeg -map 0:v:0 -c copy)",
+        )
+    return streams[0]
+
+
+def _without_previews(streams: list[VideoStream], path: Path) -> list[VideoStream]:
+    """Return the video streams without single pictures and without small copies of another stream."""
+    import av
+
+    counts = dict.fromkeys((stream.index for stream in streams), 0)
+    with open_container(path) as container, contextlib.suppress(av.error.FFmpegError):
+        for packet in container.demux([container.streams[index] for index in counts]):
+            counts[packet.stream.index] += packet.size > 0
+            if max(counts.values()) >= _COUNTED_PACKETS:
+                break
+    least = _MIN_PREVIEW_SHARE * max(counts.values())
+    moving = [stream for stream in streams if counts[stream.index] >= least]
+    area = max(stream.width * stream.height for stream in moving)
+    return [stream for stream in moving if stream.width * stream.height >= _MIN_AREA_SHARE * area]
 
 
 def error_reason(error: Exception) -> str:

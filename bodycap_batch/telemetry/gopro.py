@@ -283,8 +283,8 @@ def gpmf_payloads(path: Path) -> Iterator[tuple[bytes, float, float]]:
 
     with open_container(path) as container:
         named = [each for each in container.streams.data if _HANDLER in each.metadata.get("handler_name", "")]
-        candidates = named[:1] or list(container.streams.data)
-        chosen = candidates[0].index if named else -1
+        candidates = named or list(container.streams.data)
+        chosen = named[0].index if len(named) == 1 else -1
         if not candidates:
             return
         try:
@@ -292,7 +292,7 @@ def gpmf_payloads(path: Path) -> Iterator[tuple[bytes, float, float]]:
                 if not packet.size or packet.pts is None or packet.time_base is None:
                     continue
                 data = bytes(packet)
-                if chosen < 0 and data.startswith(b"DEVC"):  # a program that edited the file lost the name
+                if chosen < 0 and data.startswith(b"DEVC"):  # of several tracks, the first with telemetry
                     chosen = packet.stream.index
                 if packet.stream.index == chosen:
                     base = packet.time_base

@@ -22,19 +22,17 @@ def case(data_root: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "samples", "notes"),
-    [("notscale", 223, []), ("cutline", 222, ["line 231"]), ("dup", 221, ["not later"])],
+    "right", [("notscale", 223, []), ("cutline", 222, ["line 231"]), ("dup", 221, ["not later"])], ids=str
 )
 @pytest.mark.parametrize("is_linked", [False, True])
 def test_all_right_lines_are_used(
     case: Path,
     tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
-    name: str,
-    samples: int,
-    notes: list[str],
+    right: tuple[str, int, list[str]],
     is_linked: bool,
 ) -> None:
+    name, samples, notes = right
     video = tmp_path / "torso.mp4"
     if is_linked:
         video.symlink_to(case / "torso.mp4")

@@ -369,3 +369,43 @@ def test_a_task_decodes_on_the_threads_it_was_given(
     monkeypatch.setenv("OMP_NUM_THREADS", process)
     with open_container(video.path) as container:
         assert decoding.open_stream(container, video, task).codec_context.thread_count == expected
+
+
+def _write_streams(path: Path, *streams: tuple[str, int, int, int]) -> Path:
+    """Write video streams with the codec, width, height and number of pictures of each."""
+    with av.open(str(path), "w") as container:
+        opened = []
+        for codec, width, height, _ in streams:
+            stream = container.add_stream(codec, rate=10)
+            stream.width, stream.height = width, height
+            stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+            opened.append(stream)
+        for stream, (_, width, height, count) in zip(opened, streams, strict=True):
+            for index in range(count):
+                frame = av.VideoFrame.from_ndarray(textured_frame(index, width, height), format="gray")
+                frame.pts = index
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv", "avi", "ts"])
+@pytest.mark.parametrize(
+    "other", [("mjpeg", 640, 480, 1), ("libx264", 640, 480, 1), ("libx264", 64, 48, 30)], ids=str
+)
+def test_the_video_of_the_camera_is_used_beside_a_preview(
+    tmp_path: Path, suffix: str, other: tuple[str, int, int, int]
+) -> None:
+    path = _write_streams(tmp_path / f"a.{suffix}", other, ("libx264", 320, 240, 30))
+    video = index_video(path)
+    assert video.stored_size == (320, 240)
+    assert len(video.pts) == 30
+    assert len(list(decoding.decode_frames(video, np.arange(30)))) == 30
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv", "ts"])
+def test_a_file_with_the_videos_of_two_lenses_is_refused(tmp_path: Path, suffix: str) -> None:
+    path = _write_streams(tmp_path / f"a.{suffix}", *[("libx264", 96, 96, 30)] * 2)
+    with pytest.raises(CaptureError, match=r"2 videos \(96×96, 96×96\)") as caught:
+        index_video(path)
+    assert "one lens" in (caught.value.hint or "")
