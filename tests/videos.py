@@ -20,6 +20,12 @@ def textured_frame(index: int, width: int = 64, height: int = 48) -> Image:
     return image
 
 
+def unopened(content: str = "frames") -> bytes:
+    """Return a file that is a whole MP4 by its structure, for tests in which no video is opened."""
+    data = content.encode()
+    return b"\0\0\0\x08ftyp\0\0\0\x08moov\0\0\0" + bytes([8 + len(data)]) + b"mdat" + data
+
+
 def write_video(
     path: Path,
     frames: Sequence[Image],
@@ -34,15 +40,17 @@ def write_video(
     codec: str = "libx264",
     ticks: int = 10,
     pixel_aspect: Fraction | None = None,
+    movflags: str = "",
 ) -> Path:
     """Encode grey (H,W) or RGB (H,W,3) images; `pts` in units of 1/(ticks·fps) s.
 
     Args:
         rotation: Counter-clockwise degrees by which a player turns the stored frames.
         pixel_aspect: Width of a pixel over its height, as stored in the file.
+        movflags: Option of the muxer of MP4 and MOV, for example ``frag_keyframe+empty_moov``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
+    with av.open(str(path), "w", options={"movflags": movflags} if movflags else {}) as container:
         container.metadata.update(metadata or {})
         options = (
             {}

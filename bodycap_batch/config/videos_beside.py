@@ -22,6 +22,7 @@ from bodycap_batch.config.folder import (
 from bodycap_batch.config.models import CameraConfig
 from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.config.places import Places
+from bodycap_batch.config.unfinished_videos import refuse_unfinished_copies, refuse_unreadable_video
 from bodycap_batch.core.errors import CaptureError
 
 
@@ -70,9 +71,11 @@ def find_videos_beside(
 
     Raises:
         CaptureError: The folder cannot be read. Or a symbolic link to a video leads nowhere, and its name is
-            the name of a camera that the job file does not list.
+            the name of a camera that the job file does not list. Or a file is an unfinished copy of a video,
+            or a video that is left out cannot be opened.
     """
     folder, found = job_file.parent, VideosBeside()
+    refuse_unfinished_copies(folder)
     other = next((name for name in JOB_FILES if name != job_file.name and (folder / name).is_file()), None)
     if other is not None:
         found.leave_out(
@@ -100,6 +103,10 @@ def find_videos_beside(
             found.leave_out(paths, reason, f"rename it (for example to left_palm.mp4), {advice}")
         else:
             found.cameras.append(block)
+    videos = {path for _, paths in recordings for path in paths}
+    for path in found.reasons:
+        if path in videos or is_video(path):
+            refuse_unreadable_video(path)
     return found
 
 

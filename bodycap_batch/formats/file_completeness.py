@@ -1,7 +1,8 @@
 """Find out from a file's own structure whether the file was copied completely. No frame is decoded.
 
-Sources: ISO/IEC 14496-12 (boxes of MP4 and MOV), RFC 8794 and RFC 9559 (elements of Matroska and WebM), and
-the OpenDML AVI File Format Extensions 1.02 (RIFF chunks and super index of AVI).
+Sources: ISO/IEC 14496-12 (boxes of MP4 and MOV), RFC 8794 and RFC 9559 (elements of Matroska and WebM), the
+OpenDML AVI File Format Extensions 1.02 (RIFF chunks and super index of AVI), ISO/IEC 13818-1 (packets of
+MPEG-TS and MPEG-PS), and the Advanced Systems Format 01.20.05 (header of WMV).
 """
 
 from __future__ import annotations
@@ -10,12 +11,27 @@ import json
 import stat
 import struct
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+NO_VIDEO = "its content is not that of a video"
+"""Text for a file with the name of a video whose first bytes are those of no known kind of video."""
 _TEXT_SUFFIXES = frozenset({".yaml", ".yml", ".json", ".bvh", ".csv"})
 _FIRST_BOXES = frozenset({b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"styp", b"uuid"})
 """Types of the boxes with which an MP4 or MOV file may start."""
+_UNMISTAKABLE_BOXES = frozenset({b"ftyp", b"moov", b"mdat"})
+"""Types of boxes by which a file is known as MP4 or MOV if its name does not say it. The other types are
+words that a text may contain at this place."""
+_PACKET_BYTES, _SYNC = (188, 192, 204), 0x47
+"""Lengths (bytes) of the packets of MPEG-TS: plain, with a time stamp (M2TS), and with error correction; and
+the first byte of a plain packet."""
+_OTHER_STARTS = (b"\x00\x00\x01", b"\x00\x00\x00\x01", b"\x30\x26\xb2\x75", b"FLV", b"OggS")
+"""First bytes of further kinds of video: MPEG-PS, MPEG-2, H.264 and H.265 without a container; WMV, FLV and
+Ogg."""
+_MAX_HEAD_BYTES = 4 * max(_PACKET_BYTES)
+"""Number of bytes from the start of a file that tell its kind. The first packet of MPEG-TS may be cut, and
+two more must follow it."""
 _MAX_PARTS = 100_000
 """Maximum number of boxes, elements or chunks that are read. A recording in fragments of half a second
 reaches this number after seven hours. The limit bounds the time for a file that was made to have very many
@@ -39,83 +55,153 @@ _MAX_JSON_BYTES = 1 << 20
 """Maximum size (bytes) of a JSON file that is parsed. Calibrations have a few kilobytes. Evidence: none."""
 
 
-def missing_part(path: Path, video_suffixes: frozenset[str]) -> str:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissingPart:
+    """What is missing in a file.
+
+    Attributes:
+        text: Text for the user.
+        readable_bytes: Number of bytes from the start of the file in which frames can be found. It is 0 if
+            nothing can be read from the file.
+    """
+
+    text: str
+    readable_bytes: int = 0
+
+
+def missing_part(path: Path, video_suffixes: frozenset[str] | None = None) -> MissingPart | None:
     """Return what is missing in a file that was not copied completely.
 
-    The length of an MP4, MOV, Matroska, WebM or AVI file must agree with the sizes in the file. A text file
-    must not be empty, and a JSON file must not end in the middle of a value. Nothing is known about other
-    files.
+    The length of an MP4, MOV, Matroska, WebM, AVI or MPEG-TS file must agree with the sizes in the file. This
+    also holds if the name of the file does not say that it is a video. A text file must not be empty, and a
+    JSON file must not end in the middle of a value. Nothing is known about other files.
 
     Args:
         path: Path of the file. Links and special files are not opened.
-        video_suffixes: Suffixes of videos, in lower case.
+        video_suffixes: Suffixes of videos, in lower case; None if the file should be a video, whatever its
+            suffix is.
 
     Returns:
-        Text for the user; "" if nothing is missing, or if the file does not tell.
+        The missing part; None if nothing is missing, or if the file does not tell.
     """
     suffix = path.suffix.lower()
-    if suffix not in video_suffixes and suffix not in _TEXT_SUFFIXES:
-        return ""
+    is_named = video_suffixes is None or suffix in video_suffixes
     try:
         found = path.lstat()
         if not stat.S_ISREG(found.st_mode):
-            return ""
+            return None
         if found.st_size == 0:
-            return "it is empty"
+            return MissingPart(text="it is empty") if is_named or suffix in _TEXT_SUFFIXES else None
         with path.open("rb", buffering=0) as stream:
-            if suffix in video_suffixes:
-                return _missing_video_part(stream, found.st_size)
-            return _missing_json_part(stream) if suffix == ".json" else ""
+            if suffix == ".json" and not is_named:
+                return _missing_json_part(stream)
+            return _missing_video_part(stream, found.st_size, is_named=is_named)
     except OSError:  # the error is reported when the job is read
-        return ""
+        return None
 
 
-def _missing_video_part(stream: BinaryIO, size: int) -> str:
-    head = stream.read(_RIFF_HEADER)
-    if len(head) < _RIFF_HEADER:
-        return "its end is missing"
-    if not any(head):
-        return "its first bytes are not there yet"
-    if head[4:8] in _FIRST_BOXES:
+def _missing_video_part(stream: BinaryIO, size: int, *, is_named: bool) -> MissingPart | None:
+    """Return what is missing in a video.
+
+    Args:
+        stream: The file.
+        size: Size of the file, bytes.
+        is_named: False for a file whose name does not say that it is a video. Such a file is inspected only
+            if its first bytes are certainly those of a video.
+    """
+    head = stream.read(_MAX_HEAD_BYTES)
+    if head[4:8] in (_FIRST_BOXES if is_named else _UNMISTAKABLE_BOXES):
         return _missing_box(stream, size)
     if head[:4] == _EBML.to_bytes(4, "big"):
         return _missing_element(stream, size)
     if head[:4] == b"RIFF" and head[8:12] == b"AVI ":
         return _missing_chunk(stream, size)
-    return ""
+    if not is_named:
+        return None
+    if len(head) < _RIFF_HEADER:
+        return MissingPart(text="its end is missing")
+    if not any(head):
+        return MissingPart(text="its first bytes are not there yet")
+    if (packets := _packets_of(head)) is not None:
+        first, length = packets
+        is_cut = first in (0, length - min(_PACKET_BYTES)) and size % length > 0
+        return MissingPart(text="its last packet is cut", readable_bytes=size) if is_cut else None
+    return None if head.startswith(_OTHER_STARTS) else MissingPart(text=NO_VIDEO)
 
 
-def _missing_box(stream: BinaryIO, size: int) -> str:
+def _packets_of(head: bytes) -> tuple[int, int] | None:
+    """Return the position of the first packet of MPEG-TS, and the length of the packets, bytes.
+
+    Return None if the file does not consist of such packets.
+    """
+    for length in _PACKET_BYTES:
+        for first in range(length):
+            starts = head[first::length]
+            if len(starts) > 1 and set(starts) == {_SYNC}:
+                return first, length
+    return None
+
+
+def _missing_box(stream: BinaryIO, size: int) -> MissingPart | None:
     """Return what is missing in an MP4 or MOV file.
 
     Some cameras append data of their own after the last box. Such data are ignored if index and pictures are
-    complete.
+    complete. A file in fragments is readable up to its end, because each fragment (moof) has an index of its
+    own. If the end of an index is missing, the file is readable up to the start of this index.
     """
     found: set[bytes] = set()
-    position = 0
-    for _ in range(_MAX_PARTS):
-        if position == size:
-            break
-        stream.seek(position)
-        header = stream.read(_LONG_BOX_HEADER)
-        if len(header) < _BOX_HEADER:
-            return "its end is missing"
-        kind, length = header[4:_BOX_HEADER], int.from_bytes(header[:4], "big")
-        if length == 1:
-            length = int.from_bytes(header[_BOX_HEADER:], "big")
-        if not kind.decode("latin-1").isprintable() or 0 < length < _BOX_HEADER:
-            break  # not a box: data of the camera, or bytes that are not there yet
-        end = size if length == 0 else position + length  # 0: the box reaches to the end of the file
+    in_fragments = is_owed = False
+    for kind, start, content, end in _boxes(stream, 0, size):
+        has_frames = {b"moov", b"mdat"} <= found
+        if kind == b"":
+            return MissingPart(text="its end is missing", readable_bytes=start if has_frames else 0)
         if end > size:
-            return _missing_bytes(size, end)
+            has_index = b"moov" in found
+            text = _missing_bytes(size, end) + ("" if has_index else ", and no index (moov)")
+            if kind == b"mdat":
+                return MissingPart(text=text, readable_bytes=size if in_fragments else 0)
+            return MissingPart(text=text, readable_bytes=start if has_frames else 0)
+        if kind == b"moov":
+            in_fragments = any(inner[0] == b"mvex" for inner in _boxes(stream, content, end))
+        is_owed = kind == b"moof" or (is_owed and kind != b"mdat")
         found.add(kind)
-        position = end
+    if is_owed:
+        text = "its end is missing: the last index (moof) has no pictures (mdat)"
+        return MissingPart(text=text, readable_bytes=size if b"mdat" in found else 0)
+    if b"meta" in found and b"moov" not in found:
+        return None  # a photo (HEIC), which consists of boxes as well
     if b"moov" not in found:
-        return "its index (moov) is missing"
-    return "" if b"mdat" in found else "its pictures (mdat) are missing"
+        return MissingPart(
+            text="its index (moov) is missing, as after a recording or a copy that was interrupted"
+        )
+    return None if b"mdat" in found else MissingPart(text="its pictures (mdat) are missing")
 
 
-def _missing_element(stream: BinaryIO, size: int) -> str:
+def _boxes(stream: BinaryIO, position: int, size: int) -> Iterator[tuple[bytes, int, int, int]]:
+    """Yield the type, the start, the start of the content, and the end of each box between two positions.
+
+    The type is empty for a box whose header is cut. The boxes end at data that are not a box: data of the
+    camera, or bytes that are not there yet.
+    """
+    for _ in range(_MAX_PARTS):
+        if position >= size:
+            return
+        stream.seek(position)
+        header = stream.read(min(_LONG_BOX_HEADER, size - position))
+        kind, length, content = header[4:_BOX_HEADER], int.from_bytes(header[:4], "big"), _BOX_HEADER
+        if len(header) < _BOX_HEADER:
+            yield b"", position, size, size
+            return
+        if length == 1:
+            length, content = int.from_bytes(header[_BOX_HEADER:], "big"), _LONG_BOX_HEADER
+        if not kind.decode("latin-1").isprintable() or 0 < length < _BOX_HEADER:
+            return
+        end = size if length == 0 else position + length  # 0: the box reaches to the end of the file
+        yield kind, position, position + content, end
+        position = end
+
+
+def _missing_element(stream: BinaryIO, size: int) -> MissingPart | None:
     """Return what is missing in a Matroska or WebM file.
 
     The file of an interrupted or live recording does not state its size. Such a file must end at the end of
@@ -127,21 +213,21 @@ def _missing_element(stream: BinaryIO, size: int) -> str:
             break
         element = _read_element(stream, position)
         if element is None:
-            return "its end is missing"
+            return MissingPart(text="its end is missing", readable_bytes=size)
         identifier, start, length = element
         if identifier == _SEGMENT:
             if length is not None and start + length > size:
-                return _missing_bytes(size, start + length)
+                return MissingPart(text=_missing_bytes(size, start + length), readable_bytes=size)
             if length is not None:
-                return ""
+                return None
             position = start
         elif length is None:
-            return ""
+            return None
         else:
             position = start + length
             if position > size:
-                return _missing_bytes(size, position)
-    return ""
+                return MissingPart(text=_missing_bytes(size, position), readable_bytes=size)
+    return None
 
 
 def _read_element(stream: BinaryIO, position: int) -> tuple[int, int, int | None] | None:
@@ -169,7 +255,7 @@ def _vint_length(data: bytes) -> int | None:
     return 9 - data[0].bit_length() if data and data[0] else None
 
 
-def _missing_chunk(stream: BinaryIO, size: int) -> str:
+def _missing_chunk(stream: BinaryIO, size: int) -> MissingPart | None:
     """Return what is missing in an AVI file.
 
     An AVI file of more than 1 GB consists of several RIFF lists. The index in the first list names positions
@@ -188,7 +274,9 @@ def _missing_chunk(stream: BinaryIO, size: int) -> str:
     is_list = headers[_RIFF_HEADER:].startswith(b"LIST")
     lists_end = _RIFF_HEADER + 8 + int.from_bytes(headers[16:20], "little") if is_list else 0
     expected = max([position, *_indexed_ends(headers[:lists_end])])
-    return _missing_bytes(size, expected) if expected > size + _RIFF_TOLERANCE else ""
+    if expected <= size + _RIFF_TOLERANCE:
+        return None
+    return MissingPart(text=_missing_bytes(size, expected), readable_bytes=size)
 
 
 def _indexed_ends(headers: bytes) -> Iterator[int]:
@@ -207,21 +295,21 @@ def _indexed_ends(headers: bytes) -> Iterator[int]:
         start = headers.find(b"indx", start + 1)
 
 
-def _missing_json_part(stream: BinaryIO) -> str:
+def _missing_json_part(stream: BinaryIO) -> MissingPart | None:
     """Return what is missing in a JSON file. Any other error in the file is reported when it is read."""
     data = stream.read(_MAX_JSON_BYTES + 1)
     if len(data) > _MAX_JSON_BYTES:
-        return ""
+        return None
     text = data.decode("utf-8", "replace")
     try:
         json.loads(text)
     except json.JSONDecodeError as error:
         is_cut = error.pos >= len(text.rstrip()) or error.msg.startswith("Unterminated string")
-        return "its end is missing" if is_cut else ""
+        return MissingPart(text="its end is missing") if is_cut else None
     except RecursionError:
-        return ""
-    return ""
+        return None
+    return None
 
 
 def _missing_bytes(size: int, expected: int) -> str:
-    return f"{size:,} of {expected:,} bytes are there"
+    return f"its end is missing: {size:,} of {expected:,} bytes are there"

@@ -30,7 +30,8 @@ from bodycap_batch.watch.inbox_entries import (
     InboxEntry,
     entries_in,
     ignored_paths_in,
-    missing_content,
+    latest_change,
+    reason_to_wait,
     take_snapshot,
 )
 from bodycap_batch.watch.job_status import FINAL, JobStatusFile, read_status, utc_text
@@ -276,9 +277,7 @@ def _waiting_row(entry: InboxEntry) -> JobRow:
     """Return the row of a waiting entry of the inbox."""
     try:
         snapshot = take_snapshot(entry, _MAX_SNAPSHOT_FILES)
-        waits_for = snapshot.incomplete_reason
-        if not waits_for and not snapshot.ready:
-            waits_for = missing_content(entry, _MAX_SNAPSHOT_FILES)
+        waits_for = reason_to_wait(entry, snapshot, _MAX_SNAPSHOT_FILES) or latest_change(snapshot)
         changed = entry.path.stat().st_mtime
     except OSError as error:
         return JobRow(name=entry.name, state="waiting", cause=str(error), path=str(entry.path))

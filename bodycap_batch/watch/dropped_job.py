@@ -10,12 +10,14 @@ from pathlib import Path
 
 import yaml
 
-from bodycap_batch.config.folder import job_file_in
+from bodycap_batch.capture.video import COPY_AGAIN
+from bodycap_batch.config.folder import VIDEO_SUFFIXES, job_file_in
 from bodycap_batch.config.job import load_job, load_job_with_origins, safe_name
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, Job
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.core.errors import CaptureError, JobError, StoreError
+from bodycap_batch.formats.file_completeness import NO_VIDEO, missing_part
 from bodycap_batch.pipeline.results import write_results_file
 from bodycap_batch.watch.inbox_entries import YAML_SUFFIXES, EntrySnapshot, InboxEntry
 from bodycap_batch.watch.spool import JobDir, visible_entries
@@ -40,7 +42,7 @@ class JobPermissions:
 def read_dropped_job(
     entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
 ) -> tuple[Job, tuple[str, ...]]:
-    """Read and resolve a job in the inbox.
+    """Read and resolve a job in the inbox. Its videos are opened, but no frame is decoded.
 
     Args:
         entry: A complete entry of the inbox.
@@ -52,8 +54,8 @@ def read_dropped_job(
 
     Raises:
         JobError: The job is not valid, holds a special file, or names a path that is not permitted.
-        CaptureError: A calibration or a folder of videos cannot be used, a video is too large, or there are
-            too many files.
+        CaptureError: A calibration, a folder of videos or a video cannot be used, a video is too large, or
+            there are too many files.
     """
     if snapshot.undecodable:
         shown = snapshot.undecodable.encode(errors="backslashreplace").decode()
@@ -90,6 +92,7 @@ def read_dropped_job(
         # the name of the entry.
         job = job.model_copy(update={"name": safe_name(entry.name)})
     _require_video_sizes(job, permissions.limits)
+    _require_readable_videos(job)
     capture = job.capture.model_copy(update={"synthetic": None})
     return job.model_copy(update={"capture": capture}), loaded.warnings_of_run()
 
@@ -240,4 +243,19 @@ def _require_video_sizes(job: Job, limits: Limits) -> None:
                     field=f"capture.cameras.{index}.video",
                     hint="shorten the recording, or ask the operator of the watched folder to raise "
                     "--limit video_gb",
+                )
+
+
+def _require_readable_videos(job: Job) -> None:
+    """Raise `CaptureError` for a video whose structure shows that no frame can be read from it."""
+    for index, camera in enumerate(job.capture.cameras):
+        for path in camera.video:
+            part = missing_part(path, VIDEO_SUFFIXES)
+            # FFmpeg knows more kinds of video than `missing_part`.
+            if part is not None and not part.readable_bytes and part.text != NO_VIDEO:
+                raise CaptureError(
+                    f"the video is not complete: {part.text}",
+                    path=path,
+                    field=f"capture.cameras.{index}.video",
+                    hint=COPY_AGAIN,
                 )

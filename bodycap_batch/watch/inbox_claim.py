@@ -216,7 +216,7 @@ def _move_entry(
         absolute_link.symlink_to(leads_to)
         os.replace(absolute_link, target)
         return True
-    if take_snapshot(InboxEntry(target), int(permissions.limits.files)).digest == snapshot.digest:
+    if snapshot.is_same(take_snapshot(InboxEntry(target), int(permissions.limits.files))):
         return True
     move_to_free_name(target, entry.path.parent, entry.path.name)
     return False

@@ -8,11 +8,16 @@ import os
 import stat
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bodycap_batch.config.folder import VIDEO_SUFFIXES
-from bodycap_batch.formats.file_completeness import missing_part
+from bodycap_batch.config.folder import shown_name
+from bodycap_batch.config.unfinished_videos import (
+    is_system_folder,
+    names_video,
+    relevant_files,
+    unfinished_files,
+)
 from bodycap_batch.watch.spool import visible_entries
 
 READY = "READY"
@@ -20,21 +25,14 @@ NOT_A_JOB = "this is not a job, because it is neither a folder nor a YAML file"
 """Text that explains why a path in the inbox is ignored."""
 YAML_SUFFIXES = (".yaml", ".yml")
 _PARTIAL_SUFFIX = ".part"
+"""Suffix of a folder that a user renames when it is complete."""
 _MAX_STALL_S = 1800.0
 """Time (seconds) without a change after which an entry with an incomplete file is processed anyway. Origin:
 Linux closes a connection that does not answer after 13 to 30 minutes (tcp_retries2 in the manual page
 tcp(7)). A copy over the network that has stopped for longer does not continue."""
-_FILE_MANAGER_FILES = (
-    ".DS_Store",
-    ".localized",
-    ".directory",
-    ".Spotlight-V100",
-    ".Trashes",
-    ".fseventsd",
-    ".nomedia",
-)
-"""Names of hidden files that file managers create in folders. A folder that holds such files can be complete.
-Names that start with ``._`` (resource forks) are treated in the same way."""
+_RECENT_S = 60.0
+"""Time (seconds) for which a change of a file is named as the reason to wait. The usual time to wait is 10
+seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,30 +59,30 @@ class EntrySnapshot:
     Two snapshots show whether a user is still copying or changing the files.
 
     Attributes:
-        digest: Digest of the names, sizes and times of all files. It changes if a file is added, removed,
-            renamed or modified.
+        digest: Digest of the names, sizes and times of the videos and the YAML files. It changes if one of
+            them is added, removed, renamed or modified. Unfinished copies of videos belong to the videos.
+        changes: The same digest of all files but those that a system keeps for itself; "" for a complete
+            entry in which a file that is neither a video nor a YAML file changes all the time.
         files: Number of files, at most `max_files` + 1 (see `take_snapshot`).
         ready: True if a file named READY states that the entry is complete.
-        unfinished: Relative path of a file that is still being copied; "" if there is no such file.
+        is_empty: True if there are no files but those that a system keeps for itself.
+        newest: Time (Unix seconds) of the latest change of one of these files, and the name of the file.
         special: Relative path of a pipe, a device or another special file; "" if there is no such file.
         undecodable: Relative path that is not UTF-8 text; "" if there is no such path.
     """
 
     digest: str
+    changes: str
     files: int
     ready: bool
-    unfinished: str
+    is_empty: bool
+    newest: tuple[float, str]
     special: str
     undecodable: str
 
-    @property
-    def incomplete_reason(self) -> str:
-        """Reason why the entry cannot be complete yet; "" if there is no reason."""
-        if self.ready:
-            return ""
-        if self.unfinished:
-            return f"{self.unfinished} is being copied"
-        return "" if self.files else "the folder is empty"
+    def is_same(self, later: EntrySnapshot) -> bool:
+        """Return True if the entry has not changed since this snapshot of a complete entry."""
+        return later.digest == self.digest and self.changes in ("", later.changes)
 
 
 def entries_in(inbox: Path) -> list[InboxEntry]:
@@ -98,63 +96,82 @@ def ignored_paths_in(inbox: Path) -> list[Path]:
 
 
 def take_snapshot(entry: InboxEntry, max_files: int) -> EntrySnapshot:
-    """Record the names, sizes and times of an entry's files. No file is opened.
+    """Record the names, sizes and times of an entry's files.
 
     Args:
         entry: Entry to record.
         max_files: Maximum number of files. The inspection ends at the first file beyond this number.
     """
-    digest, count = hashlib.sha256(), 0
-    ready, unfinished, special = False, "", ""
-    undecodable = "" if _is_utf8(entry.path.name) else entry.path.name
-    for path, name in _files_below(entry.path):
-        try:
-            found = path.stat()
-        except OSError:  # a broken link; the error is reported when the job is read
-            found = path.lstat()
-        count += 1
-        digest.update(repr((name, found.st_size, found.st_mtime_ns, found.st_ino)).encode())
-        ready = ready or name == READY
-        undecodable = undecodable if _is_utf8(name) else name
-        if not unfinished and any(map(_is_partial_or_hidden, Path(name).parts)):
-            unfinished = name
-        if not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode) and not path.is_symlink():
+    files = list(itertools.islice(_files_below(entry.path), max_files + 1))
+    digest, changes = hashlib.sha256(), hashlib.sha256()
+    special, newest = "", (0.0, "")
+    relevant = relevant_files(files)
+    for path, name in relevant:
+        found = _state_of(path)
+        state = repr((name, found.st_size, found.st_mtime_ns, found.st_ino)).encode()
+        changes.update(state)
+        if names_video(name) or path.suffix.lower() in YAML_SUFFIXES:
+            digest.update(state)
+        newest = max(newest, (found.st_mtime, shown_name(Path(name))))
+    for path, name in files:
+        mode = _state_of(path).st_mode
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode) and not path.is_symlink():
             special = name
-        if count > max_files:
-            break
     return EntrySnapshot(
         digest=digest.hexdigest(),
-        files=count,
-        ready=ready,
-        unfinished=unfinished,
+        changes=changes.hexdigest(),
+        files=len(files),
+        ready=any(name == READY for _, name in files),
+        is_empty=not relevant,
+        newest=newest,
         special=special,
-        undecodable=undecodable,
+        undecodable=next(
+            (name for name in (entry.path.name, *(n for _, n in files)) if not _is_utf8(name)), ""
+        ),
     )
 
 
-def missing_content(entry: InboxEntry, max_files: int) -> str:
-    """Return which file of an entry is not complete according to its own content.
+def _state_of(path: Path) -> os.stat_result:
+    try:
+        return path.stat()
+    except OSError:  # a broken link; the error is reported when the job is read
+        return path.lstat()
+
+
+def reason_to_wait(entry: InboxEntry, snapshot: EntrySnapshot, max_files: int) -> str:
+    """Return why an entry is not complete, although its files do not change.
 
     Args:
         entry: Entry to inspect. Its videos are opened, but no frame is decoded.
+        snapshot: The state of the entry's files.
         max_files: Maximum number of files that are inspected.
 
     Returns:
-        Text for the user; "" if no file is known to be incomplete.
+        Text for the user; "" if no file is known to be incomplete, or if the user says that it is complete.
     """
-    for path, name in itertools.islice(_files_below(entry.path), max_files):
-        if missing := missing_part(path, VIDEO_SUFFIXES):
-            limit = f"it is processed after {_MAX_STALL_S / 60:.0f} minutes without a change"
-            return f"{name} is not complete: {missing} ({limit})"
+    if snapshot.ready:
+        return ""
+    limit = f"it is processed after {_MAX_STALL_S / 60:.0f} minutes without a change"
+    if snapshot.is_empty:
+        return f"the folder is empty ({limit})"
+    for found in unfinished_files(itertools.islice(_files_below(entry.path), max_files)):
+        return f"{shown_name(Path(found.name))} is not complete: {found.reason} ({limit})"
     return ""
+
+
+def latest_change(snapshot: EntrySnapshot) -> str:
+    """Return which file of an entry changed a short time ago, as text for the user; "" if there is none."""
+    age_s = time.time() - snapshot.newest[0]
+    return f"{snapshot.newest[1]} changed {age_s:.0f} s ago" if 0 <= age_s < _RECENT_S else ""
 
 
 class CompletionTracker:
     """Find out which entries of the inbox users have copied completely.
 
     An entry is complete if it has not changed for some time, and if the content of its files agrees with
-    their lengths. An entry with a damaged file never agrees. It is treated as complete after `_MAX_STALL_S`
-    seconds without a change, so that its error is reported.
+    their names and lengths. An entry with a damaged file never agrees. It is treated as complete after
+    `_MAX_STALL_S` seconds without a change, so that its error is reported. A file that is neither a video nor
+    a job file and changes all the time delays an entry for at most this time, too.
 
     Args:
         unchanged_s: Time (seconds) for which the names, sizes and times of an entry's files must not change
@@ -175,8 +192,8 @@ class CompletionTracker:
         self._unchanged_s = unchanged_s
         self._most = max_files
         self._clock = clock
-        self._seen: dict[Path, tuple[str, float]] = {}
-        self._missing: dict[Path, tuple[str, str]] = {}
+        self._seen: dict[Path, tuple[tuple[str, float], ...]] = {}
+        self._reasons: dict[Path, tuple[str, str]] = {}
         self.incomplete: dict[Path, str] = {}
         self.unreadable: dict[Path, str] = {}
 
@@ -191,37 +208,39 @@ class CompletionTracker:
         self.incomplete, self.unreadable = {}, {}
         for entry in entries:
             snapshot, error = _try_snapshot(entry, self._most)
-            state = error if snapshot is None else snapshot.digest
-            last_state, since = previous.get(entry.path, ("", now))
-            since = since if last_state == state else now
-            self._seen[entry.path] = (state, since)
-            is_still = now - since >= self._unchanged_s
+            states = (error, error) if snapshot is None else (snapshot.changes, snapshot.digest)
+            last = previous.get(entry.path, (("", now), ("", now)))
+            self._seen[entry.path] = tuple(
+                (state, since if state == last_state else now)
+                for state, (last_state, since) in zip(states, last, strict=True)
+            )
+            (_, since), (_, since_video) = self._seen[entry.path]
+            is_still = now - since >= self._unchanged_s or now - since_video >= _MAX_STALL_S
             if snapshot is None:
                 if is_still and error:
                     self.incomplete[entry.path] = self.unreadable[entry.path] = error
             elif snapshot.ready:
                 found.append((since, entry, snapshot))
             elif is_still:
-                reason = snapshot.incomplete_reason
-                if not reason and now - since < _MAX_STALL_S:
-                    reason = self._missing_content(entry, snapshot)
+                reason = "" if now - since >= _MAX_STALL_S else self._reason_to_wait(entry, snapshot)
                 if reason:
                     self.incomplete[entry.path] = reason
                 else:
-                    found.append((since, entry, snapshot))
-        self._missing = {path: value for path, value in self._missing.items() if path in self._seen}
+                    is_restless = now - since < self._unchanged_s
+                    found.append((since, entry, replace(snapshot, changes="") if is_restless else snapshot))
+        self._reasons = {path: value for path, value in self._reasons.items() if path in self._seen}
         found.sort(key=lambda item: (item[0], item[1].path))
         return [(entry, snapshot) for _, entry, snapshot in found]
 
-    def _missing_content(self, entry: InboxEntry, snapshot: EntrySnapshot) -> str:
-        """Return which file of an entry is not complete. An unchanged entry is inspected only once."""
-        digest, reason = self._missing.get(entry.path, ("", ""))
-        if digest != snapshot.digest:
+    def _reason_to_wait(self, entry: InboxEntry, snapshot: EntrySnapshot) -> str:
+        """Return why an entry is not complete. An unchanged entry is inspected only once."""
+        changes, reason = self._reasons.get(entry.path, ("", ""))
+        if changes != snapshot.changes:
             try:
-                reason = missing_content(entry, self._most)
+                reason = reason_to_wait(entry, snapshot, self._most)
             except OSError:  # a copying program renames a file at this moment
                 return "it is changing"
-            self._missing[entry.path] = (snapshot.digest, reason)
+            self._reasons[entry.path] = (snapshot.changes, reason)
         return reason
 
     @property
@@ -266,12 +285,6 @@ def _is_utf8(name: str) -> bool:
     return True
 
 
-def _is_partial_or_hidden(name: str) -> bool:
-    if name.lower().endswith(_PARTIAL_SUFFIX):
-        return True
-    return name.startswith(".") and name not in _FILE_MANAGER_FILES and not name.startswith("._")
-
-
 def _files_below(path: Path) -> Iterator[tuple[Path, str]]:
     """Yield the path and relative name of each file, link and special file in a folder and its subfolders.
 
@@ -283,7 +296,13 @@ def _files_below(path: Path) -> Iterator[tuple[Path, str]]:
     folders = [(path, "")]
     while folders:
         folder, prefix = folders.pop()
-        for entry in sorted(os.scandir(folder), key=lambda item: item.name):
+        try:
+            entries = sorted(os.scandir(folder), key=lambda item: item.name)
+        except PermissionError:
+            if is_system_folder(folder.name) and prefix:
+                continue  # for example the waste basket of another user
+            raise
+        for entry in entries:
             name = f"{prefix}{entry.name}"
             if entry.is_dir(follow_symlinks=False):
                 folders.append((Path(entry.path), f"{name}/"))

@@ -75,7 +75,7 @@ class Watcher:
         self._worker = JobWorker(spool, options, self._stop)
         self._running: dict[Future[JobOutcome], Claim] = {}
         self._unmovable: dict[str, tuple[str, float]] = {}
-        self._unreadable: dict[Path, str] = {}
+        self._reported: dict[Path, str] = {}
         self._complete: collections.deque[tuple[InboxEntry, EntrySnapshot]] = collections.deque()
         self._retry_failure_reported = False
         self._last_reports: dict[str, str] = {}
@@ -220,17 +220,22 @@ class Watcher:
         names = {str(entry.path) for entry in entries}
         self._unmovable = {name: value for name, value in self._unmovable.items() if name in names}
         self._has_waiting = bool(names - self._unmovable.keys() - set(map(str, self._tracker.incomplete)))
-        self._report_unreadable()
+        self._report_incomplete()
         now = time.monotonic()
         self._next_scan_at = now + _SCAN_PAUSE_FACTOR * (now - started)
 
-    def _report_unreadable(self) -> None:
-        """Report each entry that cannot be read. Each entry is reported once."""
-        found = self._tracker.unreadable
-        for path in found.keys() - self._unreadable.keys():
-            self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
-            self._write_line(f"{path.name}: cannot be read: {found[path]}")
-        self._unreadable = found
+    def _report_incomplete(self) -> None:
+        """Report each entry that cannot be read or is not complete, once for each reason."""
+        tracker, found = self._tracker, dict(self._tracker.incomplete)
+        for path, reason in found.items():
+            if self._reported.get(path) == reason:
+                continue
+            if path in tracker.unreadable:
+                self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
+                self._write_line(f"{path.name}: cannot be read: {reason}")
+            elif not self._options.once:  # otherwise the reasons are reported at the end
+                self._write_line(f"{path.name} waits: {reason}")
+        self._reported = found
 
     def _start(self, pool: ThreadPoolExecutor, claim: Claim, read_error: BodycapError | None) -> None:
         if read_error is None and claim.job.name not in self._last_reports:

@@ -15,6 +15,7 @@ from typing import Any
 from bodycap_batch.watch import JobPermissions, Spool, Watcher, WatchOptions
 from bodycap_batch.watch.spool import JobDir
 from tests.pipeline.fake_stages import ORDERS, give_orders
+from tests.videos import unopened
 
 ROOT = Path(__file__).parents[2]
 CHILD = (sys.executable, str(Path(__file__).with_name("fake_stages.py")))
@@ -44,7 +45,7 @@ class SpoolFixture:
         capture = folder / name
         capture.mkdir()
         for camera in CAMERAS:
-            (capture / f"{camera}.mp4").write_text(f"frames of {camera} in {name}")
+            (capture / f"{camera}.mp4").write_bytes(unopened(f"frames of {camera} in {name}"))
         if job is not None:
             (capture / "job.yaml").write_text(job)
         if ready:

@@ -139,3 +139,17 @@ def test_an_earlier_result_that_may_not_be_changed_is_replaced_where_the_folder_
     (walk / "results").chmod(0o700)
     assert told.code == 5, told.text
     assert "hint: " in told.text
+
+
+def test_a_folder_of_the_system_that_may_not_be_read_holds_no_job(tmp_path: Path, walk: Path) -> None:
+    inbox = tmp_path / "jobs" / "inbox"
+    inbox.mkdir(parents=True)
+    (walk / ".Trash-1000").mkdir()
+    (walk / ".Trash-1000").chmod(0)
+    walk.rename(inbox / "walk")
+    told = bodycap(tmp_path, "watch", "jobs", "--once", "--settle", "0")
+    for path in tmp_path.rglob(".Trash-1000"):
+        path.chmod(0o700)
+    assert "cannot be read" not in told.text
+    assert "walk: started" in told.text
+    assert not list(inbox.iterdir())

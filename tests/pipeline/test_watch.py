@@ -21,7 +21,7 @@ from bodycap_batch.core.errors import CaptureError, JobError, StoreError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.garbage_collection import collect_garbage
-from bodycap_batch.watch import JobPermissions, cancel_job, inbox_claim, job_rows, retry_job
+from bodycap_batch.watch import JobPermissions, cancel_job, inbox_claim, inbox_entries, job_rows, retry_job
 from bodycap_batch.watch.claim import Claim, create_claim, take_over_job
 from bodycap_batch.watch.commands import job_row
 from bodycap_batch.watch.inbox_entries import EntrySnapshot, InboxEntry, take_snapshot
@@ -31,7 +31,7 @@ from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir
 from tests.pipeline.spools import SpoolFixture, remove_in_use, wait_for
 from tests.pipeline.test_watch_disk import running
 from tests.processes import gone
-from tests.videos import textured_frame, write_video
+from tests.videos import textured_frame, unopened, write_video
 
 
 def leftovers(bench: SpoolFixture) -> list[str]:
@@ -46,7 +46,7 @@ def test_a_dropped_folder_ends_in_done_with_results_videos_and_a_status(bench: S
     assert job.path.parent == bench.spool.done
     assert (job.result / "metrics.json").is_file()
     assert (job.result / "result.bvh").is_file()
-    assert (job.input / "torso.mp4").read_text() == "frames of torso in küchen gang 1"
+    assert b"frames of torso in k" in (job.input / "torso.mp4").read_bytes()
     assert "map: finished" in job.log.read_text()
     status = bench.status("küchen gang 1")
     assert (status["state"], status["exit_code"], status["error"]) == ("done", 0, None)
@@ -428,12 +428,12 @@ def test_a_bug_fails_only_its_job(bench: SpoolFixture) -> None:
 
 def test_a_copy_in_progress_stays_in_the_inbox_until_it_is_complete(bench: SpoolFixture) -> None:
     dropped = bench.drop("walk", ready=False)
-    (dropped / "head.mp4.part").write_text("frames of the head")
+    (dropped / "head.mp4.part").write_bytes(unopened("frames of the head"))
     watcher = bench.watcher(once=False)
     thread = threading.Thread(target=watcher.run)
     thread.start()
     try:
-        wait_for(lambda: job_rows(bench.spool)[0].cause == "head.mp4.part is being copied")
+        wait_for(lambda: job_rows(bench.spool)[0].cause.startswith("head.mp4.part is not complete"))
         time.sleep(0.3)
         assert dropped.is_dir()
         (dropped / "head.mp4.part").rename(dropped / "head.mp4")
@@ -442,6 +442,37 @@ def test_a_copy_in_progress_stays_in_the_inbox_until_it_is_complete(bench: Spool
         watcher.stop()
         thread.join(30)
     assert not thread.is_alive()
+
+
+def test_a_folder_that_lacks_a_camera_fails_after_the_limit_and_never_runs(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inbox_entries, "_MAX_STALL_S", 1.0)
+    dropped = bench.drop("walk", ready=False)
+    (dropped / "head.mp4.crdownload").write_bytes(unopened("frames of the head")[:-1])
+    watcher = bench.watcher(once=False)
+    thread = threading.Thread(target=watcher.run)
+    thread.start()
+    try:
+        wait_for((bench.spool.failed / "walk" / "status.json").is_file)
+    finally:
+        watcher.stop()
+        thread.join(30)
+    assert any(line.startswith("walk waits: head.mp4.crdownload is not complete") for line in bench.lines)
+    assert not any("started" in line for line in bench.lines)
+    status = bench.status("walk")
+    assert (status["state"], status["exit_code"], status["attempts"], status["started_at"]) == (
+        "failed",
+        3,
+        0,
+        None,
+    )
+    assert status["error"]["path"] == str(bench.spool.failed / "walk" / "input" / "head.mp4.crdownload")
+    assert not list(bench.spool.running.glob("[!.]*"))
+    (bench.spool.failed / "walk" / "input" / "head.mp4.crdownload").unlink()
+    assert main(["retry", "walk"]) == 0
+    assert bench.run_once() == 0
+    assert bench.status("walk")["state"] == "done"
 
 
 def test_a_stalled_copy_is_left_with_its_reason(
@@ -455,7 +486,7 @@ def test_a_stalled_copy_is_left_with_its_reason(
     assert any("head.mp4 is not complete" in line for line in bench.lines)
     assert main(["status", str(bench.spool.root)]) == 0
     count = f"{len(whole) - 100:,} of {len(whole):,} bytes are there"
-    assert f"head.mp4 is not complete: {count}" in capfd.readouterr().out
+    assert f"head.mp4 is not complete: its end is missing: {count}" in capfd.readouterr().out
     video.write_bytes(whole)
     assert bench.run_once() == 0
     assert bench.status("walk")["state"] == "done"

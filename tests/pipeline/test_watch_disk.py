@@ -303,8 +303,9 @@ def test_paths_left_in_the_inbox_are_reported_when_a_watcher_ends(bench: SpoolFi
     assert bench.status("walk")["state"] == "done"
     left = dict(line.split(" stays in the inbox: ") for line in bench.lines if "stays in the inbox" in line)
     assert left == {
-        "empty": "the folder is empty",
-        "copied": "head.mp4.part is being copied",
+        "empty": "the folder is empty (it is processed after 30 minutes without a change)",
+        "copied": "head.mp4.part is not complete: the video head.mp4 itself is not there yet "
+        "(it is processed after 30 minutes without a change)",
         "torso.mp4": "this is not a job, because it is neither a folder nor a YAML file",
     }
     assert (bench.spool.inbox / "copied" / "head.mp4.part").exists()

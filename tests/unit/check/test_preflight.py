@@ -22,7 +22,7 @@ from bodycap_batch.formats import optional_libraries
 from bodycap_batch.formats.bvh import write_bvh
 from bodycap_batch.store.disk_space import require_room
 from tests.bodies import reaching
-from tests.videos import textured_frame, write_video
+from tests.videos import textured_frame, unopened, write_video
 
 FRAMES = [textured_frame(index % 40) for index in range(75)]
 LENS = {"model": "PINHOLE", "params": [40, 40, 32, 24], "width": 64, "height": 48}
@@ -269,7 +269,7 @@ def test_the_check_says_where_settings_come_from_and_what_is_not_used(
 ) -> None:
     write_video(walk / "head.mkv", FRAMES[20:], metadata={FOCAL_KEY: "28"})
     for name in ("board.mp4", "notes.txt", "left_palm.timestamps.txt"):
-        (walk / name).touch()
+        (walk / name).write_bytes(unopened() if name == "board.mp4" else b"")
     times = "".join(f"{index / 30:.6f}\n" for index in range(75))
     (walk / "left_palm.timestamps.txt").write_text(times)
     (walk / "job.yaml").write_text(

@@ -17,6 +17,7 @@ from bodycap_batch.core.errors import CaptureError, JobError
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.provisional_scale import reach_constraint
 from bodycap_batch.model.skeleton_presets import load_skeleton
+from tests.videos import unopened
 
 LENS = {"model": "PINHOLE", "params": [420, 420, 320, 240], "width": 640, "height": 480}
 
@@ -25,7 +26,7 @@ def folder(tmp_path: Path, *names: str) -> Path:
     for name in names:
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(b"not opened when a job is loaded")
+        path.write_bytes(unopened())
     return tmp_path
 
 

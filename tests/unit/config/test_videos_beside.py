@@ -14,6 +14,7 @@ from bodycap_batch.config.models import Job
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.core.errors import CaptureError, JobError
 from tests.unit.config.test_job_folder import LENS, folder
+from tests.videos import unopened
 
 TORSO = "capture: {cameras: [{name: torso, video: torso.mp4}]}\n"
 ONLY = "capture: {cameras_only: true, cameras: [{name: torso, video: torso.mp4}]}\n"
@@ -208,7 +209,8 @@ def test_paths_that_cannot_be_followed_and_names_that_are_no_text(tmp_path: Path
     root = folder(tmp_path, "torso.mp4")
     (root / "loop.mp4").symlink_to("loop.mp4")
     (root / "loop.txt").symlink_to("loop.txt")
-    os.close(os.open(os.fsencode(root) + b"/caf\xe9.mp4", os.O_CREAT))
+    with open(os.fsencode(root) + b"/caf\xe9.mp4", "wb") as stream:
+        stream.write(unopened())
     (root / "job.yaml").write_text(TORSO)
     (warning,) = load_job_with_origins(root).warnings
     assert warning.startswith(r"caf\udce9.mp4 is not used")

@@ -19,7 +19,8 @@ FRAMES = [textured_frame(index % 40) for index in range(30)]
 
 
 def missing(path: Path) -> str:
-    return missing_part(path, VIDEO_SUFFIXES)
+    part = missing_part(path, VIDEO_SUFFIXES)
+    return "" if part is None else part.text
 
 
 def box(kind: bytes, content: bytes = b"", *, long: bool = False) -> bytes:
@@ -82,7 +83,8 @@ def test_a_file_with_reserved_space_is_incomplete_until_its_index_is_there(tmp_p
         (box(b"ftyp") + box(b"mdat", b"x" * 90) + box(b"moov") + b"\x00\x00\x00", "end"),
         (box(b"ftyp") + struct.pack(">I4s", 3, b"mdat") + b"x" * 90, "moov"),
         (box(b"ftyp") + struct.pack(">I4s", 1, b"mdat"), "moov"),
-        (b"frames of no known format", ""),
+        (b"frames of no known format", "not that of a video"),
+        (box(b"ftyp") + box(b"meta", b"x") + box(b"mdat", b"x"), ""),  # a photo
         (bytes(50), "first bytes"),
         (b"", "empty"),
     ],
@@ -166,7 +168,7 @@ def test_a_file_with_very_many_parts_is_not_read_to_its_end(
         ("times.csv", "", "empty"),
         ("notes.txt", "", ""),
         ("a.ts", "", "empty"),
-        ("a.ts", "anything at all", ""),
+        ("a.ts", "anything at all", "not that of a video"),
     ],
 )
 def test_text_files(tmp_path: Path, name: str, content: str, expected: str) -> None:
