@@ -170,7 +170,8 @@ class _ForwardDecoder:
             if self._video.is_counted:
                 self.position += 1
             elif self._newest.pts is not None:
-                self.position = int(np.searchsorted(self._video.pts, self._newest.pts))
+                # A decoded frame that is not listed, because its data are cut, is between two positions.
+                self.position = int(np.searchsorted(self._video.pts, self._newest.pts, side="right")) - 1
         is_exact = self._video.is_counted or self._newest.pts == self._video.pts[index]
         return self._newest if is_exact and self.position == index else None
 

@@ -22,6 +22,7 @@ from bodycap_batch.capture.video import (
 )
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.formats.file_completeness import missing_part
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -46,17 +47,22 @@ def index_video(path: Path, threads: int = 0) -> VideoFile:
         path: Path of the video file.
         threads: Number of threads of the decoder, as in `open_stream`.
 
+    A video whose end is missing is used up to its last whole frame, unless an index of the whole file shows
+    that the file was not copied completely.
+
     Raises:
         CaptureError: There is no video stream, there are no frames, the timestamps are implausible, or the
             file contains fewer frames than its index lists.
     """
+    part = missing_part(path.resolve())
+    missing_end = part.text if part is not None and part.readable_bytes else ""
     with open_container(path) as container:
         stream = video_stream(container, path)
         container_format = container.format.name
         # An MP4 file has an index of all packets. The length of the index is read before demuxing, because
         # demuxing adds entries to the index.
-        expected = len(stream.index_entries) if "mp4" in container_format else 0
-        pts, key_pts, end = _scan_packets(path, container, stream, expected)
+        expected = len(stream.index_entries) if "mp4" in container_format and not missing_end else 0
+        pts, key_pts, end, is_cut = _scan_packets(path, container, stream, expected)
         metadata = {**container.metadata, **stream.metadata}
         time_base, rate = Fraction(stream.time_base or 0), stream.average_rate or stream.guessed_rate
         pixel_aspect = _pixel_aspect(stream.sample_aspect_ratio)
@@ -75,6 +81,7 @@ def index_video(path: Path, threads: int = 0) -> VideoFile:
         orientation=((1, 0), (0, 1)),
         created_s=_creation_time(metadata),
         focal_35mm=_focal_35mm(metadata),
+        missing_end=missing_end or ("its last frame is cut" if is_cut else ""),
         pixel_aspect=pixel_aspect,
     )
     return _with_first_frame(video, container_format, threads)
@@ -82,8 +89,8 @@ def index_video(path: Path, threads: int = 0) -> VideoFile:
 
 def _scan_packets(
     path: Path, container: InputContainer, stream: Any, expected: int
-) -> tuple[IntArray, IntArray, int]:
-    """Read the timestamps of all packets of a video stream.
+) -> tuple[IntArray, IntArray, int, bool]:
+    """Read the timestamps of all packets of a video stream. A last packet that is cut is left out.
 
     Args:
         path: Path of the video file, for error messages.
@@ -92,23 +99,24 @@ def _scan_packets(
         expected: Minimum number of packets; a smaller number means that the file is truncated.
 
     Returns:
-        The timestamps of all frames, the timestamps of the key frames, and the end time of the last frame.
-        All are in units of the stream's time base.
+        The timestamps of all frames, the timestamps of the key frames, and the end time of the last frame,
+        all in units of the stream's time base; and whether the last packet is cut.
     """
     import av
 
     pts: list[int] = []
-    key: list[int] = []
-    read, end = 0, 0
+    ends: list[int] = []
+    is_key: list[bool] = []
+    read, is_cut = 0, False
     try:
         for packet in container.demux(stream):
             read += packet.size > 0
             if packet.pts is None or packet.is_discard or packet.size == 0:
                 continue
             pts.append(packet.pts)
-            end = max(end, packet.pts + (packet.duration or 0))
-            if packet.is_keyframe:
-                key.append(packet.pts)
+            ends.append(packet.pts + (packet.duration or 0))
+            is_key.append(packet.is_keyframe)
+            is_cut = packet.is_corrupt
     except av.error.FFmpegError as error:
         raise CaptureError(
             f"the video cannot be read after {len(pts)} frames ({error_reason(error)})",
@@ -123,10 +131,12 @@ def _scan_packets(
         raise CaptureError(message, path=path, hint=COPY_AGAIN)
     if not pts:
         raise CaptureError("the video contains no frame", path=path, hint=COPY_AGAIN)
-    frame_pts = np.unique(np.array(pts, dtype=np.int64))
+    whole = slice(len(pts) - 1 if is_cut and len(pts) > 1 else len(pts))
+    packet_pts, end = np.array(pts[whole], dtype=np.int64), max(ends[whole])
+    frame_pts, key_pts = np.unique(packet_pts), np.unique(packet_pts[is_key[whole]])
     if len(frame_pts) > 1 and end <= int(frame_pts[-1]):
         end = int(frame_pts[-1]) + int(np.median(np.diff(frame_pts)))
-    return frame_pts, np.unique(np.array(key, dtype=np.int64)), end
+    return frame_pts, key_pts, end, is_cut
 
 
 def _nominal_fps(pts: IntArray, time_base: Fraction, rate: Fraction | None) -> float:

@@ -77,11 +77,25 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         # Sensors are wider than they are high. Therefore a picture that is higher than wide was rotated by
         # 90°, by the camera or by the person who edited the video.
         may_be_sideways=_is_quarter_turned(videos[0]) or camera.height_px > camera.width_px,
-        notes=(*timeline.notes, *([] if lens is None or not lens.note else [lens.note])),
+        notes=(
+            *_missing_end_notes(videos),
+            *timeline.notes,
+            *([] if lens is None or not lens.note else [lens.note]),
+        ),
         videos=videos,
         threads=threads,
         mask=None if config.mask is None else read_mask(config.mask, (camera.width_px, camera.height_px)),
     )
+
+
+def _missing_end_notes(videos: tuple[VideoFile, ...]) -> list[str]:
+    """Return a note for the user about each chapter whose end is missing."""
+    return [
+        f"{video.path.name}: {video.missing_end}; the video is used up to its last whole frame, at "
+        f"{video.length_s:.2f} s: to get the rest, copy the video again from the camera's card"
+        for video in videos
+        if video.missing_end
+    ]
 
 
 def _is_quarter_turned(video: VideoFile) -> bool:

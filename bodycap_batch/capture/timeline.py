@@ -6,6 +6,7 @@ The times come from the container of each video, or from sidecar files: text fil
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -148,23 +149,26 @@ def join_chapters(videos: tuple[VideoFile, ...], sidecars: tuple[Path, ...]) -> 
 
     Args:
         videos: The chapters in the order of the recording.
-        sidecars: One sidecar file for all chapters, one sidecar file for each chapter, or none.
+        sidecars: One sidecar file for all chapters, one sidecar file for each chapter, or none. It may have
+            more times than its video has frames if the end of the video is missing.
 
     Raises:
         CaptureError: A sidecar file does not match its video.
     """
     if len(sidecars) == len(videos):
-        parts = [_sidecar_times(path, len(v.pts)) for path, v in zip(sidecars, videos, strict=True)]
+        parts = [_sidecar_times(path, (v,)) for path, v in zip(sidecars, videos, strict=True)]
         return _join_parts(videos, parts)
     if len(sidecars) == 1:
-        times = _sidecar_times(sidecars[0], sum(len(video.pts) for video in videos))
+        times = _sidecar_times(sidecars[0], videos)
         return _join_parts(videos, np.split(times, np.cumsum([len(video.pts) for video in videos])[:-1]))
     return _join_parts(videos, _container_times(videos))
 
 
-def _sidecar_times(path: Path, frames: int) -> IntArray:
-    """Read a sidecar file and check that it has one time for each frame."""
-    times = read_timestamps(path)
+def _sidecar_times(path: Path, videos: Sequence[VideoFile]) -> IntArray:
+    """Read a sidecar file and check that it has one time for each frame of some chapters."""
+    times, frames = read_timestamps(path), sum(len(video.pts) for video in videos)
+    if videos[-1].missing_end:
+        times = times[:frames]
     if len(times) != frames:
         raise CaptureError(
             f"there are {len(times)} timestamps for {frames} frames",

@@ -13,6 +13,8 @@ import numpy as np
 
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.formats.file_completeness import missing_part
+from bodycap_batch.formats.file_url import file_url
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -58,6 +60,7 @@ class VideoFile:
         is_counted: True if the frames must be identified by counting them from the start, because the decoder
             returns no timestamps (AVI with B-frames).
         is_interlaced: True if a frame contains two half pictures of different times.
+        missing_end: What is missing at the end of the file; "" if nothing is known to be missing.
         pixel_aspect: Width of a stored pixel over its height. For example, it is 4/3 if 1440 stored columns
             are shown as 1920 columns.
     """
@@ -74,6 +77,7 @@ class VideoFile:
     focal_35mm: float | None = None
     is_counted: bool = False
     is_interlaced: bool = False
+    missing_end: str = ""
     pixel_aspect: Fraction = Fraction(1)
 
     @property
@@ -91,6 +95,11 @@ class VideoFile:
     def _turned(self, width: int, height: int) -> tuple[int, int]:
         return (width, height) if self.orientation[0][0] else (height, width)
 
+    @property
+    def length_s(self) -> float:
+        """Time (seconds) from the first frame to the last frame."""
+        return float((int(self.pts[-1]) - int(self.pts[0])) * self.time_base)
+
     def times_ns(self) -> IntArray:
         """Return the timestamps (N,) in nanoseconds, rounded to the nearest nanosecond."""
         top, bottom = self.time_base.numerator * 1_000_000_000, self.time_base.denominator
@@ -99,13 +108,14 @@ class VideoFile:
 
 
 def open_container(path: Path) -> InputContainer:
-    """Open a media file.
+    """Open a media file. A file whose end is missing is opened up to the last part that is complete.
 
     Raises:
         CaptureError: The file is missing, empty or not a video.
     """
     import av
 
+    container: InputContainer
     try:
         if not path.is_file():
             raise CaptureError(
@@ -116,7 +126,15 @@ def open_container(path: Path) -> InputContainer:
             )
         if path.stat().st_size == 0:
             raise CaptureError("the video is empty (0 bytes)", path=path, hint=COPY_AGAIN)
-        container: InputContainer = av.open(str(path), metadata_errors="replace")
+        try:
+            container = av.open(file_url(path), metadata_errors="replace")
+        except (av.error.EOFError, av.error.InvalidDataError):
+            # The file may end inside the index of a fragment. FFmpeg then reads no frame at all.
+            part = missing_part(path.resolve())
+            if part is None or not 0 < part.readable_bytes < path.stat().st_size:
+                raise
+            url = f"subfile,,start,0,end,{part.readable_bytes},,:{file_url(path)}"
+            container = av.open(url, metadata_errors="replace")
     except av.error.EOFError as error:
         raise CaptureError("the video contains no frame", path=path, hint=COPY_AGAIN) from error
     except PermissionError as error:
@@ -124,11 +142,10 @@ def open_container(path: Path) -> InputContainer:
             "the program has no permission to read the video", path=path, hint=MAY_READ
         ) from error
     except (av.error.FFmpegError, OSError) as error:
+        part = missing_part(path.resolve())
+        reason = error_reason(error) if part is None else part.text
         raise CaptureError(
-            f"the file cannot be read as a video ({error_reason(error)}); this happens, for example, if "
-            "the recording was interrupted",
-            path=path,
-            hint=COPY_AGAIN,
+            f"the file cannot be read as a video: {reason}", path=path, hint=COPY_AGAIN
         ) from error
     return container
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.atomic_files import store_error_from_os_error
+from bodycap_batch.formats.file_url import file_url
 from bodycap_batch.formats.sound_frames import sound_frames
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ class VideoWriter:
         self._quality = quality
         rate = Fraction(fps).limit_denominator(100_000)
         try:
-            self._container = av.open(str(path), "w", options=_CONTAINER_OPTIONS.get(quality, {}))
+            self._container = av.open(file_url(path), "w", options=_CONTAINER_OPTIONS.get(quality, {}))
             self._stream = self._container.add_stream("libx264", rate=rate)
             self._sound_stream = sound and self._container.add_stream(
                 "aac", rate=sound.rate_hz, layout="mono"

@@ -182,6 +182,7 @@ def _cameras(
                 "frames": 0 if path is None else len(path.status),
                 "registered": 0 if path is None else int(path.registered.sum()),
                 "losses": len(camera_losses),
+                "notes": () if inputs.capture is None else inputs.capture.camera(name).notes,
                 "sees": _lost_frames_see(inputs, name),
                 "causes": [(cause.value, frames) for cause, frames in causes.get(name, {}).items()],
             }

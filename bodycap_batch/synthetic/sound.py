@@ -16,6 +16,7 @@ import numpy.typing as npt
 from scipy.signal import butter, oaconvolve, sosfilt
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.formats.file_url import file_url
 from bodycap_batch.formats.sound_frames import sound_frames
 
 Samples = npt.NDArray[np.float32]
@@ -188,7 +189,7 @@ def write_sound(
     """
     import av
 
-    with av.open(str(path), "w") as container:
+    with av.open(file_url(path), "w") as container:
         stream = container.add_stream(codec, rate=rate_hz, layout=layout)
         for frame in sound_frames(samples, rate_hz, layout):
             container.mux(stream.encode(frame))
