@@ -101,10 +101,10 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
 
     A folder is complete when it has not changed for a while, and no file in it shows that a video is not
     complete: a copy under another name (torso.mp4.part), or a video that is cut. The wait for such a file
-    ends after 30 minutes. A folder with a file named READY is complete at once. Jobs move from inbox/ to running/, then to done/ or failed/.
-    These folders are next to inbox/. done/NAME/result/ holds the results, done/NAME/input/ holds the dropped
-    files. Stop the command with Ctrl-C at any time: the jobs continue when you start the command again.
-    Several watchers, also on several machines, may share the folders.
+    ends after 30 minutes. A folder with a file named READY is complete at once. Jobs move from inbox/ to
+    running/, then to done/ or failed/. These folders are next to inbox/. done/NAME/result/ holds the results,
+    done/NAME/input/ holds the dropped files. Stop the command with Ctrl-C at any time: the jobs continue when
+    you start the command again. Several watchers, also on several machines, may share the folders.
 
     A dropped job may only use files in its own folder and in the folders given by --root.
 

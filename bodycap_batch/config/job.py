@@ -42,7 +42,7 @@ from bodycap_batch.config.places import Places
 from bodycap_batch.config.resolved_camera import ResolvedCamera, resolved_camera, with_found_calibrations
 from bodycap_batch.config.rules import missing_files, problems_in, skeleton_of
 from bodycap_batch.config.trust import PathPolicy
-from bodycap_batch.config.unfinished_videos import refuse_unfinished_copies
+from bodycap_batch.config.unfinished_videos import refuse_missing_cameras
 from bodycap_batch.config.videos_beside import VideosBeside, find_videos_beside
 from bodycap_batch.config.yaml_source import Location, YamlSource, dotted, read_yaml
 from bodycap_batch.core.errors import CaptureError, JobError
@@ -249,7 +249,7 @@ def _stated_without_places(
     full: Path, source: YamlSource | None, places: Places, *, alone: bool
 ) -> _StatedJob:
     if source is None:
-        refuse_unfinished_copies(full)
+        refuse_missing_cameras(full)
         data: dict[str, Any] = {"capture": folder_capture(full, places.is_known)}
         job = _validated(data, full, source)
         stated = _without_cameras(job.capture)
@@ -449,7 +449,7 @@ def _with_folder_capture(data: dict[str, Any], folder: Path, places: Places) -> 
         return data
     if not (data.keys() <= Job.model_fields.keys() and capture.keys() <= CaptureConfig.model_fields.keys()):
         return data
-    refuse_unfinished_copies(folder)
+    refuse_missing_cameras(folder)
     try:
         videos_in(folder)
     except CaptureError:  # no videos here: the validation reports the missing cameras

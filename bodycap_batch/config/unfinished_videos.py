@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from bodycap_batch.config.folder import PHOTO_SUFFIXES, RUN_FILE, VIDEO_SUFFIXES, is_video, shown_name
 from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.core.errors import CaptureError
-from bodycap_batch.formats.file_completeness import missing_part
+from bodycap_batch.formats.file_completeness import is_video_by_content, missing_part
 
 _VIDEO_NAME = re.compile(rf"({'|'.join(map(re.escape, sorted(VIDEO_SUFFIXES)))})(?![0-9a-z])", re.IGNORECASE)
 """Pattern of the end of a video's name, which something may follow: ``.mp4`` in ``torso.mp4.part``."""
@@ -111,11 +111,16 @@ def unfinished_files(files: Iterable[tuple[Path, str]]) -> Iterator[UnfinishedFi
             yield UnfinishedFile(path=path, name=name, reason=part.text, lacks_video=lacks_video)
 
 
-def refuse_unfinished_copies(folder: Path) -> None:
-    """Refuse a folder with a file that is an unfinished copy of a video that is not there.
+def refuse_missing_cameras(folder: Path, listed: Collection[Path] = ()) -> None:
+    """Refuse a folder with a file that should be the video of a camera, but is not used as one.
 
-    Without this check, the result would lack the camera of this video. Folders of cameras and hidden folders
-    in the folder are searched, too.
+    Without this check, the result would lack this camera. Such a file is an unfinished copy of a video that
+    is not there, or a video that has the name of a place on the body, but not the suffix of a video. Folders
+    of cameras and hidden folders in the folder are searched, too.
+
+    Args:
+        folder: The folder.
+        listed: The files that a job file lists.
 
     Raises:
         CaptureError: There is such a file.
@@ -123,10 +128,30 @@ def refuse_unfinished_copies(folder: Path) -> None:
     inner = [path for path in _entries(folder) if path.is_dir() and _may_hold_copies(path)]
     paths = [path for place in (folder, *inner) for path in _entries(place) if path.is_file()]
     for found in unfinished_files((path, path.relative_to(folder).as_posix()) for path in paths):
-        if found.lacks_video:
+        if found.lacks_video and found.path not in listed:
             raise CaptureError(
                 f"this file is an unfinished copy of a video: {found.reason}", path=found.path, hint=_HINT
             )
+    for path in _videos_without_suffix(folder):
+        if path not in listed:
+            raise CaptureError(
+                f"this file is a video, but {path.suffix or 'its name'} does not say so",
+                path=path,
+                hint=f"rename it (for example to {path.stem}.mp4), or {_HINT}",
+            )
+
+
+def _videos_without_suffix(folder: Path) -> Iterator[Path]:
+    """Yield the videos that have the name of a place on the body, but not the suffix of a video.
+
+    Videos that are there with a suffix are omitted: cameras write small copies beside them.
+    """
+    entries = [path for path in _entries(folder) if not path.name.startswith(".")]
+    stems = {path.stem.lower() for path in entries if is_video(path) or path.is_dir()}
+    for path in entries:
+        is_known = path.suffix.lower() in VIDEO_SUFFIXES | _SIDECAR_SUFFIXES or path.stem.lower() in stems
+        if not is_known and mount_of(path.stem) is not None and is_video_by_content(path):
+            yield path
 
 
 def refuse_unreadable_video(path: Path) -> None:

@@ -22,7 +22,7 @@ from bodycap_batch.config.folder import (
 from bodycap_batch.config.models import CameraConfig
 from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.config.places import Places
-from bodycap_batch.config.unfinished_videos import refuse_unfinished_copies, refuse_unreadable_video
+from bodycap_batch.config.unfinished_videos import refuse_missing_cameras, refuse_unreadable_video
 from bodycap_batch.core.errors import CaptureError
 
 
@@ -75,7 +75,7 @@ def find_videos_beside(
             or a video that is left out cannot be opened.
     """
     folder, found = job_file.parent, VideosBeside()
-    refuse_unfinished_copies(folder)
+    refuse_missing_cameras(folder, [folder / video for camera in listed for video in camera.video])
     other = next((name for name in JOB_FILES if name != job_file.name and (folder / name).is_file()), None)
     if other is not None:
         found.leave_out(

@@ -23,12 +23,13 @@ _FIRST_BOXES = frozenset({b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", 
 _UNMISTAKABLE_BOXES = frozenset({b"ftyp", b"moov", b"mdat"})
 """Types of boxes by which a file is known as MP4 or MOV if its name does not say it. The other types are
 words that a text may contain at this place."""
+_OTHER_BRANDS = (b"M4A", b"M4B", b"hei", b"mif", b"avif", b"crx")
+"""Kinds (brands) of files of boxes that hold sound or photos: M4A, M4B, HEIC, AVIF and CR3."""
 _PACKET_BYTES, _SYNC = (188, 192, 204), 0x47
 """Lengths (bytes) of the packets of MPEG-TS: plain, with a time stamp (M2TS), and with error correction; and
 the first byte of a plain packet."""
-_OTHER_STARTS = (b"\x00\x00\x01", b"\x00\x00\x00\x01", b"\x30\x26\xb2\x75", b"FLV", b"OggS")
-"""First bytes of further kinds of video: MPEG-PS, MPEG-2, H.264 and H.265 without a container; WMV, FLV and
-Ogg."""
+_OTHER_STARTS = (b"\x00\x00\x01\xba", b"\x00\x00\x01\xb3", b"\x00\x00\x00\x01", b"\x30\x26\xb2\x75", b"FLV")
+"""First bytes of further kinds of video: MPEG-PS; MPEG-2, H.264 and H.265 without a container; WMV, FLV."""
 _MAX_HEAD_BYTES = 4 * max(_PACKET_BYTES)
 """Number of bytes from the start of a file that tell its kind. The first packet of MPEG-TS may be cut, and
 two more must follow it."""
@@ -40,6 +41,7 @@ _BOX_HEADER, _LONG_BOX_HEADER = 8, 16
 """Sizes (bytes) of the header of a box: with a size of 32 bits, and with a size of 64 bits."""
 _EBML, _SEGMENT = 0x1A45DFA3, 0x18538067
 """Identifiers of elements of Matroska: the header of the file, and its content."""
+_EBML_BYTES = _EBML.to_bytes(4, "big")
 _MAX_VINT_BYTES = 8
 """Maximum length (bytes) of a number of variable length. Source: RFC 8794, section 4."""
 _RIFF_HEADER = 12
@@ -67,6 +69,25 @@ class MissingPart:
 
     text: str
     readable_bytes: int = 0
+
+
+def is_video_by_content(path: Path) -> bool:
+    """Return True if a file begins as a video, whatever its name is. Links are not opened."""
+    try:
+        if not stat.S_ISREG(path.lstat().st_mode):
+            return False
+        with path.open("rb") as stream:
+            head = stream.read(_MAX_HEAD_BYTES)
+    except OSError:
+        return False
+    return _begins_as_video(head)
+
+
+def _begins_as_video(head: bytes) -> bool:
+    if head[4:8] == b"ftyp":
+        return not head[8:12].startswith(_OTHER_BRANDS)
+    is_known = head[4:8] in _UNMISTAKABLE_BOXES or head.startswith((_EBML_BYTES, *_OTHER_STARTS))
+    return is_known or (head[:4] == b"RIFF" and head[8:12] == b"AVI ") or _packets_of(head) is not None
 
 
 def missing_part(path: Path, video_suffixes: frozenset[str] | None = None) -> MissingPart | None:
@@ -110,14 +131,14 @@ def _missing_video_part(stream: BinaryIO, size: int, *, is_named: bool) -> Missi
             if its first bytes are certainly those of a video.
     """
     head = stream.read(_MAX_HEAD_BYTES)
-    if head[4:8] in (_FIRST_BOXES if is_named else _UNMISTAKABLE_BOXES):
+    if not is_named and not _begins_as_video(head):
+        return None
+    if head[4:8] in _FIRST_BOXES:
         return _missing_box(stream, size)
-    if head[:4] == _EBML.to_bytes(4, "big"):
+    if head.startswith(_EBML_BYTES):
         return _missing_element(stream, size)
     if head[:4] == b"RIFF" and head[8:12] == b"AVI ":
         return _missing_chunk(stream, size)
-    if not is_named:
-        return None
     if len(head) < _RIFF_HEADER:
         return MissingPart(text="its end is missing")
     if not any(head):
@@ -168,8 +189,6 @@ def _missing_box(stream: BinaryIO, size: int) -> MissingPart | None:
     if is_owed:
         text = "its end is missing: the last index (moof) has no pictures (mdat)"
         return MissingPart(text=text, readable_bytes=size if b"mdat" in found else 0)
-    if b"meta" in found and b"moov" not in found:
-        return None  # a photo (HEIC), which consists of boxes as well
     if b"moov" not in found:
         return MissingPart(
             text="its index (moov) is missing, as after a recording or a copy that was interrupted"

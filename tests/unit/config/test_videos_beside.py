@@ -351,3 +351,75 @@ def test_a_job_that_computes_no_body_says_what_is_missing(tmp_path: Path) -> Non
     assert load_job_with_origins(root).no_body == ""
     (root / "job.yaml").write_text(f"height_m: 1.7\n{TORSO.replace('torso,', 'phone,')}")
     assert "name each video after its place" in load_job_with_origins(root).no_body
+
+
+@pytest.mark.parametrize("job", ["", "height_m: 1.7\n", TORSO])
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("head.mp4.part", b"anything", "unfinished copy of a video: the video head.mp4 itself is not there"),
+        ("head/GX010042.MP4.part", b"anything", "the video GX010042.MP4 itself is not there"),
+        ("head.mp4.download/head.mp4", unopened(), "the video head.mp4 itself is not there"),
+        ("Unconfirmed 12.crdownload", unopened()[:-1], "unfinished copy of a video: its end is missing"),
+        (".rsync-partial/head.mp4", unopened()[:-1], "unfinished copy of a video: its end is missing"),
+        ("head.flv", b"FLV\x01" + bytes(20), "this file is a video, but .flv does not say so"),
+        ("head", unopened(), "this file is a video, but its name does not say so"),
+    ],
+)
+def test_a_camera_whose_file_is_there_is_never_left_out_silently(
+    tmp_path: Path, job: str, name: str, content: bytes, message: str
+) -> None:
+    root = folder(tmp_path, "torso.mp4", "left_palm.mp4")
+    (root / name).parent.mkdir(exist_ok=True)
+    (root / name).write_bytes(content)
+    if job:
+        (root / "job.yaml").write_text(job)
+    with pytest.raises(CaptureError, match=message) as caught:
+        load_job(root)
+    assert caught.value.path == str(root / name)
+    (root / "job.yaml").write_text(ONLY)
+    assert cameras(load_job(root)) == {"torso": ["torso.mp4"]}
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("torso.mp4.part", b"of an earlier copy"),
+        ("torso.mp4.timestamps.txt", b""),
+        ("head.mp4.imu.csv", b"t_s"),
+        ("torso.LRV", unopened()),
+        ("head.m4a", b"\0\0\0\x0cftypM4A "),
+        ("head.heic", b"\0\0\0\x0cftypheic"),
+        ("head.txt", b"FLV is a kind of video"),
+        ("notes on the head.docx", b"PK"),
+        ("torso.mp4.mp4", unopened()),
+        ("out/head.mp4.part", b"anything"),
+    ],
+)
+def test_other_files_beside_the_videos_are_no_reason_to_refuse_a_job(
+    tmp_path: Path, name: str, content: bytes
+) -> None:
+    root = folder(tmp_path, "torso.mp4", "left_palm.mp4")
+    (root / name).parent.mkdir(exist_ok=True)
+    (root / name).write_bytes(content)
+    (root / "job.yaml").write_text(TORSO)
+    assert set(cameras(load_job(root))) >= {"torso", "left_palm"}
+
+
+def test_a_listed_file_may_have_any_name(tmp_path: Path) -> None:
+    root = folder(tmp_path, "torso.mp4.bak", "head.flv")
+    (root / "job.yaml").write_text(
+        "capture: {cameras: [{name: torso, video: torso.mp4.bak}, {name: head, video: head.flv}]}\n"
+    )
+    assert cameras(load_job(root)) == {"torso": ["torso.mp4.bak"], "head": ["head.flv"]}
+
+
+def test_a_video_that_is_left_out_and_cannot_be_opened_is_an_error(tmp_path: Path) -> None:
+    root = folder(tmp_path, "torso.mp4", "GX010042.MP4")
+    (root / "job.yaml").write_text(TORSO)
+    assert len(load_job_with_origins(root).warnings) == 1
+    (root / "GX010042.MP4").write_bytes(unopened()[:-1])
+    with pytest.raises(CaptureError, match="cannot be opened: its end is missing"):
+        load_job(root)
+    (root / "job.yaml").write_text(ONLY)
+    assert load_job_with_origins(root).warnings == ()

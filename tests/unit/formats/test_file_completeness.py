@@ -12,7 +12,7 @@ import pytest
 
 from bodycap_batch.config.folder import VIDEO_SUFFIXES
 from bodycap_batch.formats import file_completeness
-from bodycap_batch.formats.file_completeness import missing_part
+from bodycap_batch.formats.file_completeness import is_video_by_content, missing_part
 from tests.videos import textured_frame, write_video
 
 FRAMES = [textured_frame(index % 40) for index in range(30)]
@@ -84,7 +84,6 @@ def test_a_file_with_reserved_space_is_incomplete_until_its_index_is_there(tmp_p
         (box(b"ftyp") + struct.pack(">I4s", 3, b"mdat") + b"x" * 90, "moov"),
         (box(b"ftyp") + struct.pack(">I4s", 1, b"mdat"), "moov"),
         (b"frames of no known format", "not that of a video"),
-        (box(b"ftyp") + box(b"meta", b"x") + box(b"mdat", b"x"), ""),  # a photo
         (bytes(50), "first bytes"),
         (b"", "empty"),
     ],
@@ -174,6 +173,28 @@ def test_a_file_with_very_many_parts_is_not_read_to_its_end(
 def test_text_files(tmp_path: Path, name: str, content: str, expected: str) -> None:
     (tmp_path / name).write_text(content)
     assert (expected in missing(tmp_path / name)) if expected else missing(tmp_path / name) == ""
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (box(b"ftyp", b"isom") + box(b"moov") + box(b"mdat", b"x" * 90)[:-1], "bytes are there"),
+        (box(b"ftyp", b"heic") + box(b"meta") + box(b"mdat", b"x" * 90)[:-1], ""),
+        (box(b"ftyp", b"M4A ") + box(b"mdat", b"x" * 90), ""),
+        (b"the skip is no box", ""),
+        (b"\0\0\1\0\1\0 an icon", ""),
+        ((b"\x47" + bytes(187)) * 4 + b"\x47", "last packet"),
+        (bytes(50), ""),
+        (b"", ""),
+    ],
+)
+def test_a_file_of_another_name_is_inspected_if_it_begins_as_a_video(
+    tmp_path: Path, content: bytes, expected: str
+) -> None:
+    path = tmp_path / "Unconfirmed 12.crdownload"
+    path.write_bytes(content)
+    assert (expected in missing(path)) if expected else missing(path) == ""
+    assert is_video_by_content(path) == bool(expected)
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda path: os.symlink("/dev/zero", path)])
