@@ -40,11 +40,11 @@ def evaluate(
         ),
     ],
     truth: Annotated[
-        Path,
+        Path | None,
         typer.Argument(
-            metavar="TRUTH", help="The true values: a gt/ folder, or a .tum, .bvh or joints.npz file."
+            metavar="[TRUTH]", help="The true values: a gt/ folder, or a .tum, .bvh or joints.npz file."
         ),
-    ],
+    ] = None,
     align: Annotated[
         Align,
         typer.Option(
@@ -60,20 +60,39 @@ def evaluate(
             "positions are compared in metres and are not scaled.",
         ),
     ] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder or job file of the videos: count the delivered frames that the pictures confirm. No "
+            "truth is needed.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print all numbers as JSON.")] = False,
 ) -> None:
-    """Compare results with the true motion or the true camera paths.
+    """Compare results with the truth, or with the pictures themselves.
 
     For camera paths, the command prints ATE, RPE and coverage. For a motion, the command prints the errors of
     the joints. The files of a camera are found by their name, and all cameras are aligned together. A frame
     without a pose reduces the coverage.
 
+    With --video, features that the job did not use are matched in frames that are 1, 5, 15 and 45 apart, and
+    across lost frames. A frame is right if the matches join it to the largest set of frames whose relative
+    rotations and positions they confirm. It is wrong if they contradict it by more than 5 degrees, or if the
+    path leaps. Where they say nothing, the frame is not measurable.
+
     \b
     Examples:
+      bodycap evaluate out/my_walk --video my_walk/
       bodycap evaluate out/my_walk my_walk/gt
       bodycap evaluate camera.tum groundtruth.txt
       bodycap evaluate out/my_walk/motion.bvh mocap.bvh
     """  # noqa: D301 - \b keeps lines as they are
+    if video is not None:
+        _evaluate_with_pictures(estimate, video, as_json=as_json)
+        return
+    if truth is None:
+        raise JobError("neither the truth nor the videos are given", hint="add the truth, or --video FOLDER")
     pairs, motions = _trajectory_pairs(estimate, truth), _motion_pair(estimate, truth)
     reports: dict[str, Any] = {}
     if pairs:
@@ -92,6 +111,38 @@ def evaluate(
         return
     for line in _table_lines(values):
         print_line(line)
+
+
+def _evaluate_with_pictures(results: Path, video: Path, *, as_json: bool) -> None:
+    """Print how many delivered frames of each camera the pictures confirm."""
+    from bodycap_batch.capture import open_capture
+    from bodycap_batch.cli.job_places import find_job
+    from bodycap_batch.cli.progress_display import make_progress_display
+    from bodycap_batch.config.job import load_job
+    from bodycap_batch.config.overrides import Overrides
+    from bodycap_batch.core.progress import Event
+    from bodycap_batch.evaluate.picture_check import check_with_pictures, read_delivered, to_dict
+
+    delivered = read_delivered(results)
+    capture = open_capture(load_job(find_job(video).file, Overrides()).capture)
+    cameras = {camera.name: camera for camera in capture.cameras}
+    with make_progress_display(as_json=False) as display:
+
+        def show(name: str, done: int, total: int) -> None:
+            display(
+                Event(kind="progress", stage="evaluate", camera=name, done=done, total=total, what="frames")
+            )
+
+        found = to_dict(check_with_pictures(delivered, cameras, show))
+    if as_json:
+        print_json(found, indent=1)
+        return
+    print_line(f"{'camera':14}{'frames':>8}{'posed':>8}{'right':>8}{'wrong':>8}{'not measurable':>16}")
+    for name, each in found.items():
+        print_line(
+            f"{name:14}{each['frames']:>8}{each['delivered']:>8}{each['right']:>8}{each['wrong']:>8}"
+            f"{each['not_measurable']:>16}"
+        )
 
 
 def _evaluate_trajectories(

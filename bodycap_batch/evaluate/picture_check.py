@@ -1,0 +1,150 @@
+"""Measure how many delivered frames of a results folder the pictures confirm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.errors import JobError
+from bodycap_batch.evaluate.fresh_features import FrameFeatures, detect_features
+from bodycap_batch.evaluate.right_frames import RightFrames, find_right_frames, measure_pictures
+from bodycap_batch.evaluate.two_view import Outcome
+from bodycap_batch.formats.tum import TimedPoses, read_tum
+from bodycap_batch.model.camera import Camera
+
+_TIME_TOLERANCE = 0.25
+"""Maximum difference between the times of a pose and its frame, as a fraction of the frame interval."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeliveredCamera:
+    """What a results folder delivers of one camera.
+
+    Attributes:
+        poses: The delivered poses world_from_camera.
+        lens: The delivered intrinsics.
+    """
+
+    poses: TimedPoses
+    lens: Camera
+
+
+def read_delivered(results: Path) -> dict[str, DeliveredCamera]:
+    """Read the paths and the intrinsics of a results folder, by camera name.
+
+    The folder must hold ``trajectories/<camera>.tum`` and a COLMAP model in ``colmap/<n>/`` for each camera.
+    Cameras without a pose are left out.
+
+    Raises:
+        JobError: The folder holds no paths, or a file is malformed.
+    """
+    paths = sorted((results / "trajectories").glob("*.tum"))
+    if not paths:
+        raise JobError(
+            f"{results} holds no camera paths",
+            hint="give the folder of a finished job, with trajectories/<camera>.tum in it",
+        )
+    lenses = _lenses(results / "colmap")
+    poses = {path.stem: read_tum(path) for path in paths}
+    return {
+        name: DeliveredCamera(poses=found, lens=lenses[name])
+        for name, found in poses.items()
+        if name in lenses and len(found.times_ns)
+    }
+
+
+def _lenses(models: Path) -> dict[str, Camera]:
+    """Return the intrinsics of each camera from the largest model that has it."""
+    import pycolmap
+
+    lenses: dict[str, Camera] = {}
+    for folder in sorted(models.glob("*/"), key=lambda path: (len(path.name), path.name)):
+        scene = pycolmap.Reconstruction(str(folder))
+        for image in scene.images.values():
+            camera = image.camera
+            lens = Camera(
+                model=camera.model.name, width_px=camera.width, height_px=camera.height, params=camera.params
+            )
+            lenses.setdefault(image.name.rpartition("/")[0], lens)
+    return lenses
+
+
+def check_with_pictures(
+    delivered: Mapping[str, DeliveredCamera],
+    cameras: Mapping[str, CaptureCamera],
+    progress: Callable[[str, int, int], None],
+) -> dict[str, RightFrames]:
+    """Compare delivered poses with measurements in the pictures, for each camera.
+
+    Args:
+        delivered: Paths and intrinsics, by camera name.
+        cameras: The videos, by camera name. Cameras without a delivered path are not compared.
+        progress: Receives the camera's name, the number of finished frames and of all frames.
+
+    Raises:
+        JobError: A delivered camera has no video.
+    """
+    missing = sorted(set(delivered) - set(cameras))
+    if missing:
+        raise JobError(
+            f"there is no video of camera {', '.join(missing)}",
+            hint=f"the videos are of: {', '.join(sorted(cameras))}",
+        )
+    return {
+        name: _check_camera(each, cameras[name], partial(progress, name)) for name, each in delivered.items()
+    }
+
+
+def _check_camera(
+    delivered: DeliveredCamera, camera: CaptureCamera, progress: Callable[[int, int], None]
+) -> RightFrames:
+    poses = poses_of_frames(delivered.poses, camera)
+    count = len(poses)
+    features: list[FrameFeatures | None] = [None] * count
+    for index, image in camera.read_decodable(np.arange(count)):
+        features[index] = detect_features(image, delivered.lens.scaled(image.shape[1], image.shape[0]))
+        progress(index // 2, count)
+    posed = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    evidence = measure_pictures(features, posed, lambda done, total: progress((total + done) // 2, total))
+    return find_right_frames(evidence, poses)
+
+
+def poses_of_frames(poses: TimedPoses, camera: CaptureCamera) -> FloatArray:
+    """Return the pose (N,4,4) of each of the N frames of a video; NaN for a frame without a pose."""
+    out = np.full((len(camera.times_ns), 4, 4), np.nan)
+    if len(poses.times_ns) == 0:
+        return out
+    after = np.clip(np.searchsorted(poses.times_ns, camera.times_ns), 0, len(poses.times_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    apart = np.abs(np.stack([poses.times_ns[before], poses.times_ns[after]]) - camera.times_ns)
+    nearest = np.where(apart[0] < apart[1], before, after)
+    interval = np.median(np.diff(camera.times_ns)) if len(camera.times_ns) > 1 else 1e9
+    has_pose = apart.min(axis=0) <= _TIME_TOLERANCE * interval
+    out[has_pose] = poses.world_from_cam[nearest[has_pose]]
+    return out
+
+
+def to_dict(found: Mapping[str, RightFrames]) -> dict[str, Any]:
+    """Return the outcomes of all cameras as plain JSON values."""
+    return {
+        name: {
+            "frames": len(each.outcome),
+            "delivered": sum(outcome is not None for outcome in each.outcome),
+            **{_KEYS[outcome]: each.count(outcome) for outcome in Outcome},
+            "wrong_frames": [index for index, outcome in enumerate(each.outcome) if outcome is Outcome.WRONG],
+            "rotations": {_KEYS[outcome]: each.links.get(outcome, 0) for outcome in Outcome},
+            "positions": {_KEYS[outcome]: each.positions.get(outcome, 0) for outcome in Outcome},
+        }
+        for name, each in found.items()
+    }
+
+
+_KEYS = {Outcome.RIGHT: "right", Outcome.WRONG: "wrong", Outcome.UNMEASURABLE: "not_measurable"}
+"""Key of each outcome in the JSON values."""

@@ -1,0 +1,162 @@
+"""The right frames of a path: confirmed by fresh matches, without truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.evaluate.fresh_features import CELLS, FrameFeatures, detect_features, match_features
+from bodycap_batch.evaluate.right_frames import PictureEvidence, find_right_frames, measure_pictures
+from bodycap_batch.evaluate.two_view import Outcome
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert, make_transform, so3_exp, transform_points
+
+FRAMES = 120
+PIXEL_RAD = 1 / 500
+NOISE_PX = 0.5
+BORDER_FRAMES = 15
+"""Frames beside a break that may be joined to either side: the distance of frames whose parallax, 6 degrees
+here, shows it."""
+
+
+def true_path() -> FloatArray:
+    """A camera that walks along a wall at 4 m, 2.5 cm a frame, and looks to and fro by 15 degrees."""
+    time = np.arange(FRAMES)
+    yaw = np.deg2rad(15) * np.sin(time / 20)
+    turn = so3_exp(np.column_stack([np.zeros(FRAMES), yaw, 0.02 * np.sin(time / 7)]))
+    return make_transform(turn, np.column_stack([0.025 * time, 0.02 * np.sin(time / 5), 0 * time]))
+
+
+def pictures(path: FloatArray, seed: int = 0) -> list[FrameFeatures | None]:
+    """The features of points on a wall and on furniture before it, with noise and wrong descriptors."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack([rng.uniform(-5, 9, 900), rng.uniform(-3, 3, 900), rng.uniform(2.5, 4.5, 900)])
+    names = rng.integers(0, 256, (len(points), 32)).astype(np.uint8)
+    features: list[FrameFeatures | None] = []
+    for pose in path:
+        seen = transform_points(invert(pose), points)
+        plane = seen[:, :2] / seen[:, 2:] + NOISE_PX * PIXEL_RAD * rng.normal(size=(len(points), 2))
+        inside = (np.abs(plane[:, 0]) < 0.64) & (np.abs(plane[:, 1]) < 0.48)
+        descriptors = names[inside].copy()
+        replaced = rng.random(len(descriptors)) < 0.2
+        descriptors[replaced] = rng.integers(0, 256, (np.count_nonzero(replaced), 32))
+        rays = np.column_stack([plane[inside], np.ones(np.count_nonzero(inside))])
+        column = ((plane[inside, 0] + 0.64) / 1.28 * CELLS[0]).astype(np.int64)
+        row = ((plane[inside, 1] + 0.48) / 0.96 * CELLS[1]).astype(np.int64)
+        features.append(
+            FrameFeatures(
+                rays=rays / np.linalg.norm(rays, axis=1, keepdims=True),
+                cells=row * CELLS[0] + column,
+                descriptors=descriptors,
+                pixel_rad=np.full(len(rays), PIXEL_RAD),
+            )
+        )
+    return features
+
+
+@pytest.fixture(scope="module")
+def path() -> FloatArray:
+    return true_path()
+
+
+@pytest.fixture(scope="module")
+def evidence(path: FloatArray) -> PictureEvidence:
+    return measure_pictures(pictures(path), np.ones(FRAMES, dtype=bool))
+
+
+def outcomes(evidence: PictureEvidence, path: FloatArray) -> np.ndarray:
+    return np.array([str(each) for each in find_right_frames(evidence, path).outcome])
+
+
+def test_a_true_path_is_right(evidence: PictureEvidence, path: FloatArray) -> None:
+    found = find_right_frames(evidence, path)
+    assert found.count(Outcome.RIGHT) == FRAMES
+    assert found.links.get(Outcome.WRONG, 0) == 0
+    assert found.positions.get(Outcome.WRONG, 0) == 0
+    assert found.positions[Outcome.RIGHT] > 40
+
+
+def test_another_gauge_changes_nothing(evidence: PictureEvidence, path: FloatArray) -> None:
+    moved = make_transform(so3_exp([0.3, -1.0, 0.5]), [3.0, 1.0, -2.0]) @ path
+    moved[:, :3, 3] *= 0.07
+    assert (outcomes(evidence, moved) == "right").all()
+
+
+def test_noise_of_the_poses_is_no_error(evidence: PictureEvidence, path: FloatArray) -> None:
+    rng = np.random.default_rng(3)
+    noise = make_transform(so3_exp(np.deg2rad(0.3) * rng.normal(size=(FRAMES, 3))), np.zeros((FRAMES, 3)))
+    noisy = path @ noise
+    noisy[:, :3, 3] += 0.003 * rng.normal(size=(FRAMES, 3))
+    assert (outcomes(evidence, noisy) == "right").all()
+
+
+def fold(path: FloatArray) -> FloatArray:
+    """Turn a part of the path by 90 degrees about its first pose."""
+    start = path[60]
+    return start @ make_transform(so3_exp([0, np.pi / 2, 0]), np.zeros(3)) @ invert(start) @ path
+
+
+def leap(path: FloatArray) -> FloatArray:
+    moved = path.copy()
+    moved[:, :3, 3] += [0.3, 0.9, -0.5]
+    return moved
+
+
+def other_scale(path: FloatArray) -> FloatArray:
+    scaled = path.copy()
+    scaled[:, :3, 3] = path[60, :3, 3] + 2.5 * (path[:, :3, 3] - path[60, :3, 3])
+    return scaled
+
+
+@pytest.mark.parametrize("harm", [fold, leap, other_scale])
+def test_a_broken_path_is_found(
+    evidence: PictureEvidence, path: FloatArray, harm: Callable[[FloatArray], FloatArray]
+) -> None:
+    broken = np.concatenate([path[:60], harm(path)[60:]])
+    found = outcomes(evidence, broken)
+    assert (found[: 60 - BORDER_FRAMES] == "right").all()
+    assert (found[60 + BORDER_FRAMES :] == "wrong").all()
+
+
+def test_a_fold_across_lost_frames_is_found_from_the_rotations_between(path: FloatArray) -> None:
+    posed = np.ones(FRAMES, dtype=bool)
+    posed[40:95] = False
+    # Frames that are 45 apart have no pose across the gap, so only the chain of rotations can show the fold.
+    evidence = measure_pictures(pictures(path), posed)
+    delivered = np.where(posed[:, None, None], path, np.nan)
+    assert find_right_frames(evidence, delivered).count(Outcome.RIGHT) == np.count_nonzero(posed)
+    folded = delivered.copy()
+    folded[95:] = fold(path)[95:]
+    found = outcomes(evidence, folded)
+    assert (found[:40] == "right").all()
+    assert (found[40:95] == "None").all()
+    assert (found[95:] == "wrong").all()
+
+
+def test_without_matches_nothing_is_claimed(path: FloatArray) -> None:
+    blank: list[FrameFeatures | None] = [None] * FRAMES
+    found = find_right_frames(measure_pictures(blank, np.ones(FRAMES, dtype=bool)), path)
+    assert found.count(Outcome.UNMEASURABLE) == FRAMES
+
+
+def test_features_of_a_picture_are_spread_and_found_again() -> None:
+    rng = np.random.default_rng(0)
+    import cv2
+
+    image = cv2.GaussianBlur(rng.integers(0, 256, (480, 640)).astype(np.uint8), (0, 0), 2.0)
+    camera = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([500.0, 500, 320, 240]))
+    first = detect_features(image, camera)
+    assert len(np.unique(first.cells)) == CELLS[0] * CELLS[1]
+    moved = np.roll(image, 12, axis=1)
+    second = detect_features(moved, camera)
+    rows = match_features(first, second)
+    assert len(rows) > 300
+    shift = (
+        second.rays[rows[:, 1], 0] / second.rays[rows[:, 1], 2]
+        - first.rays[rows[:, 0], 0] / first.rays[rows[:, 0], 2]
+    )
+    # A shift of 12 px of 500 px; half a pixel of ORB's corners.
+    assert np.median(shift) == pytest.approx(12 / 500, abs=0.5 / 500)
