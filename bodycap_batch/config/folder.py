@@ -56,6 +56,9 @@ belongs to the results; it is not a job to run."""
 PARTIAL = "partial"
 """Name of the subfolder for the results of a job that did not finish. The subfolder holds the results without
 the skeleton that the job asks for, or only the report of a job without results."""
+_SYSTEM_MARKS = (".", "@", "#", "$")
+"""First characters of the names of folders that a system keeps for itself: hidden folders, and folders of
+network storage (@eaDir, #recycle) and of Windows ($RECYCLE.BIN)."""
 Recording = tuple[str, tuple[Path, ...]]
 """The name of a recording, and its videos in order."""
 _GOPRO = re.compile(r"^(G[HXPSLOT])(PR|[0-9]{2})([0-9]{4})$", re.IGNORECASE)
@@ -171,8 +174,21 @@ def shown_name(path: Path) -> str:
 
 
 def visible_entries(folder: Path) -> list[Path]:
-    """Return the files and folders in a folder that are not hidden, sorted by name."""
-    return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    """Return the files and folders in a folder that are not hidden, sorted by name.
+
+    Folders that a system keeps for itself are omitted, unless they have the name of a place on the body.
+    """
+    return sorted(
+        path
+        for path in folder.iterdir()
+        if not path.name.startswith(".")
+        and not (is_system_folder(path.name) and path.is_dir() and mount_of(path.name) is None)
+    )
+
+
+def is_system_folder(name: str) -> bool:
+    """Return True for the name of a folder that a system keeps for itself."""
+    return name.startswith(_SYSTEM_MARKS)
 
 
 def _has_chapters(folder: Path) -> bool:

@@ -329,6 +329,7 @@ def _resolved_job(
             camera.calibration_file for camera in cameras if camera.calibration_file is not None
         ),
         reasons=stated.beside.reasons,
+        unreadable=stated.beside.unreadable,
         unlisted=_reason_of_unlisted(stated),
         warnings=(
             *stated.beside.warnings,

@@ -127,6 +127,7 @@ class LoadedJob:
         job_file: The job file; None for a folder without a job file.
         calibration_files: The calibration files that were read.
         reasons: For each file or folder in the capture's folder that is known to be unused, the reason.
+        unreadable: For each video in the capture's folder that is not used and cannot be opened, the reason.
         unlisted: Reason why any other video in the capture's folder is not used.
         warnings: Sentences about what the user probably did not intend.
         no_body: Sentence that explains why no body is computed although the job does not say
@@ -139,6 +140,7 @@ class LoadedJob:
     job_file: Path | None
     calibration_files: frozenset[Path]
     reasons: Mapping[Path, str]
+    unreadable: Mapping[Path, str]
     unlisted: str
     warnings: tuple[str, ...]
     no_body: str

@@ -14,7 +14,14 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from bodycap_batch.config.folder import PHOTO_SUFFIXES, RUN_FILE, VIDEO_SUFFIXES, is_video, shown_name
+from bodycap_batch.config.folder import (
+    PHOTO_SUFFIXES,
+    RUN_FILE,
+    VIDEO_SUFFIXES,
+    is_system_folder,
+    is_video,
+    shown_name,
+)
 from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.formats.file_completeness import is_video_by_content, missing_part
@@ -24,9 +31,6 @@ _VIDEO_NAME = re.compile(rf"({'|'.join(map(re.escape, sorted(VIDEO_SUFFIXES)))})
 _SIDECAR_SUFFIXES = PHOTO_SUFFIXES | {".txt", ".csv", ".gcsv", ".json", ".yaml", ".yml", ".xml", ".bvh"}
 """Suffixes of files that are no videos although their names may contain that of a video, for example
 ``torso.mp4.timestamps.txt``."""
-_SYSTEM_MARKS = (".", "@", "#", "$")
-"""First characters of the names of folders that a system keeps for itself: hidden folders, and folders of
-network storage (@eaDir, #recycle) and of Windows ($RECYCLE.BIN)."""
 _HINT = (
     "copy the video again, remove this file, or state `cameras_only: true` in a job.yaml that lists the "
     "cameras to use"
@@ -56,7 +60,8 @@ class _ParsedName:
 
     Attributes:
         folder: The user's folder that holds the file, or that holds the folder of the system with the file.
-        video: The name of the video that the name contains; "" if there is none.
+        video: The name of the video that the name contains; "" if there is none, or if the file lies in a
+            folder of the system that is not hidden. Copying programs use hidden folders only.
         is_longer: True if something follows the name of the video.
         is_system: True if the file is hidden, or lies in a folder of the system.
         is_sidecar: True if the suffix is that of a file that is no video.
@@ -77,11 +82,6 @@ class _ParsedName:
 def names_video(name: str) -> bool:
     """Return True if a name contains the name of a video, or if it is one."""
     return _VIDEO_NAME.search(name) is not None
-
-
-def is_system_folder(name: str) -> bool:
-    """Return True for the name of a folder that a system keeps for itself."""
-    return name.startswith(_SYSTEM_MARKS)
 
 
 def relevant_files(files: Iterable[tuple[Path, str]]) -> list[tuple[Path, str]]:
@@ -154,20 +154,14 @@ def _videos_without_suffix(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def refuse_unreadable_video(path: Path) -> None:
-    """Refuse a video, or a folder with a video, that is beside the videos of a job and cannot be opened.
+def unreadable_videos(path: Path) -> dict[Path, str]:
+    """Return why a video, or a video in a folder, cannot be opened, for each such video.
 
-    Raises:
-        CaptureError: The structure of a video shows that no frame can be read.
+    A video cannot be opened if its structure shows that no frame can be read.
     """
-    for video in filter(is_video, _entries(path) if path.is_dir() else [path]):
-        part = missing_part(video, VIDEO_SUFFIXES)
-        if part is not None and not part.readable_bytes:
-            raise CaptureError(
-                f"this video beside the videos of the job cannot be opened: {part.text}",
-                path=video,
-                hint=_HINT,
-            )
+    videos = filter(is_video, _entries(path) if path.is_dir() else [path])
+    parts = {video: missing_part(video, VIDEO_SUFFIXES) for video in videos}
+    return {video: part.text for video, part in parts.items() if part is not None and not part.readable_bytes}
 
 
 def _may_hold_copies(folder: Path) -> bool:
@@ -203,14 +197,15 @@ def _relevant(files: Iterable[tuple[Path, str]]) -> list[tuple[Path, str, _Parse
 def _parsed(name: str) -> _ParsedName:
     parts = PurePosixPath(name).parts
     in_system = next((i for i, part in enumerate(parts[:-1]) if is_system_folder(part)), None)
+    is_hidden = parts[-1 if in_system is None else in_system].startswith(".")
     ends = [max((found.end() for found in _VIDEO_NAME.finditer(part)), default=0) for part in parts]
     # A download may be a folder with the name of the video (torso.mp4.download).
     longer = [i for i, (part, end) in enumerate(zip(parts, ends, strict=True)) if 0 < end < len(part)]
     place = longer[0] if longer and in_system is None else len(parts) - 1
     return _ParsedName(
         folder="/".join(parts[: place if in_system is None else in_system]),
-        video=parts[place][: ends[place]].lstrip(".~"),
+        video=parts[place][: ends[place]].lstrip(".~") if is_hidden or in_system is None else "",
         is_longer=bool(longer) and in_system is None,
-        is_system=in_system is not None or parts[-1].startswith("."),
+        is_system=is_hidden or in_system is not None,
         is_sidecar=PurePosixPath(name).suffix.lower() in _SIDECAR_SUFFIXES,
     )

@@ -22,7 +22,7 @@ from bodycap_batch.config.folder import (
 from bodycap_batch.config.models import CameraConfig
 from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.config.places import Places
-from bodycap_batch.config.unfinished_videos import refuse_missing_cameras, refuse_unreadable_video
+from bodycap_batch.config.unfinished_videos import refuse_missing_cameras, unreadable_videos
 from bodycap_batch.core.errors import CaptureError
 
 
@@ -34,11 +34,13 @@ class VideosBeside:
         cameras: The raw blocks of the cameras to add.
         reasons: For each video that is not used, the reason.
         warnings: Sentences about videos that the user probably wanted to use.
+        unreadable: For each of these videos that cannot be opened, the reason.
     """
 
     cameras: list[dict[str, object]] = field(default_factory=list)
     reasons: dict[Path, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    unreadable: dict[Path, str] = field(default_factory=dict)
 
     def leave_out(self, paths: Sequence[Path], reason: str, advice: str = "") -> None:
         """Record videos that are not used, with the reason.
@@ -52,7 +54,12 @@ class VideosBeside:
         if advice:
             names = ", ".join(shown_name(Path(path.name)) for path in paths)
             verb = "is" if len(paths) == 1 else "are"
-            self.warnings.append(f"{names} {verb} not used: {reason}; {advice}")
+            unreadable = {video: why for path in paths for video, why in unreadable_videos(path).items()}
+            what = "".join(
+                f"; {shown_name(Path(v.name))} cannot be opened: {w}" for v, w in unreadable.items()
+            )
+            self.warnings.append(f"{names} {verb} not used: {reason}; {advice}{what}")
+            self.unreadable.update(unreadable)
 
 
 def find_videos_beside(
@@ -71,8 +78,7 @@ def find_videos_beside(
 
     Raises:
         CaptureError: The folder cannot be read. Or a symbolic link to a video leads nowhere, and its name is
-            the name of a camera that the job file does not list. Or a file is an unfinished copy of a video,
-            or a video that is left out cannot be opened.
+            the name of a camera that the job file does not list. Or a file is an unfinished copy of a video.
     """
     folder, found = job_file.parent, VideosBeside()
     refuse_missing_cameras(folder, [folder / video for camera in listed for video in camera.video])
@@ -103,10 +109,6 @@ def find_videos_beside(
             found.leave_out(paths, reason, f"rename it (for example to left_palm.mp4), {advice}")
         else:
             found.cameras.append(block)
-    videos = {path for _, paths in recordings for path in paths}
-    for path in found.reasons:
-        if path in videos or is_video(path):
-            refuse_unreadable_video(path)
     return found
 
 

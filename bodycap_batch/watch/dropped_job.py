@@ -10,14 +10,15 @@ from pathlib import Path
 
 import yaml
 
-from bodycap_batch.capture.video import COPY_AGAIN
-from bodycap_batch.config.folder import VIDEO_SUFFIXES, job_file_in
+from bodycap_batch.config.folder import job_file_in
 from bodycap_batch.config.job import load_job, load_job_with_origins, safe_name
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, Job
+from bodycap_batch.config.origins import LoadedJob
 from bodycap_batch.config.trust import PathPolicy
+from bodycap_batch.config.unfinished_videos import unreadable_videos
 from bodycap_batch.core.errors import CaptureError, JobError, StoreError
-from bodycap_batch.formats.file_completeness import NO_VIDEO, missing_part
+from bodycap_batch.formats.file_completeness import NO_VIDEO
 from bodycap_batch.pipeline.results import write_results_file
 from bodycap_batch.watch.inbox_entries import YAML_SUFFIXES, EntrySnapshot, InboxEntry
 from bodycap_batch.watch.spool import JobDir, visible_entries
@@ -92,7 +93,7 @@ def read_dropped_job(
         # the name of the entry.
         job = job.model_copy(update={"name": safe_name(entry.name)})
     _require_video_sizes(job, permissions.limits)
-    _require_readable_videos(job)
+    _require_readable_videos(loaded)
     capture = job.capture.model_copy(update={"synthetic": None})
     return job.model_copy(update={"capture": capture}), loaded.warnings_of_run()
 
@@ -246,16 +247,19 @@ def _require_video_sizes(job: Job, limits: Limits) -> None:
                 )
 
 
-def _require_readable_videos(job: Job) -> None:
-    """Raise `CaptureError` for a video whose structure shows that no frame can be read from it."""
-    for index, camera in enumerate(job.capture.cameras):
-        for path in camera.video:
-            part = missing_part(path, VIDEO_SUFFIXES)
-            # FFmpeg knows more kinds of video than `missing_part`.
-            if part is not None and not part.readable_bytes and part.text != NO_VIDEO:
-                raise CaptureError(
-                    f"the video is not complete: {part.text}",
-                    path=path,
-                    field=f"capture.cameras.{index}.video",
-                    hint=COPY_AGAIN,
-                )
+def _require_readable_videos(loaded: LoadedJob) -> None:
+    """Raise `CaptureError` for a video whose structure shows that no frame can be read from it.
+
+    Videos that the job leaves out with a warning are checked, too: nobody reads the warning before the
+    result is there.
+    """
+    found = dict(loaded.unreadable)
+    for path in (path for camera in loaded.job.capture.cameras for path in camera.video):
+        # FFmpeg knows more kinds of video than the structure of a file tells.
+        found.update({video: why for video, why in unreadable_videos(path).items() if why != NO_VIDEO})
+    for path, reason in found.items():
+        raise CaptureError(
+            f"this video cannot be opened: {reason}",
+            path=path,
+            hint="copy the video again, or remove it",
+        )

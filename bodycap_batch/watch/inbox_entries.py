@@ -11,9 +11,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bodycap_batch.config.folder import shown_name
+from bodycap_batch.config.folder import is_system_folder, shown_name
 from bodycap_batch.config.unfinished_videos import (
-    is_system_folder,
     names_video,
     relevant_files,
     unfinished_files,

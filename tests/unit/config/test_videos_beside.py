@@ -392,8 +392,10 @@ def test_a_camera_whose_file_is_there_is_never_left_out_silently(
         ("head.heic", b"\0\0\0\x0cftypheic"),
         ("head.txt", b"FLV is a kind of video"),
         ("notes on the head.docx", b"PK"),
-        ("torso.mp4.mp4", unopened()),
         ("out/head.mp4.part", b"anything"),
+        ("#recycle/head.mp4", unopened()),
+        ("@Recycle/GX010042.MP4", unopened()[:-1]),
+        ("@eaDir/torso.mp4@SynoEAStream", b"anything"),
     ],
 )
 def test_other_files_beside_the_videos_are_no_reason_to_refuse_a_job(
@@ -402,8 +404,16 @@ def test_other_files_beside_the_videos_are_no_reason_to_refuse_a_job(
     root = folder(tmp_path, "torso.mp4", "left_palm.mp4")
     (root / name).parent.mkdir(exist_ok=True)
     (root / name).write_bytes(content)
+    assert set(cameras(load_job(root))) == {"torso", "left_palm"}
     (root / "job.yaml").write_text(TORSO)
-    assert set(cameras(load_job(root))) >= {"torso", "left_palm"}
+    loaded = load_job_with_origins(root)
+    assert set(cameras(loaded.job)) >= {"torso", "left_palm"}
+    assert loaded.warnings == ()
+
+
+def test_a_video_with_two_suffixes_is_a_video(tmp_path: Path) -> None:
+    root = folder(tmp_path, "left_palm.MP4.mov")
+    assert [path.name for path in load_job(root).capture.cameras[0].video] == ["left_palm.MP4.mov"]
 
 
 def test_a_listed_file_may_have_any_name(tmp_path: Path) -> None:
@@ -414,12 +424,15 @@ def test_a_listed_file_may_have_any_name(tmp_path: Path) -> None:
     assert cameras(load_job(root)) == {"torso": ["torso.mp4.bak"], "head": ["head.flv"]}
 
 
-def test_a_video_that_is_left_out_and_cannot_be_opened_is_an_error(tmp_path: Path) -> None:
-    root = folder(tmp_path, "torso.mp4", "GX010042.MP4")
+def test_a_warning_says_that_a_video_cannot_be_opened(tmp_path: Path) -> None:
+    root = folder(tmp_path, "torso.mp4", "GX010042.MP4", "cam7/GX010043.MP4")
     (root / "job.yaml").write_text(TORSO)
-    assert len(load_job_with_origins(root).warnings) == 1
-    (root / "GX010042.MP4").write_bytes(unopened()[:-1])
-    with pytest.raises(CaptureError, match="cannot be opened: its end is missing"):
-        load_job(root)
+    assert not any("opened" in warning for warning in load_job_with_origins(root).warnings)
+    for name in ("GX010042.MP4", "cam7/GX010043.MP4"):
+        (root / name).write_bytes(unopened()[:-1])
+    loaded = load_job_with_origins(root)
+    for name, warning in zip(("GX010042.MP4", "GX010043.MP4"), sorted(loaded.warnings), strict=True):
+        assert f"{name} cannot be opened: its end is missing" in warning
+    assert set(loaded.unreadable) == {root / "GX010042.MP4", root / "cam7" / "GX010043.MP4"}
     (root / "job.yaml").write_text(ONLY)
     assert load_job_with_origins(root).warnings == ()

@@ -301,7 +301,7 @@ def test_a_video_beside_the_listed_ones_that_cannot_be_opened_is_named(
     assert tracker.incomplete[walk].startswith("GX010042.MP4 is not complete: ")
     clock.now += 1
     ((entry, snapshot),) = tracker.complete_entries(entries_in(tmp_path))
-    with pytest.raises(CaptureError, match="beside the videos of the job cannot be opened") as caught:
+    with pytest.raises(CaptureError, match="this video cannot be opened") as caught:
         read_dropped_job(entry, snapshot, JobPermissions())
     assert caught.value.path == str(walk / "GX010042.MP4")
 
@@ -315,7 +315,7 @@ def test_a_video_of_a_job_that_cannot_be_opened_fails_before_the_job_runs(
     (walk / "torso.mp4").write_bytes(unopened())
     (walk / "head.mp4").write_bytes(content)
     entry = InboxEntry(walk)
-    with pytest.raises(CaptureError, match="the video is not complete") as caught:
+    with pytest.raises(CaptureError, match="this video cannot be opened") as caught:
         read_dropped_job(entry, take_snapshot(entry, 100), JobPermissions())
     assert caught.value.path == str(walk / "head.mp4")
 
