@@ -42,6 +42,7 @@ _BOX_HEADER, _LONG_BOX_HEADER = 8, 16
 _EBML, _SEGMENT = 0x1A45DFA3, 0x18538067
 """Identifiers of elements of Matroska: the header of the file, and its content."""
 _EBML_BYTES = _EBML.to_bytes(4, "big")
+"""First bytes of a Matroska or WebM file."""
 _MAX_VINT_BYTES = 8
 """Maximum length (bytes) of a number of variable length. Source: RFC 8794, section 4."""
 _RIFF_HEADER = 12
