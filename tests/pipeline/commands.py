@@ -130,14 +130,13 @@ class Site:
 def make_site(folder: Path, reference: Place) -> Site:
     """Copy the videos and the store of a job that has been run, and make the files that the pages name."""
     site = Site(folder)
-    link = {"copy_function": os.link}
-    shutil.copytree(reference.store, folder / "stored", **link)
-    shutil.copytree(reference.folder / "capture", folder / "capture", **link)
+    shutil.copytree(reference.store, folder / "stored")  # a linked lock would be that of the other store
+    shutil.copytree(reference.folder / "capture", folder / "capture", copy_function=os.link)
     (folder / "my_walk").mkdir()
     for name in ("torso.mp4", "left_palm.mp4", "calib.json"):
         shutil.copy(folder / "capture" / name, folder / "my_walk" / name)
     (folder / "cpl_lab.yaml").write_text(JOB)
-    shutil.copytree(folder / "capture" / "gt", folder / "examples" / "cpl_lab" / "gt", **link)
+    shutil.copytree(folder / "capture" / "gt", folder / "examples" / "cpl_lab" / "gt")
     for name in ("mocap.bvh", "walk.bvh"):
         shutil.copy(folder / "capture" / "gt" / "motion.bvh", folder / name)
     board = board_clip(
