@@ -14,6 +14,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.copied_frames import find_pictures
 from bodycap_batch.model.frame_matches import FrameMatcher
 from bodycap_batch.model.frozen_frames import find_frozen_frames, picture_change_px
 from bodycap_batch.model.optical_flow import (
@@ -52,6 +53,9 @@ Evidence: none."""
 _NOISE_SAMPLES = 20_000
 """Approximate number of samples from which the tracking noise is estimated. Each sample is one corner tracked
 forward and backward. More samples do not change the estimate."""
+_MIN_NOISE_CHANGE_PX = 0.1
+"""Minimum change of a picture, px of the reduced image, for a sample of the tracking noise. In a copy of the
+picture, points are tracked without error. Evidence: docs/decisions/keyframes.md."""
 _RAYLEIGH_MEDIAN = 1.177
 """Ratio of the median of a Rayleigh distribution to its scale parameter sigma: sqrt(2 ln 2)."""
 
@@ -149,7 +153,8 @@ class _KeyframeTracker:
         self.largest_shift_px = max(
             self.largest_shift_px, since_keyframe if np.isfinite(since_keyframe) else np.inf
         )
-        if self.kept_samples < _NOISE_SAMPLES:
+        is_copy = bool(self.round_trips) and self.change_px < _MIN_NOISE_CHANGE_PX
+        if self.kept_samples < _NOISE_SAMPLES and not is_copy:
             self.round_trips.append(flow.round_trip_px[flow.ok] * self._full_scale(image))
             self.kept_samples += int(flow.ok.sum())
         self.image = image
@@ -235,7 +240,8 @@ def select_keyframes(
 
     Returns:
         The frame indices of the keyframes, the sharpness of every frame, the tracking noise and the damaged
-        frames. Damaged frames are not selected.
+        frames. Damaged frames are not selected. If the video has copies of frames, the indices count the
+        other frames only, which are listed in `pictures`.
 
     Raises:
         CaptureError: The camera has no frames, or all its frames are damaged.
@@ -309,7 +315,7 @@ def select_keyframes(
         motion_px=tracker.motion_px(),
         matches=matcher.matches(),
         blur_px=np.zeros(0) if blur_px is None else blur_px,
-    )
+    ).only(find_pictures(change_px, shift_px, camera.times_ns))
 
 
 def _frame_matcher(camera: CaptureCamera, mask: BoolArray | None, *, with_matches: bool) -> FrameMatcher:

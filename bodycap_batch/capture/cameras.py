@@ -24,6 +24,7 @@ from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.camera_clock import ClockRelation
+from bodycap_batch.model.copied_frames import Pictures
 from bodycap_batch.model.wearer_view import WearerView
 
 if TYPE_CHECKING:
@@ -105,6 +106,17 @@ class CaptureCamera:
     def common_times_ns(self) -> IntArray:
         """Return the frame times (N,) on the common clock, nanoseconds."""
         return self.clock.common_ns(self.times_ns)
+
+    def only(self, pictures: Pictures | None) -> CaptureCamera:
+        """Return the camera without the frames that are copies of the frame before; unchanged for None."""
+        if pictures is None:
+            return self
+        return replace(
+            self,
+            frame_numbers=self.frame_numbers[pictures.frames],
+            times_ns=pictures.times_ns,
+            nominal_fps=1e9 / float(np.median(np.diff(pictures.times_ns))),
+        )
 
     def is_unmasked(self, px: npt.NDArray[Any], frame: int | IntArray) -> BoolArray:
         """Find the pixels at which the room is visible.

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bodycap_batch.capture.video import COPY_AGAIN, VideoFile, error_reason, open_container, video_stream
+from bodycap_batch.capture.video import (
+    COPY_AGAIN,
+    VideoFile,
+    error_reason,
+    is_frame,
+    open_container,
+    video_stream,
+)
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import CaptureError
 
@@ -79,7 +86,7 @@ def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
     """
     import av
 
-    with open_container(video.path) as container:
+    with open_container(video.path, video.part) as container:
         stream = open_stream(container, video, threads)
         first: VideoFrame | None = None
         try:
@@ -135,9 +142,10 @@ class _ForwardDecoder:
 
     def __init__(self, video: VideoFile, indices: IntArray | None, threads: int) -> None:
         self.position = -1
-        self.sequential = indices is None or video.is_counted
+        # After a restart, a time in the file does not name one place in the file.
+        self.sequential = indices is None or video.is_counted or bool(video.restarts)
         self._video = video
-        self._container = open_container(video.path)
+        self._container = open_container(video.path, video.part)
         self._stream = open_stream(self._container, video, threads)
         # Frames are skipped only in H.264 that is not interlaced. The two halves of an interlaced frame may
         # be in separate packets, and the decoder of AV1 loses the first frame if it skips frames.
@@ -189,7 +197,12 @@ class _ForwardDecoder:
         """
         import av
 
+        restarts, shift, number = dict(self._video.restarts), 0, 0
         for packet in self._container.demux(self._stream):
+            if restarts and is_frame(packet):
+                shift = restarts.get(number, shift)
+                number += 1
+                packet.pts = (packet.pts or 0) + shift
             if self._needed_pts is not None:
                 needed = packet.pts is None or packet.pts in self._needed_pts
                 self._stream.codec_context.skip_frame = "DEFAULT" if needed else "NONREF"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
 from fractions import Fraction
@@ -11,11 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bodycap_batch.capture.capture_rate import capture_fps
 from bodycap_batch.capture.decoding import first_frame
+from bodycap_batch.capture.joined_files import parts_of
+from bodycap_batch.capture.packet_order import PacketTimes, sort_packets
 from bodycap_batch.capture.video import (
     COPY_AGAIN,
     VideoFile,
     error_reason,
+    is_frame,
     open_container,
     orientation_from_frame,
     video_stream,
@@ -34,18 +39,35 @@ recording, and far below the largest number of nanoseconds in 64 bits."""
 _MIN_PIXEL_ASPECT = Fraction(2, 5)
 """Minimum plausible pixel aspect, width over height. The maximum is the inverse of this value. Origin: HDV
 and AVCHD have 4:3; television and anamorphic lenses have pixel aspects between 1:2 and 2:1."""
+_NO_ZERO = 0x200
+"""Flag of containers whose times start at an arbitrary number: MPEG transport and program streams. Origin:
+FFmpeg's AVFMT_TS_DISCONT."""
 _SQUARE_TOLERANCE = 0.004
 """Maximum difference of the pixel aspect from 1. With a smaller difference, the pixels are treated as square.
 Origin: image sizes are rounded to even numbers. Resampling would blur every image to correct an error of less
 than one pixel."""
 
 
-def index_video(path: Path, threads: int = 0) -> VideoFile:
+def index_videos(paths: Iterable[Path], threads: int = 0) -> tuple[VideoFile, ...]:
+    """List the frames of the chapters of a camera. A file of several recordings gives several chapters.
+
+    Args:
+        paths: Paths of the video files.
+        threads: Number of threads of the decoder, as in `open_stream`.
+
+    Raises:
+        CaptureError: A file cannot be used: see `index_video`.
+    """
+    return tuple(index_video(path, threads, part) for path in paths for part in parts_of(path))
+
+
+def index_video(path: Path, threads: int = 0, part: tuple[int, int] | None = None) -> VideoFile:
     """List the frames of a video. Only one frame is decoded, to read its size and orientation.
 
     Args:
         path: Path of the video file.
         threads: Number of threads of the decoder, as in `open_stream`.
+        part: First byte, and the byte after the last byte, of the recording in the file; None for all bytes.
 
     A video whose end is missing is used up to its last whole frame, unless an index of the whole file shows
     that the file was not copied completely.
@@ -54,16 +76,20 @@ def index_video(path: Path, threads: int = 0) -> VideoFile:
         CaptureError: There is no video stream, there are no frames, the timestamps are implausible, or the
             file contains fewer frames than its index lists.
     """
-    part = missing_part(path.resolve())
-    missing_end = part.text if part is not None and part.readable_bytes else ""
-    with open_container(path) as container:
+    missing = missing_part(path.resolve())
+    missing_end = missing.text if missing is not None and missing.readable_bytes else ""
+    with open_container(path, part) as container:
         stream = video_stream(container, path)
         container_format = container.format.name
         # An MP4 file has an index of all packets. The length of the index is read before demuxing, because
         # demuxing adds entries to the index.
         expected = len(stream.index_entries) if "mp4" in container_format and not missing_end else 0
-        pts, key_pts, end, is_cut = _scan_packets(path, container, stream, expected)
+        packets, is_cut = _scan_packets(path, container, stream, expected)
+        pts = packets.pts
         metadata = {**container.metadata, **stream.metadata}
+        sound_s = max(
+            (float((s.duration or 0) * (s.time_base or 0)) for s in container.streams.audio), default=0
+        )
         time_base, rate = Fraction(stream.time_base or 0), stream.average_rate or stream.guessed_rate
         pixel_aspect = _pixel_aspect(stream.sample_aspect_ratio)
     if max(abs(int(pts[0])), abs(int(pts[-1]))) * time_base > _MAX_SECONDS or time_base <= 0:
@@ -73,23 +99,28 @@ def index_video(path: Path, threads: int = 0) -> VideoFile:
     video = VideoFile(
         path=path,
         pts=pts,
-        key_pts=key_pts,
+        key_pts=packets.key_pts,
         time_base=time_base,
         fps=_nominal_fps(pts, time_base, rate),
-        duration_ns=round((end - int(pts[0])) * time_base * 1_000_000_000),
+        duration_ns=round((packets.end - int(pts[0])) * time_base * 1_000_000_000),
         stored_size=(0, 0),
         orientation=((1, 0), (0, 1)),
         created_s=_creation_time(metadata),
         focal_35mm=_focal_35mm(metadata),
         missing_end=missing_end or ("its last frame is cut" if is_cut else ""),
         pixel_aspect=pixel_aspect,
+        restarts=packets.restarts,
+        start_pts=packets.start,
+        capture_fps=capture_fps(metadata, path),
+        sound_s=sound_s,
+        part=part,
     )
-    return _with_first_frame(video, container_format, threads)
+    return _with_lost_frames(_with_first_frame(video, container_format, threads), packets.lost)
 
 
 def _scan_packets(
     path: Path, container: InputContainer, stream: Any, expected: int
-) -> tuple[IntArray, IntArray, int, bool]:
+) -> tuple[PacketTimes, bool]:
     """Read the timestamps of all packets of a video stream. A last packet that is cut is left out.
 
     Args:
@@ -99,27 +130,25 @@ def _scan_packets(
         expected: Minimum number of packets; a smaller number means that the file is truncated.
 
     Returns:
-        The timestamps of all frames, the timestamps of the key frames, and the end time of the last frame,
-        all in units of the stream's time base; and whether the last packet is cut.
+        The times of the frames; whether the last packet is cut.
     """
     import av
 
-    pts: list[int] = []
-    ends: list[int] = []
-    is_key: list[bool] = []
-    read, is_cut = 0, False
+    frames: list[tuple[int, int, bool]] = []
+    first_dts: int | None = None
+    read, untimed, is_cut = 0, 0, False
     try:
         for packet in container.demux(stream):
             read += packet.size > 0
-            if packet.pts is None or packet.is_discard or packet.size == 0:
-                continue
-            pts.append(packet.pts)
-            ends.append(packet.pts + (packet.duration or 0))
-            is_key.append(packet.is_keyframe)
-            is_cut = packet.is_corrupt
+            if is_frame(packet):
+                first_dts = first_dts if frames else packet.dts
+                frames.append((packet.pts, packet.duration or 0, packet.is_keyframe))
+                is_cut = packet.is_corrupt
+            elif packet.size > 0 and packet.pts is None:
+                untimed += 1
     except av.error.FFmpegError as error:
         raise CaptureError(
-            f"the video cannot be read after {len(pts)} frames ({error_reason(error)})",
+            f"the video cannot be read after {len(frames)} frames ({error_reason(error)})",
             path=path,
             hint=COPY_AGAIN,
         ) from error
@@ -129,14 +158,12 @@ def _scan_packets(
             f"{read} of these frames"
         )
         raise CaptureError(message, path=path, hint=COPY_AGAIN)
-    if not pts:
+    if not frames:
         raise CaptureError("the video contains no frame", path=path, hint=COPY_AGAIN)
-    whole = slice(len(pts) - 1 if is_cut and len(pts) > 1 else len(pts))
-    packet_pts, end = np.array(pts[whole], dtype=np.int64), max(ends[whole])
-    frame_pts, key_pts = np.unique(packet_pts), np.unique(packet_pts[is_key[whole]])
-    if len(frame_pts) > 1 and end <= int(frame_pts[-1]):
-        end = int(frame_pts[-1]) + int(np.median(np.diff(frame_pts)))
-    return frame_pts, key_pts, end, is_cut
+    whole = frames[:-1] if is_cut and len(frames) > 1 else frames
+    has_zero = not container.format.flags & _NO_ZERO
+    packets = sort_packets(np.array(whole, dtype=np.int64), first_dts, untimed, has_zero=has_zero)
+    return packets, is_cut
 
 
 def _nominal_fps(pts: IntArray, time_base: Fraction, rate: Fraction | None) -> float:
@@ -180,6 +207,19 @@ def _focal_35mm(metadata: dict[str, str]) -> float | None:
                 value = float(text)
                 return value if 5.0 < value < 300.0 else None
     return None
+
+
+def _with_lost_frames(video: VideoFile, lost: int) -> VideoFile:
+    """Return the video with a note about frames without a time of their own.
+
+    The two halves of an interlaced frame may be in two packets, and the second packet needs no time.
+    """
+    if not lost or video.is_interlaced:
+        return video
+    text = (
+        f"{lost} of {len(video.pts) + lost} frames have no time, or that of another frame: they are left out"
+    )
+    return replace(video, notes=(*video.notes, text))
 
 
 def _with_first_frame(video: VideoFile, container_format: str, threads: int) -> VideoFile:

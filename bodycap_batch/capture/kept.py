@@ -6,7 +6,7 @@ The work size is the image size that all stages work at. A frame with a stored c
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +19,7 @@ from bodycap_batch.capture.images import Colours, Image, Planes, work_image
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
 from bodycap_batch.formats.mp4_writer import TIME_BASE_HZ, Quality, VideoWriter
+from bodycap_batch.model.copied_frames import Pictures
 
 KEPT_NAME = "kept"
 """Name of the stored `KeptFrames` in a keyframe artefact, and name of the video file with the copies."""
@@ -44,7 +45,7 @@ class KeptFrames:
 
     Attributes:
         path: Path of the video with the copies.
-        frames: (K,) indices of the kept frames among the frames of the camera, increasing.
+        frames: (K,) indices of the kept frames among the frames of the camera, not decreasing.
         width_px: Width of the copies at the camera's work size, pixels.
         height_px: Height of the copies at the camera's work size, pixels.
         group: Number of frames from one codec key frame to the next (GOP length).
@@ -58,6 +59,16 @@ class KeptFrames:
 
     def __post_init__(self) -> None:
         set_array(self, "frames", (len(self.frames),), np.int64)
+
+    def only(self, pictures: Pictures | None) -> KeptFrames:
+        """Return the kept frames with indices among the frames that are no copies; unchanged for None.
+
+        A kept copy gets the index of its original.
+        """
+        if pictures is None:
+            return self
+        index = np.searchsorted(pictures.frames, self.frames, side="right") - 1
+        return replace(self, frames=index)
 
     def holds(self, indices: IntArray) -> BoolArray:
         """Return a mask (N,) that is True where the frame with the given index (N,) is kept."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from bodycap_batch.capture.cameras import Capture, CaptureCamera
-from bodycap_batch.capture.frame_index import index_video
+from bodycap_batch.capture.frame_index import index_videos
 from bodycap_batch.capture.initial_intrinsics import guessed_camera, work_camera, work_size_of
 from bodycap_batch.capture.lens_choice import chosen_lens
 from bodycap_batch.capture.masks import read_mask
@@ -17,6 +17,10 @@ from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.arrays import BoolArray, IntArray
 from bodycap_batch.core.errors import CaptureError
+
+_MAX_RATE_CHANGE = 1.5
+"""Maximum ratio of the nominal frame rate to the rate of the frame times, or its inverse, at which the former
+is kept. Origin: cameras drop frames, and slow motion has a ratio of 2 or more."""
 
 
 def open_capture(spec: CaptureConfig, threads: int = 0) -> Capture:
@@ -45,7 +49,7 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         CaptureError: A video of the camera, its timestamps or its calibration cannot be used, or there is no
             frame between start_s and end_s.
     """
-    videos = tuple(index_video(path, threads) for path in config.video)
+    videos = index_videos(config.video, threads)
     _check_one_format(videos)
     timeline = join_chapters(videos, config.timestamps)
     used = timeline.usable
@@ -71,7 +75,7 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         calibrated=calibration is not None,
         frame_numbers=np.flatnonzero(used),
         times_ns=timeline.times_ns[used],
-        nominal_fps=videos[0].fps,
+        nominal_fps=_real_fps(videos[0], timeline.times_ns),
         rolling_shutter_s=_shown_rolling_shutter_s(config.rolling_shutter_s or 0.0, videos[0]),
         rolling_shutter_known=config.rolling_shutter_s is not None,
         # Sensors are wider than they are high. Therefore a picture that is higher than wide was rotated by
@@ -80,6 +84,7 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         notes=(
             *_missing_end_notes(videos),
             *timeline.notes,
+            *_late_start_notes(spec, config, timeline.times_ns),
             *([] if lens is None or not lens.note else [lens.note]),
         ),
         videos=videos,
@@ -95,6 +100,26 @@ def _missing_end_notes(videos: tuple[VideoFile, ...]) -> list[str]:
         f"{video.length_s:.2f} s: to get the rest, copy the video again from the camera's card"
         for video in videos
         if video.missing_end
+    ]
+
+
+def _real_fps(video: VideoFile, times_ns: IntArray) -> float:
+    """Return the nominal frame rate of the file, or the rate of the frame times if it is much different."""
+    steps = np.diff(times_ns[: len(video.pts)])
+    if not len(steps):
+        return video.fps
+    fps = 1e9 / float(np.median(steps))
+    return video.fps if fps / _MAX_RATE_CHANGE < video.fps < fps * _MAX_RATE_CHANGE else fps
+
+
+def _late_start_notes(spec: CaptureConfig, config: CameraConfig, times_ns: IntArray) -> list[str]:
+    """Return a note if clocks are stated to agree, and the file states that its first frame is late."""
+    late_s = float(times_ns[0]) / 1e9
+    if spec.clocks != "common" or config.offset_s or config.timestamps or not late_s:
+        return []
+    return [
+        f"the first picture is {late_s:.3f} s after the start of the file, as the file states, and this is "
+        f"used. If the first pictures of all videos show the same moment, set offset_s: {-late_s:.3f}"
     ]
 
 

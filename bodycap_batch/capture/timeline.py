@@ -6,28 +6,22 @@ The times come from the container of each video, or from sidecar files: text fil
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
+from bodycap_batch.capture.capture_rate import slow_motion
+from bodycap_batch.capture.sidecar_times import sidecar_times
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.core.errors import CaptureError
 
 _NS = 1_000_000_000
 """Nanoseconds per second."""
-_MAX_BYTES = 256 << 20
-"""Maximum size, bytes, of a sidecar file that is read."""
 _CLOCK_RESOLUTION_NS = 2 * _NS
 """Maximum error, nanoseconds, of the difference between the creation times of two files. Creation times are
 rounded to whole seconds. In addition, they are the time at which the camera began to write the file, not the
 time of the first exposure."""
-_MAX_ABS_NS = 1 << 62
-"""Maximum absolute value, nanoseconds, of a timestamp; about 146 years. With this limit, sums of times and
-offsets fit into 64 bits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +32,8 @@ class Timeline:
         times_ns: (N,) time of every frame on the clock of the camera, nanoseconds.
         usable: (N,) True if the frame is later than all earlier frames. Otherwise the chapter of the frame
             repeats the end of the previous chapter, and the frame is not used.
-        notes: Notes for the user about gaps and overlaps between chapters.
+        notes: Notes for the user about times that contradict each other, and about gaps and overlaps between
+            chapters.
     """
 
     times_ns: IntArray
@@ -81,71 +76,14 @@ def clock_of_chapter(file_ns: IntArray, camera_ns: IntArray) -> ChapterClock:
     return ChapterClock(1.0 + slope, shift_s + constant - slope * float(file_ns[0]) / 1e9)
 
 
-def read_timestamps(path: Path) -> IntArray:
-    """Read a sidecar file, which contains the time in seconds of one frame on each line.
-
-    Empty lines and comments, which start with ``#``, are ignored.
-
-    Returns:
-        (N,) times, nanoseconds.
-
-    Raises:
-        CaptureError: The file cannot be read, a line is not a number, or a time is not later than the
-            previous time. The error names the line.
-    """
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise CaptureError(
-                "the file is too large for a file of timestamps",
-                path=path,
-                hint="write one time in seconds on each line",
-            )
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise CaptureError(
-            f"the timestamps cannot be read ({error})",
-            path=path,
-            hint="give a text file with one time in seconds on each line",
-        ) from error
-    times: list[int] = []
-    for number, line in enumerate(lines, start=1):
-        text = line.split("#", 1)[0].strip()
-        if text:
-            times.append(_parse_seconds(text, path, number))
-            if len(times) > 1 and times[-1] <= times[-2]:
-                raise CaptureError(
-                    f"time {text} is not later than the previous time",
-                    path=path,
-                    line=number,
-                    hint="write one time in seconds for each frame; each time must be later than the time "
-                    "before",
-                )
-    return np.array(times, dtype=np.int64)
-
-
-def _parse_seconds(text: str, path: Path, line: int) -> int:
-    """Convert a text with seconds to nanoseconds, exactly.
-
-    A float64 is not used, because its resolution for Unix times is only 200 ns.
-    """
-    try:
-        value = Decimal(text)
-        if value.is_finite() and abs(value.adjusted()) < 12 and abs(value * _NS) < _MAX_ABS_NS:
-            return round(value * _NS)
-    except InvalidOperation:
-        pass
-    raise CaptureError(
-        f"{text[:40]!r} is not a time in seconds", path=path, line=line, hint="write one number on each line"
-    )
-
-
 def join_chapters(videos: tuple[VideoFile, ...], sidecars: tuple[Path, ...]) -> Timeline:
     """Compute the times of the frames of all chapters on the clock of the camera.
 
-    Sidecar files have priority over the containers. Without sidecar files, the timestamps of the containers
-    are used. If the timestamps of a chapter start again at zero, the chapter is placed directly after the
-    previous chapter. If the creation times show that more than two seconds are missing between the two
-    chapters, there is a gap of this length.
+    All that states a time is compared here: sidecar files, the containers, the order of their packets, and
+    the rate at which the pictures were taken. Sidecar files have priority over the containers. Without
+    sidecar files, the timestamps of the containers are used. If the timestamps of a chapter start again at
+    zero, the chapter is placed directly after the previous chapter. If the creation times show that more than
+    two seconds are missing between the two chapters, there is a gap of this length.
 
     Args:
         videos: The chapters in the order of the recording.
@@ -155,50 +93,74 @@ def join_chapters(videos: tuple[VideoFile, ...], sidecars: tuple[Path, ...]) -> 
     Raises:
         CaptureError: A sidecar file does not match its video.
     """
-    if len(sidecars) == len(videos):
-        parts = [_sidecar_times(path, (v,)) for path, v in zip(sidecars, videos, strict=True)]
-        return _join_parts(videos, parts)
-    if len(sidecars) == 1:
-        times = _sidecar_times(sidecars[0], videos)
-        return _join_parts(videos, np.split(times, np.cumsum([len(video.pts) for video in videos])[:-1]))
-    return _join_parts(videos, _container_times(videos))
+    own = [_real_times(video) for video in videos]
+    notes = [f"{video.path.name}: {note}" for video in videos for note in video.notes]
+    if sidecars:
+        by_file: dict[Path | None, list[IntArray]] = {}
+        for video, (times, _) in zip(videos, own, strict=True):
+            by_file.setdefault(video.path if len(sidecars) > 1 else None, []).append(times)
+        is_cut = bool(videos[-1].missing_end)
+        read = [
+            sidecar_times(path, group, is_cut=is_cut)
+            for path, group in zip(sidecars, by_file.values(), strict=True)
+        ]
+        parts = [part for group, _ in read for part in group]
+        notes += [note for _, note in read if note]
+    else:
+        parts = _container_times(videos, own)
+        notes += dict.fromkeys(note for video in videos if (note := slow_motion(video)[1]))
+        notes += _restart_notes(videos)
+    return _join_parts(videos, parts, notes)
 
 
-def _sidecar_times(path: Path, videos: Sequence[VideoFile]) -> IntArray:
-    """Read a sidecar file and check that it has one time for each frame of some chapters."""
-    times, frames = read_timestamps(path), sum(len(video.pts) for video in videos)
-    if videos[-1].missing_end:
-        times = times[:frames]
-    if len(times) != frames:
-        raise CaptureError(
-            f"there are {len(times)} timestamps for {frames} frames",
-            path=path,
-            hint="write one line for each frame of the video, or export the video and the timestamps "
-            "again from the same recording",
-        )
-    return times
+def _real_times(video: VideoFile) -> tuple[IntArray, int]:
+    """Return the frame times (N,) of a file and its duration, in real nanoseconds.
+
+    Times and duration in the file differ from these in slow motion.
+    """
+    ratio, _ = slow_motion(video)
+    if ratio == 1.0:
+        return video.times_ns(), video.duration_ns
+    return np.round(video.times_ns() / ratio).astype(np.int64), round(video.duration_ns / ratio)
 
 
-def _container_times(videos: tuple[VideoFile, ...]) -> list[IntArray]:
-    """Return the frame times of each chapter from the containers.
+def _restart_notes(videos: tuple[VideoFile, ...]) -> list[str]:
+    """Return a note about each file whose times start again."""
+    notes = []
+    for path, group in itertools.groupby(videos, lambda video: video.path):
+        chapters = list(group)
+        count = len(chapters) + sum(len(video.restarts) for video in chapters)
+        if count > 1:
+            notes.append(
+                f"the times in {path.name} start again, as in a file of {count} recordings that were joined. "
+                "Unless the file tells the time between them, each is taken to follow directly the one "
+                "before. If time passed, give the recordings as separate files, or write a file of timestamps"
+            )
+    return notes
+
+
+def _container_times(videos: tuple[VideoFile, ...], own: list[tuple[IntArray, int]]) -> list[IntArray]:
+    """Return the frame times of each chapter on the clock of the camera, from the containers.
 
     If the timestamps of a chapter start again at zero, the chapter is moved to the end of the previous
     chapter.
+
+    Args:
+        videos: The chapters.
+        own: The frame times of each chapter in its file, and its duration, real nanoseconds.
     """
-    parts = [videos[0].times_ns()]
-    for before, video in itertools.pairwise(videos):
-        own, start = video.times_ns(), int(parts[-1][0])
-        is_continuous = int(own[0]) > start + before.duration_ns // 2
-        shift = (
-            0
-            if is_continuous
-            else start + before.duration_ns + _missing_between_ns(before, video) - int(own[0])
-        )
-        parts.append(own + shift)
+    shift = -round(videos[0].start_pts * videos[0].time_base * _NS / slow_motion(videos[0])[0])
+    parts = [own[0][0] + shift]
+    for index, (times, _) in enumerate(own[1:], start=1):
+        start, duration_ns = int(own[index - 1][0][0]), own[index - 1][1]
+        if int(times[0]) <= start + duration_ns // 2:
+            missing_ns = _missing_between_ns(videos[index - 1], videos[index], duration_ns)
+            shift = int(parts[-1][0]) + duration_ns + missing_ns - int(times[0])
+        parts.append(times + shift)
     return parts
 
 
-def _missing_between_ns(before: VideoFile, video: VideoFile) -> int:
+def _missing_between_ns(before: VideoFile, video: VideoFile, duration_ns: int) -> int:
     """Return the time that is missing between two chapters, according to their creation times.
 
     The result is 0 if the creation times are unknown, or if the missing time is not longer than the error of
@@ -206,17 +168,16 @@ def _missing_between_ns(before: VideoFile, video: VideoFile) -> int:
     """
     if before.created_s is None or video.created_s is None:
         return 0
-    gap = round((video.created_s - before.created_s) * _NS) - before.duration_ns
+    gap = round((video.created_s - before.created_s) * _NS) - duration_ns
     return gap if gap > _CLOCK_RESOLUTION_NS else 0
 
 
-def _join_parts(videos: tuple[VideoFile, ...], parts: list[IntArray]) -> Timeline:
+def _join_parts(videos: tuple[VideoFile, ...], parts: list[IntArray], notes: list[str]) -> Timeline:
     """Join the frame times of all chapters, and find the usable frames, gaps and overlaps."""
     times = np.concatenate(parts)
     latest = np.maximum.accumulate(times)
     usable = np.ones(len(times), dtype=bool)
     usable[1:] = times[1:] > latest[:-1]
-    notes = []
     for (before, start), (video, part) in itertools.pairwise(zip(videos, parts, strict=True)):
         frame_ns = float(np.median(np.diff(start))) if len(start) > 1 else before.duration_ns
         gap_ns = int(part[0]) - (int(start[-1]) + frame_ns)

@@ -18,6 +18,7 @@ from bodycap_batch.formats.file_url import file_url
 
 if TYPE_CHECKING:
     from av.container import InputContainer
+    from av.packet import Packet
     from av.video.frame import VideoFrame
     from av.video.stream import VideoStream
 
@@ -63,6 +64,16 @@ class VideoFile:
         missing_end: What is missing at the end of the file; "" if nothing is known to be missing.
         pixel_aspect: Width of a stored pixel over its height. For example, it is 4/3 if 1440 stored columns
             are shown as 1920 columns.
+        restarts: The packets at which the times start again, and the number that is added to the timestamps
+            from there on: see `PacketTimes`. `pts` contains the sums.
+        start_pts: Timestamp of the start of the file. It is not 0 if the time of the first frame comes from
+            the format of the file alone, as in MPEG transport streams.
+        capture_fps: Frames per second at which the camera took the pictures, from the metadata; None if it is
+            unknown.
+        sound_s: Duration of the longest sound track, seconds; 0 without sound, or if it is unknown.
+        part: First byte, and the byte after the last byte, of the recording in the file, if the file consists
+            of several recordings. None if the whole file is one recording.
+        notes: Notes for the user about frames without a time of their own.
     """
 
     path: Path
@@ -79,6 +90,12 @@ class VideoFile:
     is_interlaced: bool = False
     missing_end: str = ""
     pixel_aspect: Fraction = Fraction(1)
+    restarts: tuple[tuple[int, int], ...] = ()
+    start_pts: int = 0
+    capture_fps: float | None = None
+    sound_s: float = 0.0
+    part: tuple[int, int] | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def turned_size(self) -> tuple[int, int]:
@@ -107,8 +124,12 @@ class VideoFile:
         return np.array(exact, dtype=np.int64)
 
 
-def open_container(path: Path) -> InputContainer:
+def open_container(path: Path, part: tuple[int, int] | None = None) -> InputContainer:
     """Open a media file. A file whose end is missing is opened up to the last part that is complete.
+
+    Args:
+        path: Path of the file.
+        part: First byte, and the byte after the last byte, that are read; None to read the whole file.
 
     Raises:
         CaptureError: The file is missing, empty or not a video.
@@ -127,14 +148,13 @@ def open_container(path: Path) -> InputContainer:
         if path.stat().st_size == 0:
             raise CaptureError("the video is empty (0 bytes)", path=path, hint=COPY_AGAIN)
         try:
-            container = av.open(file_url(path), metadata_errors="replace")
+            container = av.open(_url(path, part), metadata_errors="replace")
         except (av.error.EOFError, av.error.InvalidDataError):
             # The file may end inside the index of a fragment. FFmpeg then reads no frame at all.
-            part = missing_part(path.resolve())
-            if part is None or not 0 < part.readable_bytes < path.stat().st_size:
+            missing = missing_part(path.resolve())
+            if part is not None or missing is None or not 0 < missing.readable_bytes < path.stat().st_size:
                 raise
-            url = f"subfile,,start,0,end,{part.readable_bytes},,:{file_url(path)}"
-            container = av.open(url, metadata_errors="replace")
+            container = av.open(_url(path, (0, missing.readable_bytes)), metadata_errors="replace")
     except av.error.EOFError as error:
         raise CaptureError("the video contains no frame", path=path, hint=COPY_AGAIN) from error
     except PermissionError as error:
@@ -142,12 +162,17 @@ def open_container(path: Path) -> InputContainer:
             "the program has no permission to read the video", path=path, hint=MAY_READ
         ) from error
     except (av.error.FFmpegError, OSError) as error:
-        part = missing_part(path.resolve())
-        reason = error_reason(error) if part is None else part.text
+        missing = missing_part(path.resolve())
+        reason = error_reason(error) if missing is None else missing.text
         raise CaptureError(
             f"the file cannot be read as a video: {reason}", path=path, hint=COPY_AGAIN
         ) from error
     return container
+
+
+def _url(path: Path, part: tuple[int, int] | None) -> str:
+    """Return the URL of a file, or of the bytes from the first to before the second of `part`, for FFmpeg."""
+    return file_url(path) if part is None else f"subfile,,start,{part[0]},end,{part[1]},,:{file_url(path)}"
 
 
 def video_stream(container: InputContainer, path: Path) -> VideoStream:
@@ -199,6 +224,11 @@ def _without_previews(streams: list[VideoStream], path: Path) -> list[VideoStrea
     moving = [stream for stream in streams if counts[stream.index] >= least]
     area = max(stream.width * stream.height for stream in moving)
     return [stream for stream in moving if stream.width * stream.height >= _MIN_AREA_SHARE * area]
+
+
+def is_frame(packet: Packet[Any]) -> bool:
+    """Return True if a packet of the video stream contains a frame that is shown, and its time."""
+    return packet.pts is not None and not packet.is_discard and packet.size > 0
 
 
 def error_reason(error: Exception) -> str:

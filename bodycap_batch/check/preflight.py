@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera, open_camera
-from bodycap_batch.capture.damage import damage_notes, find_damaged_frames
+from bodycap_batch.capture.damage import damage_notes, find_damage_and_copies
 from bodycap_batch.check.camera_settings import setting_notes
 from bodycap_batch.check.check_report import CameraSummary, CheckReport
 from bodycap_batch.check.file_mixups import require_distinct_videos
@@ -44,6 +44,7 @@ from bodycap_batch.core.errors import (
 from bodycap_batch.formats.bvh import RigOptions, read_rig
 from bodycap_batch.formats.optional_libraries import require_formats
 from bodycap_batch.model.camera_clock import ClockRelation
+from bodycap_batch.model.copied_frames import copied_notes
 from bodycap_batch.store.disk_space import require_room
 
 _RATE_TOLERANCE = 0.2
@@ -159,8 +160,9 @@ def _check_camera(
     camera = replace(camera, clock=ClockRelation(offset_s=config.offset_s or 0.0))
     quality = check_picture_quality(camera)
     if decode_all:
-        damage = damage_notes(camera, find_damaged_frames(camera))
-        quality = replace(quality, notes=(*quality.notes, *damage))
+        damaged, pictures = find_damage_and_copies(camera)
+        copies = [] if quality.is_static else copied_notes(camera.times_ns, pictures)
+        quality = replace(quality, notes=(*quality.notes, *damage_notes(camera, damaged), *copies))
     summary = _summarise_camera(camera, config, quality)
     if origins is None:
         return summary

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bodycap_batch.capture.frame_index import index_video
+from bodycap_batch.capture.frame_index import index_videos
 from bodycap_batch.capture.timeline import join_chapters
 from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM, ClockPair
 from bodycap_batch.clocks.container_times import (
@@ -241,7 +241,7 @@ def _with_sensor(recording: Recording, track: SensorTrack) -> Recording:
 
 def _read_sensor(config: CameraConfig) -> SensorTrack:
     """Return the signals of the inertial sensor of a camera; a problem if its samples cannot be read."""
-    videos = tuple(index_video(path, 1) for path in config.video)
+    videos = index_videos(config.video, 1)
     times_ns = join_chapters(videos, config.timestamps).times_ns
     try:
         telemetry = read_telemetry(videos, times_ns, config.samples)
@@ -288,7 +288,7 @@ def estimate_clocks(
 
 
 def _read_recording(config: CameraConfig) -> tuple[Recording, SoundTrack]:
-    videos = tuple(index_video(path, 1) for path in config.video)
+    videos = index_videos(config.video, 1)
     times_ns = join_chapters(videos, config.timestamps).times_ns
     track = read_sound_track(config.name, videos, times_ns)
     first_frame_s = int(times_ns[0]) / 1e9

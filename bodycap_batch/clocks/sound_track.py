@@ -29,6 +29,12 @@ _MAX_JUMP_S = 0.01
 """Maximum difference, seconds, of a timestamp from the end of the sound before it. With a larger difference,
 sound is missing or repeated, and a new piece starts. Origin: containers with a resolution of 1 ms round
 timestamps; the shortest frame of common codecs that can be missing lasts 20 ms."""
+_MIN_RESTART_S = 0.2
+"""Minimum jump back, seconds, at which the times of a file start again. Evidence: none."""
+_MAX_RATE_ERROR = 0.02
+"""Maximum relative difference of the clock of the pictures from that of the sound. With a larger one, the
+file plays the pictures at another speed. Origin: crystals differ by 0.01 %; nominal rates such as 30 and
+29.97 by 0.1 %."""
 _HIGH_PASS_HZ = 150.0
 """Frequency, Hz, below which wind and handling are removed. Origin: the correlation uses 200 Hz and above. A
 strong sound below leaks into all frequencies where a window cuts it off."""
@@ -157,7 +163,11 @@ def read_sound_track(camera: str, videos: Sequence[VideoFile], times_ns: IntArra
     for video in videos:
         clock = clock_of_chapter(video.times_ns(), times_ns[first : first + len(video.pts)])
         first += len(video.pts)
-        chapter = read_sound_file(video.path)
+        shifts_s = [float(shift * video.time_base) for _, shift in video.restarts]
+        chapter = read_sound_file(video.path, video.part, shifts_s)
+        if chapter.pieces and abs(clock.rate - 1.0) > _MAX_RATE_ERROR:
+            slower = f"the file plays its pictures {1.0 / clock.rate:.3g} times slower than they were taken"
+            chapter = SoundTrack(camera="", problem=f"{slower}, so nothing tells the times of its sound")
         pieces += [moved for piece in chapter.pieces for moved in _moved(piece, clock)]
         notes += [f"{video.path.name}: {note}" for note in chapter.notes]
         if chapter.problem:
@@ -198,16 +208,24 @@ def _without_overlaps(pieces: list[SoundPiece]) -> tuple[SoundPiece, ...]:
     return tuple(out)
 
 
-def read_sound_file(path: Path) -> SoundTrack:
-    """Read the sound of one file. The times are those of the file."""
-    with open_container(path) as container:
+def read_sound_file(
+    path: Path, part: tuple[int, int] | None = None, shifts_s: Sequence[float] = ()
+) -> SoundTrack:
+    """Read the sound of one file. The times are those of the file.
+
+    Args:
+        path: Path of the file.
+        part: First byte, and the byte after the last byte, of the recording in the file; None for all bytes.
+        shifts_s: For each place at which the times start again, what is added to the times after it, seconds.
+    """
+    with open_container(path, part) as container:
         stream = _audio_stream(container)
         if stream is None:
             has_sound = bool(container.streams.audio)
             problem = "there is no decoder for its sound" if has_sound else "the video has no sound"
             return SoundTrack(camera="", problem=problem)
         recorder = recorder_of(container, stream)
-        reader = _PieceReader()
+        reader = _PieceReader(shifts_s)
         broken = _decode(container, stream, reader)
         pieces = reader.finish()
     notes = []
@@ -260,7 +278,8 @@ def _decode(container: InputContainer, stream: AudioStream, reader: _PieceReader
 class _PieceReader:
     """Joins decoded frames to pieces and converts them to mono at `RATE_HZ`."""
 
-    def __init__(self) -> None:
+    def __init__(self, shifts_s: Sequence[float] = ()) -> None:
+        self._shifts_s = [0.0, *shifts_s]
         self._pieces: list[SoundPiece] = []
         self._parts: list[npt.NDArray[np.int16]] = []
         self._waiting: list[npt.NDArray[np.int16]] = []
@@ -276,7 +295,9 @@ class _PieceReader:
         if not frame.samples or not frame.sample_rate:
             return
         kind = (frame.sample_rate, frame.format.name, frame.layout.name)
-        time_s = self._end_s if frame.time is None else float(frame.time)
+        time_s = self._end_s if frame.time is None else float(frame.time) + self._shifts_s[0]
+        if self._count and time_s < self._end_s - _MIN_RESTART_S and len(self._shifts_s) > 1:
+            time_s += self._shifts_s[1] - self._shifts_s.pop(0)
         if kind != self._format or abs(time_s - self._end_s) > _MAX_JUMP_S:
             self._close()
             self._open(kind, time_s)

@@ -166,8 +166,8 @@ class CameraConfig(_Block):
     )
     timestamps: tuple[Path, ...] = Field(
         (),
-        description="file with one time in seconds for each frame; one file for all chapters, or one "
-        "file for each chapter",
+        description="file with one time for each frame, in seconds (other units are recognised); one file "
+        "for all chapters, or one file for each chapter",
     )
     samples: Path | None = Field(
         None,

@@ -51,7 +51,8 @@ _RIFF_TOLERANCE = 9
 """Maximum number of bytes that an AVI file may be too short. Origin: some programs count the 8 bytes of the
 header in the size, and omit the padding byte at the end."""
 _MAX_HEADERS_BYTES = 1 << 20
-"""Maximum size (bytes) of the headers of an AVI file that are searched for the index. Evidence: none."""
+"""Maximum size (bytes) of the headers of an AVI file that are searched for the index, and of a box that is
+read. Evidence: none."""
 _SUPER_INDEX, _SUPER_INDEX_ENTRY = struct.Struct("<4sIHBBI4s12x"), struct.Struct("<QII")
 """Layout of the index of an AVI file and of its entries: offset, size and duration of a part of the index."""
 _MAX_JSON_BYTES = 1 << 20
@@ -195,6 +196,42 @@ def _missing_box(stream: BinaryIO, size: int) -> MissingPart | None:
             text="its index (moov) is missing, as after a recording or a copy that was interrupted"
         )
     return None if b"mdat" in found else MissingPart(text="its pictures (mdat) are missing")
+
+
+def movie_starts(stream: BinaryIO, size: int) -> list[int]:
+    """Return the position of each movie in a file that may consist of several MP4 or MOV files.
+
+    A movie starts with the box `ftyp` and contains a box `moov`.
+
+    Args:
+        stream: The opened file.
+        size: Size of the file, bytes.
+    """
+    starts: list[int] = []
+    latest = 0
+    for kind, start, _, end in _boxes(stream, 0, size):
+        latest = start if kind == b"ftyp" else latest
+        if kind == b"moov" and latest not in starts and end <= size:
+            starts.append(latest)
+    return starts
+
+
+def first_box(path: Path, kind: bytes) -> bytes:
+    """Return the content of a box of an MP4 or MOV file that is in no other box; b"" without such a box.
+
+    Args:
+        path: Path of the file.
+        kind: Type of the box.
+    """
+    with path.open("rb", buffering=0) as stream:
+        head = stream.read(_BOX_HEADER)
+        for found, _, content, end in _boxes(
+            stream, 0, path.stat().st_size if head[4:] in _FIRST_BOXES else 0
+        ):
+            if found == kind:
+                stream.seek(content)
+                return stream.read(min(end - content, _MAX_HEADERS_BYTES))
+    return b""
 
 
 def _boxes(stream: BinaryIO, position: int, size: int) -> Iterator[tuple[bytes, int, int, int]]:

@@ -19,11 +19,11 @@ docs/decisions/keyframes.md."""
 _MAX_ENCODER_SHIFT_PX = 0.15
 """Maximum median displacement of corners, px of the reduced image, in a repetition that the encoder encodes
 again. Evidence: none."""
-_MIN_JUMP_PX = 0.3
+MIN_JUMP_PX = 0.3
 """Minimum change next to a frozen part, px of the reduced image. At this limit, the movement stops or starts
 within one frame. The picture of a person who stops or starts to move changes gradually. Evidence:
 docs/decisions/keyframes.md."""
-_MIN_COPIES, _MIN_FROZEN_S = 3, 0.2
+_MIN_COPIES, MIN_FROZEN_S = 3, 0.2
 """Minimum number of repetitions in a frozen part, and minimum duration (seconds) of the part. Shorter parts
 come from a conversion to a constant frame rate: it repeats single frames. Evidence: none."""
 
@@ -97,8 +97,8 @@ def find_frozen_frames(change_px: FloatArray, shift_px: FloatArray, times_s: Flo
     for start, stop in runs(is_copy[:-1] | again):
         if start == 0:
             continue
-        has_jump = jump_px[start - 1] > _MIN_JUMP_PX or jump_px[stop] > _MIN_JUMP_PX
-        is_long = stop - start >= _MIN_COPIES and times_s[stop - 1] - times_s[start - 1] >= _MIN_FROZEN_S
+        has_jump = jump_px[start - 1] > MIN_JUMP_PX or jump_px[stop] > MIN_JUMP_PX
+        is_long = stop - start >= _MIN_COPIES and times_s[stop - 1] - times_s[start - 1] >= MIN_FROZEN_S
         if has_jump and is_long and np.median(change_px[start:stop]) < _MAX_MEDIAN_CHANGE_PX:
             frozen[start:stop] = True
     return frozen

@@ -7,7 +7,7 @@ each `Trajectory` names its gauge. Poses in different gauges must not be combine
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.copied_frames import Pictures
 from bodycap_batch.model.frame_matches import FrameMatches
 from bodycap_batch.model.gyro_rates import GyroRates
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
@@ -99,6 +100,8 @@ class KeyframeSelection:
         blur_px: (N,) predicted motion blur of each frame, pixels of an image with a long side of 640 px; NaN
             where it is unknown. An empty array means that no blur is known.
         gyro: Angular velocities that the gyroscope of the camera measured; None if it cannot be used.
+        pictures: The frames that are no copies of the frame before; None if the video has no copies. Then all
+            indices in this selection count these frames only.
     """
 
     camera: str
@@ -112,6 +115,7 @@ class KeyframeSelection:
     matches: FrameMatches | None = None
     gyro: GyroRates | None = None
     blur_px: FloatArray = field(default_factory=lambda: np.zeros(0))
+    pictures: Pictures | None = None
 
     def __post_init__(self) -> None:
         set_array(self, "frames", (None,), np.int64)
@@ -127,6 +131,34 @@ class KeyframeSelection:
             self.frames[0] < 0 or self.frames[-1] >= self.frame_count or (np.diff(self.frames) <= 0).any()
         ):
             raise ValueError("frames: indices must increase and lie inside the video")
+
+    def only(self, pictures: Pictures | None) -> KeyframeSelection:
+        """Return the selection from the video without its copies; unchanged for None.
+
+        Args:
+            pictures: The frames that are no copies, by their indices in this selection.
+        """
+        if pictures is None:
+            return self
+        kept = np.isin(np.arange(self.frame_count), pictures.frames)
+        index, matches = np.cumsum(kept) - 1, self.matches
+        if matches is not None:
+            # The next frame of a copy is the next frame of its original.
+            own = kept[matches.frame + 1]
+            first_px, second_px = matches.first_px[own], matches.second_px[own]
+            frame = index[matches.frame[own]]
+            matches = replace(matches, frame=frame, first_px=first_px, second_px=second_px)
+        return replace(
+            self,
+            frames=np.unique(index[self.frames]),
+            frame_count=int(kept.sum()),
+            sharpness=self.sharpness[kept],
+            damaged=index[self.damaged[kept[self.damaged]]],
+            frozen=self.frozen[kept],
+            matches=matches,
+            blur_px=self.blur_px[kept],
+            pictures=pictures,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -76,7 +76,7 @@ def make_served_content(
         chapters = _chapters(camera)
         for index, chapter in enumerate(chapters):
             chapter["url"] = f"video/{number}/{index}"
-            files[f"/{chapter['url']}"] = camera.chapters[index]
+            files[f"/{chapter['url']}"] = camera.videos[index].path
         videos[camera.name] = [chapter for chapter in chapters if chapter["common"]]
     return ServedContent(files=files, videos=videos, overlays=overlays)
 

@@ -47,6 +47,7 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
     from bodycap_batch.capture import open_capture
     from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
     from bodycap_batch.inertial import use_sensor
+    from bodycap_batch.model.camera_clock import FrameTiming
     from bodycap_batch.model.relative_pose import RigPoses
     from bodycap_batch.telemetry import read_telemetry
     from bodycap_batch.telemetry.comparison import all_times_ns
@@ -76,6 +77,7 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
     if telemetry.gyro is not None and found.camera.relation is None:
         notes.append(f"{camera.name}: the inertial sensor is not used: {found.camera.reason}")
     registration = replace(registration, trajectory=found.trajectory)
+    camera = replace(camera, nominal_fps=read_dataclass(FrameTiming, before, "timing").nominal_fps)
     save_registration(registration, camera, files, rolling=read_summary(before)["rolling"], notes=notes)
     write_dataclass(found.camera, files, INERTIAL_CAMERA)
     if (before / f"{RIG_POSES}.json").exists():

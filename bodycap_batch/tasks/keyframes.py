@@ -49,6 +49,7 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     from bodycap_batch.capture.kept import KEPT_NAME, FrameKeeper
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.keyframes import select_keyframes
+    from bodycap_batch.model.copied_frames import copied_notes
     from bodycap_batch.model.frozen_frames import frozen_notes
     from bodycap_batch.model.optical_flow import pixel_scale
     from bodycap_batch.telemetry.blur import predicted_blur_px
@@ -67,13 +68,15 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
         selection = select_keyframes(
             camera, task.options, context, keeper, with_matches=task.with_gyro, blur_px=blur_px
         )
+    copies = copied_notes(camera.times_ns, selection.pictures)
+    camera = camera.only(selection.pictures)
     if telemetry is not None and task.with_gyro:
         assert selection.matches is not None
         selection = replace(selection, gyro=relate_gyro(camera, selection.matches, telemetry).rates)
     if (kept := keeper.kept_frames()) is not None:
-        write_dataclass(kept, files, KEPT_NAME)
+        write_dataclass(kept.only(selection.pictures), files, KEPT_NAME)
     write_dataclass(selection, files, "keyframes")
-    notes = [f"{camera.name}: {note}" for note in damage_notes(camera, selection.damaged)]
+    notes = [f"{camera.name}: {note}" for note in [*copies, *damage_notes(camera, selection.damaged)]]
     notes += frozen_notes(camera.name, selection.frozen, camera.common_times_ns() / 1e9)
     notes += [*telemetry_notes, *_blur_notes(camera.name, selection)]
     write_summary(files, frames=selection.frame_count, keyframes=len(selection.frames), notes=notes)

@@ -31,8 +31,9 @@ def load_capture(
     Args:
         capture: The cameras and their videos.
         keyframes: The artefact with the keyframes of each camera, by camera name. It lists the damaged
-            frames. If an artefact holds copies of decoded frames, the copies are read instead of the video.
-            None to read all frames from the videos.
+            frames, and the frames that are no copies of the frame before: only the latter are used. If an
+            artefact holds stored copies of decoded frames, these are read instead of the video. None to read
+            all frames from the videos.
         clocks: The clocks of all cameras; None for a task that does not relate times of different cameras.
         threads: Number of threads of each video decoder; 0 lets the decoder choose.
     """
@@ -43,12 +44,12 @@ def load_capture(
     cameras = []
     for camera in opened.cameras:
         artefact = stored.get(camera.name)
-        damaged = camera.damaged if artefact is None else load_keyframes(artefact.path).damaged
+        if artefact is not None:
+            selection = load_keyframes(artefact.path)
+            camera = replace(camera.only(selection.pictures), damaged=selection.damaged)  # noqa: PLW2901
         clock = camera.clock if clocks is None else clocks.cameras.get(camera.name, camera.clock)
         wearer = _load_wearer(capture.wearer, camera.name)
-        cameras.append(
-            replace(camera, kept=_kept_frames(artefact), damaged=damaged, clock=clock, wearer=wearer)
-        )
+        cameras.append(replace(camera, kept=_kept_frames(artefact), clock=clock, wearer=wearer))
     return replace(opened, cameras=tuple(cameras))
 
 

@@ -99,14 +99,14 @@ def _find_frame(trajectories: Sequence[Trajectory], name: str) -> _End:
             field=_FIELD,
             hint=f"use one of the cameras {', '.join(each.camera for each in trajectories)}",
         )
-    rows = np.flatnonzero(found.frame_numbers == int(number))
-    if not len(rows):
+    # A frame that is a copy of the frame before has no number of its own.
+    row = int(np.searchsorted(found.frame_numbers, int(number), side="right")) - 1
+    if row < 0 or int(number) > found.frame_numbers[-1] + 1:
         raise JobError(
             f"camera {camera} has no frame {number}",
             field=_FIELD,
             hint="choose a frame of the video; the first frame is 0",
         )
-    row = int(rows[0])
     if not found.localised[row]:
         raise EstimationError(
             f"frame {name} of the known distance was not localised: {found.status[row].name}",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodycap_batch.capture import CaptureCamera, open_camera, open_capture
-from bodycap_batch.capture.timeline import read_timestamps
+from bodycap_batch.capture.sidecar_times import read_timestamps
 from bodycap_batch.config.folder import natural_key
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
@@ -125,7 +126,7 @@ def test_any_sidecar_gives_times_or_a_typed_error(
         times = read_timestamps(path)
     except CaptureError:
         return
-    assert (np.diff(times) > 0).all()
+    assert all(before < after for before, after in pairwise(times))
 
 
 def test_chapters_follow_one_another(tmp_path: Path) -> None:
@@ -163,7 +164,7 @@ def test_frames_repeated_by_the_next_chapter_are_used_once(tmp_path: Path) -> No
     assert (np.diff(camera.times_ns) > 0).all()
     # 0.35 and 0.45 of the second chapter lie before the first one's last frame at 0.5 s.
     assert camera.frame_numbers.tolist() == [0, 1, 2, 3, 4, 5, 8, 9, 10, 11]
-    assert "overlap" in camera.notes[0]
+    assert "overlap" in camera.notes[-1]
     assert [index for index, _ in camera.grey_frames()] == list(range(10))
 
 
@@ -193,10 +194,10 @@ def test_chapter_names_sort_the_way_cameras_count() -> None:
 def test_a_camera_folder_of_chapters_and_its_sidecar(tmp_path: Path) -> None:
     for k in (2, 1):
         write_video(tmp_path / "torso" / f"GX0{k}0042.MP4", FRAMES[:4])
-    (tmp_path / "torso.timestamps.txt").write_text("".join(f"{k}\n" for k in range(8)))
+    (tmp_path / "torso.timestamps.txt").write_text("".join(f"{k / 20}\n" for k in range(8)))
     job = load_job(tmp_path)
     assert [path.name for path in job.capture.cameras[0].video] == ["GX010042.MP4", "GX020042.MP4"]
     camera = open_capture(job.capture).camera("torso")
-    assert camera.times_ns.tolist() == [k * 10**9 for k in range(8)]
+    assert camera.times_ns.tolist() == [k * 50_000_000 for k in range(8)]
     with pytest.raises(KeyError):
         open_capture(job.capture).camera("head")

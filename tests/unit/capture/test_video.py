@@ -68,7 +68,7 @@ def test_a_missing_timestamp_of_the_first_decoded_frame_removes_no_later_frame(
                     frame.pts = None if index < unknown else frame.pts + shift
                     yield frame
 
-    monkeypatch.setattr(decoding, "open_container", lambda _: Container())
+    monkeypatch.setattr(decoding, "open_container", lambda *_: Container())
     context = SimpleNamespace(has_b_frames=0)
     codec = SimpleNamespace(codec_context=context, decode=lambda packet: [packet])
     monkeypatch.setattr(decoding, "open_stream", lambda *_: codec)
