@@ -11,6 +11,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.core.text_encoding import decode_text
 
 _NS = 1_000_000_000
 """Nanoseconds per second."""
@@ -56,7 +57,7 @@ def read_timestamps(path: Path) -> tuple[Decimal, ...]:
                 path=path,
                 hint="write one time in seconds on each line",
             )
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = decode_text(path.read_bytes()).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CaptureError(
             f"the timestamps cannot be read ({error})",

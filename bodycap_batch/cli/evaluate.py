@@ -16,6 +16,7 @@ from bodycap_batch.cli.application import app
 from bodycap_batch.cli.terminal import print_json, print_line
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.percent import format_percent
+from bodycap_batch.core.text_encoding import encoding_of_file
 
 TUM_SUFFIXES = (".tum", ".txt")
 _MOTION_FILE = "motion.bvh"
@@ -183,15 +184,16 @@ def _evaluate_motion(estimate: Path, truth: Path) -> dict[str, Any]:
 def _motion_figures(results: Path) -> dict[str, Any]:
     """Return the block `motion` of metrics.json in a results folder; empty without such a block."""
     try:
-        return dict(json.loads((results / "metrics.json").read_text(encoding="utf-8"))["motion"])
+        return dict(json.loads((results / "metrics.json").read_bytes())["motion"])
     except (OSError, ValueError, KeyError, TypeError):
         return {}
 
 
 def _frame_counts(results: Path) -> dict[str, int]:
     """Return the number of video frames of each camera, by camera name, from frames.csv in the results."""
+    table = results / "frames.csv"
     try:
-        with (results / "frames.csv").open(newline="", encoding="utf-8") as stream:
+        with table.open(newline="", encoding=encoding_of_file(table)) as stream:
             rows = csv.DictReader(line for line in stream if not line.startswith("#"))
             return dict(Counter(row["camera"] for row in rows))
     except (FileNotFoundError, KeyError):

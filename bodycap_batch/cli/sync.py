@@ -74,7 +74,7 @@ def with_clocks_of_run(estimates: ClockEstimates, results: Path) -> ClockEstimat
         results: Folder of the results of the job. It may be missing.
     """
     try:
-        stored = json.loads((results / "metrics.json").read_text(encoding="utf-8"))["clocks"]
+        stored = json.loads((results / "metrics.json").read_bytes())["clocks"]
     except (OSError, ValueError, KeyError, TypeError):
         stored = {}
     cameras = []

@@ -13,6 +13,7 @@ from pathlib import Path
 import yaml
 
 from bodycap_batch.core.errors import JobError
+from bodycap_batch.core.text_encoding import decode_text
 
 MAX_BYTES = 1 << 20
 """Maximum size (bytes) of a job file. Evidence: none."""
@@ -73,7 +74,7 @@ def read_yaml(path: Path, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DE
             raise JobError(
                 "the file is too large for a job file", path=path, hint="give the YAML file of the job"
             )
-        text = path.read_text(encoding="utf-8-sig")
+        text = decode_text(path.read_bytes())
     except FileNotFoundError as error:
         raise JobError(
             "there is no such job file", path=path, hint="give a YAML file or a folder of videos"

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from bodycap_batch.core.text_encoding import decode_text
+
 NO_VIDEO = "its content is not that of a video"
 """Text for a file with the name of a video whose first bytes are those of no known kind of video."""
 _TEXT_SUFFIXES = frozenset({".yaml", ".yml", ".json", ".bvh", ".csv"})
@@ -357,7 +359,7 @@ def _missing_json_part(stream: BinaryIO) -> MissingPart | None:
     data = stream.read(_MAX_JSON_BYTES + 1)
     if len(data) > _MAX_JSON_BYTES:
         return None
-    text = data.decode("utf-8", "replace")
+    text = decode_text(data, "replace")
     try:
         json.loads(text)
     except json.JSONDecodeError as error:

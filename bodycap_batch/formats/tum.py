@@ -14,6 +14,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
 from bodycap_batch.core.errors import JobError
+from bodycap_batch.core.text_encoding import encoding_of_file
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.model.geometry import make_transform, quat_xyzw_from_rotation, rotation_from_quat_xyzw
 
@@ -59,7 +60,7 @@ def read_tum(path: Path | str) -> TimedPoses:
     rows: list[list[float]] = []
     headed = False
     try:
-        with open(path, encoding="utf-8-sig", errors="replace") as handle:
+        with open(path, encoding=encoding_of_file(path), errors="replace") as handle:
             for number, line in enumerate(handle, start=1):
                 words = line.replace(",", " ").split()
                 if not words:

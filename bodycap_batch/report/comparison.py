@@ -14,6 +14,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, runs
 from bodycap_batch.core.errors import JobError
+from bodycap_batch.core.text_encoding import encoding_of_file
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.joint_positions import motion_from_positions, read_joint_positions
@@ -104,9 +105,9 @@ def _observed(table: Path, motion: Motion) -> BoolArray:
     other names, so joints are matched by role and ticks by time.
     """
     try:
-        facts = json.loads(table.with_name("metrics.json").read_text(encoding="utf-8"))["motion"]
+        facts = json.loads(table.with_name("metrics.json").read_bytes())["motion"]
         role_of = {name: joint["role"] for name, joint in facts["joints"].items()}
-        with table.open(newline="", encoding="utf-8") as stream:
+        with table.open(newline="", encoding=encoding_of_file(table)) as stream:
             rows = [
                 (float(r["time"]), role_of.get(r["joint"], ""), r["observed"] == "1")
                 for r in csv.DictReader(stream)

@@ -81,7 +81,7 @@ def summarise(metrics: Mapping[str, Any]) -> ResultSummary:
 def summary_of_folder(folder: Path) -> ResultSummary | None:
     """Return the summary of a folder of results; None if the folder holds no metrics that can be read."""
     try:
-        return summarise(json.loads((folder / "metrics.json").read_text(encoding="utf-8")))
+        return summarise(json.loads((folder / "metrics.json").read_bytes()))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.core.text_encoding import decode_text
 from bodycap_batch.telemetry.gopro import gaps_of
 from bodycap_batch.telemetry.saturation import saturated_stretches
 from bodycap_batch.telemetry.streams import ACCELEROMETER, GYROSCOPE, CameraTelemetry, Stream, TelemetrySource
@@ -99,15 +100,13 @@ def _lines_of(path: Path) -> list[str]:
                 path=path,
                 hint="write at most 1,000 samples per second, for the recording only",
             )
-        data = path.read_bytes()
+        return decode_text(path.read_bytes(), "replace").splitlines()
     except OSError as error:
         raise CaptureError(
             f"the inertial samples cannot be read ({error.strerror or error})",
             path=path,
             hint="correct the permissions, or remove the file",
         ) from error
-    encoding = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
-    return data.decode(encoding, errors="replace").splitlines()
 
 
 @dataclass(frozen=True, slots=True)

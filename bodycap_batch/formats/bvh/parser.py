@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
+from bodycap_batch.core.text_encoding import encoding_of
 
 _CHANNELS = {name.lower(): name for axis in "XYZ" for name in (f"{axis}position", f"{axis}rotation")}
 """Channel names as the BVH specification spells them. The keys are the same names in lower case."""
@@ -66,7 +68,13 @@ def parse_bvh(path: Path) -> BvhFile:
     """
     try:
         with open(path, "rb") as handle:
-            lines = _LineReader(path, iter(handle))
+            is_utf16 = encoding_of(handle.peek(2)) == "utf-16"
+            rows = (
+                (row.encode() for row in io.TextIOWrapper(handle, "utf-16", "replace"))
+                if is_utf16
+                else iter(handle)
+            )
+            lines = _LineReader(path, rows)
             joints, at_motion = _read_hierarchy(lines)
             size_bytes = path.stat().st_size
             values, frame_time = _read_motion(lines, joints, size_bytes) if at_motion else (None, "")

@@ -12,6 +12,7 @@ from bodycap_batch.config.body_height import height_from_text
 from bodycap_batch.config.folder import JOB_FILES, VIDEO_SUFFIXES, camera_block, grouped_recordings
 from bodycap_batch.config.mounts import MOTION_PLACES, MOUNT_NAMES, mount_of
 from bodycap_batch.core.errors import JobError
+from bodycap_batch.core.text_encoding import decode_text
 from bodycap_batch.store.artefacts import disk_errors
 
 _FIRST_LINE = "# Written by the live page from the answers of the user."
@@ -52,7 +53,7 @@ def files_below(folder: Path) -> list[str]:
 def is_answered_by_page(folder: Path) -> bool:
     """Return True if a folder has no job file, or only one that the page has written."""
     found = [folder / name for name in JOB_FILES if (folder / name).is_file()]
-    return all(path.read_text(encoding="utf-8", errors="replace").startswith(_FIRST_LINE) for path in found)
+    return all(decode_text(path.read_bytes(), "replace").startswith(_FIRST_LINE) for path in found)
 
 
 def earlier_answers(folder: Path) -> dict[str, Any]:
@@ -65,7 +66,7 @@ def earlier_answers(folder: Path) -> dict[str, Any]:
     path = folder / JOB_FILES[0]
     if not path.is_file() or not is_answered_by_page(folder):
         return {}
-    document = yaml.safe_load(path.read_text(encoding="utf-8", errors="replace")) or {}
+    document = yaml.safe_load(decode_text(path.read_bytes(), "replace")) or {}
     capture = document.get("capture") or {}
     return {"height": str(document.get("height_m") or ""), "find_places": bool(capture.get("places"))}
 
