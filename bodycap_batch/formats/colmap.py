@@ -30,6 +30,7 @@ _COLMAP_MODEL_IDS = {
     "SIMPLE_RADIAL_FISHEYE": 8,
     "RADIAL_FISHEYE": 9,
     "THIN_PRISM_FISHEYE": 10,
+    "EUCM": 16,
 }
 """Number of each camera model in COLMAP's binary files. The keys are the names of the models. Source: COLMAP,
 sensor/models.h."""

@@ -31,6 +31,7 @@ _FOCAL_INDICES = {
     "RADIAL_FISHEYE": (0,),
     "THIN_PRISM_FISHEYE": (0, 1),
     "FOV": (0, 1),
+    "EUCM": (0, 1),
 }
 """Indices of the focal lengths among the parameters of each COLMAP camera model. Source: COLMAP,
 sensor/models.h."""
@@ -47,6 +48,7 @@ _PARAM_COUNT = {
     "RADIAL_FISHEYE": 5,
     "THIN_PRISM_FISHEYE": 12,
     "FOV": 5,
+    "EUCM": 6,
 }
 """Number of parameters of each COLMAP camera model. Source: COLMAP, sensor/models.h."""
 

@@ -114,11 +114,22 @@ def _field_of_view(plane: FloatArray, omega_rad: float) -> FloatArray:
     return np.asarray(plane * gain)
 
 
+def _enhanced_unified(plane: FloatArray, alpha: float, beta: float) -> FloatArray:
+    """Return points (...,2) of a perspective plane after projection onto an ellipsoid and from there.
+
+    Source: Khomutenko, Garcia, Martinet, "An enhanced unified camera model", RA-L 2016.
+    """
+    squared = (plane * plane).sum(axis=-1, keepdims=True)
+    return np.asarray(plane / (alpha * np.sqrt(beta * squared + 1.0) + 1.0 - alpha))
+
+
 def distortion_of(camera: Camera) -> Distortion:
     """Return the distortion function of a camera."""
     extra = camera.params[(3 if camera.model in _SINGLE_FOCAL else 4) :]
     if camera.model == "FOV":
         return lambda plane: _field_of_view(plane, float(extra[0]))
+    if camera.model == "EUCM":
+        return lambda plane: _enhanced_unified(plane, float(extra[0]), float(extra[1]))
     if camera.model == "THIN_PRISM_FISHEYE":
         return lambda plane: _thin_prism(plane, extra)
     radial, p1, p2 = np.zeros(6), 0.0, 0.0

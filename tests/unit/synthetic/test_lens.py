@@ -63,6 +63,7 @@ def test_fisheye_rays_project_to_their_pixels_with_opencv():
         ("RADIAL_FISHEYE", [*SINGLE, 0.03, -0.01]),
         ("THIN_PRISM_FISHEYE", [*HEAD, 0.02, -0.01, 0.001, -0.002, 0.003, -0.001, 0.002, -0.001]),
         ("FOV", [*HEAD, 0.9]),
+        ("EUCM", [*HEAD, 0.6, 1.1]),
     ],
 )
 def test_rays_agree_with_the_solvers_projection(model, params):
