@@ -532,10 +532,10 @@ def _prepare_synthetic(job: Job, stated: _StatedJob, overrides: Overrides, prepa
 
 
 def _require_plausible_calibrations(job: Job, path: Path, source: YamlSource | None) -> None:
-    """Refuse a job that contains a calibration with a parameter that no camera has.
+    """Refuse a job that contains a calibration with a value that no usable calibration has.
 
     Raises:
-        CaptureError: A parameter is not plausible.
+        CaptureError: A value is not plausible.
     """
     places: list[tuple[Location, object]] = [(("capture", "calibration"), job.capture.calibration)]
     for index, camera in enumerate(job.capture.cameras):
@@ -543,10 +543,9 @@ def _require_plausible_calibrations(job: Job, path: Path, source: YamlSource | N
     for place, calibration in places:
         if not isinstance(calibration, Calibration):
             continue
-        if (found := calibration.implausible_parameter()) is not None:
-            location = (*place, "params")
-            line = None if source is None else source.line_of(location)
-            raise implausible_calibration(found, path, dotted(location), line)
+        if (found := calibration.implausible_value()) is not None:
+            line = None if source is None else source.line_of((*place, found.field.partition(".")[0]))
+            raise implausible_calibration(found, path, dotted(place), line)
 
 
 def _with_resolved(

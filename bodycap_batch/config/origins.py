@@ -213,7 +213,7 @@ class LoadedJob:
         if name in JOB_FILES:
             return f"the job file is {self.job_file.name}" if self.job_file else "the folder holds results"
         if name.endswith((".yaml", ".yml")):
-            return f"a job file in a folder must have the name {JOB_FILES[0]}"
+            return f"a job file must have the name {JOB_FILES[0]}, and a calibration must be named in it"
         if name == CALIBRATION_FILE:
             if any(origins.calibration.source == "default" for origins in self.origins.values()):
                 return f"only a {JOB_FILES[0]} uses it without `calibration:`"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from bodycap_batch.capture.video import MAY_READ
 from bodycap_batch.config.folder import VIDEO_SUFFIXES
@@ -41,9 +42,10 @@ def camera_digest(
         CaptureError: A file cannot be read.
         StoreError: The disk fails (`DiskAway` if the disk does not answer).
     """
-    omitted = {*_FILE_FIELDS, *_MOUNT_FIELDS}
+    omitted: dict[str, Any] = dict.fromkeys((*_FILE_FIELDS, *_MOUNT_FIELDS), True)
     if capture.start_s is None and capture.end_s is None:
-        omitted |= {*_CLOCK_FIELDS}
+        omitted |= dict.fromkeys(_CLOCK_FIELDS, True)
+    omitted["calibration"] = {"calibrated_with"}
     settings = camera.model_dump(mode="json", exclude=omitted)
     shared = capture.model_dump(mode="json", include={"start_s", "end_s", "work_px"})
     content = [_footage_digest(path, digests, on_bytes) for path in camera.input_files()]

@@ -20,7 +20,10 @@ from bodycap_batch.pipeline import Settings, prepare_capture
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.synthetic.options import SynthOptions
 
-CALIBRATION = {"model": "PINHOLE", "params": [420, 420, 320, 240], "width": 640, "height": 480}
+CALIBRATION = {
+    "model": "PINHOLE", "params": [420, 420, 320, 240], "width": 640, "height": 480,
+    "calibrated_with": {"rms_px": 0.2},
+}  # fmt: skip
 IDENTITY = [[float(row == column) for column in range(4)] for row in range(4)]
 JOB: dict[str, Any] = {
     "capture": {
