@@ -85,6 +85,22 @@ class CalibrationBoard:
             return f"chessboard of {self.columns}x{self.rows} inner corners"
         return f"ChArUco board of {self.columns}x{self.rows} squares ({self.dictionary})"
 
+    def options(self) -> str:
+        """Return the options of `bodycap calibrate` that name the board."""
+        size = f"--{self.kind} {self.columns}x{self.rows}"
+        if self.kind == "chessboard":
+            return size
+        return f"{size} --dictionary {self.dictionary}{' --legacy' if self.legacy else ''}"
+
+    def is_like(self, other: CalibrationBoard) -> bool:
+        """Return True if both boards have the same corners; a chessboard has them in any orientation."""
+        if self.kind != other.kind or self.legacy != other.legacy:
+            return False
+        if self.kind == "chessboard":
+            return {self.columns, self.rows} == {other.columns, other.rows}
+        family, other_family = (board.dictionary.upper().split("_")[-2] for board in (self, other))
+        return (self.columns, self.rows, family) == (other.columns, other.rows, other_family)
+
     def find(self, image: GreyImage) -> BoardCorners | None:
         """Find the board's corners in a grey picture (H,W); return None if too few corners are visible.
 

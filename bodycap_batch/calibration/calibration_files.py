@@ -49,7 +49,10 @@ def _calibration_entry(result: CalibrationResult) -> dict[str, Any]:
             "rms_px": round(fit.rms_px, 4),
             "view_rms_px": [round(value, 4) for value in fit.view_rms_px],
             "focal_sigma_px": [round(value, 4) for value in fit.focal_sigma_px],
+            "focal_of_halves_px": result.halves_px and [round(value, 4) for value in result.halves_px],
             "coverage": round(result.coverage, 3),
+            "camera": result.mode.model,
+            "lens_mode": result.mode.lens_mode,
             "notes": list(result.notes),
         },
     }
@@ -60,7 +63,7 @@ def _read_camera_entries(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_bytes())
     except (OSError, ValueError) as error:
         raise JobError(
             f"the file cannot be read ({error})", path=path, hint="choose another file with --out"

@@ -12,12 +12,15 @@ import cv2
 import numpy as np
 
 from bodycap_batch.calibration.board_detection import BoardCorners, CalibrationBoard, GreyImage
+from bodycap_batch.calibration.board_search import boards_in
 from bodycap_batch.calibration.intrinsics_fit import ImageSize, IntrinsicsFit, fit_intrinsics
 from bodycap_batch.capture import CaptureCamera, open_camera
+from bodycap_batch.capture.lens_choice import VideoMode, video_mode
+from bodycap_batch.config.calibration import NOTED_RMS_RATIO, max_rms_px
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.errors import CaptureError, EstimationError
+from bodycap_batch.core.errors import BodycapError, CaptureError, EstimationError
 
 CameraModelChoice = Literal["auto", "pinhole", "opencv", "fisheye"]
 _MODELS: dict[str, tuple[str, ...]] = {
@@ -47,9 +50,10 @@ picture has no corners and its distortion is extrapolated. The result then has a
 _MAX_FOCAL_SIGMA_RATIO = 0.005
 """Maximum ratio of the focal length's standard deviation to the focal length. With a larger ratio, the result
 has a note. Evidence: none."""
-_MAX_RMS_PX = 1.0
-"""Maximum reprojection error, in px of a picture with a long side of 640 px. With a larger error, the result
-has a note. Evidence: none."""
+_MAX_FOCAL_DIFFERENCE = 0.05
+"""Maximum relative difference of the focal lengths from two halves of the views, and maximum ratio of two
+standard deviations of the focal length to the focal length. With larger values, the calibration is refused.
+Evidence: docs/decisions/calibration.md."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +68,8 @@ class CalibrationResult:
         found: Number of pictures in which the board was found.
         coverage: Fraction of the cells of an 8x6 grid in the picture that contain a corner.
         notes: Notes for the user: reasons why the result may be wrong, with remedies.
+        halves_px: Focal lengths from every second view and from the others, px; None without a fit.
+        mode: What the video states about the camera.
         preview: (H,W) grey picture of the view with the most corners, for `write_preview`.
     """
 
@@ -74,6 +80,8 @@ class CalibrationResult:
     found: int
     coverage: float
     notes: tuple[str, ...]
+    halves_px: tuple[float, float] | None
+    mode: VideoMode
     preview: GreyImage
 
     def lines(self) -> list[str]:
@@ -81,11 +89,13 @@ class CalibrationResult:
         fit, (width, height) = self.fit, self.size
         sigma = ", ".join(f"{value:.2f}" for value in fit.focal_sigma_px)
         worst = max(fit.view_rms_px)
+        halves = self.halves_px and " and ".join(f"{value:.2f}" for value in self.halves_px)
         return [
             f"{self.board}: the board was found in {self.found} of {self.inspected} pictures, and "
             f"{len(fit.kept)} of these views were used",
             f"{fit.model} at {width}×{height}: focal length {fit.matrix[0, 0]:.2f}, "
-            f"{fit.matrix[1, 1]:.2f} px (±{sigma})",
+            f"{fit.matrix[1, 1]:.2f} px (±{sigma})"
+            f"{f', from the two halves of the views {halves} px' if halves else ''}",
             f"reprojection error {fit.rms_px:.3f} px, in the worst view {worst:.3f} px; corners of the "
             f"board were found in {100 * self.coverage:.0f} % of the picture",
             *(f"note: {note}" for note in self.notes),
@@ -109,7 +119,8 @@ def calibrate_clip(
 
     Raises:
         CaptureError: The video cannot be used, or the board was found in too few pictures.
-        EstimationError: No camera model fits the views.
+        EstimationError: No camera model fits the views, or the fit is not usable: the error is too large, or
+            the views do not agree on the focal length. If the clip shows another board, the error names it.
     """
     camera = open_camera(
         CaptureConfig(cameras=(CameraConfig(name="camera", video=(video,)),), work_px=8192),
@@ -127,14 +138,19 @@ def calibrate_clip(
         if view is not None:
             found.append((frame, view))
     if len(found) < MIN_VIEWS:
-        raise _too_few_views(video, board, len(found), inspected)
+        raise _with_shown_board(_too_few_views(video, board, len(found), inspected), video, board, context)
     kept = select_diverse_views([view for _, view in found], size, _MAX_VIEWS)
-    fit = _best_fit([found[index][1] for index in kept], size, lens, video)
+    fit = _best_fit([found[index][1] for index in kept], size, lens)
+    if fit is None or fit.rms_px > max_rms_px(size):
+        raise _with_shown_board(_no_lens_fits(video, board, fit, len(kept)), video, board, context)
     frames = [found[kept[index]][0] for index in fit.kept]
     views = [found[kept[index]][1] for index in fit.kept]
     shown = frames[int(np.argmax([len(view.px) for view in views]))]
     _, preview = next(iter(camera.read([shown])))
     coverage = corner_coverage([view.px for view in views], size)
+    mode = video_mode(video)
+    halves_px = _focal_lengths_of_halves(fit.model, views, size)
+    _require_known_focal_length(fit, halves_px, video)
     return CalibrationResult(
         board=board,
         fit=fit,
@@ -142,7 +158,9 @@ def calibrate_clip(
         inspected=inspected,
         found=len(found),
         coverage=coverage,
-        notes=tuple(_notes(fit, size, coverage)),
+        notes=tuple(_notes(fit, size, coverage, mode)),
+        halves_px=halves_px,
+        mode=mode,
         preview=preview,
     )
 
@@ -183,22 +201,16 @@ def _sharpest_pictures(
 
 
 def _best_fit(
-    views: Sequence[BoardCorners], size: ImageSize, lens: CameraModelChoice, video: Path
-) -> IntrinsicsFit:
-    """Fit each camera model that `lens` permits to the views, and return the best fit.
+    views: Sequence[BoardCorners], size: ImageSize, lens: CameraModelChoice
+) -> IntrinsicsFit | None:
+    """Fit each camera model that `lens` permits to the views, and return the best fit; None if none fits.
 
     If `lens` is ``auto``, the fisheye model is the best fit only if its error is clearly smaller.
     """
     fits = [fit for model in _MODELS[lens] if (fit := fit_intrinsics(model, views, size)) is not None]
-    if not fits:
-        raise EstimationError(
-            f"no camera model fits the {len(views)} views of the board",
-            path=video,
-            hint="film the board in all corners of the picture, tilt the board to all sides, and keep the "
-            "board flat",
-        )
-    best = fits[0]
+    best = fits[0] if fits else None
     for other in fits[1:]:
+        assert best is not None
         if other.rms_px < _MAX_FISHEYE_ERROR_RATIO * best.rms_px:
             best = other
     return best
@@ -261,8 +273,13 @@ def corner_coverage(pixels: Sequence[FloatArray], size: ImageSize) -> float:
     return float(cells.mean())
 
 
-def _notes(fit: IntrinsicsFit, size: ImageSize, coverage: float) -> list[str]:
+def _notes(fit: IntrinsicsFit, size: ImageSize, coverage: float, mode: VideoMode) -> list[str]:
     notes = []
+    if mode.stabilisation not in ("", "off"):
+        notes.append(
+            f"the camera stabilised the video ({mode.stabilisation}), so the picture moved relative to the "
+            "lens: film the board again with stabilisation off"
+        )
     if coverage < _MIN_COVERAGE:
         notes.append(
             f"corners of the board were found in only {100 * coverage:.0f} % of the picture, so the "
@@ -275,13 +292,66 @@ def _notes(fit: IntrinsicsFit, size: ImageSize, coverage: float) -> list[str]:
             f"the focal length has an uncertainty of {100 * sigma:.1f} %: tilt the board more to all "
             "sides, and film the board from a shorter distance"
         )
-    if fit.rms_px > _MAX_RMS_PX * max(size) / 640.0:
+    if fit.rms_px > NOTED_RMS_RATIO * max_rms_px(size):
         notes.append(
             f"a reprojection error of {fit.rms_px:.1f} px is large: check that the board is flat, that its "
             "numbers of columns and rows are correct, that the focus is fixed, and that stabilisation is "
             "off"
         )
     return notes
+
+
+def _focal_lengths_of_halves(
+    model: str, views: Sequence[BoardCorners], size: ImageSize
+) -> tuple[float, float] | None:
+    """Return the focal lengths (px) from every second view and from the others; None if a half has no fit."""
+    fits = [fit_intrinsics(model, views[start::2], size) for start in (0, 1)]
+    found = [float(fit.matrix[[0, 1], [0, 1]].mean()) for fit in fits if fit is not None]
+    return (found[0], found[1]) if len(found) == 2 else None
+
+
+def _require_known_focal_length(
+    fit: IntrinsicsFit, halves_px: tuple[float, float] | None, video: Path
+) -> None:
+    """Raise `EstimationError` if the views do not determine the focal length, or do not agree on it."""
+    focal = float(fit.matrix[[0, 1], [0, 1]].mean())
+    parts = []
+    if 2.0 * max(fit.focal_sigma_px) > _MAX_FOCAL_DIFFERENCE * focal:
+        parts.append(f"it is {focal:.0f} ± {max(fit.focal_sigma_px):.0f} px")
+    if halves_px is not None and abs(halves_px[0] - halves_px[1]) > _MAX_FOCAL_DIFFERENCE * focal:
+        parts.append(f"half of the views give {halves_px[0]:.0f} px, the others {halves_px[1]:.0f} px")
+    if parts:
+        raise EstimationError(
+            f"the views of the board do not determine the focal length: {'; '.join(parts)}",
+            path=video,
+            hint="tilt the board more to all sides, film it near and far, keep it flat, fix focus and "
+            "zoom, and switch off stabilisation",
+        )
+
+
+def _no_lens_fits(
+    video: Path, board: CalibrationBoard, fit: IntrinsicsFit | None, views: int
+) -> EstimationError:
+    error = "" if fit is None else f" (the best has a reprojection error of {fit.rms_px:.1f} px)"
+    return EstimationError(
+        f"no lens fits the {views} views of the {board}{error}",
+        path=video,
+        hint="check the numbers of columns and rows; keep the board flat, fix the focus, switch off "
+        "stabilisation, and film the board in all corners of the picture, tilted to all sides",
+    )
+
+
+def _with_shown_board(
+    error: BodycapError, video: Path, stated: CalibrationBoard, context: StageContext
+) -> BodycapError:
+    """Return the error, which names the board that the clip shows if another one was stated."""
+    shown = next(iter(boards_in(video, context)), None)
+    if shown is not None and shown.is_usable and not shown.board.is_like(stated):
+        error.message += (
+            f"; the clip shows a {shown.board}, which a lens fits with an error of {shown.rms_px:.2f} px"
+        )
+        error.hint = f"give the board that the clip shows: {shown.board.options()}"
+    return error
 
 
 def _too_few_views(video: Path, board: CalibrationBoard, found: int, inspected: int) -> CaptureError:

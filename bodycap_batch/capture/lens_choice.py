@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 
 from bodycap_batch.capture.video import VideoFile, open_container
 from bodycap_batch.config.calibration import Calibration
@@ -13,6 +15,33 @@ from bodycap_batch.formats.gpmf import gopro_lens_mode, gopro_model, gopro_setti
 
 _MODEL_KEYS = ("com.apple.quicktime.model", "com.android.model", "model")
 """Keys of the metadata that name the model of a phone or a camera."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoMode:
+    """What a video states about the camera and its mode; "" for what it does not state.
+
+    Attributes:
+        model: Model of the camera.
+        lens_mode: Lens mode, such as Wide.
+        stabilisation: Mode of the stabilisation, or "off".
+    """
+
+    model: str
+    lens_mode: str
+    stabilisation: str
+
+
+def video_mode(path: Path) -> VideoMode:
+    """Return what a video states about the camera and its mode. Raises `CaptureError` if it is unreadable."""
+    with open_container(path) as container:
+        metadata = {key.lower(): str(value) for key, value in container.metadata.items()}
+    settings = gopro_settings(path)
+    return VideoMode(
+        model=_model(settings, metadata),
+        lens_mode=gopro_lens_mode(settings),
+        stabilisation=gopro_stabilisation(settings),
+    )
 
 
 def chosen_lens(config: CameraConfig, video: VideoFile) -> LensChoice | None:
@@ -32,7 +61,8 @@ def chosen_lens(config: CameraConfig, video: VideoFile) -> LensChoice | None:
         CaptureError: The job names a lens that does not fit the video.
     """
     if isinstance(config.calibration, str) and config.calibration != "auto":
-        found = choose_named(config.calibration, video.shown_size, video.fps)
+        name = config.calibration
+        found = _first_choice(video, lambda size: choose_named(name, size, video.fps))
         if isinstance(found, str):
             raise CaptureError(
                 found,
@@ -43,16 +73,22 @@ def chosen_lens(config: CameraConfig, video: VideoFile) -> LensChoice | None:
         return found
     if isinstance(config.calibration, Calibration) or config.fov_deg is not None:
         return None
-    with open_container(video.path) as container:
-        metadata = {key.lower(): str(value) for key, value in container.metadata.items()}
-    settings = gopro_settings(video.path)
-    if gopro_stabilisation(settings) not in ("", "off"):
+    mode = video_mode(video.path)
+    if mode.stabilisation not in ("", "off") or not mode.model:
         return None
-    model = _model(settings, metadata)
-    if not model:
-        return None
-    choice = choose_for_file(model, gopro_lens_mode(settings), video.shown_size, video.fps)
+    choice = _first_choice(video, lambda size: choose_for_file(mode.model, mode.lens_mode, size, video.fps))
     return None if isinstance(choice, str) else choice
+
+
+def _first_choice(
+    video: VideoFile, choose: Callable[[tuple[int, int]], LensChoice | str]
+) -> LensChoice | str:
+    """Return the choice for the size in square pixels, else that for the size in stored pixels."""
+    found = choose(video.shown_size)
+    if isinstance(found, str) and video.turned_size != video.shown_size:
+        stored = choose(video.turned_size)
+        return found if isinstance(stored, str) else stored
+    return found
 
 
 def _model(settings: Mapping[str, str], metadata: Mapping[str, str]) -> str:

@@ -90,8 +90,9 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
     Print a board (--print), and glue it on something flat. Film the board with the camera settings of your
     captures: stabilisation is off; picture size, zoom and lens mode are the same. Move the board slowly to
     every corner of the picture, near and far, and tilt the board to all sides; half a minute is enough. If no
-    board is named, the usual boards are tried. The command writes calib.json and a picture from which the
-    distortion is removed, so that you can check it.
+    board is named, its kind and size are measured. The command writes calib.json and a picture from which the
+    distortion is removed, so that you can check it. Nothing is written if the error is too large, or if the
+    views do not determine the focal length.
 
     \b
     Examples:

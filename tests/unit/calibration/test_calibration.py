@@ -1,8 +1,10 @@
 """Calibration from clips of boards: boards drawn with known intrinsics must give these intrinsics."""
 
 import json
+from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 
@@ -15,14 +17,20 @@ from bodycap_batch.calibration import (
     write_preview,
 )
 from bodycap_batch.calibration.board_detection import BoardCorners
-from bodycap_batch.calibration.clip_calibration import corner_coverage, select_diverse_views
+from bodycap_batch.calibration.board_search import _charuco_boards
+from bodycap_batch.calibration.clip_calibration import (
+    _focal_lengths_of_halves,
+    _require_known_focal_length,
+    corner_coverage,
+    select_diverse_views,
+)
 from bodycap_batch.calibration.intrinsics_fit import fit_intrinsics
 from bodycap_batch.calibration.printed_board import PRINTED_BOARD
 from bodycap_batch.capture import open_camera
 from bodycap_batch.config.calibration import read_calibration
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.errors import CaptureError, JobError
+from bodycap_batch.core.errors import CaptureError, EstimationError, JobError
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
 from bodycap_batch.model.geometry import so3_exp
 from tests.boards import (
@@ -114,6 +122,8 @@ def test_a_job_reads_the_written_file(result, clip, tmp_path):
     report = json.loads((tmp_path / "calib.json").read_text())["calibrated_with"]
     assert report["rms_px"] == pytest.approx(result.fit.rms_px, abs=1e-4)
     assert len(report["view_rms_px"]) == report["views"]
+    one, other = report["focal_of_halves_px"]
+    assert abs(one / other - 1) < 0.005
 
 
 def test_cameras_are_added_to_one_file(result, tmp_path):
@@ -148,7 +158,8 @@ def test_a_clip_without_the_board_is_refused_with_numbers(tmp_path):
         CaptureError, match=r"found in 0 of 4 inspected pictures, but 8 pictures with the board are needed"
     ) as refused:
         calibrate_clip(clip, CHESSBOARD, "auto", StageContext(work_dir=tmp_path))
-    assert "inner corners" in refused.value.hint
+    assert "the clip shows a ChArUco board of 9x6 squares" in refused.value.message
+    assert "--charuco 9x6 --dictionary 4X4_50" in refused.value.hint
 
 
 def test_the_command_writes_calibration_and_preview(clip, tmp_path, capsys):
@@ -177,12 +188,12 @@ def test_wrong_options_are_refused(clip, tmp_path, capsys, words, message):
     assert not (tmp_path / "calib.json").exists()
 
 
-def _exact_views(lens, rng, count, noise_px=0.0):
+def _exact_views(lens, rng, count, noise_px=0.0, tilt=0.5):
     x, y = np.meshgrid(np.arange(9.0), np.arange(6.0))
     board = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     views = []
     for _ in range(count):
-        turn = so3_exp(rng.uniform(-0.5, 0.5, 3))
+        turn = so3_exp(rng.uniform(-tilt, tilt, 3))
         centre = np.append(rng.uniform(-2, 2, 2), rng.uniform(9, 13))
         px = lens.project((board - [4.0, 2.5, 0.0]) @ turn.T + centre) - CV2_PIXEL_OFFSET_PX
         views.append(BoardCorners(board_m=board, px=px + rng.normal(0, noise_px, px.shape)))
@@ -249,9 +260,78 @@ def test_the_board_of_a_clip_is_found_without_naming_it(clip):
     assert (board.kind, board.columns, board.rows) == ("charuco", 9, 6)
 
 
+@pytest.fixture(scope="module")
+def unusual(tmp_path_factory):
+    """A chessboard of a size that no list of usual boards has."""
+    images = board_clip(
+        PINHOLE_LENS, with_margin(chessboard_picture(11, 7)), 16, np.random.default_rng(1), whole=True
+    )
+    return write_video(tmp_path_factory.mktemp("unusual") / "board.mp4", images, fps=5)
+
+
+@pytest.mark.parametrize("stated", ["10x7", "7x5"])
+def test_a_wrongly_counted_board_is_refused_with_the_size_that_fits(unusual, tmp_path, capsys, stated):
+    """10x7 is never found; parts of 7x5 corners are, each at another place of the board."""
+    out = tmp_path / "calib.json"
+    code = cli.main(["calibrate", str(unusual), "--chessboard", stated, "--out", str(out)])
+    assert code in (3, 4)
+    error = " ".join(capsys.readouterr().err.split())
+    assert (
+        "the clip shows a chessboard of 11x7 inner corners, which a lens fits with an error of 0.0" in error
+    )
+    assert "--chessboard 11x7" in error
+    assert not out.exists()
+
+
+def test_the_size_of_a_chessboard_is_measured(unusual):
+    found = find_board(unusual, StageContext(work_dir=unusual.parent))
+    assert (found.kind, found.columns, found.rows) == ("chessboard", 11, 7)
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "legacy", "lens"),
+    [(8, 6, True, PINHOLE_LENS), (5, 7, False, FISHEYE_LENS), (12, 9, False, PINHOLE_LENS)],
+)
+def test_the_size_of_a_charuco_board_is_measured(columns, rows, legacy, lens):
+    board = CalibrationBoard(kind="charuco", columns=columns, rows=rows, dictionary="5X5_100", legacy=legacy)
+    picture = with_margin(board.picture(SQUARE_TEXELS))
+    (found,) = _charuco_boards(board_clip(lens, picture, 10, np.random.default_rng(3), whole=False))
+    assert found.is_like(board)
+    assert found.legacy == legacy
+
+
+def test_a_bent_board_is_refused_with_its_error(tmp_path, capsys):
+    picture = with_margin(chessboard_picture(9, 6))
+    y, x = np.indices(picture.shape, dtype=np.float32)
+    # The corners are up to a sixth of a square beside their places.
+    bent = cv2.remap(picture, x + 8 * np.sin(y / 60), y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    images = board_clip(PINHOLE_LENS, bent, 16, np.random.default_rng(1), whole=True)
+    clip = write_video(tmp_path / "bent.mp4", images, fps=5)
+    assert cli.main(["calibrate", str(clip), "--chessboard", "9x6"]) == 4
+    error = " ".join(capsys.readouterr().err.split())
+    assert "no lens fits the 16 views of the chessboard of 9x6 inner corners (the best has a reproj" in error
+    assert "the clip shows" not in error
+    assert not (tmp_path / "calib.json").exists()
+
+
+@pytest.mark.parametrize(("tilt", "is_known"), [(0.5, True), (0.03, False)])
+def test_views_that_do_not_determine_the_focal_length_are_refused(tilt, is_known):
+    views = _exact_views(PINHOLE_LENS, np.random.default_rng(0), 16, noise_px=0.2, tilt=tilt)
+    fit = fit_intrinsics("OPENCV", views, (640, 480))
+    halves = _focal_lengths_of_halves("OPENCV", views, (640, 480))
+    if is_known:
+        _require_known_focal_length(fit, halves, Path("a.mp4"))
+        # 16 views with errors of 0.2 px: a third of a percent.
+        assert abs(halves[0] / halves[1] - 1) < 0.02
+    else:
+        with pytest.raises(EstimationError, match="do not determine the focal length") as caught:
+            _require_known_focal_length(fit, halves, Path("a.mp4"))
+        assert "tilt the board" in caught.value.hint
+
+
 def test_a_clip_without_a_board_is_refused(tmp_path):
     grey = np.full((20, 240, 320), 110, dtype=np.uint8)
-    with pytest.raises(CaptureError, match="no usual calibration board") as caught:
+    with pytest.raises(CaptureError, match="no calibration board") as caught:
         find_board(write_video(tmp_path / "wall.mp4", grey, fps=5), StageContext(work_dir=tmp_path))
     assert "--print" in caught.value.hint
 
