@@ -23,6 +23,7 @@ from bodycap_batch.capture.video import (
     is_frame,
     open_container,
     orientation_from_frame,
+    projection_from_frame,
     video_stream,
 )
 from bodycap_batch.core.arrays import IntArray
@@ -235,6 +236,7 @@ def _with_first_frame(video: VideoFile, container_format: str, threads: int) -> 
         stored_size=(frame.width, frame.height),
         orientation=orientation_from_frame(frame),
         is_interlaced=bool(frame.interlaced_frame),
+        projection=projection_from_frame(frame, video.path),
     )
     if container_format == "avi" and reordered:
         return replace(video, is_counted=True, key_pts=video.pts[:1])

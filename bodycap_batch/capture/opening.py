@@ -12,7 +12,7 @@ from bodycap_batch.capture.initial_intrinsics import guessed_camera, work_camera
 from bodycap_batch.capture.lens_choice import chosen_lens
 from bodycap_batch.capture.masks import read_mask
 from bodycap_batch.capture.timeline import join_chapters
-from bodycap_batch.capture.video import VideoFile
+from bodycap_batch.capture.video import VideoFile, spherical_error
 from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.arrays import BoolArray, IntArray
@@ -50,6 +50,9 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
             frame between start_s and end_s.
     """
     videos = index_videos(config.video, threads)
+    for video in videos:
+        if video.projection:
+            raise spherical_error(video.path, video.projection)
     _check_one_format(videos)
     timeline = join_chapters(videos, config.timestamps)
     used = timeline.usable

@@ -28,6 +28,14 @@ orientation · stored. x points to the right and y down. The matrix is a signed 
 
 COPY_AGAIN = "copy the video again from the memory card of the camera, or leave this camera out"
 """Hint of the error about a damaged file."""
+_SPHERICAL_PROJECTIONS = {
+    0: "equirectangular",
+    1: "a cube map",
+    2: "a part of an equirectangular picture",
+    3: "half an equirectangular picture",
+    6: "a parametric immersive picture",
+}
+"""FFmpeg's numbers of the projections that no lens has. Rectilinear and fisheye pictures are left out."""
 MAY_READ = (
     "give the user who runs this program the permission to read the file and to enter its folders (chmod)"
 )
@@ -74,6 +82,8 @@ class VideoFile:
         part: First byte, and the byte after the last byte, of the recording in the file, if the file consists
             of several recordings. None if the whole file is one recording.
         notes: Notes for the user about frames without a time of their own.
+        projection: Projection of a 360° picture, which no lens has, as the file states it; "" for a picture
+            through a lens.
     """
 
     path: Path
@@ -96,6 +106,7 @@ class VideoFile:
     sound_s: float = 0.0
     part: tuple[int, int] | None = None
     notes: tuple[str, ...] = ()
+    projection: str = ""
 
     @property
     def turned_size(self) -> tuple[int, int]:
@@ -249,6 +260,31 @@ def orientation_from_frame(frame: VideoFrame) -> Orientation:
     if abs(a) + abs(d) >= abs(b) + abs(c):
         return (_sign(a), 0), (0, _sign(d))
     return (0, _sign(c)), (_sign(b), 0)
+
+
+def projection_from_frame(frame: VideoFrame, path: Path) -> str:
+    """Return the projection of a 360° picture, as the metadata or the format of the file state it; else "".
+
+    Source: FFmpeg, libavutil/spherical.h, which reads both versions of Google's Spherical Video metadata.
+    """
+    side_data: Any = frame.side_data.get("SPHERICAL")
+    number = None if side_data is None else struct.unpack("=i", bytes(side_data)[:4])[0]
+    if number in _SPHERICAL_PROJECTIONS:
+        return f"{_SPHERICAL_PROJECTIONS[number]} in its metadata"
+    suffix, shape = path.suffix.lower(), Fraction(frame.width, frame.height)
+    if suffix == ".360" or (suffix == ".insv" and shape in (1, 2)):
+        return f"unstitched pictures of a 360° camera in a file {suffix}"
+    return ""
+
+
+def spherical_error(path: Path, projection: str) -> CaptureError:
+    """Return the error for a video of 360° pictures."""
+    return CaptureError(
+        f"a 360° picture ({projection}), which no lens can have",
+        path=path,
+        hint="export a flat view first: in the program of the camera, reframe the video to a fixed direction "
+        "and a fixed field of view, without stabilisation, and use the exported file",
+    )
 
 
 def _sign(value: int) -> int:

@@ -11,9 +11,10 @@ import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.images import Image
-from bodycap_batch.capture.video import COPY_AGAIN
+from bodycap_batch.capture.video import COPY_AGAIN, spherical_error
+from bodycap_batch.check.spherical_pictures import is_sphere, sphere_differences
 from bodycap_batch.check.static_pictures import has_one_view, is_static, reduced_picture, static_notes
-from bodycap_batch.core.arrays import IntArray, evenly_spaced
+from bodycap_batch.core.arrays import FloatArray, IntArray, evenly_spaced
 from bodycap_batch.core.errors import CaptureError
 
 _SAMPLES = 8
@@ -93,6 +94,8 @@ def check_picture_quality(camera: CaptureCamera) -> PictureQuality:
     dark, bright = [], []
     grey, corners = [], []
     indices, reduced_pictures = [], []
+    edges: list[FloatArray] = []
+    width, height = camera.videos[0].shown_size
     for index, image in camera.read_decodable(sample_indices(camera, _SAMPLES)):
         low, high = np.percentile(image, (1, 99))
         dark.append(float(low))
@@ -101,11 +104,17 @@ def check_picture_quality(camera: CaptureCamera) -> PictureQuality:
         reduced_pictures.append(reduced_picture(image))
         grey.append(float(np.median(image)))
         corners.append(_corner_count(image))
+        if width == 2 * height:
+            edges.append(sphere_differences(image))
     if not indices:
         raise CaptureError(
             f"none of the inspected frames of camera {camera.name} can be decoded",
             path=camera.chapters[0],
             hint=COPY_AGAIN,
+        )
+    if edges and is_sphere(edges):
+        raise spherical_error(
+            camera.chapters[0], "equirectangular, because the left edge continues the right edge"
         )
     black = int(np.sum(np.array(bright) < _MAX_BLACK_GREY))
     if black == len(bright):

@@ -24,6 +24,7 @@ VIDEO_SUFFIXES = frozenset(
         ".mpg",
         ".mpeg",
         ".insv",
+        ".360",
         ".3gp",
         ".wmv",
     }
