@@ -18,12 +18,13 @@ _MIN_WHITE_RATIO = 0.05
 """Minimum fraction of the pixels of a mask that are white. Evidence: none."""
 
 
-def read_mask(path: Path, size: tuple[int, int]) -> BoolArray:
+def read_mask(path: Path, size: tuple[int, int], stored_size: tuple[int, int] | None = None) -> BoolArray:
     """Read a mask image that is white where the room is visible.
 
     Args:
         path: Path of the mask image. It may have any size, with the aspect ratio of the picture.
         size: Width and height of the picture, pixels.
+        stored_size: Width and height in stored pixels, if they are not square. The mask may have this shape.
 
     Returns:
         Read-only mask (H,W) that is True where the room is visible.
@@ -46,7 +47,8 @@ def read_mask(path: Path, size: tuple[int, int]) -> BoolArray:
     if image is None:
         raise error_because("the mask cannot be read as a picture", "save the mask as a PNG picture")
     height, width = image.shape
-    if abs(width * size[1] / (height * size[0]) - 1.0) > _ASPECT_TOLERANCE:
+    shapes = (size, stored_size or size)
+    if all(abs(width * high / (height * wide) - 1.0) > _ASPECT_TOLERANCE for wide, high in shapes):
         raise error_because(
             f"the mask is {width}×{height}, but the picture is {size[0]}×{size[1]}: their aspect ratios "
             "differ",

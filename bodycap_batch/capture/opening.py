@@ -92,7 +92,9 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         ),
         videos=videos,
         threads=threads,
-        mask=None if config.mask is None else read_mask(config.mask, (camera.width_px, camera.height_px)),
+        mask=None
+        if config.mask is None
+        else read_mask(config.mask, (camera.width_px, camera.height_px), videos[0].turned_size),
     )
 
 

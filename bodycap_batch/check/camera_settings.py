@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.capture.lens_choice import video_mode
 from bodycap_batch.capture.video import open_container
+from bodycap_batch.config.calibration import NOTED_RMS_RATIO, CalibratedWith, Calibration, max_rms_px
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.formats.gpmf import gopro_settings
 
@@ -21,6 +23,9 @@ _PHONE_KEYS = {
     "com.android.model": "com.android.manufacturer",
 }
 """Metadata key of a phone's maker, by the metadata key of the phone's model."""
+_MAX_FOCAL_DIFFERENCE = 0.05
+"""Maximum relative difference of the focal lengths for the two axes of square pixels. 3,052 of 3,140
+published calibrations have less; most of the others are of anamorphic lenses or of stretched modes."""
 _MAX_RATE_RATIO = 1.5
 """Maximum ratio of the 95th to the 5th percentile of the frame steps for a fixed frame rate.
 
@@ -43,6 +48,46 @@ def setting_notes(camera: CaptureCamera) -> list[str]:
     """Return notes on a camera's settings, found in the first chapter's metadata and in the frame times."""
     path = camera.chapters[0]
     return [*_gopro_notes(gopro_settings(path)), *_phone_notes(path), *_rate_notes(camera.times_ns)]
+
+
+def calibration_notes(calibration: Calibration, camera: CaptureCamera) -> list[str]:
+    """Return notes on a given calibration that contradicts the video, or whose own report is bad.
+
+    Args:
+        calibration: The calibration.
+        camera: The camera, with the intrinsics of the calibration at the work size.
+    """
+    size, video = (calibration.width, calibration.height), camera.videos[0]
+    made = calibration.calibrated_with or CalibratedWith()
+    mode = video_mode(video.path)
+    notes = [f"the lens was calibrated with this note: {note}" for note in made.notes]
+    if made.rms_px is not None and made.rms_px > NOTED_RMS_RATIO * max_rms_px(size):
+        notes.append(
+            f"the calibration has a large reprojection error ({made.rms_px:.2f} px): calibrate again"
+        )
+    if size not in (video.shown_size, video.turned_size):
+        notes.append(
+            f"the lens was calibrated with pictures of {size[0]}×{size[1]} pixels, and the video shows "
+            f"{video.shown_size[0]}×{video.shown_size[1]}: the calibration is scaled, which is right only if "
+            "both modes of the camera show the same view"
+        )
+    for what, stated, shown in (
+        ("camera", made.camera, mode.model),
+        ("lens mode", made.lens_mode, mode.lens_mode),
+    ):
+        if stated and shown and _letters(shown) not in _letters(stated):
+            notes.append(f"the calibration is of the {what} {stated}, and the video states {shown}")
+    ratio = camera.camera.focal_ratio
+    if abs(ratio - 1.0) > _MAX_FOCAL_DIFFERENCE:
+        notes.append(
+            f"in square pixels, the focal lengths of the calibration are {ratio:.2f} to 1 (the pixels of the "
+            f"video are {video.pixel_aspect} to 1): one of the two is wrong, or the lens is anamorphic"
+        )
+    return notes
+
+
+def _letters(text: str) -> str:
+    return "".join(letter for letter in text.lower() if letter.isalnum())
 
 
 def _gopro_notes(settings: dict[str, str]) -> list[str]:

@@ -12,13 +12,14 @@ import numpy as np
 
 from bodycap_batch.capture import CaptureCamera, open_camera
 from bodycap_batch.capture.damage import damage_notes, find_damage_and_copies
-from bodycap_batch.check.camera_settings import setting_notes
+from bodycap_batch.check.camera_settings import calibration_notes, setting_notes
 from bodycap_batch.check.check_report import CameraSummary, CheckReport
 from bodycap_batch.check.file_mixups import require_distinct_videos
 from bodycap_batch.check.overview import with_first_guess
 from bodycap_batch.check.picture_quality import PictureQuality, check_picture_quality, stands_still
 from bodycap_batch.check.recording_advice import advise
 from bodycap_batch.config.bounds import MAX_TICKS
+from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.export_targets import export_target
 from bodycap_batch.config.job import load_job_with_origins
 from bodycap_batch.config.models import (
@@ -196,6 +197,11 @@ def _summarise_camera(camera: CaptureCamera, config: CameraConfig, quality: Pict
             *quality.notes,
             *_dropped_frame_notes(camera, median_ns),
             *setting_notes(camera),
+            *(
+                calibration_notes(config.calibration, camera)
+                if isinstance(config.calibration, Calibration)
+                else []
+            ),
             *_intrinsics_notes(camera),
             *_duration_notes(duration),
         ),
@@ -212,14 +218,16 @@ def _intrinsics_text(camera: CaptureCamera) -> str:
     width, focal = max(camera.camera.width_px, camera.camera.height_px), camera.camera.focal_px
     is_fisheye = camera.camera.model.endswith("FISHEYE")
     view = 2.0 * np.degrees(0.5 * width / focal if is_fisheye else np.arctan(0.5 * width / focal))
+    aspect = camera.videos[0].pixel_aspect
+    squared = "" if aspect == 1 else f"; the pixels of the video ({aspect} to 1) are made square"
     if camera.calibrated:
         return (
             f"the camera is calibrated: {camera.camera.model}, focal length {focal:.0f} px in the reduced "
-            "frames (long side: work_px)"
+            f"frames (long side: work_px){squared}"
         )
     return (
         "the camera is not calibrated: its lens is estimated together with the map; the first guess is a "
-        f"field of view of {view:.0f}° along the long side"
+        f"field of view of {view:.0f}° along the long side{squared}"
     )
 
 

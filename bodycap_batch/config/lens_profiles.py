@@ -10,14 +10,15 @@ import gzip
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 from typing import Any
 
 import numpy as np
 
-from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX, Camera
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX, Camera, with_two_focal_lengths
 
 NAME_SEPARATOR = " / "
 """Separates the parts of a name: model, lens mode, size."""
@@ -58,7 +59,7 @@ class LensProfile:
         rms_px: Reprojection error of the calibration, pixels.
         official: Whether the collection marks it as made by its maintainers or by the maker.
         stabilised: Whether it was made with stabilised pictures.
-        anamorphic: Whether an anamorphic lens or attachment was used.
+        anamorphic: Whether an anamorphic lens or attachment was used, or a mode that stretches the picture.
         readout_s: Time from the exposure of the first row to the last, seconds; negative if the sensor reads
             upwards; None if it is unknown.
         sizes: Further image sizes for which the collection lists the same profile, pixels.
@@ -83,6 +84,12 @@ class LensProfile:
     def camera_name(self) -> str:
         """Maker and model."""
         return self.model if _key(self.model).startswith(_key(self.brand)) else f"{self.brand} {self.model}"
+
+    @property
+    def has_attachment(self) -> bool:
+        """Whether the profile names an anamorphic lens or attachment."""
+        words = f"{self.model} {self.lens} {self.setting}".lower()
+        return self.anamorphic and ("anamor" in words or "anomor" in words)
 
     @property
     def name(self) -> str:
@@ -123,14 +130,18 @@ class LensProfile:
 
         Mapping refines its focal length and radial terms. One focal length and two terms are fitted to the
         radial curve of the profile, as far as the image goes, with a fisheye model or with a perspective
-        model, whichever fits better. If neither fits, the lens has the four terms of the profile.
+        model, whichever fits better. If neither fits, the lens has the four terms of the profile. If the
+        pixels are not square, or the lens is anamorphic, it has a focal length for each axis.
 
         Args:
-            size: Width and height, pixels, of the same shape as the profile.
+            size: Width and height, pixels. If its shape differs from that of the profile, the pixels of one
+                of the two are not square.
         """
         fx, fy, cx, cy, *radial = self.params
+        x, y = size[0] / self.width, size[1] / self.height
+        fx, fy, centre = fx * x, fy * y, [(cx + CV2_PIXEL_OFFSET_PX) * x, (cy + CV2_PIXEL_OFFSET_PX) * y]
         focal = 0.5 * (fx + fy)
-        corner = 0.5 * float(np.hypot(self.width, self.height)) / focal
+        corner = 0.5 * float(np.hypot(*size)) / focal
         theta = np.linspace(0.0, _MAX_ANGLE_RAD, _CURVE_POINTS)
         squared = theta**2
         curve = theta * (1.0 + squared * np.polynomial.polynomial.polyval(squared, radial))
@@ -143,13 +154,16 @@ class LensProfile:
             misfit = float(np.sqrt(np.mean((terms @ found - curve[:end]) ** 2)))
             fits.append((misfit, model, found.tolist()))
         misfit, model, (scale, cubic, fifth) = min(fits)
-        ratio = size[0] / self.width
-        centre = [(cx + CV2_PIXEL_OFFSET_PX) * ratio, (cy + CV2_PIXEL_OFFSET_PX) * size[1] / self.height]
-        params = [focal * scale * ratio, *centre, cubic / scale, fifth / scale]
+        params: FloatArray | list[float] = [focal * scale, *centre, cubic / scale, fifth / scale]
         has_inverse = bool(curve[end - 1] > _LEAST_REACH * corner)
-        if has_inverse and misfit * focal / max(self.width, self.height) > _MAX_MISFIT:
-            model, params = "OPENCV_FISHEYE", [focal * ratio, focal * ratio, *centre, *radial]
-        return Camera(model=model, width_px=size[0], height_px=size[1], params=np.array(params), refine=True)
+        if has_inverse and misfit * focal / max(size) > _MAX_MISFIT:
+            model, params = "OPENCV_FISHEYE", [focal, focal, *centre, *radial]
+        lens = Camera(model=model, width_px=size[0], height_px=size[1], params=np.array(params), refine=True)
+        if abs(fx / fy - 1.0) <= _SAME_FOCAL:
+            return lens
+        lens = with_two_focal_lengths(lens)
+        params = np.concatenate([lens.params[:2] * [fx / focal, fy / focal], lens.params[2:]])
+        return replace(lens, params=params)
 
 
 _MAX_MISFIT = 0.15 / 640
@@ -273,7 +287,8 @@ def choose_named(name: str, size: tuple[int, int], fps: float) -> LensChoice | s
             f"the lens profiles with the name {name!r} are for pictures of {sizes}, but the video shows "
             f"{size[0]}x{size[1]}: the shapes differ"
         )
-    if all(each.anamorphic for each in fitting) and "an" not in _key(name):
+    # Other profiles with two focal lengths are of modes that stretch the picture of every such camera.
+    if all(each.has_attachment for each in fitting) and "an" not in _key(name):
         return f"the lens profiles with the name {name!r} are all of anamorphic lenses"
     plain = [each for each in fitting if not each.anamorphic] or fitting
     best = _best(plain, size, fps)

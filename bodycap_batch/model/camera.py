@@ -102,6 +102,12 @@ class Camera:
         return float(np.mean([self.params[i] for i in _FOCAL_INDICES[self.model]]))
 
     @property
+    def focal_ratio(self) -> float:
+        """Ratio of the focal length along x to that along y; 1 if the model has one focal length."""
+        focal = _FOCAL_INDICES[self.model]
+        return float(self.params[focal[0]] / self.params[focal[-1]])
+
+    @property
     def principal_point_px(self) -> tuple[float, float]:
         """Principal point (cx, cy) in pixels."""
         first = len(_FOCAL_INDICES[self.model])

@@ -259,12 +259,12 @@ def _change_model(camera: Any, name: str) -> None:
     """Change the model of a camera in place; the projection near the image's centre stays the same.
 
     Args:
-        camera: A camera whose model has one focal length.
+        camera: The camera. A model with two focal lengths, of an anamorphic lens, stays as it is.
         name: The candidate: a camera model, `_PRINCIPAL_POINT` or `_PIXEL_ASPECT`.
     """
     import pycolmap
 
-    if name == _PRINCIPAL_POINT:
+    if name == _PRINCIPAL_POINT or len(camera.focal_length_idxs()) > 1:
         return
     focal, centre_x, centre_y, *radial = camera.params.tolist()
     if name == _PIXEL_ASPECT:

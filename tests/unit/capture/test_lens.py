@@ -6,6 +6,7 @@ import json
 from fractions import Fraction
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -227,3 +228,50 @@ def test_the_real_capture_has_opencv_pixels_and_unix_times(data_root: Path) -> N
     assert camera.camera.principal_point_px == (319.1, 255.8)
     assert camera.times_ns[0] == 1305031102175304000
     assert not camera.camera.refine
+
+
+@pytest.fixture(scope="module")
+def camcorder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """1440 stored columns that are shown as 1920."""
+    return write_video(
+        tmp_path_factory.mktemp("hdv") / "a.mp4",
+        [textured_frame(0, 1440, 1080)] * 2,
+        pixel_aspect=Fraction(4, 3),
+    )
+
+
+@pytest.mark.parametrize(
+    ("camera", "ratio"),
+    [
+        ({}, 1.0),
+        ({"fov_deg": 80.0}, 1.0),
+        ({"calibration": "GoPro HERO11 Black / Wide"}, 1.0),
+        # A mode that stretches the picture to 16:9, in square pixels.
+        ({"calibration": "Hawkeye Firefly X Lite / 150"}, 1335.68 / 1000.54),
+        # A profile of stored pixels, 2880x2160, which are shown as 3840x2160.
+        ({"calibration": "SJCAM c100+ / 2880x2160"}, 1955.88 * 4 / 3 / 2605.22),
+        ({"calibration": {**LENS, "params": [1050, 1400, 720, 540], "width": 1440, "height": 1080}}, 1.0),
+        ({"calibration": {**LENS, "params": [1400, 1400, 960, 540], "width": 1920, "height": 1080}}, 1.0),
+    ],
+)
+def test_pixels_that_are_not_square_are_in_the_lens(
+    camcorder: Path, camera: dict[str, object], ratio: float
+) -> None:
+    lens = lens_of(camcorder, **camera)
+    assert (lens.width_px, lens.height_px) == (960, 540)
+    # The shapes of profiles are rounded to even numbers; focal lengths within 3 % are taken as equal.
+    assert lens.focal_ratio == pytest.approx(ratio, rel=0.03 if abs(ratio - 1.0) < 0.03 else 0.002)
+    if "SJCAM" in str(camera):
+        assert lens.focal_px == pytest.approx(2605.22 / 4, rel=0.03)
+
+
+def test_a_mask_may_have_the_shape_of_the_stored_picture(camcorder: Path, tmp_path: Path) -> None:
+    mask = np.zeros((540, 720), np.uint8)
+    mask[:, :360] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    config = CameraConfig(name="torso", video=(camcorder,), mask=tmp_path / "mask.png")
+    found = open_camera(CaptureConfig(cameras=(config,)), config).mask
+    assert found is not None
+    assert found.shape == (540, 960)
+    assert found[:, :479].all()
+    assert not found[:, 481:].any()

@@ -1,5 +1,6 @@
 """Camera settings that a check reads: GoPro's settings box, a phone's metadata, a variable rate."""
 
+import json
 import struct
 
 import av
@@ -104,3 +105,25 @@ def test_dropped_frames_and_jitter_are_not_a_variable_rate(tmp_path):
     steps = np.where(rng.uniform(size=74) < 0.1, 20, 10) + rng.integers(-1, 2, 74)
     notes = _notes(tmp_path, pts=np.concatenate([[0], np.cumsum(steps)]).tolist())
     assert not any("varies" in note for note in notes)
+
+
+LENS = {"model": "PINHOLE", "params": [40, 40, 32, 24], "width": 64, "height": 48}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"calibrated_with": {"rms_px": 0.7}}, "large reprojection error (0.70 px)"),
+        ({"calibrated_with": {"rms_px": 0.1, "notes": ["tilt more"]}}, "with this note: tilt more"),
+        ({"width": 128, "height": 96, "params": [80, 80, 64, 48]}, "with pictures of 128×96 pixels"),
+        ({"calibrated_with": {"lens_mode": "Linear"}}, "lens mode Linear, and the video states Wide"),
+        ({"calibrated_with": {"camera": "GoPro HERO8 Black"}}, "of the camera GoPro HERO8 Black"),
+        ({"params": [30, 40, 32, 24]}, "the focal lengths of the calibration are 0.75 to 1"),
+        ({"calibrated_with": {"rms_px": 0.1, "camera": "GoPro HERO9 Black", "lens_mode": "Wide"}}, ""),
+    ],
+)
+def test_a_calibration_that_contradicts_the_video_is_named(tmp_path, change, words):
+    (tmp_path / "calib.json").write_text(json.dumps({**LENS, **change}))
+    notes = _notes(tmp_path, settings={"MINF": "HERO9 Black", "VFOV": "W", "EISE": "N"})
+    assert len(notes) == bool(words)
+    assert not notes or words in notes[0]
