@@ -1,6 +1,6 @@
 """Find the recordings in a file that was made by joining files byte by byte, as `cat` does.
 
-The demuxers of MP4, MOV and FLV read the first recording only. Those of other formats read all of them.
+The demuxers of MP4, MOV, FLV and WMV read the first recording only. Those of other formats read all of them.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ from pathlib import Path
 
 from bodycap_batch.formats.file_completeness import movie_starts
 
-_FLV_HEADER = b"FLV\x01"
-"""First bytes of an FLV file."""
+_HEADERS = (b"FLV\x01", b"\x30\x26\xb2\x75")
+"""First bytes of FLV and WMV files."""
+_HEADER_BYTES = 9
+"""Number of bytes at the start that all files of one kind have, and that are searched for in the file."""
 
 
 def parts_of(path: Path) -> tuple[tuple[int, int] | None, ...]:
@@ -23,11 +25,11 @@ def parts_of(path: Path) -> tuple[tuple[int, int] | None, ...]:
     try:
         size = path.stat().st_size
         with path.open("rb", buffering=0) as stream:
-            head = stream.read(8)
-            if head[4:] == b"ftyp":
+            head = stream.read(_HEADER_BYTES)
+            if head[4:8] == b"ftyp":
                 starts = movie_starts(stream, size)
-            elif head[:4] == _FLV_HEADER:
-                starts = _occurrences(stream.fileno(), _FLV_HEADER + head[4:5] + bytes(3) + b"\x09")
+            elif head.startswith(_HEADERS):
+                starts = _occurrences(stream.fileno(), head)
             else:
                 return (None,)
     except OSError:  # the error is reported when the file is opened

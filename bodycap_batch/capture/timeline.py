@@ -125,18 +125,21 @@ def _real_times(video: VideoFile) -> tuple[IntArray, int]:
 
 
 def _restart_notes(videos: tuple[VideoFile, ...]) -> list[str]:
-    """Return a note about each file whose times start again."""
-    notes = []
-    for path, group in itertools.groupby(videos, lambda video: video.path):
-        chapters = list(group)
-        count = len(chapters) + sum(len(video.restarts) for video in chapters)
-        if count > 1:
-            notes.append(
-                f"the times in {path.name} start again, as in a file of {count} recordings that were joined. "
-                "Unless the file tells the time between them, each is taken to follow directly the one "
-                "before. If time passed, give the recordings as separate files, or write a file of timestamps"
-            )
-    return notes
+    """Return a note about each file whose times start again, with the numbers of the frames."""
+    restarts: dict[Path, list[int]] = {}
+    first = 0
+    for video in videos:
+        at = [first + packet for packet, _ in video.restarts]
+        restarts.setdefault(video.path, []).extend([first, *at] if video.part and video.part[0] else at)
+        first += len(video.pts)
+    return [
+        f"the times in {path.name} start again at frame {', '.join(map(str, at))}, as in a file of "
+        f"{len(at) + 1} recordings that were joined. Unless the file tells the time between them, each is "
+        "taken to follow directly the one before. If time passed, give the recordings as separate files, or "
+        "write a file of timestamps"
+        for path, at in restarts.items()
+        if at
+    ]
 
 
 def _container_times(videos: tuple[VideoFile, ...], own: list[tuple[IntArray, int]]) -> list[IntArray]:
