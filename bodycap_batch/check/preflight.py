@@ -46,6 +46,7 @@ from bodycap_batch.formats.bvh import RigOptions, read_rig
 from bodycap_batch.formats.optional_libraries import require_formats
 from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.copied_frames import copied_notes
+from bodycap_batch.model.nominal_mounts import require_limb
 from bodycap_batch.store.disk_space import require_room
 
 _RATE_TOLERANCE = 0.2
@@ -355,22 +356,20 @@ def _check_rates(job: Job, summaries: list[CameraSummary]) -> list[str]:
 
 
 def _check_skeleton(job: Job, _findings: list[CameraSummary]) -> list[str]:
-    """Check that a skeleton file can be read and contains the bones on which cameras are mounted."""
+    """Check that a skeleton file can be used and contains the bones that the cameras need."""
     if job.skeleton is None or job.skeleton in SKELETON_PRESETS:
         return []
     path = Path(job.skeleton)
-    skeleton, _ = read_rig(path, RigOptions(roles=job.skeleton_map, tpose_frame=job.tpose_frame))
+    options = RigOptions(roles=job.skeleton_map, tpose_frame=job.tpose_frame, height_m=job.height_m)
+    skeleton, _ = read_rig(path, options)
     for camera in job.capture.cameras:
-        if camera.role is not None and skeleton.index_of_role(camera.role) is None:
-            raise JobError(
-                f"the skeleton has no joint with the role {camera.role}, but camera {camera.name} is "
-                f"mounted on {camera.role}",
-                path=path,
-                field="skeleton",
-                hint=f"give the role to a joint with skeleton_map; `bodycap skeleton {path.name}` shows "
-                "the roles of all joints; the joints of the file are: " + ", ".join(skeleton.joints[:30]),
-            )
-    return [f"skeleton {path.name}: {len(skeleton.joints)} joints"]
+        if camera.role is not None:
+            require_limb(camera.name, camera.role, skeleton, path)
+    findings = (*skeleton.notes, *(f"warning: {text}" for text in skeleton.warnings))
+    return [
+        f"skeleton {path.name}: {len(skeleton.joints)} joints",
+        *(f"skeleton {path.name}: {text}" for text in findings),
+    ]
 
 
 def _check_formats(job: Job, _findings: list[CameraSummary]) -> list[str]:

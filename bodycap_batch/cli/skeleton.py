@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.application import app
+from bodycap_batch.cli.shared_options import HeightOption, make_overrides
 from bodycap_batch.cli.terminal import print_json, print_line
 from bodycap_batch.core.errors import JobError
 
@@ -36,17 +37,19 @@ def skeleton(
         int | None,
         typer.Option(
             metavar="N",
-            help="Number of the frame with the T-pose (the first frame is 0), if the zero pose is not "
-            "a T-pose.",
+            help="Number of the frame with the T-pose (the first frame is 0), if the zero pose is no "
+            "pose of a body. Default: the frame nearest to a T-pose.",
         ),
     ] = None,
+    height: HeightOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the roles of all joints as JSON.")] = False,
 ) -> None:
     """Show how a rig is interpreted, before a job uses it.
 
-    Lists the role of each joint, the length and direction of its bone, and the missing roles. The motion does
-    not rotate joints without a role (fingers, twist bones, helpers). The results keep the file's hierarchy,
-    OFFSETs, channel order and zero pose.
+    Lists the role of each joint, the length and direction of its bone, and the missing roles. Roles follow
+    from the names and from the tree. Up and forward follow from the joints, whatever axes the file has.
+    The motion does not rotate joints without a role (fingers, twist bones, helpers). The results keep
+    hierarchy, OFFSETs, channel order and zero pose of the file.
 
     \b
     Examples:
@@ -55,23 +58,23 @@ def skeleton(
       bodycap skeleton hero.bvh --tpose-frame 0
       bodycap run my_walk/ --skeleton hero.bvh
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.formats.bvh import RigOptions, read_rig
-    from bodycap_batch.formats.bvh.skeleton_description import describe_joints, missing_roles
+    from bodycap_batch.formats.bvh import RigOptions, inspect_rig, missing_roles
+    from bodycap_batch.formats.bvh.skeleton_description import describe_joints
 
-    options = RigOptions(roles=_parse_roles(roles or []), tpose_frame=tpose_frame)
-    rig, motion = read_rig(file, options)
+    stated = make_overrides(height=height).height_m
+    height_m = None if isinstance(stated, str) else stated  # the text asks for a run without a height
+    options = RigOptions(roles=_parse_roles(roles or []), tpose_frame=tpose_frame, height_m=height_m)
+    rig, motion, problem = inspect_rig(file, options)
     if as_json:
         joints = [dataclasses.asdict(line) for line in describe_joints(rig)]
-        print_json({"joints": joints, "missing": missing_roles(rig)}, indent=1)
-        return
-    for line in (
-        *_heading_lines(file, rig, motion, tpose_frame),
-        "",
-        *_joint_table(rig),
-        "",
-        *_closing_lines(rig, options),
-    ):
-        print_line(line)
+        findings = {"notes": rig.notes, "warnings": rig.warnings}
+        print_json({"joints": joints, "missing": missing_roles(rig), **findings}, indent=1)
+    else:
+        heading = _heading_lines(file, rig, motion, tpose_frame)
+        for line in (*heading, "", *_joint_table(rig), "", *_closing_lines(rig, options)):
+            print_line(line)
+    if problem is not None:
+        raise problem
 
 
 def _parse_roles(words: list[str]) -> dict[str, str]:
@@ -125,11 +128,11 @@ def _joint_table(rig: SkeletonModel) -> list[str]:
 
 
 def _closing_lines(rig: SkeletonModel, options: RigOptions) -> list[str]:
-    from bodycap_batch.formats.bvh.skeleton_description import missing_roles, skeleton_warnings
+    from bodycap_batch.formats.bvh import missing_roles
 
     missing = missing_roles(rig)
     lines = [f"roles without a joint: {', '.join(missing)}" if missing else "every role has a joint"]
-    lines += [f"warning: {text}" for text in skeleton_warnings(rig)]
+    lines += [f"note: {text}" for text in rig.notes] + [f"warning: {text}" for text in rig.warnings]
     if options.roles:
         pairs = ", ".join(f"{json.dumps(name)}: {role}" for name, role in options.roles.items())
         lines.append(f"write in the job: skeleton_map: {{{pairs}}}")

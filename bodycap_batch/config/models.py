@@ -310,7 +310,7 @@ class Job(_Block):
     skeleton_map: dict[str, str] = Field(
         default_factory=dict,
         description="roles of joints in the skeleton file, by joint name; a role given here replaces the "
-        "role that the program finds from the joint's name",
+        "role that the program finds from the names and the tree",
     )
     tpose_frame: int | None = Field(
         None,
@@ -318,7 +318,7 @@ class Job(_Block):
         le=_MAX_FRAME,
         description=(
             "number of the frame with the T-pose in the skeleton file (the first frame is 0), if "
-            "the zero pose is not a T-pose"
+            "the zero pose is no pose of a body; default: the frame nearest to a T-pose"
         ),
     )
     height_m: Annotated[float | None, BeforeValidator(_height)] = Field(

@@ -74,6 +74,8 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
             **inputs.merge.report.to_dict(),
             "unused_cameras": dict(inputs.merge.unused_cameras),
         }
+        if (skeleton := inputs.merge.skeleton).notes or skeleton.warnings:
+            out["merge"]["skeleton"] = {"notes": skeleton.notes, "warnings": skeleton.warnings}
     if motion is not None:
         out["motion"] = _motion_metrics(motion, gap)
     return dict(_json_value(out))

@@ -39,7 +39,7 @@ from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.formats.trc import write_trc
 from bodycap_batch.model.bone_axes import align_axes_with_bones
 from bodycap_batch.model.merge_data import MergeResult
-from bodycap_batch.model.skeleton import Motion, with_file_zero_pose
+from bodycap_batch.model.skeleton import Motion, with_file_zero_pose, with_outer_joints
 
 LEFT_OUT = "left_out"
 """Name of the list in ``metrics.json`` with a sentence about each empty part that the files leave out."""
@@ -108,7 +108,8 @@ def _motion_writers(
     measurement formats (C3D, TRC, NPZ) contain the solved motion.
     """
     folder, measured = inputs.out_dir, _measured_joints(inputs, motion)
-    animated, centres = apply_layout(motion, options), points_from_motion(motion, measured)
+    animated = apply_layout(_with_all_joints(inputs, motion), options)
+    centres = points_from_motion(motion, measured)
     aligned, place = align_axes_with_bones(animated), earth_of_world(inputs)
     earth = None if place is None else place.figures()
     markers = points_from_motion(motion, None if options.filled_markers else measured)
@@ -129,6 +130,14 @@ def _motion_writers(
         "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m)],
         "blender": lambda: write_blender_files(folder, collect_blender_scene(inputs, aligned, options)),
     }
+
+
+def _with_all_joints(inputs: ExportInputs, motion: Motion) -> Motion:
+    """Return a complete motion with the joints of the user's file that are no part of the body."""
+    merge = inputs.merge
+    if merge is None or motion.skeleton.joints != merge.skeleton.joints:
+        return motion
+    return with_file_zero_pose(with_outer_joints(merge.motion))
 
 
 def _measured_joints(inputs: ExportInputs, motion: Motion) -> BoolArray | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 
@@ -33,6 +34,8 @@ STATED_SIGMA_M = 0.015
 Derivation: 4.5 cm are three sigmas."""
 _ARTICULATED = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase", "Neck", "Head")
 """Parts of the body that move relative to their parent. The spine is treated as rigid."""
+_LIMBS = (("Arm", "ForeArm", "Hand"), ("UpLeg", "Leg", "Foot", "ToeBase"))
+"""Parts of the limbs that a camera needs, from the trunk to the tip: all parts up to its own."""
 _REACH_MARGIN_RATIO = 0.15
 """Margin for the possible distances between two cameras, as a fraction of the distance. The smallest distance
 is decreased by this fraction, and the largest distance is increased by it, because bodies differ from the
@@ -58,16 +61,9 @@ def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
     ``torso_back``.
 
     Raises:
-        JobError: The skeleton has no joint with this role.
+        JobError: The skeleton has no joint with this role, or a joint above it on the limb is missing.
     """
-    if skeleton.index_of_role(role) is None:
-        raise JobError(
-            f"camera {camera!r} is mounted on {role}, but the skeleton {skeleton.name!r} has no joint with "
-            "this role",
-            field="capture.cameras",
-            hint="use a skeleton with this joint, or mount the camera on one of "
-            f"{', '.join(name for name in skeleton.roles if name)}",
-        )
+    require_limb(camera, role, skeleton)
     entry = load_preset_data("mounts.yaml")[split_side(role)[1]]
     axes = segment_axes(skeleton, role)
     bone = bone_vector(skeleton, role)
@@ -86,6 +82,28 @@ def nominal_mount(camera: str, role: str, skeleton: SkeletonModel) -> Mount:
         sigma_m=NOMINAL_SIGMA_M,
         by_name=True,
     )
+
+
+def require_limb(camera: str, role: str, skeleton: SkeletonModel, path: Path | None = None) -> None:
+    """Check that a skeleton has the joint on which a camera is mounted, and those above it on the limb.
+
+    Raises:
+        JobError: A joint is missing. The error says which, and what to write.
+    """
+    side, part = split_side(role)
+    limb = next((parts[: parts.index(part) + 1] for parts in _LIMBS if part in parts), (part,))
+    missing = [side + each for each in limb if skeleton.index_of_role(side + each) is None]
+    if missing:
+        free = [name for name, own in zip(skeleton.joints, skeleton.roles, strict=True) if not own]
+        pairs = ", ".join(f"JOINT: {each}" for each in missing)
+        raise JobError(
+            f"camera {camera} is mounted on {role}, but no joint of the skeleton {skeleton.name!r} has the "
+            f"role {', '.join(missing)}",
+            path=path,
+            field="skeleton",
+            hint=f"write skeleton_map: {{{pairs}}} in the job, with the names of the joints; `bodycap "
+            f"skeleton` shows all joints; joints without a role: {', '.join(free[:30]) or 'none'}",
+        )
 
 
 def _faces_back(camera: str, role: str) -> bool:
@@ -138,14 +156,7 @@ def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple
 
 def _joints_to_root(skeleton: SkeletonModel, mount: Mount) -> list[int]:
     """Return the index of the joint that a camera is mounted on, followed by its ancestors up to the root."""
-    joint = skeleton.index_of_role(mount.role)
-    if joint is None:
-        raise JobError(
-            f"no joint of the skeleton has the role {mount.role}",
-            field="capture.cameras",
-            hint="use a skeleton with this joint, or change the `mount` of the camera",
-        )
-    path = [joint]
+    path = [skeleton.roles.index(mount.role)]
     while skeleton.parents[path[-1]] >= 0:
         path.append(int(skeleton.parents[path[-1]]))
     return path

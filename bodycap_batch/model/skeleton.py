@@ -13,6 +13,10 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.geometry import make_transform
 
+_MAX_SOLE_M = 0.15
+"""Maximum height, metres, of the lowest joint of the feet above or below the floor. Derivation: the ankles of
+adults, which some skeletons end with, are 6 to 10 cm above the sole."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SkeletonModel:
@@ -32,6 +36,10 @@ class SkeletonModel:
             pose.
         file_rotation: (J,3,3) world_from_joint rotations of the T-pose in the original file. Only a skeleton
             from `with_tpose_as_zero_pose` has this value; otherwise None.
+        outer: The same skeleton with the joints that are not below the hips. Only a skeleton from
+            `without_outer_joints` that lacks such joints has this value; otherwise None.
+        notes: Sentences about how the file was understood.
+        warnings: Sentences about what the user should correct in the file.
     """
 
     name: str
@@ -43,6 +51,9 @@ class SkeletonModel:
     bvh_channels: tuple[tuple[str, ...], ...]
     tpose_rotation: FloatArray | None = None
     file_rotation: FloatArray | None = None
+    outer: SkeletonModel | None = None
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self.joints)
@@ -166,20 +177,21 @@ def rest_pose(skeleton: SkeletonModel) -> FloatArray:
     """Return the joint poses (J,4,4) in the world when the skeleton stands at the origin in its T-pose.
 
     A skeleton without a separate T-pose stands in its zero pose. The height of the root is taken from its
-    entry in `offsets_m`. If this height is not positive, the body is raised until its lowest point touches
-    the floor.
+    entry in `offsets_m`, if the feet are then near the floor. Otherwise the body is raised or lowered until
+    the lowest point of the feet touches the floor; without feet, the lowest point of the skeleton.
     """
     count = len(skeleton.joints)
     local = skeleton.tpose_rotation
     rotation = np.tile(np.eye(3), (count, 1, 1)) if local is None else local
     pose: FloatArray = forward_kinematics(skeleton, np.zeros((1, 3)), rotation[None])[0]
+    tips = pose[:, :3, 3] + np.einsum("jab,jb->ja", pose[:, :3, :3], np.nan_to_num(skeleton.end_offsets_m))
+    feet = [role.endswith("Foot") for role in skeleton.roles]
+    for joint, parent in enumerate(skeleton.parents.tolist()):
+        feet[joint] = feet[joint] or (parent >= 0 and feet[parent])
+    lowest = np.minimum(tips[:, 2], pose[:, 2, 3])[np.array(feet) if any(feet) else slice(None)]
     height = float(skeleton.offsets_m[0, 2])
-    if height <= 0.0:
-        tips = pose[:, :3, 3] + np.einsum(
-            "jab,jb->ja", pose[:, :3, :3], np.nan_to_num(skeleton.end_offsets_m)
-        )
-        height = -float(min(tips[:, 2].min(), pose[:, 2, 3].min()))
-    pose[:, 2, 3] += height
+    is_near = -_MAX_SOLE_M <= lowest.min() + height <= _MAX_SOLE_M
+    pose[:, 2, 3] += height if is_near and height > 0.0 else -lowest.min()
     return pose
 
 
@@ -191,10 +203,10 @@ def with_tpose_as_zero_pose(skeleton: SkeletonModel) -> SkeletonModel:
     if skeleton.tpose_rotation is None:
         return skeleton
     world: FloatArray = rest_pose(skeleton)[:, :3, :3]
-    parent = np.concatenate([np.eye(3)[None], world[skeleton.parents[1:]]])
+    above = np.concatenate([world[:1], world[skeleton.parents[1:]]])
     return replace(
         skeleton,
-        offsets_m=np.einsum("jab,jb->ja", parent, skeleton.offsets_m),
+        offsets_m=np.einsum("jab,jb->ja", above, skeleton.offsets_m),
         end_offsets_m=np.einsum("jab,jb->ja", world, skeleton.end_offsets_m),
         tpose_rotation=None,
         file_rotation=world,
@@ -215,12 +227,69 @@ def with_file_zero_pose(motion: Motion) -> Motion:
     inverse = np.swapaxes(parent, -1, -2)
     file_skeleton = replace(
         skeleton,
-        offsets_m=np.einsum("jab,jb->ja", inverse, skeleton.offsets_m),
+        offsets_m=np.einsum("jba,jb->ja", np.concatenate([world[:1], parent[1:]]), skeleton.offsets_m),
         end_offsets_m=np.einsum("jba,jb->ja", world, skeleton.end_offsets_m),
         tpose_rotation=inverse @ world,
         file_rotation=None,
     )
     return replace(motion, skeleton=file_skeleton, local_rotation=inverse @ motion.local_rotation @ world)
+
+
+def without_outer_joints(skeleton: SkeletonModel) -> SkeletonModel:
+    """Return the skeleton from the hips downwards.
+
+    Joints above the hips (a root on the floor, an armature) and beside them (targets, props) are no part of
+    the body. `with_outer_joints` adds them to a motion. A skeleton without hips is returned unchanged, and a
+    skeleton in which another joint with a role is not below the hips.
+    """
+    hips = skeleton.index_of_role("Hips")
+    below = np.arange(len(skeleton.joints)) == hips
+    for joint in range(1, len(below)):
+        below[joint] |= below[skeleton.parents[joint]]
+    if below.all() or any(role and not below[joint] for joint, role in enumerate(skeleton.roles)) or not hips:
+        return skeleton
+    kept = np.flatnonzero(below)
+    offsets = skeleton.offsets_m[kept]
+    offsets[0] = _from_root(skeleton, hips) + skeleton.offsets_m[0]
+    rotations = (skeleton.tpose_rotation, skeleton.file_rotation)
+    tpose, file = (None if rotation is None else rotation[kept] for rotation in rotations)
+    return replace(
+        skeleton,
+        joints=tuple(skeleton.joints[joint] for joint in kept),
+        parents=np.concatenate([[-1], np.searchsorted(kept, skeleton.parents[kept[1:]])]),
+        offsets_m=offsets,
+        end_offsets_m=skeleton.end_offsets_m[kept],
+        roles=tuple(skeleton.roles[joint] for joint in kept),
+        bvh_channels=tuple(skeleton.bvh_channels[joint] for joint in kept),
+        tpose_rotation=tpose,
+        file_rotation=file,
+        outer=skeleton,
+    )
+
+
+def with_outer_joints(motion: Motion) -> Motion:
+    """Return the motion with the joints that `without_outer_joints` removed.
+
+    These joints keep their orientation of the T-pose. They move with the hips.
+    """
+    outer = motion.skeleton.outer
+    if outer is None:
+        return motion
+    kept = [outer.joints.index(name) for name in motion.skeleton.joints]
+    ticks, count = len(motion.root_in_world_m), len(outer.joints)
+    local = np.tile(np.eye(3), (ticks, count, 1, 1))
+    observed = np.zeros((ticks, count), dtype=np.bool_)
+    local[:, kept], observed[:, kept] = motion.local_rotation, motion.observed
+    root = motion.root_in_world_m - _from_root(outer, kept[0])
+    return replace(motion, skeleton=outer, root_in_world_m=root, local_rotation=local, observed=observed)
+
+
+def _from_root(skeleton: SkeletonModel, joint: int) -> FloatArray:
+    """Return the position (3,) of a joint in the frame of the root in the zero pose, metres."""
+    out = np.zeros(3)
+    while joint > 0:
+        out, joint = out + skeleton.offsets_m[joint], int(skeleton.parents[joint])
+    return out
 
 
 def _chain_poses(skeleton: SkeletonModel, parent_from_joint: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -26,9 +27,11 @@ _STATURE_RANGE_M = (0.5, 2.8)
 """Minimum and maximum stature, metres. Derivation: the range from small children to the tallest people, with
 a margin. A stature in centimetres or feet is outside this range and is therefore refused."""
 
-_MEASURED_PARTS = ("ForeArm", "Hand", "Leg", "Foot")
+LEG_PARTS = ("Leg", "Foot")
+_MEASURED_PARTS = ("ForeArm", "Hand", *LEG_PARTS)
 """Parts of limbs whose distance from the part above is the length of a long bone. These bones give the
 stature of a body."""
+
 _UP, _FORWARD, _LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 """Unit vectors of a standing body in the axes of the skeleton: z up, −y forward."""
 _NEXT_ROLE = {
@@ -99,25 +102,34 @@ def load_skeleton(preset: str, height_m: float | None = None) -> SkeletonModel:
     )
 
 
-def stature_from_limbs(skeleton: SkeletonModel) -> float | None:
-    """Return the stature, metres, of a usual person with the arms and legs of a skeleton.
+def stature_from_limbs(skeleton: SkeletonModel, parts: Sequence[str] = _MEASURED_PARTS) -> float | None:
+    """Return the stature, metres, of a usual person with the limbs of a skeleton.
 
     It is the median over the long bones of the limbs. Real people have proportions that differ by some
     percent; a larger difference shows that the unit of length is not the metre.
 
+    Args:
+        skeleton: The skeleton.
+        parts: Parts at the lower end of the long bones.
+
     Returns:
         The stature; None if the skeleton has no long bone of a limb with a role.
     """
-    usual = load_skeleton("full_body", MEAN_HEIGHT_M)
-    ratios = []
-    for role in (f"{side}{part}" for side in ("Left", "Right") for part in _MEASURED_PARTS):
-        own, other = skeleton.index_of_role(role), usual.index_of_role(role)
-        if own is not None and other is not None:
-            lengths = [
-                float(np.linalg.norm(each)) for each in (skeleton.offsets_m[own], usual.offsets_m[other])
-            ]
-            ratios.append(lengths[0] / lengths[1])
+    usual, ratios = load_skeleton("full_body", MEAN_HEIGHT_M), []
+    for side in ("Left", "Right"):
+        for upper, lower in _NEXT_ROLE.items():
+            own, other = (_distance_m(body, side + upper, side + lower) for body in (skeleton, usual))
+            if lower in parts and own is not None and other:
+                ratios.append(own / other)
     return float(np.median(ratios)) * MEAN_HEIGHT_M if ratios else None
+
+
+def _distance_m(skeleton: SkeletonModel, first: str, second: str) -> float | None:
+    """Return the distance, metres, between two joints in the zero pose; None if the skeleton lacks a role."""
+    joints = [joint for role in (first, second) if (joint := skeleton.index_of_role(role)) is not None]
+    if len(joints) < 2:
+        return None
+    return float(np.linalg.norm(np.subtract(*rest_positions(skeleton)[joints])))
 
 
 def is_plausible_stature(height_m: float) -> bool:

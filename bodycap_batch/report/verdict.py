@@ -395,6 +395,15 @@ def describe_lens_misfit(factor: float) -> str:
 
 
 def _body_criteria(merge: Mapping[str, Any]) -> Iterator[Criterion]:
+    if skeleton := merge.get("skeleton"):
+        yield Criterion(
+            subject="body",
+            name="Skeleton file",
+            grade=Grade.FAIR if skeleton["warnings"] else Grade.GOOD,
+            finding="; ".join((*skeleton["warnings"], *skeleton["notes"])),
+            rationale="All lengths of the body come from this file. If a joint, an axis or the unit of "
+            "length is understood wrongly, the whole motion is wrong: by 28 to 46 cm on one walk.",
+        )
     scale = merge.get("scale", {}).get("relative_sigma")
     if scale is not None:
         yield Criterion(

@@ -10,7 +10,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.formats.bvh import inspect_rig
 from bodycap_batch.model.geometry import interpolate_pose, make_transform
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, forward_kinematics
 from bodycap_batch.model.skeleton_presets import MEAN_HEIGHT_M, is_plausible_stature, stature_from_limbs
@@ -63,9 +63,11 @@ def load_clip(path: Path, start_s: float, length_s: float, height_m: float = MEA
         height_m: Stature (metres) of the body if the file is neither in metres nor in centimetres.
 
     Raises:
-        JobError: The file cannot be read, holds no motion, or is too short.
+        JobError: The file cannot be read, holds no motion or no pose of a body, or is too short.
     """
-    _, motion = read_bvh(path)
+    _, motion, problem = inspect_rig(path)
+    if problem is not None and problem.field != "skeleton":  # a wrong size is corrected below
+        raise problem
     if motion is None or len(motion.root_in_world_m) < 2:
         raise JobError(
             "the file contains no motion",

@@ -57,10 +57,11 @@ def mount_prior(mount: MountInput, skeleton: SkeletonModel) -> Mount:
 def _load_skeleton(body: BodyInput) -> SkeletonModel:
     if body.skeleton_file is not None:
         from bodycap_batch.formats.bvh import RigOptions, read_rig
-        from bodycap_batch.model.skeleton import with_tpose_as_zero_pose
+        from bodycap_batch.model.skeleton import with_tpose_as_zero_pose, without_outer_joints
 
-        rig = RigOptions(roles=body.skeleton_map, tpose_frame=body.tpose_frame)
-        return with_tpose_as_zero_pose(read_rig(body.skeleton_file.path, rig)[0])
+        rig = RigOptions(roles=body.skeleton_map, tpose_frame=body.tpose_frame, height_m=body.height_m)
+        skeleton, _ = read_rig(body.skeleton_file.path, rig)
+        return without_outer_joints(with_tpose_as_zero_pose(skeleton))
     from bodycap_batch.model.skeleton_presets import load_skeleton
 
     assert body.skeleton is not None

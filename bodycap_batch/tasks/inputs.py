@@ -113,8 +113,8 @@ class BodyInput:
         skeleton: Name of a skeleton preset; None if the job names a skeleton file.
         skeleton_file: The user's BVH file; None if the job names a preset.
         skeleton_map: Role of each joint that the user assigns, by joint name in the skeleton file.
-        tpose_frame: Index of the skeleton file's frame that shows the T-pose; None if the file's zero pose is
-            the T-pose.
+        tpose_frame: Index of the skeleton file's frame that shows the T-pose; None if the zero pose, or the
+            frame that is nearest to a T-pose, is used.
         height_m: Stature (metres) of the subject; None if the job does not give it.
         activity: The activity of the subject.
         mounts: The mount of each camera.

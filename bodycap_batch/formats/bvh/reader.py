@@ -6,31 +6,38 @@ accepted.
 
 from __future__ import annotations
 
-import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.formats.bvh.axes import world_from_file_points, world_from_file_rotations
+from bodycap_batch.formats.bvh.axes import (
+    UNITS_PER_METRE,
+    world_from_file_points,
+    world_from_file_rotations,
+)
 from bodycap_batch.formats.bvh.euler import rotation_from_angles
 from bodycap_batch.formats.bvh.parser import FileJoint, parse_bvh
 from bodycap_batch.formats.bvh.roles import assign_roles
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
+from bodycap_batch.model.skeleton_presets import rest_positions, stature_from_limbs
 
-logger = logging.getLogger(__name__)
-
-_MAX_METRE_EXTENT = 10.0
-"""Limit for the extent of the zero pose, file units. If the extent is smaller, the file is in metres;
-otherwise it is in centimetres. Derivation: the extent of a body is 1 to 2 m, which is 100 to 200 cm."""
+_MAX_METRE_STATURE = 10.0
+"""Limit for the stature of the body, file units. If the stature is smaller, the file is in metres; otherwise
+it is in centimetres. Derivation: the stature of a person is 1 to 2 m, which is 100 to 200 cm."""
 
 _MOTION_THRESHOLD = 1e-3
 """A joint whose position relative to its parent changes by less than this threshold is treated as not moving.
 Unit: file unit. Derivation: the threshold is 10 µm for a file in centimetres. This is larger than the
 rounding error of numbers with the usual six decimals."""
 
+_MAX_NOISE_RATIO = 0.1
+"""Maximum standard deviation of a joint's position relative to its parent, as a part of its mean distance,
+for a bone of constant length. Derivation: noise of recordings is below 1 %; a joint that travels has more."""
+
 _WARNING_THRESHOLD = 1.0
-"""If the position of a joint relative to its parent changes by more than this threshold, a warning is logged.
+"""If the position of a joint relative to its parent changes by more than this threshold, the user is warned.
 Unit: file unit. Derivation: the threshold is 1 cm for a file in centimetres; such a change is visible."""
 
 
@@ -42,13 +49,15 @@ def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, M
     - Root: the position channels give the motion of the root.
     - Hips, if they are the first child of the root: the position channels give the motion of the hips
       relative to the root.
-    - Any other joint: constant position channels give the offset of the joint. Position channels that change
-      are ignored, and the OFFSET is used.
+    - Any other joint: the mean of position channels that are constant except for noise gives the offset of
+      the joint. If the position channels change more, the OFFSET is used; the mean if the OFFSET is zero and
+      the joint is below the hips.
 
     Args:
         path: Path of the file.
         units: Unit of length of the file: "cm", "m", or "auto". With "auto", the unit is the metre if the
-            extent of the zero pose is smaller than 10 units. Otherwise it is the centimetre.
+            stature of the body is smaller than 10 units (the extent of the zero pose if there are no limbs).
+            Otherwise it is the centimetre.
 
     Returns:
         The skeleton, and its motion. The motion is None if the file has no frames. `Motion.start_ns` is 0,
@@ -61,10 +70,19 @@ def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, M
     text = parse_bvh(path)
     joints, values = text.joints, text.values
     offsets = np.array([joint.offset for joint in joints])
+    notes: list[str] = []
+    warnings: list[str] = []
     if values is not None:
-        offsets = _offsets_from_channels(path, joints, offsets, values)
-    units = _detect_units(joints, offsets) if units == "auto" else units
-    skeleton = _skeleton(path.stem, joints, offsets, units)
+        offsets, notes, warnings = _offsets_from_channels(joints, offsets, values)
+    skeleton = _skeleton(path.stem, joints, offsets)
+    units = _detect_units(skeleton) if units == "auto" else units
+    skeleton = replace(
+        skeleton,
+        offsets_m=skeleton.offsets_m / UNITS_PER_METRE[units],
+        end_offsets_m=skeleton.end_offsets_m / UNITS_PER_METRE[units],
+        notes=tuple(notes),
+        warnings=tuple(warnings),
+    )
     if values is None:
         return skeleton, None
     columns = _channel_slices(joints)
@@ -114,8 +132,7 @@ def _channel_slices(joints: list[FileJoint]) -> list[slice]:
 
 def _have_hips_own_translation(joints: list[FileJoint], values: FloatArray) -> bool:
     """Return True if the first child of the root is the hips, and the position of the hips changes."""
-    parents = [joint.parent for joint in joints]
-    if len(joints) < 2 or assign_roles([joint.name for joint in joints], parents)[:2] != ("", "Hips"):
+    if len(joints) < 2 or _roles(joints)[:2] != ("", "Hips"):
         return False
     moving = [name.endswith("position") for name in joints[1].channels]
     return any(moving) and bool(
@@ -123,43 +140,61 @@ def _have_hips_own_translation(joints: list[FileJoint], values: FloatArray) -> b
     )
 
 
+def _roles(joints: list[FileJoint]) -> tuple[str, ...]:
+    """Return the roles of joints by their names alone."""
+    return assign_roles([joint.name for joint in joints], [joint.parent for joint in joints])
+
+
 def _offsets_from_channels(
-    path: Path, joints: list[FileJoint], offsets: FloatArray, values: FloatArray
-) -> FloatArray:
-    """Replace the offsets of joints whose position channels are constant and not zero.
+    joints: list[FileJoint], offsets: FloatArray, values: FloatArray
+) -> tuple[FloatArray, list[str], list[str]]:
+    """Replace the offsets of joints whose position channels give the lengths of bones.
 
     Args:
-        path: Path of the file, for warnings.
         joints: The joints of the file.
         offsets: (J,3) OFFSET of each joint, in file axes and units.
         values: (T, channels) values of all frames.
 
     Returns:
-        The offsets (J,3), in file axes and units.
+        The offsets (J,3), in file axes and units, notes about them, and warnings.
     """
-    out = offsets.copy()
-    for index, (joint, columns) in enumerate(zip(joints, _channel_slices(joints), strict=True)):
-        if index == 0 or not any(name.endswith("position") for name in joint.channels):
+    out, replaced, moving = offsets.copy(), [], []
+    placed = [index for index, joint in enumerate(joints) if index and _has_position(joint)]
+    roles = _roles(joints) if placed else ()
+    hips = roles.index("Hips") if "Hips" in roles else 0
+    own_way = bool(placed) and _have_hips_own_translation(joints, values)
+    columns = _channel_slices(joints)
+    for index in placed:
+        if index == 1 and own_way:
             continue
-        if index == 1 and _have_hips_own_translation(joints, values):
-            continue
-        positions = _positions(joint, values[:, columns], offsets[index])
-        spread = float(np.ptp(positions, axis=0).max())
-        if spread > _WARNING_THRESHOLD:
-            logger.warning(
-                "%s: the position of joint %s relative to its parent changes by %.3g units in the motion; "
-                "the joint's OFFSET is used instead",
-                path,
-                joint.name,
-                spread,
-            )
-        if (
-            spread < _MOTION_THRESHOLD
-            and positions.any()
-            and not np.allclose(positions[0], offsets[index], atol=1e-3)
-        ):
-            out[index] = positions[0]
-    return out
+        positions = _positions(joints[index], values[:, columns[index]], offsets[index])
+        mean, offset = positions.mean(axis=0), offsets[index]
+        noise, distance = float(np.linalg.norm(positions.std(axis=0))), float(np.linalg.norm(mean))
+        is_constant = noise <= max(_MAX_NOISE_RATIO * distance, _MOTION_THRESHOLD)
+        if np.ptp(positions, axis=0).max() > _WARNING_THRESHOLD and not is_constant and index > hips:
+            moving.append(joints[index].name)
+        may_replace = is_constant or (index > hips and not offset.any())
+        if may_replace and distance > 0.0 and not np.allclose(mean, offset, atol=max(1e-3, noise)):
+            out[index] = mean
+            replaced.append(joints[index].name)
+    notes, warnings = [], []
+    if replaced:
+        notes.append(f"the position channels, not the OFFSETs, give the place of {_some(replaced)}")
+    if moving:
+        warnings.append(
+            f"the positions of {_some(moving)} relative to the parent change in the motion; the skeleton "
+            "keeps one length for each bone"
+        )
+    return out, notes, warnings
+
+
+def _some(names: list[str]) -> str:
+    """Return a list of names as text; only the first ones of a long list."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more joints" if len(names) > 3 else "")
+
+
+def _has_position(joint: FileJoint) -> bool:
+    return any(name.endswith("position") for name in joint.channels)
 
 
 def _positions(joint: FileJoint, values: FloatArray, offset: FloatArray) -> FloatArray:
@@ -184,30 +219,27 @@ def _rotations(joints: list[FileJoint], values: FloatArray) -> FloatArray:
     return out
 
 
-def _detect_units(joints: list[FileJoint], offsets: FloatArray) -> str:
-    """Return the unit of length, "m" or "cm", that fits the extent of the zero pose with offsets (J,3)."""
-    centres = np.zeros_like(offsets)
-    for index, joint in enumerate(joints[1:], start=1):
-        centres[index] = centres[joint.parent] + offsets[index]
-    extent = float(np.ptp(centres, axis=0).max())
-    return "m" if 0.0 < extent < _MAX_METRE_EXTENT else "cm"
+def _detect_units(in_metres: SkeletonModel) -> str:
+    """Return the unit of length, "m" or "cm", that fits a skeleton whose lengths are read as metres."""
+    stature = stature_from_limbs(in_metres) or float(np.ptp(rest_positions(in_metres), axis=0).max())
+    return "m" if 0.0 < stature < _MAX_METRE_STATURE else "cm"
 
 
-def _skeleton(name: str, joints: list[FileJoint], offsets: FloatArray, units: str) -> SkeletonModel:
-    """Return the skeleton with these joints and offsets (J,3), which are in file axes and units."""
+def _skeleton(name: str, joints: list[FileJoint], offsets: FloatArray) -> SkeletonModel:
+    """Return the skeleton with these joints and offsets (J,3), which are in file axes, read as metres."""
     ends = np.full((len(joints), 3), np.nan)
     for index, joint in enumerate(joints):
         if joint.children == 0:
             ends[index] = 0.0 if joint.end is None else joint.end
     names = tuple(joint.name for joint in joints)
     parents = [joint.parent for joint in joints]
-    offsets_m = world_from_file_points(offsets, units)
+    offsets_m, ends_m = world_from_file_points(offsets, "m"), world_from_file_points(ends, "m")
     return SkeletonModel(
         name=name,
         joints=names,
         parents=np.array(parents),
         offsets_m=offsets_m,
-        end_offsets_m=world_from_file_points(ends, units),
-        roles=assign_roles(names, parents, offsets_m),
+        end_offsets_m=ends_m,
+        roles=assign_roles(names, parents, offsets_m, ends_m),
         bvh_channels=tuple(joint.channels for joint in joints),
     )

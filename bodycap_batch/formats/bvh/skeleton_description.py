@@ -1,14 +1,12 @@
-"""Describe a user's skeleton in words: roles of the joints, directions of the bones, missing joints."""
+"""Describe a user's skeleton in words: roles of the joints and directions of the bones."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.formats.bvh.roles import ROLES
 from bodycap_batch.model.skeleton import SkeletonModel, rest_pose
 
 _DIRECTIONS = {
@@ -20,10 +18,6 @@ _DIRECTIONS = {
 _MAX_NAMED_DIRECTION_DEG = 10.0
 """If the angle between a bone and one of the six directions is smaller than this limit, the description of
 the bone is only the name of this direction, without an angle. Unit: degrees. Evidence: none."""
-
-_MIN_HEIGHT_DIFFERENCE_M = 0.2
-"""Minimum height, metres, of the head above the hips, and of the hips above the feet, in a standing pose.
-Derivation: both heights are larger even for a child with a stature of 1 m."""
 
 _MIN_BONE_M = 1e-6
 """Minimum length, metres, of a bone. A shorter bone is treated as a bone without direction. Derivation: the
@@ -38,9 +32,6 @@ _NEXT_PART = {
     "Foot": "ToeBase",
 }
 """Next part of a limb for each part. The bone of a part ends at the joint of the next part."""
-
-_OPTIONAL_PARTS = ("Shoulder", "ToeBase")
-"""Parts of limbs that many skeletons do not have. There is no warning if these parts are missing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,37 +141,3 @@ def describe_arm_pose(skeleton: SkeletonModel) -> str:
 def _describe_direction_or_empty(vector: FloatArray) -> str:
     """Describe the direction of a vector in words; return "" for a vector without length."""
     return describe_direction(vector) if np.linalg.norm(vector) > _MIN_BONE_M else ""
-
-
-def missing_roles(skeleton: SkeletonModel) -> tuple[str, ...]:
-    """Return the roles that no joint of the skeleton has."""
-    return tuple(role for role in ROLES if role not in skeleton.roles)
-
-
-def skeleton_warnings(skeleton: SkeletonModel) -> Iterator[str]:
-    """Yield warnings: for missing joints, and for a T-pose that is not the pose of a standing body."""
-    missing = [role for role in missing_roles(skeleton) if not role.endswith(_OPTIONAL_PARTS)]
-    if missing:
-        yield (
-            f"no joint has the role {', '.join(missing)}, so no camera can be mounted on this part of the "
-            "body: give the role to a joint with --map JOINT=ROLE"
-        )
-    rest = rest_pose(skeleton)
-    head, hips, foot = (skeleton.index_of_role(role) for role in ("Head", "Hips", "LeftFoot"))
-    height, margin = rest[:, 2, 3], _MIN_HEIGHT_DIFFERENCE_M
-    if head is not None and hips is not None and not height[head] > height[hips] + margin:
-        yield (
-            "in the T-pose, the head is not above the hips: use --tpose-frame N to choose a frame in "
-            "which the person stands"
-        )
-    elif foot is not None and hips is not None and not height[foot] < height[hips] - margin:
-        yield (
-            "in the T-pose, the feet are not below the hips: use --tpose-frame N to choose a frame in "
-            "which the person stands"
-        )
-    left, right = (skeleton.index_of_role(f"{side}UpLeg") for side in ("Left", "Right"))
-    if left is not None and right is not None and not rest[left, 0, 3] > rest[right, 0, 3]:
-        yield (
-            "in the T-pose, the left leg is not on the left side of the person: use --tpose-frame N to "
-            "choose a frame in which the person stands"
-        )

@@ -205,6 +205,36 @@ def test_a_skeleton_file_keeps_its_names(walk: Path, tmp_path: Path) -> None:
     assert "skeleton_map" in str(error.hint)
 
 
+def test_what_a_skeleton_file_means_is_said_before_the_run(walk: Path, tmp_path: Path) -> None:
+    """Findings about the file are notes; a joint that the cameras need, and a wrong height, are refused."""
+    body = reaching(1).skeleton
+    sideways = body.offsets_m[:, [1, 0, 2]] * [-1.0, 1.0, 1.0]
+    turned = replace(body, offsets_m=sideways, end_offsets_m=body.end_offsets_m[:, [1, 0, 2]] * [-1, 1, 1])
+    write_bvh(tmp_path / "s.bvh", replace(reaching(1), skeleton=turned))
+    overrides = Overrides(out=tmp_path / "out", skeleton=str(tmp_path / "s.bvh"), height_m=1.75)
+    job = load_job(walk, overrides)
+    notes = [note for note in check_job(job).notes if note.startswith("skeleton s.bvh")]
+    assert "up is +Y and the body faces +X" in notes[1]
+    assert "skeleton file" not in " ".join(notes)
+    (note,) = [
+        note
+        for note in check_job(job.model_copy(update={"skeleton_map": {"Neck": "none"}})).notes
+        if "warning" in note
+    ]
+    assert "no joint has the role Neck" in note
+    mapped = job.model_copy(update={"skeleton_map": {"LeftForeArm": "none", "LeftArm": "none"}})
+    (error,) = [error for error in check_job(mapped).errors if isinstance(error, JobError)]
+    assert "camera left_palm is mounted on LeftHand" in error.message
+    assert "the role LeftArm, LeftForeArm" in error.message
+    assert "skeleton_map: {JOINT: LeftArm, JOINT: LeftForeArm}" in str(error.hint)
+    (error,) = [
+        error
+        for error in check_job(job.model_copy(update={"height_m": 1.3})).errors
+        if isinstance(error, JobError)
+    ]
+    assert "the stated height is 1.3 m" in error.message
+
+
 def test_room_on_the_disk(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import shutil
     from collections import namedtuple

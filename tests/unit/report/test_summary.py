@@ -87,6 +87,15 @@ def test_a_camera_that_fell_off_is_named_before_the_gap_that_it_leaves() -> None
     assert "left_palm stands still in the room between 2.5 s and 5.0 s" in summary.doubts[0]
 
 
+def test_warnings_about_the_skeleton_file_are_doubts() -> None:
+    values = metrics(gap_s=0.0, scale=0.01)
+    skeleton: dict[str, list[str]] = {"notes": ["up is +Z"], "warnings": []}
+    values["merge"]["skeleton"] = skeleton  # type: ignore[index]
+    assert not any("up is +Z" in doubt for doubt in summarise(values).doubts)
+    skeleton["warnings"] = ["the toes point back"]
+    assert any("the toes point back; up is +Z" in doubt for doubt in summarise(values).doubts)
+
+
 def test_a_good_result_names_no_criterion() -> None:
     values = metrics(gap_s=0.0, scale=0.01)
     values["merge"]["cameras"]["torso"]["residual_m"]["p95"] = 0.001  # type: ignore[index]
