@@ -96,10 +96,9 @@ def resolved_camera(
         entry = read_calibration(file, camera.name)
         calibration = entry.calibration
     update: dict[str, Any] = {"video": videos, "timestamps": sidecars, "calibration": calibration or "auto"}
-    places = [base / video for video in camera.video]
-    update["samples"] = (
-        samples_beside(videos, camera.name, places) if camera.samples is None else base / camera.samples
-    )
+    stated_videos = [base / video for video in camera.video]
+    found = samples_beside(videos, camera.name, stated_videos)
+    update["samples"] = found if camera.samples is None else base / camera.samples
     if camera.mask is not None:
         update["mask"] = real_path(base / camera.mask)
     if camera.offset_s is None:
@@ -113,12 +112,10 @@ def resolved_camera(
     origins = CameraOrigins(
         video=Origin(source="folder" if listed is None else "job file", value=_file_names(videos)),
         calibration=_calibration_origin(config, file, base, is_stated=is_stated),
-        timestamps=_timestamps_origin(config, is_stated=bool(camera.timestamps)),
-        samples=None
-        if config.samples is None
-        else Origin(
-            source="sidecar file" if camera.samples is None else "job file",
-            value=_file_names((config.samples,)),
+        timestamps=_file_origin(config.timestamps, is_stated=bool(camera.timestamps))
+        or Origin(source="video metadata", value="frame times"),
+        samples=_file_origin(
+            () if config.samples is None else (config.samples,), is_stated=camera.samples is not None
         ),
         clock_offset=Origin(source="job file", value=f"{camera.offset_s:g} s")
         if camera.offset_s is not None
@@ -151,11 +148,10 @@ def _calibration_origin(config: CameraConfig, file: Path | None, folder: Path, *
     return Origin(source="calib.json", value=model if in_folder else f"{model} of {file.parent.name}/")
 
 
-def _timestamps_origin(config: CameraConfig, *, is_stated: bool) -> Origin:
-    if not config.timestamps:
-        return Origin(source="video metadata", value="frame times")
+def _file_origin(files: tuple[Path, ...], *, is_stated: bool) -> Origin | None:
+    """Return the origin of files that lie beside the video or that the job names; None if there are none."""
     source: Source = "job file" if is_stated else "sidecar file"
-    return Origin(source=source, value=_file_names(config.timestamps))
+    return Origin(source=source, value=_file_names(files)) if files else None
 
 
 def _offset_origin(

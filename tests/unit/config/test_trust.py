@@ -15,6 +15,8 @@ from bodycap_batch.config.limits import Limits, limits_from
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.core.errors import CaptureError, JobError
+from bodycap_batch.watch.dropped_job import with_changed_paths
+from bodycap_batch.watch.web.uploads import is_accepted
 from tests.videos import textured_frame, write_video
 
 
@@ -111,6 +113,19 @@ def test_every_path_a_job_can_name_is_known_to_the_policy() -> None:
     camera = {f"capture.cameras.{name}" for name in ("video", "timestamps", "samples", "calibration", "mask")}
     # `out` is replaced; `skeleton` is a text. A new path must be checked in `trust` and moved in `intake`.
     assert paths(Job) == {"out", "capture.calibration", *camera}
+
+
+def test_samples_beside_a_video_are_accepted_moved_and_not_read_from_outside(
+    folder: Path, tmp_path: Path
+) -> None:
+    assert is_accepted("walk/torso.gcsv")
+    assert is_accepted("torso.imu.csv")
+    (tmp_path / "secret").touch()
+    (folder / "torso.gcsv").symlink_to(tmp_path / "secret")
+    with pytest.raises(JobError, match="outside"):
+        load_job(folder, policy=PathPolicy(folder=folder))
+    moved = with_changed_paths(load_job(folder), lambda path: Path("input") / path.name)
+    assert moved.capture.cameras[0].samples == Path("input/torso.gcsv")
 
 
 def _kinds(annotation: object) -> Iterator[object]:
