@@ -214,7 +214,7 @@ def video_stream(container: InputContainer, path: Path) -> VideoStream:
     if len(streams) > 1:
         sizes = ", ".join(f"{each.width}×{each.height}" for each in streams)
         raise CaptureError(
-            f"the file contains {len(streams)} videos ({sizes}), for example those of two lenses",
+            f"the file contains {len(streams)} video tracks ({sizes}), for example those of two lenses",
             path=path,
             hint="export the video of one lens as a file of its own (ffmpeg -map 0:v:0 -c copy)",
         )

@@ -406,6 +406,6 @@ def test_the_video_of_the_camera_is_used_beside_a_preview(
 @pytest.mark.parametrize("suffix", ["mp4", "mkv", "ts"])
 def test_a_file_with_the_videos_of_two_lenses_is_refused(tmp_path: Path, suffix: str) -> None:
     path = _write_streams(tmp_path / f"a.{suffix}", *[("libx264", 96, 96, 30)] * 2)
-    with pytest.raises(CaptureError, match=r"2 videos \(96×96, 96×96\)") as caught:
+    with pytest.raises(CaptureError, match=r"2 video tracks \(96×96, 96×96\)") as caught:
         index_video(path)
     assert "one lens" in (caught.value.hint or "")
