@@ -28,6 +28,7 @@ def write_video_with_sound(
     seconds: float | None = None,
     frame_times: Sequence[int] | None = None,
     metadata: dict[str, str] | None = None,
+    more: Sequence[Samples] = (),
 ) -> Path:
     """Write tiny pictures at 10 fps with sound.
 
@@ -36,6 +37,7 @@ def write_video_with_sound(
         gap: Time in the sound, and duration, of a jump of the timestamps, seconds.
         seconds: Duration of the pictures; default: that of the sound.
         frame_times: Times of the frames in thousandths of a second, for a variable frame rate.
+        more: (2,N) samples of further sound tracks.
     """
     length = 1.0 if samples is None else np.atleast_2d(samples).shape[1] / rate_hz
     with av.open(str(path), "w") as container:
@@ -44,6 +46,7 @@ def write_video_with_sound(
         pictures.width, pictures.height, pictures.pix_fmt = 64, 48, "yuv420p"
         pictures.time_base = pictures.codec_context.time_base = Fraction(1, 1000)
         sound = None if samples is None else container.add_stream("aac", rate=rate_hz, layout=layout)
+        others = [container.add_stream("aac", rate=rate_hz, layout="stereo") for _ in more]
         count = int((seconds or length) * FPS)
         for number, time_ms in enumerate(frame_times or range(0, 100 * count, 100)):
             frame = av.VideoFrame.from_ndarray(textured_frame(number % 40), format="gray")
@@ -56,6 +59,10 @@ def write_video_with_sound(
                     frame.pts += round(gap[1] * rate_hz)
                 container.mux(sound.encode(frame))
             container.mux(sound.encode(None))
+        for other, track_samples in zip(others, more, strict=True):
+            for frame in sound_frames(track_samples, rate_hz, "stereo"):
+                container.mux(other.encode(frame))
+            container.mux(other.encode(None))
     return path
 
 

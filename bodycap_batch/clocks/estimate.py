@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -29,12 +29,12 @@ from bodycap_batch.clocks.joint_offsets import (
     connected_cameras,
     solve_clocks,
 )
-from bodycap_batch.clocks.pair_offsets import MAX_DRIFT_PPM, PairOffset, measure_pair
+from bodycap_batch.clocks.pair_offsets import MAX_DRIFT_PPM, PairOffset, measure_channels
 from bodycap_batch.clocks.phase_correlation import PEAK_WIDTH_S
 from bodycap_batch.clocks.recorders import Recorder
 from bodycap_batch.clocks.sensor_offsets import SensorOffset, measure_sensor_offset
 from bodycap_batch.clocks.sensor_signals import SensorTrack, sensor_track
-from bodycap_batch.clocks.sound_track import SoundTrack, read_sound_track
+from bodycap_batch.clocks.sound_track import SoundTrack, read_channels, read_sound_track
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import CaptureError
@@ -186,10 +186,9 @@ def measure_sound(spec: CaptureConfig, threads: int | None = None, *, sensors: b
     """
     with ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool:
         read = list(pool.map(_read_recording, spec.cameras))
-        tracks = {track.camera: track for _, track in read}
         found = SoundEvidence(recordings=tuple(recording for recording, _ in read))
+        tracks = {mix.camera: [] if mix.problem else [mix] for _, mix in read}
         expected = found.expected()
-
         measured: dict[tuple[str, str], PairOffset] = {}
 
         def measure(pair: tuple[str, str]) -> PairOffset:
@@ -197,16 +196,41 @@ def measure_sound(spec: CaptureConfig, threads: int | None = None, *, sensors: b
             limits = _offset_through(reference, pair, measured, tracks)
             if limits is None and prior is not None:
                 limits = prior.limits()
-            return measure_pair(tracks[pair[0]], tracks[pair[1]], limits)
+            return measure_channels(tracks[pair[0]], tracks[pair[1]], limits)
+
+        def measure_all(pairs: Sequence[tuple[str, str]]) -> list[str]:
+            direct = [pair for pair in pairs if reference in pair]
+            for some in (direct, [pair for pair in pairs if pair not in direct]):
+                for pair, offset in zip(some, list(pool.map(measure, some)), strict=True):
+                    if offset.accepted or pair not in measured:
+                        measured[pair] = offset
+            return connected_cameras(reference, [pair for pair in measured.values() if pair.accepted])
 
         reference = spec.reference_camera().name
-        pairs = camera_pairs([name for name, track in tracks.items() if not track.problem])
-        direct = [pair for pair in pairs if reference in pair]
-        measured.update(zip(direct, pool.map(measure, direct), strict=True))
-        others = [pair for pair in pairs if reference not in pair]
-        measured.update(zip(others, list(pool.map(measure, others)), strict=True))
-        found = replace(found, pairs=tuple(measured[pair] for pair in pairs))
-        heard = connected_cameras(reference, [pair for pair in found.pairs if pair.accepted])
+        heard = measure_all(camera_pairs([name for name, usable in tracks.items() if usable]))
+        if len(heard) < len(spec.cameras):
+            # The mixes of several cameras that are heard resemble each other: they need no other channels.
+            lost = [
+                (camera, mix)
+                for camera, (_, mix) in zip(spec.cameras, read, strict=True)
+                if mix.channels > 1 and (camera.name not in heard or len(heard) == 1)
+            ]
+            tracks |= zip((mix.camera for _, mix in lost), pool.map(_read_channels, lost), strict=True)
+            pairs = camera_pairs([name for name, usable in tracks.items() if usable])
+            heard = measure_all(
+                [
+                    pair
+                    for pair in pairs
+                    if (pair[0] in heard) != (pair[1] in heard)
+                    and (pair not in measured or any(len(tracks[name]) > 1 for name in pair))
+                ]
+            )
+        found = SoundEvidence(
+            recordings=tuple(
+                _with_channel(each, tracks[each.camera], measured.values()) for each in found.recordings
+            ),
+            pairs=tuple(measured[pair] for pair in camera_pairs(list(tracks)) if pair in measured),
+        )
         if not sensors or len(heard) == len(spec.cameras):
             return found
         return _with_sensors(found, list(pool.map(_read_sensor, spec.cameras)), heard)
@@ -254,7 +278,7 @@ def _offset_through(
     reference: str,
     pair: tuple[str, str],
     measured: Mapping[tuple[str, str], PairOffset],
-    tracks: Mapping[str, SoundTrack],
+    tracks: Mapping[str, Sequence[SoundTrack]],
 ) -> tuple[float, float] | None:
     """Return limits of the offset of a pair, seconds, from the offsets of both to the reference camera.
 
@@ -266,7 +290,8 @@ def _offset_through(
         if through is None or not through.accepted:
             return None
         offsets_s.append(through.offset_s if through.first == reference else -through.offset_s)
-    longest_s = max(abs(time) for name in pair for time in (tracks[name].start_s, tracks[name].end_s))
+    sounds = [tracks[name][0] for name in pair]
+    longest_s = max(abs(time) for sound in sounds for time in (sound.start_s, sound.end_s))
     middle_s, reach_s = offsets_s[1] - offsets_s[0], PEAK_WIDTH_S + 2e-6 * MAX_DRIFT_PPM * longest_s
     return middle_s - reach_s, middle_s + reach_s
 
@@ -304,6 +329,36 @@ def _read_recording(config: CameraConfig) -> tuple[Recording, SoundTrack]:
         frames=len(times_ns),
     )
     return recording, track
+
+
+def _read_channels(camera: tuple[CameraConfig, SoundTrack]) -> list[SoundTrack]:
+    config, mix = camera
+    videos = index_videos(config.video, 1)
+    return read_channels(mix, videos, join_chapters(videos, config.timestamps).times_ns)
+
+
+def _with_channel(
+    recording: Recording, tracks: Sequence[SoundTrack], pairs: Iterable[PairOffset]
+) -> Recording:
+    """Return a recording with the sound that was compared, and a note if it is not the mono mix."""
+    if not tracks or (not tracks[0].name and len(tracks) == 1):
+        return recording
+    names = [
+        name
+        for pair in pairs
+        for camera, name in zip((pair.first, pair.second), pair.channels, strict=True)
+        if pair.accepted and camera == recording.camera and name
+    ]
+    why = recording.problem or "the mono mix of the first sound track agrees with no other camera"
+    notes = [f"the clock comes from {name} ({why})" for name in dict.fromkeys(names)]
+    return replace(
+        recording,
+        sound_start_s=tracks[0].start_s,
+        end_s=tracks[0].end_s,
+        recorder=tracks[0].recorder,
+        problem="",
+        notes=(*recording.notes, *notes),
+    )
 
 
 def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstimates:

@@ -6,6 +6,7 @@ the whole common time: the offsets of these windows must lie on one line, whose 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -41,6 +42,10 @@ _MAX_WINDOWS = 24
 _SEARCHES = (1, 3, 8, 12)
 """Number of windows in each round of the search. The search ends as soon as an offset is accepted, or two
 offsets pass every test but the comparison with each other. Evidence: docs/decisions/clocks.md."""
+_EXAMINED_CHANNELS = 2
+"""Maximum number of combinations of two channels that are examined. The others have less clear peaks."""
+_CHANCE_HEIGHT = 4.0
+"""Height of the highest peak of a window of unrelated sounds, σ. Evidence: docs/decisions/clocks.md."""
 _CANDIDATES = 6
 """Number of peaks of each searched window that are examined."""
 _MIN_CANDIDATE_RATIO = 0.5
@@ -62,6 +67,9 @@ _MAX_LOG_CHANCE = float(np.log(1e-3))
 conditions reduce the probability further. Evidence: docs/decisions/clocks.md."""
 _MIN_RIVAL_RATIO = 2.0
 """Least ratio of the summed heights of the accepted lag to those of any other lag. Evidence:
+docs/decisions/clocks.md."""
+_MIN_CHANNELS_RATIO = 4.0
+"""The same ratio, if several channels were compared: hum of the mains is in many dead channels. Evidence:
 docs/decisions/clocks.md."""
 _MIN_AGREEING = 0.6
 """Least fraction of the windows with a clear peak that must agree with the line. Evidence: none."""
@@ -99,6 +107,7 @@ class PairOffset(ClockPair):
     """What the sound of two cameras says about their clocks; `sigma_s` is without the way of sound.
 
     Attributes:
+        channels: Name of the compared channel of each camera; "" for the mono mix of its first sound stream.
         evidence: Summed heights of the windows that agree, σ.
         rival_ratio: `evidence` over that of the best other lag.
         log_chance: Logarithm of the probability that unrelated sounds give this result.
@@ -107,6 +116,7 @@ class PairOffset(ClockPair):
         curve: (N,) mean energy of the correlations of the windows, relative to its mean.
     """
 
+    channels: tuple[str, str] = ("", "")
     rival_ratio: float = 0.0
     log_chance: float = 0.0
     chunks: tuple[ChunkOffset, ...] = ()
@@ -114,8 +124,39 @@ class PairOffset(ClockPair):
     curve: FloatArray | None = None
 
 
+def measure_channels(
+    first: Sequence[SoundTrack], second: Sequence[SoundTrack], expected_s: tuple[float, float] | None = None
+) -> PairOffset:
+    """Measure the difference between the clocks of two cameras from any of their channels.
+
+    All combinations of two channels are searched; only the clearest ones are examined. Each combination is
+    one more trial, in which unrelated sounds may resemble each other.
+
+    Args:
+        first: Channels of the first camera, without a problem; at least one.
+        second: Channels of the second camera, without a problem; at least one.
+        expected_s: See `measure_pair`.
+    """
+    pairs = list(itertools.product(first, second))
+    if len(pairs) > 1:
+        pairs.sort(key=lambda pair: -_clearness(*pair))
+    found = [measure_pair(*pair, expected_s, len(pairs)) for pair in pairs[:_EXAMINED_CHANNELS]]
+    return next((pair for pair in found if pair.accepted), found[0])
+
+
+def _clearness(first: SoundTrack, second: SoundTrack) -> float:
+    """Return the ratio of the two highest peaks, in the clearest of some windows of the shorter sound."""
+    one, two = sorted((first, second), key=lambda track: track.end_s - track.start_s)
+    starts = _search_starts(one)[: sum(_SEARCHES[:2])]
+    heights = [[*(peak.height for peak in peaks), 0.0, 0.0] for peaks, _ in _search(one, starts, two, None)]
+    return max(highest / max(next_one, _CHANCE_HEIGHT) for highest, next_one, *_ in heights)
+
+
 def measure_pair(
-    first: SoundTrack, second: SoundTrack, expected_s: tuple[float, float] | None = None
+    first: SoundTrack,
+    second: SoundTrack,
+    expected_s: tuple[float, float] | None = None,
+    trials: int = 1,
 ) -> PairOffset:
     """Measure the difference between the clocks of two cameras.
 
@@ -124,14 +165,15 @@ def measure_pair(
         second: Sound of the second camera, without a problem.
         expected_s: Least and greatest offset that is searched first, seconds. If nothing is found there, all
             offsets are searched.
+        trials: Number of pairs of sounds of these cameras that are compared.
     """
     # Windows are taken from the shorter sound, because most of the longer one may be alone.
     if second.end_s - second.start_s < first.end_s - first.start_s:
         swapped = None if expected_s is None else (-expected_s[1], -expected_s[0])
-        return _turned(measure_pair(second, first, swapped))
+        return _turned(measure_pair(second, first, swapped, trials))
     best: PairOffset | None = None
     for limits in [expected_s, None] if expected_s is not None else [None]:
-        found = _measure(first, second, limits)
+        found = _measure(first, second, limits, trials)
         if found.accepted:
             return found
         if best is None or found.log_chance < best.log_chance:
@@ -156,6 +198,7 @@ def _turned(pair: PairOffset) -> PairOffset:
         second=pair.first,
         accepted=pair.accepted,
         reason=pair.reason,
+        channels=(pair.channels[1], pair.channels[0]),
         pivot_s=pair.pivot_s + pair.offset_s,
         offset_s=-pair.offset_s,
         sigma_s=pair.sigma_s,
@@ -171,7 +214,9 @@ def _turned(pair: PairOffset) -> PairOffset:
     )
 
 
-def _measure(first: SoundTrack, second: SoundTrack, limits: tuple[float, float] | None) -> PairOffset:
+def _measure(
+    first: SoundTrack, second: SoundTrack, limits: tuple[float, float] | None, trials: int
+) -> PairOffset:
     starts = _search_starts(first)
     examined: list[_Candidate] = []
     searched: list[tuple[float, Peak, float]] = []
@@ -187,17 +232,17 @@ def _measure(first: SoundTrack, second: SoundTrack, limits: tuple[float, float] 
             for peak in peaks:
                 is_high = peak.height >= _MIN_CANDIDATE_RATIO * peaks[0].height
                 if is_high and not _is_known(examined, peak.lag_s):
-                    searched.append((start_s, peak, lags * len(starts)))
+                    searched.append((start_s, peak, lags * len(starts) * trials))
                     examined.append(_examine(first, second, *searched[-1], _FEW_WINDOWS))
         if examined:
-            outcome = _decide(first, second, examined)
+            outcome = _decide(first, second, examined, trials)
         if examined and not outcome.accepted and first.end_s - first.start_s <= _FINE_UP_TO_S:
             # The second examination counts as twice the number of lags.
             finer = [
                 _examine(first, second, start_s, peak, 2 * lags, _MAX_WINDOWS)
                 for start_s, peak, lags in searched
             ]
-            found = _decide(first, second, finer)
+            found = _decide(first, second, finer, trials)
             outcome = found if found.accepted else outcome
         if outcome.accepted or _repeats(examined):
             break
@@ -437,12 +482,12 @@ def _repeats(examined: Sequence[_Candidate]) -> bool:
     return _rival_ratio(passing, max(passing, key=lambda each: each.evidence)) < _MIN_RIVAL_RATIO
 
 
-def _decide(first: SoundTrack, second: SoundTrack, examined: Sequence[_Candidate]) -> PairOffset:
+def _decide(first: SoundTrack, second: SoundTrack, examined: Sequence[_Candidate], trials: int) -> PairOffset:
     """Accept or refuse the best candidate."""
     best = max(examined, key=lambda each: each.evidence)
     ratio = _rival_ratio(examined, best)
     reason = best.refusal()
-    if not reason and ratio < _MIN_RIVAL_RATIO:
+    if not reason and ratio < (_MIN_RIVAL_RATIO if trials == 1 else _MIN_CHANNELS_RATIO):
         reason = "several offsets suit the sound equally well: it repeats"
     chunks = tuple(
         ChunkOffset(time_s=time, offset_s=offset, height=height, agrees=bool(agrees))
@@ -457,6 +502,7 @@ def _decide(first: SoundTrack, second: SoundTrack, examined: Sequence[_Candidate
         second=second.camera,
         accepted=not reason,
         reason=reason,
+        channels=(first.name, second.name),
         pivot_s=line.pivot_s,
         offset_s=line.offset_s,
         sigma_s=line.sigma_s,

@@ -1,13 +1,17 @@
-"""Read the sound of a camera: mono, 16 kHz, with the time of its samples on the clock of the camera."""
+"""Read the sound of a camera: mono, 16 kHz, with the time of its samples on the clock of the camera.
+
+The mono mix of the first sound stream is read first. Its channels may cancel each other, it may be empty, or
+it may belong to another microphone. Then each channel of each stream is read as a track of its own.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +23,6 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from av.audio.frame import AudioFrame
-    from av.audio.stream import AudioStream
     from av.container import InputContainer
 
 RATE_HZ = 16_000
@@ -54,6 +57,20 @@ _BATCH_SAMPLES = 10 * RATE_HZ
 """Number of samples of a piece of a track, if the clock of the frames runs faster or slower than that of the
 sound. Within a piece the difference is ignored: 0.5 ms at 50 ppm."""
 
+_MAX_CHANNELS = 6
+"""Maximum number of tracks of a camera that are compared, if the mono mix is not enough. Origin: 5.1
+sound."""
+_LIKE_CORRELATION = 0.95
+"""Correlation, without regard to the sign, from which a track is a copy of another one. Derivation: what
+differs has less than a tenth of the power."""
+_LINE_RATIO = 20.0
+"""Power of a frequency relative to those around it from which it belongs to a line of a hum. Evidence:
+docs/decisions/clocks.md."""
+_LINE_WIDTH_HZ = 41
+"""Width, Hz, of the band around a frequency with which it is compared. Origin: less than 50 Hz."""
+_MAX_HUM = 0.8
+"""Maximum share of the power of a track in such lines. Evidence: docs/decisions/clocks.md."""
+
 Samples = npt.NDArray[np.float32]
 
 
@@ -81,6 +98,8 @@ class SoundTrack:
 
     Attributes:
         camera: Name of the camera.
+        name: Name of the channel and its stream for the user; "" for the mono mix of the first stream.
+        channels: Number of channels of all streams of the file.
         pieces: Sound without gaps, in the order of time. The gaps between pieces are silent.
         top_hz: Highest frequency that the recording contains, Hz: half its lowest sample rate.
         recorder: What is known about the device and the encoder; None without sound.
@@ -89,6 +108,8 @@ class SoundTrack:
     """
 
     camera: str
+    name: str = ""
+    channels: int = 1
     pieces: tuple[SoundPiece, ...] = ()
     top_hz: float = RATE_HZ / 2
     recorder: Recorder | None = None
@@ -141,7 +162,7 @@ class SoundTrack:
 
 
 def read_sound_track(camera: str, videos: Sequence[VideoFile], times_ns: IntArray) -> SoundTrack:
-    """Read the sound of all chapters of a camera.
+    """Read the mono mix of the first sound stream of all chapters of a camera.
 
     Args:
         camera: Name of the camera.
@@ -155,38 +176,111 @@ def read_sound_track(camera: str, videos: Sequence[VideoFile], times_ns: IntArra
     Raises:
         CaptureError: A file cannot be opened.
     """
-    pieces: list[SoundPiece] = []
-    notes: list[str] = []
-    problems: list[str] = []
-    recorders: list[Recorder] = []
+    (mix,) = _read_tracks(camera, videos, times_ns, separate=False)
+    return mix
+
+
+def read_channels(mix: SoundTrack, videos: Sequence[VideoFile], times_ns: IntArray) -> list[SoundTrack]:
+    """Return the tracks of a camera that may be compared: the mono mix, and the channels of all streams.
+
+    Silent tracks and those of a hum are left out. So are copies of earlier ones, which may have the sign
+    inverted.
+
+    Args:
+        mix: The track that `read_sound_track` returned.
+        videos: See `read_sound_track`.
+        times_ns: See `read_sound_track`.
+
+    Raises:
+        CaptureError: A file cannot be opened.
+    """
+    kept: list[SoundTrack] = []
+    for track in (mix, *_read_tracks(mix.camera, videos, times_ns, separate=True)):
+        if not (track.problem or _is_hum(track) or any(_is_like(track, other) for other in kept)):
+            kept.append(track)
+    return kept[:_MAX_CHANNELS]
+
+
+def _is_hum(track: SoundTrack) -> bool:
+    """Return True for the hum of the mains in a channel without a microphone: it resembles any other hum."""
+    from scipy.ndimage import median_filter
+    from scipy.signal import welch
+
+    samples = track.samples(track.start_s, round((track.end_s - track.start_s) * RATE_HZ))
+    power = welch(samples, RATE_HZ, nperseg=min(RATE_HZ, len(samples)))[1][round(_HIGH_PASS_HZ) :]
+    lines = power[power > _LINE_RATIO * median_filter(power, _LINE_WIDTH_HZ)]
+    return bool(lines.sum() > _MAX_HUM * power.sum())
+
+
+def _is_like(first: SoundTrack, second: SoundTrack) -> bool:
+    """Return True if a track is a copy of another one, with any factor and sign."""
+    start_s, end_s = min(first.start_s, second.start_s), max(first.end_s, second.end_s)
+    products = np.zeros(3)
+    for block_s in np.arange(start_s, end_s, _BATCH_SAMPLES / RATE_HZ).tolist():
+        one, two = first.samples(block_s, _BATCH_SAMPLES), second.samples(block_s, _BATCH_SAMPLES)
+        products += one @ one, two @ two, one @ two
+    return bool(products[2] ** 2 >= _LIKE_CORRELATION**2 * products[0] * products[1])
+
+
+def _read_tracks(
+    camera: str, videos: Sequence[VideoFile], times_ns: IntArray, *, separate: bool
+) -> list[SoundTrack]:
+    """Return the mono mix of the first stream, or each channel of each stream, over all chapters."""
+    chapters: dict[str, list[tuple[Path, SoundTrack]]] = {}
     first = 0
     for video in videos:
         clock = clock_of_chapter(video.times_ns(), times_ns[first : first + len(video.pts)])
         first += len(video.pts)
         shifts_s = [float(shift * video.time_base) for _, shift in video.restarts]
-        chapter = read_sound_file(video.path, video.part, shifts_s)
-        if chapter.pieces and abs(clock.rate - 1.0) > _MAX_RATE_ERROR:
-            slower = f"the file plays its pictures {1.0 / clock.rate:.3g} times slower than they were taken"
-            chapter = SoundTrack(camera="", problem=f"{slower}, so nothing tells the times of its sound")
-        pieces += [moved for piece in chapter.pieces for moved in _moved(piece, clock)]
-        notes += [f"{video.path.name}: {note}" for note in chapter.notes]
-        if chapter.problem:
-            problems.append(f"{video.path.name}: {chapter.problem}" if len(videos) > 1 else chapter.problem)
-        if chapter.recorder is not None:
-            recorders.append(chapter.recorder)
-    if not pieces:
-        return SoundTrack(camera=camera, problem="; ".join(problems), notes=tuple(notes))
-    notes += problems
-    track = SoundTrack(
+        for track in _read_file(video.path, video.part, shifts_s, separate=separate):
+            if track.pieces and abs(clock.rate - 1.0) > _MAX_RATE_ERROR:
+                slower = (
+                    f"the file plays its pictures {1.0 / clock.rate:.3g} times slower than they were taken"
+                )
+                problem = f"{slower}, so nothing tells the times of its sound"
+                track = replace(track, pieces=(), recorder=None, problem=problem, notes=())
+            pieces = tuple(moved for piece in track.pieces for moved in _moved(piece, clock))
+            chapters.setdefault(track.name, []).append((video.path, replace(track, pieces=pieces)))
+    return [_joined(camera, tracks, len(videos)) for tracks in chapters.values()]
+
+
+def _joined(camera: str, chapters: Sequence[tuple[Path, SoundTrack]], count: int) -> SoundTrack:
+    """Return one track of a camera.
+
+    Args:
+        camera: Name of the camera.
+        chapters: The file and the track, on the clock of the camera, of each chapter that has it.
+        count: Number of all chapters.
+    """
+    tracks = [track for _, track in chapters]
+    pieces = [piece for track in tracks for piece in track.pieces]
+    notes = [f"{path.name}: {note}" for path, track in chapters for note in track.notes]
+    problems = [
+        f"{path.name}: {track.problem}" if count > 1 else track.problem
+        for path, track in chapters
+        if track.problem
+    ]
+    recorders = [track.recorder for track in tracks if track.recorder is not None]
+    joined = SoundTrack(
         camera=camera,
+        name=tracks[0].name,
+        channels=max(track.channels for track in tracks),
+        problem="; ".join(problems),
+        notes=tuple(notes),
+    )
+    if not pieces:
+        return joined
+    joined = replace(
+        joined,
         pieces=_without_overlaps(pieces),
         top_hz=min(RATE_HZ / 2, *(each.rate_hz / 2 for each in recorders)),
         recorder=recorders[0],
-        notes=tuple(notes),
+        problem="",
+        notes=(*notes, *problems),
     )
-    if not (track.levels()[1] > _SILENCE_LSB).any():
-        return SoundTrack(camera=camera, problem="the sound is silent", notes=track.notes)
-    return track
+    if not (joined.levels()[1] > _SILENCE_LSB).any():
+        return replace(joined, pieces=(), recorder=None, problem="the sound is silent")
+    return joined
 
 
 def _moved(piece: SoundPiece, clock: ChapterClock) -> Iterator[SoundPiece]:
@@ -208,66 +302,68 @@ def _without_overlaps(pieces: list[SoundPiece]) -> tuple[SoundPiece, ...]:
     return tuple(out)
 
 
-def read_sound_file(
-    path: Path, part: tuple[int, int] | None = None, shifts_s: Sequence[float] = ()
-) -> SoundTrack:
-    """Read the sound of one file. The times are those of the file.
+def read_sound_file(path: Path) -> SoundTrack:
+    """Read the mono mix of the first sound stream of one file. The times are those of the file."""
+    (mix,) = _read_file(path, None, (), separate=False)
+    return mix
+
+
+def _read_file(
+    path: Path, part: tuple[int, int] | None, shifts_s: Sequence[float], *, separate: bool
+) -> Iterator[SoundTrack]:
+    """Yield the mono mix of the first stream of a file, or each channel of each stream.
 
     Args:
         path: Path of the file.
         part: First byte, and the byte after the last byte, of the recording in the file; None for all bytes.
         shifts_s: For each place at which the times start again, what is added to the times after it, seconds.
+        separate: True for the channels, False for the mono mix.
     """
     with open_container(path, part) as container:
-        stream = _audio_stream(container)
-        if stream is None:
+        streams = [each for each in container.streams.audio if each.codec_context is not None]
+        channels = sum(stream.codec_context.channels for stream in streams)
+        read = streams[: None if separate else 1]
+        readers = {each.index: _PieceReader(shifts_s, separate=separate) for each in read}
+        broken = _decode(container, readers) if readers else ""
+        if not readers and not separate:
             has_sound = bool(container.streams.audio)
             problem = "there is no decoder for its sound" if has_sound else "the video has no sound"
-            return SoundTrack(camera="", problem=problem)
-        recorder = recorder_of(container, stream)
-        reader = _PieceReader(shifts_s)
-        broken = _decode(container, stream, reader)
-        pieces = reader.finish()
-    notes = []
-    if len(pieces) > 1:
-        notes.append(f"the sound has {len(pieces) - 1} gap{'s' if len(pieces) > 2 else ''}")
-    if broken:
-        notes.append(broken)
-    return SoundTrack(
-        camera="",
-        pieces=tuple(pieces),
-        recorder=recorder,
-        problem="" if pieces else broken or "its sound track is empty",
-        notes=tuple(notes) if pieces else (),
-    )
+            yield SoundTrack(camera="", channels=0, problem=problem)
+        for number, (stream, reader) in enumerate(zip(streams, readers.values(), strict=False), start=1):
+            blocks = reader.finish()
+            count = max((len(samples) for _, samples in blocks), default=0 if separate else 1)
+            for index in range(count):
+                pieces = [SoundPiece(start_s, each[index]) for start_s, each in blocks if index < len(each)]
+                gaps = f"the sound has {len(pieces) - 1} gap{'s' if len(pieces) > 2 else ''}"
+                yield SoundTrack(
+                    camera="",
+                    name=f"channel {index + 1} of sound track {number}" if separate else "",
+                    channels=channels,
+                    pieces=tuple(pieces),
+                    recorder=recorder_of(container, stream),
+                    problem="" if pieces else broken or "its sound track is empty",
+                    notes=(*([gaps] if len(pieces) > 1 else []), *([broken] if pieces and broken else [])),
+                )
 
 
-def _audio_stream(container: InputContainer) -> AudioStream | None:
-    """Return the first sound stream that has a decoder, and let the demuxer skip all others."""
-    import av
-
-    chosen = next((each for each in container.streams.audio if each.codec_context is not None), None)
-    for stream in container.streams:
-        if stream is not chosen:
-            with contextlib.suppress(AttributeError):
-                stream.discard = av.stream.Discard.all
-    return chosen
-
-
-def _decode(container: InputContainer, stream: AudioStream, reader: _PieceReader) -> str:
-    """Decode all sound of a stream. Packets that are damaged are skipped.
+def _decode(container: InputContainer, readers: Mapping[int, _PieceReader]) -> str:
+    """Decode all sound of the streams with these indices. Packets that are damaged are skipped.
 
     Returns:
         A note about the damage; empty without damage.
     """
     import av
 
+    for stream in container.streams:
+        if stream.index not in readers:  # the demuxer skips it
+            with contextlib.suppress(AttributeError):
+                stream.discard = av.stream.Discard.all
     damaged, reason = 0, ""
     try:
-        for packet in container.demux(stream):
+        for packet in container.demux([container.streams[index] for index in readers]):
             try:
                 for frame in packet.decode():
-                    reader.add(frame)
+                    readers[packet.stream.index].add(cast("AudioFrame", frame))
             except av.error.FFmpegError as error:
                 damaged, reason = damaged + 1, error_reason(error)
     except av.error.FFmpegError as error:
@@ -276,11 +372,17 @@ def _decode(container: InputContainer, stream: AudioStream, reader: _PieceReader
 
 
 class _PieceReader:
-    """Joins decoded frames to pieces and converts them to mono at `RATE_HZ`."""
+    """Joins decoded frames to pieces and converts them to `RATE_HZ`.
 
-    def __init__(self, shifts_s: Sequence[float] = ()) -> None:
+    Args:
+        shifts_s: For each place at which the times start again, what is added to the times after it, seconds.
+        separate: True to keep the channels; False for their mono mix.
+    """
+
+    def __init__(self, shifts_s: Sequence[float], *, separate: bool) -> None:
         self._shifts_s = [0.0, *shifts_s]
-        self._pieces: list[SoundPiece] = []
+        self._separate = separate
+        self._pieces: list[tuple[float, npt.NDArray[np.int16]]] = []
         self._parts: list[npt.NDArray[np.int16]] = []
         self._waiting: list[npt.NDArray[np.int16]] = []
         self._resampler: Any = None
@@ -306,46 +408,49 @@ class _PieceReader:
         frame.pts = None
         self._keep(frame)
 
-    def finish(self) -> list[SoundPiece]:
-        """Return all pieces."""
+    def finish(self) -> list[tuple[float, npt.NDArray[np.int16]]]:
+        """Return start (seconds) and samples (channels,N) of all pieces."""
         self._close()
         return self._pieces
 
     def _open(self, kind: tuple[object, ...], time_s: float) -> None:
         import av
 
-        self._resampler = av.AudioResampler(format="s16", layout="mono", rate=RATE_HZ)
+        layout = kind[2] if self._separate else "mono"
+        self._resampler = av.AudioResampler(format="s16p", layout=layout, rate=RATE_HZ)
         self._format, self._start_s, self._end_s, self._count = kind, time_s, time_s, 0
 
     def _close(self) -> None:
         if self._resampler is not None:
             self._keep(None)
         if self._parts:
-            samples = np.concatenate(self._parts)
-            count = min(_FADE_SAMPLES, len(samples) // 2)
+            samples = np.concatenate(self._parts, axis=1)
+            count = min(_FADE_SAMPLES, samples.shape[1] // 2)
             fade = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))
-            samples[:count] = np.rint(samples[:count] * fade)
-            samples[len(samples) - count :] = np.rint(samples[len(samples) - count :] * fade[::-1])
-            self._pieces.append(SoundPiece(self._start_s, samples))
+            samples[:, :count] = np.rint(samples[:, :count] * fade)
+            samples[:, samples.shape[1] - count :] = np.rint(
+                samples[:, samples.shape[1] - count :] * fade[::-1]
+            )
+            self._pieces.append((self._start_s, samples))
         self._parts, self._resampler, self._state, self._format = [], None, None, ()
 
     def _keep(self, frame: AudioFrame | None) -> None:
-        self._waiting += [out.to_ndarray()[0] for out in self._resampler.resample(frame)]
-        if frame is None or sum(map(len, self._waiting)) >= _FILTER_SAMPLES:
+        self._waiting += [out.to_ndarray() for out in self._resampler.resample(frame)]
+        if frame is None or sum(part.shape[1] for part in self._waiting) >= _FILTER_SAMPLES:
             self._filter()
 
     def _filter(self) -> None:
         """Remove the low frequencies from the samples that wait. The filter is slow for short parts."""
-        samples = np.concatenate([np.zeros(0), *self._waiting])
-        self._waiting = []
-        if not len(samples):
+        if not sum(part.shape[1] for part in self._waiting):
             return
+        samples = np.concatenate(self._waiting, axis=1).astype(np.float64)
+        self._waiting = []
         # Imported here, because the import takes a second and many captures have no sound.
         from scipy.signal import sosfilt, sosfilt_zi
 
         high_pass = _high_pass()
         if self._state is None:
-            self._state = sosfilt_zi(high_pass) * samples[0]
+            self._state = sosfilt_zi(high_pass)[:, None, :] * samples[:, :1]
         # The same filter delays the sound of all cameras alike. The constant prevents tiny numbers, which are
         # slow.
         filtered, self._state = sosfilt(high_pass, samples + 1e-3, zi=self._state)
