@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,9 +60,10 @@ def chosen_lens(config: CameraConfig, video: VideoFile) -> LensChoice | None:
     Raises:
         CaptureError: The job names a lens that does not fit the video.
     """
+    sizes = (video.shown_size, video.turned_size)  # in square pixels, and in stored ones
     if isinstance(config.calibration, str) and config.calibration != "auto":
         name = config.calibration
-        found = _first_choice(video, lambda size: choose_named(name, size, video.fps))
+        found = _first_choice([choose_named(name, size, video.fps) for size in sizes])
         if isinstance(found, str):
             raise CaptureError(
                 found,
@@ -76,19 +77,12 @@ def chosen_lens(config: CameraConfig, video: VideoFile) -> LensChoice | None:
     mode = video_mode(video.path)
     if mode.stabilisation not in ("", "off") or not mode.model:
         return None
-    choice = _first_choice(video, lambda size: choose_for_file(mode.model, mode.lens_mode, size, video.fps))
+    choice = _first_choice([choose_for_file(mode.model, mode.lens_mode, size, video.fps) for size in sizes])
     return None if isinstance(choice, str) else choice
 
 
-def _first_choice(
-    video: VideoFile, choose: Callable[[tuple[int, int]], LensChoice | str]
-) -> LensChoice | str:
-    """Return the choice for the size in square pixels, else that for the size in stored pixels."""
-    found = choose(video.shown_size)
-    if isinstance(found, str) and video.turned_size != video.shown_size:
-        stored = choose(video.turned_size)
-        return found if isinstance(stored, str) else stored
-    return found
+def _first_choice(choices: Sequence[LensChoice | str]) -> LensChoice | str:
+    return next((each for each in choices if isinstance(each, LensChoice)), choices[0])
 
 
 def _model(settings: Mapping[str, str], metadata: Mapping[str, str]) -> str:

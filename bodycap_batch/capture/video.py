@@ -29,12 +29,9 @@ orientation · stored. x points to the right and y down. The matrix is a signed 
 COPY_AGAIN = "copy the video again from the memory card of the camera, or leave this camera out"
 """Hint of the error about a damaged file."""
 _SPHERICAL_PROJECTIONS = {
-    0: "equirectangular",
-    1: "a cube map",
-    2: "a part of an equirectangular picture",
-    3: "half an equirectangular picture",
-    6: "a parametric immersive picture",
-}
+    0: "equirectangular", 1: "a cube map", 2: "equirectangular, in tiles", 3: "half equirectangular",
+    6: "parametric immersive",
+}  # fmt: skip
 """FFmpeg's numbers of the projections that no lens has. Rectilinear and fisheye pictures are left out."""
 MAY_READ = (
     "give the user who runs this program the permission to read the file and to enter its folders (chmod)"

@@ -26,6 +26,7 @@ from bodycap_batch.config.foreign_calibrations import (
     name_of_format,
     parse_calibration,
 )
+from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camera, parameter_count
 
@@ -255,7 +256,7 @@ def read_calibration(path: Path, camera: str) -> CalibrationEntry:
     values beside the key ``cameras`` apply to all cameras. Keys: model, params, width, height, pixel_origin,
     calibrated_with; offsets_s (by camera name) or offset_s; rolling_shutter_s. Other keys are ignored. Files
     of other programs are read, too: see `foreign_calibrations`. If such a file contains a single camera, it
-    applies to all cameras.
+    applies to all cameras, unless it is named after a place on the body.
 
     Args:
         path: Path of the calibration file.
@@ -268,7 +269,8 @@ def read_calibration(path: Path, camera: str) -> CalibrationEntry:
     data = _read_content(path)
     field = ""
     if foreign := cameras_of(data):
-        name = next(iter(foreign)) if len(foreign) == 1 else camera
+        only = next(iter(foreign)) if len(foreign) == 1 else camera
+        name = only if mount_of(only) is None else camera
         if name not in foreign:
             raise _no_such_camera(path, camera, foreign)
         field = f"{name}." if name else ""

@@ -1,16 +1,15 @@
 """Read calibration files of other programs as entries in the format of ``calib.json``.
 
 A file is recognised by its content, whatever its name: OpenCV (YAML, XML, JSON), ROS, Kalibr, COLMAP
-(``cameras.txt``), Gyroflow, Caliscope, OpenImuCameraCalibrator and files with similar keys. A lens is read if
-a camera model of COLMAP expresses it exactly.
+(``cameras.txt``), Gyroflow, Caliscope and files with similar keys. A lens is read if a camera model of COLMAP
+expresses it exactly.
 
 Sources: OpenCV, ``calibrateCamera`` and ``fisheye``; Kalibr, "Supported models"; COLMAP, sensor/models.h;
-TheiaSfM, camera models; Gyroflow, lens profiles.
+Gyroflow, lens profiles.
 """
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import re
@@ -30,16 +29,13 @@ CALIBRATION_EXAMPLE = (
     '"width": 1920, "height": 1080}'
 )
 """Advice on how to write a calibration."""
-_BINARY_FORMATS = {
-    b"PK\x03\x04": "NumPy (.npz)", b"\x93NUMPY": "NumPy (.npy)", b"\x80": "Python (pickle)",
-    b"MATLAB": "MATLAB (.mat)",
-}  # fmt: skip
-"""Name of each binary format by the first bytes of its files."""
 _OTHER_FORMATS = {
     "projection_type": "OpenSfM", "value0": "Basalt", "projection": "Agisoft Metashape",
-    "sfmData": "Meshroom", "featuresFolders": "Meshroom",
+    "intrinsic_type": "OpenImuCameraCalibrator", "fl_x": "nerfstudio", "sfmData": "Meshroom",
 }  # fmt: skip
 """Name of each text format that is not read, by a key that only its files have."""
+_PROGRAMS = {"fisheye_params": "Gyroflow", "distortion_coeffs": "Kalibr", "cam_id": "Caliscope"}
+"""Name of each program by a key of its cameras; other files are of OpenCV or ROS."""
 _COLMAP_LINE = re.compile(r"\s*(\d+)\s+([A-Z_]+)\s+(\d+)\s+(\d+)((?:\s+[-+.\deE]+)+)\s*")
 _COLMAP_UNDISTORTED = {"SIMPLE_FISHEYE": ("SIMPLE_RADIAL_FISHEYE", 1), "FISHEYE": ("OPENCV_FISHEYE", 4)}
 """Models of COLMAP without distortion: the same model with distortion, and its number of distortion terms."""
@@ -47,29 +43,18 @@ _MATRIX = re.compile(r"((camera|intrinsic)?matrix|intrinsics?)(rowmajor)?|mtx|k"
 _COEFFICIENTS = re.compile(r"dist(ortion)?s?(coeff?(icient)?s?)?|coeffs|d")
 _SIZE = re.compile(r"(camera|image|img|frame|calib)?(size|resolution|dimensions?)")
 _RMS = re.compile(r"(rms|avg|mean|final)?(reproj(ection)?)?error|rms")
-_NAMES = {
-    "fx": ("fx", "flx", "fu", "focallength"), "fy": ("fy", "fly", "fv"),
-    "cx": ("cx", "ppx", "principalptx"), "cy": ("cy", "ppy", "principalpty"),
-    "p1": ("p1", "tangentialdistortion1"), "p2": ("p2", "tangentialdistortion2"),
-}  # fmt: skip
-"""Names of intrinsics that stand alone, in small letters without separators, as all keys below."""
-_TERMS = {"brown": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), "fisheye": ("k1", "k2", "k3", "k4")}
-"""Distortion terms of each kind of lens, in OpenCV's order."""
-_NESTED = ("intrinsics", "intrinsic", "fisheyeparams")
-"""Keys whose content is read like that of the camera itself."""
+"""Keys in small letters without separators, as in `_flat`."""
 _LENSES = {
     **dict.fromkeys(
         ("", "pinhole", "simplepinhole", "none", "perspective", "opencv", "opencvstandard", "radtan", "brown",
-         "radialtangential", "plumbbob", "rationalpolynomial", "pinholeradialtangential", "brownconrady"),
+         "radialtangential", "plumbbob", "rationalpolynomial", "brownconrady"),
         "brown",
     ),
     **dict.fromkeys(
         ("fisheye", "opencvfisheye", "equidistant", "equi", "kannalabrandt", "kannalabrandt4", "kb4"),
         "fisheye",
     ),
-    **dict.fromkeys(("eucm", "extendedunified"), "eucm"),
-    **dict.fromkeys(("omni", "mei", "unified"), "omni"),
-    "fov": "fov", "atan": "fov",
+    "eucm": "eucm", "omni": "omni", "fov": "fov",
 }  # fmt: skip
 """Kind of each lens model that can be expressed, by its name in small letters without separators."""
 _MAX_DEPTH = 20
@@ -100,29 +85,18 @@ def parse_calibration(data: bytes, path: Path) -> dict[str, Any]:
     Raises:
         CaptureError: The file is no text, or no dictionary in a format that is read.
     """
-    known = next((name for start, name in _BINARY_FORMATS.items() if data.startswith(start)), "")
     try:
-        text = "" if known else decode_text(data)
-    except UnicodeDecodeError:
-        known = "binary"
-    if known or "\0" in text:
-        raise CaptureError(
-            f"a calibration in the format {known or 'binary'} cannot be read",
-            path=path,
-            hint="export it as text (COLMAP: cameras.txt; OpenCV: YAML, XML or JSON), or "
-            + CALIBRATION_EXAMPLE,
-        )
-    try:
-        content = _parsed(text)
+        content = _parsed(decode_text(data))
     except (ValueError, RecursionError, yaml.YAMLError, ET.ParseError) as error:
         mark = getattr(error, "problem_mark", None)
-        problem = getattr(error, "problem", None) or getattr(error, "msg", None) or error
         kind = "JSON" if isinstance(error, json.JSONDecodeError) else "text"
+        problem = getattr(error, "problem", None) or getattr(error, "msg", None) or error
         raise CaptureError(
             f"the file is not valid {kind}: {problem}",
             path=path,
             line=mark.line + 1 if mark is not None else getattr(error, "lineno", None),
-            hint="correct the file, or use `calibration: auto`",
+            hint="correct the file, or use `calibration: auto`; from a binary format (NumPy, MATLAB, pickle, "
+            "COLMAP's cameras.bin), export text (COLMAP: cameras.txt)",
         ) from error
     if isinstance(content, dict):
         return content
@@ -130,6 +104,8 @@ def parse_calibration(data: bytes, path: Path) -> dict[str, Any]:
 
 
 def _parsed(text: str) -> object:
+    if "\0" in text:
+        raise ValueError("it is binary")
     levels = itertools.accumulate((letter in "[{") - (letter in "]}") for letter in text)
     if max(levels, default=0) > _MAX_DEPTH:
         raise ValueError(f"its blocks are nested deeper than {_MAX_DEPTH} levels")
@@ -170,36 +146,26 @@ def _colmap_camera(row: re.Match[str]) -> dict[str, Any]:
 def cameras_of(content: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the cameras of another program's calibration, by name; empty if there are none.
 
-    A file with a single camera has the name "".
+    The camera of a file without names has the name "".
     """
     if _is_camera(content):
         return {"": dict(content)}
     group = content.get("cameras", content)
-    if isinstance(group, list):
-        group = {
-            str(each.get("name", each.get("id", index))): each
-            for index, each in enumerate(group)
-            if isinstance(each, dict)
-        }
-    if not isinstance(group, dict):
-        return {}
-    return {str(name): each for name, each in group.items() if isinstance(each, dict) and _is_camera(each)}
+    named = group.items() if isinstance(group, dict) else ()
+    return {str(name): each for name, each in named if isinstance(each, dict) and _is_camera(each)}
 
 
 def _is_camera(content: Mapping[str, Any]) -> bool:
     if "params" in content:
         return "colmap_id" in content
-    keys = _flat(content)
-    return _first(keys, _MATRIX) is not None or any(name in keys for name in _NAMES["fx"])
+    return "intrinsic_type" not in content and _first(_flat(content), _MATRIX) is not None
 
 
 def _flat(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values by key in small letters without separators, with those of nested intrinsics."""
-    out: dict[str, Any] = {}
-    for key, value in content.items():
-        name = _plain(key)
-        out.update(_flat(value) if name in _NESTED and isinstance(value, dict) else {name: value})
-    return out
+    """Return the values by key in small letters without separators, with those of a profile of Gyroflow."""
+    inner = content.get("fisheye_params")
+    both = {**content, **inner} if isinstance(inner, dict) else content
+    return {_plain(key): value for key, value in both.items()}
 
 
 def _plain(text: object) -> str:
@@ -211,16 +177,14 @@ def _first(keys: Mapping[str, Any], pattern: re.Pattern[str]) -> Any:
 
 
 def _numbers(value: Any) -> list[float]:
-    """Return the numbers of a list, of nested lists, of a matrix of OpenCV, or of a text with spaces."""
+    """Return the numbers of a number, of nested lists, of a matrix of OpenCV, or of a text with spaces."""
     if isinstance(value, dict):
-        value = value["data"]
-    if isinstance(value, str):
+        return _numbers(value["data"])
+    if isinstance(value, str) and (" " in value or "," in value):
         value = value.replace(",", " ").split()
-    if not isinstance(value, list):
-        return [float(value)]
-    return [
-        number for part in value for number in (_numbers(part) if isinstance(part, list) else [float(part)])
-    ]
+    if isinstance(value, list):
+        return [number for part in value for number in _numbers(part)]
+    return [float(value)]
 
 
 def in_own_format(camera: Mapping[str, Any], path: Path, field: str) -> dict[str, Any]:
@@ -229,7 +193,7 @@ def in_own_format(camera: Mapping[str, Any], path: Path, field: str) -> dict[str
     Args:
         camera: The camera.
         path: Path of the file, for errors.
-        field: Key of the camera in the file; "" for a file with a single camera.
+        field: Key of the camera in the file; "" for a file without names.
 
     Raises:
         CaptureError: No camera model of COLMAP expresses the lens, or a value is missing or wrong.
@@ -238,77 +202,58 @@ def in_own_format(camera: Mapping[str, Any], path: Path, field: str) -> dict[str
         return dict(camera)
     keys = _flat(camera)
     try:
-        lens = _lens(camera, keys)
+        made: dict[str, Any] = {}
+        if "camerabrand" in keys:  # Gyroflow
+            made["camera"] = f"{keys['camerabrand']} {keys.get('cameramodel') or ''}"
+            made["lens_mode"] = str(keys.get("lensmodel") or "")
+        if (rms := _first(keys, _RMS)) is not None:
+            made["rms_px"] = _numbers(rms)[0]
+        return {**camera, **_lens(camera, keys), "calibrated_with": made}
     except (ValueError, TypeError, LookupError, ArithmeticError) as error:
+        program = next((name for key, name in _PROGRAMS.items() if key in camera), "OpenCV or ROS")
         reason = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
         raise CaptureError(
-            f"this calibration of {_program(camera)} cannot be used: {reason}",
+            f"this calibration of {program} cannot be used: {reason}",
             path=path,
             field=field or None,
             hint="calibrate with a lens model that COLMAP has, too: OpenCV's terms k1 to k6, p1 and p2, "
             "equidistant (fisheye), FOV, EUCM, or omni without distortion (Kalibr: pinhole-radtan, "
             f"pinhole-equi, pinhole-fov, eucm-none); or {CALIBRATION_EXAMPLE}",
         ) from error
-    made: dict[str, Any] = {}
-    if "camerabrand" in keys:
-        brand = " ".join(str(keys[key]) for key in ("camerabrand", "cameramodel") if keys.get(key))
-        made = {"camera": brand, "lens_mode": str(keys.get("lensmodel") or "")}
-    with contextlib.suppress(ValueError, TypeError):
-        made["rms_px"] = float(_first(keys, _RMS))
-    return {**camera, **lens, "calibrated_with": made or None}
-
-
-def _program(camera: Mapping[str, Any]) -> str:
-    """Return the name of the program that writes the keys of a camera."""
-    names = {"fisheye_params": "Gyroflow", "rostopic": "Kalibr", "distortion_coeffs": "Kalibr"}
-    names |= {"intrinsic_type": "OpenImuCameraCalibrator", "cam_id": "Caliscope"}
-    return next((name for key, name in names.items() if key in camera), "OpenCV or ROS")
 
 
 def _lens(camera: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]:
     """Return the keys of `Calibration` for a camera. Raises `ValueError` if no model expresses the lens."""
     kind = _kind(camera, keys)
     width, height = _picture_size(keys)
-    extra, (fx, fy, cx, cy), skew = _matrix(keys, kind)
-    if abs(skew) * 0.5 * height / fy > _MAX_SKEW_PX:
-        raise ValueError(f"its axes are not perpendicular (skew {skew:g} px)")
-    coefficients = _first(keys, _COEFFICIENTS)
-    terms = _numbers(coefficients) if coefficients is not None else _named_terms(keys, kind)
-    model, params = _colmap_model(kind, extra, terms)
+    *extra, fx, fy, cx, cy = _intrinsics(keys, height)
+    model, params = _colmap_model(kind, extra, _numbers(_first(keys, _COEFFICIENTS) or []))
     if kind == "omni":
         fx, fy = fx / (1.0 + extra[0]), fy / (1.0 + extra[0])
     # Gyroflow stretches the pictures of some lenses before it calibrates.
-    x, y = (_stretch(keys.get(f"input{axis}stretch")) for axis in ("horizontal", "vertical"))
-    centre = [(cx + 0.5) / x - 0.5, (cy + 0.5) / y - 0.5]
+    x, y = (float(keys.get(f"input{axis}stretch") or 1.0) for axis in ("horizontal", "vertical"))
     return {
         "model": model,
-        "params": [fx / x, fy / y, *centre, *params],
+        "params": [fx / x, fy / y, (cx + 0.5) / x - 0.5, (cy + 0.5) / y - 0.5, *params],
         "width": round(width / x),
         "height": round(height / y),
-        "pixel_origin": "colmap" if "flx" in keys else "opencv",  # nerfstudio has COLMAP's
+        "pixel_origin": "opencv",
     }
-
-
-def _stretch(value: Any) -> float:
-    return float(value) if value and float(value) > 0.01 else 1.0
 
 
 def _kind(camera: Mapping[str, Any], keys: Mapping[str, Any]) -> str:
     """Return the kind of a lens: a value of `_LENSES`. Raises `ValueError` for any other lens."""
     distortion = _plain(keys.get("distortionmodel"))
-    projection = _plain(keys.get("cameramodel") or keys.get("intrinsictype") or keys.get("cameratype"))
+    projection = _plain(keys.get("cameramodel"))
     if "fisheye_params" in camera:  # Gyroflow, whose camera_model is a product
-        projection, distortion = "", distortion or "fisheye"
-        if keys.get("digitallens"):
-            raise ValueError(f"the camera warps the pictures ({keys['digitallens']})")
+        projection, distortion = _plain(keys.get("digitallens")), distortion or "fisheye"
     elif str(keys.get("fisheye", keys.get("fisheyemodel", 0))).lower() in ("1", "true"):
         distortion = "fisheye"
-    own = _LENSES.get(projection)
-    kind = own if own in ("eucm", "omni") else _LENSES.get(distortion or projection)
-    if own is None or kind is None:
-        name = keys.get("distortionmodel") if own is not None else projection
-        raise ValueError(f"COLMAP has no lens model {name!r}")
-    return kind
+    for name in (projection, distortion):
+        if name not in _LENSES:
+            raise ValueError(f"COLMAP has no lens model {name!r}")
+    special = _LENSES[projection] in ("eucm", "omni")
+    return _LENSES[projection if special else distortion or projection]
 
 
 def _picture_size(keys: Mapping[str, Any]) -> tuple[float, float]:
@@ -324,54 +269,33 @@ def _picture_size(keys: Mapping[str, Any]) -> tuple[float, float]:
     return width, height
 
 
-def _matrix(keys: Mapping[str, Any], kind: str) -> tuple[list[float], list[float], float]:
-    """Return the parameters of the projection, the focal lengths with the principal point, and the skew."""
-    found = _first(keys, _MATRIX)
-    if found is not None:
-        numbers = _numbers(found)
-        if len(numbers) == 9:
-            return [], [numbers[0], numbers[4], numbers[2], numbers[5]], numbers[1]
-        return numbers[:-4], numbers[-4:], 0.0
-    fx = _named(keys, "fx")
-    fy = fx * float(keys.get("aspectratio", 1.0)) if "focallength" in keys else _named(keys, "fy")
-    extra = {"eucm": ("alpha", "beta"), "omni": ("xi",)}.get(kind, ())
-    centre = [_named(keys, "cx"), _named(keys, "cy")]
-    return [float(keys[name]) for name in extra], [fx, fy, *centre], float(keys.get("skew", 0.0))
-
-
-def _named(keys: Mapping[str, Any], name: str, default: float | None = None) -> float:
-    for key in _NAMES.get(name, (name, f"radialdistortion{name[1:]}")):
-        if keys.get(key) is not None:
-            return float(keys[key])
-    if default is None:
-        raise KeyError(name)
-    return default
-
-
-def _named_terms(keys: Mapping[str, Any], kind: str) -> list[float]:
-    if kind == "fov":
-        return [float(keys[name]) for name in ("w", "omega", "radialdistortion1") if name in keys][:1]
-    return [_named(keys, name, 0.0) for name in _TERMS.get(kind, ())]
+def _intrinsics(keys: Mapping[str, Any], height: float) -> list[float]:
+    """Return the parameters of the projection, if there are any, then fx, fy, cx, cy."""
+    numbers = _numbers(_first(keys, _MATRIX))
+    if len(numbers) != 9:
+        return numbers
+    fx, skew, cx, _, fy, cy = numbers[:6]
+    if abs(skew) * 0.5 * height / fy > _MAX_SKEW_PX:
+        raise ValueError(f"its axes are not perpendicular (skew {skew:g} px)")
+    return [fx, fy, cx, cy]
 
 
 def _colmap_model(kind: str, extra: Sequence[float], terms: Sequence[float]) -> tuple[str, list[float]]:
     """Return COLMAP's model of a lens, and its parameters after the principal point."""
-    limit = {"brown": 8, "fisheye": 4, "fov": 1}.get(kind, 0)
-    if any(terms[limit:]):
+    if any(terms[{"brown": 8, "fisheye": 4, "fov": 1}.get(kind, 0) :]):
         name = "with thin-prism or tilt terms" if kind == "brown" else f"{kind} with this distortion"
         raise ValueError(f"COLMAP has no lens model {name} ({', '.join(f'{term:g}' for term in terms)})")
-    if kind == "fov":
-        return "FOV", [terms[0]]
-    if kind == "eucm":
-        alpha, beta = extra
-        return "EUCM", [alpha, beta]
-    if kind == "omni":  # the unified model is the enhanced one with beta = 1
-        return "EUCM", [extra[0] / (1.0 + extra[0]), 1.0]
-    if kind == "fisheye":
-        return "OPENCV_FISHEYE", [*terms, *[0.0] * 4][:4]
-    if any(terms[4:]):
+    if kind == "brown" and not any(terms):
+        return "PINHOLE", []
+    if kind == "brown" and any(terms[4:]):
         return "FULL_OPENCV", [*terms, *[0.0] * 8][:8]
-    return ("OPENCV", [*terms, *[0.0] * 4][:4]) if any(terms) else ("PINHOLE", [])
+    return {
+        "brown": ("OPENCV", [*terms, *[0.0] * 4][:4]),
+        "fisheye": ("OPENCV_FISHEYE", [*terms, *[0.0] * 4][:4]),
+        "fov": ("FOV", [*terms]),
+        "eucm": ("EUCM", [*extra]),
+        "omni": ("EUCM", [extra[0] / (1.0 + extra[0]) if extra else 0.0, 1.0]),  # the unified model
+    }[kind]
 
 
 def name_of_format(content: Mapping[str, Any]) -> str:

@@ -19,9 +19,8 @@ READ = {
     "camchain.yaml": ("OPENCV_FISHEYE", (*CENTRED, 0.01, -0.002, 0.0, 0.0)),
     "cv.yml": ("OPENCV", (*CENTRED, 0.01, -0.002, 0.0, 0.0)),
     "camera_array.toml": ("OPENCV", (*CENTRED, 0.01, -0.002, 0.0, 0.0)),
-    # These two have the principal point at 320, 240 with OpenCV's pixel origin.
+    # Its principal point is at 320, 240 with OpenCV's pixel origin.
     "lens.json": ("OPENCV_FISHEYE", (420.0, 420.0, 320.5, 240.5, 0.01, 0.0, 0.0, 0.0)),
-    "openicc.json": ("OPENCV_FISHEYE", (420.0, 420.0, 320.5, 240.5, 0.01, 0.0, 0.0, 0.0)),
 }
 
 
@@ -39,6 +38,12 @@ def test_the_file_is_read(folder: Path, name: str) -> None:
     model, params = READ[name]
     assert (lens.model, lens.width_px, lens.height_px) == (model, 640, 480)
     np.testing.assert_allclose(lens.params, params)
+
+
+def test_another_format_is_refused_by_name(folder: Path) -> None:
+    with pytest.raises(CaptureError, match="OpenImuCameraCalibrator") as caught:
+        read_calibration(folder / "openicc.json", "torso")
+    assert "write the calibration like this" in str(caught.value.hint)
 
 
 def test_five_coefficients_get_the_name_of_their_model(folder: Path) -> None:
