@@ -47,7 +47,11 @@ def read_telemetry(
     for video in videos:
         clock = clock_of_chapter(video.times_ns(), times_ns[first : first + len(video.pts)])
         first += len(video.pts)
-        chapter = _on_camera_clock(read_gopro_file(video.path, video.fps), clock)
+        if video.part is None or video.part[0] == 0:
+            chapter = _on_camera_clock(read_gopro_file(video.path, video.fps), clock)
+        else:
+            note = f"{video.path.name}: the telemetry of the first of the joined recordings is used only"
+            chapter = CameraTelemetry(notes=(note,))
         chapters.append(_turned(chapter, video))
     joined = _joined(chapters)
     if samples is None:

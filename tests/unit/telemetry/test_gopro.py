@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bodycap_batch.capture.frame_index import index_video
+from bodycap_batch.capture.frame_index import index_video, index_videos
 from bodycap_batch.capture.timeline import join_chapters
 from bodycap_batch.formats.gpmf import Damage, gopro_model, read_items
 from bodycap_batch.telemetry import read_telemetry
@@ -199,6 +199,17 @@ def test_a_video_with_a_track_and_its_chapters(tmp_path):
     # The second chapter starts with the 91st frame, 3.003 s after the first.
     assert len(gyro.times_s) == pytest.approx(2 * 606, abs=2)
     np.testing.assert_allclose(gyro.values[610], gyro.values[610 - 606], atol=0.01)
+
+
+def test_telemetry_of_joined_recordings_is_not_used_for_the_second_one(tmp_path):
+    frames = [textured_frame(index % 40) for index in range(90)]
+    path = write_gopro(tmp_path / "a.mp4", frames, payloads(Sensor(), 3, _turn))
+    path.write_bytes(2 * path.read_bytes())
+    videos = index_videos([path])
+    telemetry = read_telemetry(videos, join_chapters(videos, ()).times_ns)
+    assert len(videos) == 2
+    assert telemetry.gyro.times_s[-1] == pytest.approx(3.0, abs=0.02)
+    assert "the telemetry of the first of the joined recordings" in telemetry.notes[0]
 
 
 def test_the_vectors_of_a_turned_video_are_in_the_axes_of_the_shown_image(tmp_path):
