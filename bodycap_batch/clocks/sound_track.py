@@ -233,15 +233,19 @@ def _read_tracks(
         first += len(video.pts)
         shifts_s = [float(shift * video.time_base) for _, shift in video.restarts]
         for track in _read_file(video.path, video.part, shifts_s, separate=separate):
-            if track.pieces and abs(clock.rate - 1.0) > _MAX_RATE_ERROR:
-                slower = (
-                    f"the file plays its pictures {1.0 / clock.rate:.3g} times slower than they were taken"
-                )
-                problem = f"{slower}, so nothing tells the times of its sound"
-                track = replace(track, pieces=(), recorder=None, problem=problem, notes=())
-            pieces = tuple(moved for piece in track.pieces for moved in _moved(piece, clock))
-            chapters.setdefault(track.name, []).append((video.path, replace(track, pieces=pieces)))
+            in_time = _without_slow_sound(track, clock)
+            pieces = tuple(moved for piece in in_time.pieces for moved in _moved(piece, clock))
+            chapters.setdefault(track.name, []).append((video.path, replace(in_time, pieces=pieces)))
     return [_joined(camera, tracks, len(videos)) for tracks in chapters.values()]
+
+
+def _without_slow_sound(track: SoundTrack, clock: ChapterClock) -> SoundTrack:
+    """Return a track without its sound if the pictures of the file are played at another speed."""
+    if not track.pieces or abs(clock.rate - 1.0) <= _MAX_RATE_ERROR:
+        return track
+    slower = f"the file plays its pictures {1.0 / clock.rate:.3g} times slower than they were taken"
+    problem = f"{slower}, so nothing tells the times of its sound"
+    return replace(track, pieces=(), recorder=None, problem=problem, notes=())
 
 
 def _joined(camera: str, chapters: Sequence[tuple[Path, SoundTrack]], count: int) -> SoundTrack:
