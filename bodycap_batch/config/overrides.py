@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
+from pydantic import BaseModel, ConfigDict
 
 from bodycap_batch.config.folder import JOB_FILES, PARTIAL, RUN_FILE
 from bodycap_batch.config.models import Job
@@ -22,8 +23,35 @@ COMMAND_LINE = "command_line"
 """Name of the field of ``run.json`` with the values of the command line."""
 NO_HEIGHT = "none"
 """Value of `Overrides.height_m` for a run without a height, although the job or its last run has one."""
-_PLAIN: dict[str, type | tuple[type, ...]] = {"height_m": (float, int), "skeleton": str, "activity": str}
-"""Fields of `Overrides` and `Job` with one value, and the types of the value."""
+_PLAIN = ("height_m", "skeleton", "activity")
+"""Fields of `Overrides`, `LastRun` and `Job` with one value."""
+
+
+class LastRun(BaseModel):
+    """The values of the command line of the last run, by field of `Overrides`."""
+
+    model_config = ConfigDict(frozen=True)
+
+    height_m: float | None = None
+    skeleton: str | None = None
+    activity: str | None = None
+    mounts: dict[str, str] = {}
+    places: tuple[str, ...] = ()
+
+    @classmethod
+    def of_results(cls, results: Path) -> LastRun:
+        """Return the values that a folder of results records; no values if there is no sound record."""
+        for folder in (results, results / PARTIAL):
+            try:
+                record = parse_checked_json((folder / RUN_FILE).read_bytes())
+                if COMMAND_LINE in record:
+                    return cls.model_validate(record[COMMAND_LINE])
+                # An earlier version did not record the command line, but the job with its height.
+                job = yaml.safe_load((folder / JOB_FILES[0]).read_text(encoding="utf-8"))
+                return cls(height_m=job.get("height_m"))
+            except (OSError, ValueError, AttributeError, yaml.YAMLError):  # no run, or a damaged record
+                continue
+        return cls()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,51 +85,22 @@ class Overrides:
             stated: The data of the job file. Its values replace those of the last run.
             results: Folder of the results of the last run.
         """
-        last, capture = values_of_last_run(results), stated.get("capture")
-        added: dict[str, Any] = {
-            name: last[name]
+        last, capture = LastRun.of_results(results), stated.get("capture")
+        values = {
+            name: value
             for name in _PLAIN
-            if name in last and name not in stated and getattr(self, name) is None
+            if (value := getattr(last, name)) is not None
+            and name not in stated
+            and getattr(self, name) is None
         }
-        if mounts := {name: place for name, place in last["mounts"].items() if name not in self.mounts}:
-            added["last_mounts"] = mounts
-        has_places = bool(self.places) or (isinstance(capture, dict) and bool(capture.get("places")))
-        if last["places"] and not has_places:
-            added["places"] = tuple(last["places"])
-        options = [f"--{name.removesuffix('_m')} {added[name]}" for name in _PLAIN if name in added]
-        options += [f"--camera {name}={place}" for name, place in added.get("last_mounts", {}).items()]
-        options += [f"--places {','.join(added['places'])}"] if "places" in added else []
+        mounts = {name: place for name, place in last.mounts.items() if name not in self.mounts}
+        has_places = self.places or (isinstance(capture, dict) and capture.get("places"))
+        places = self.places if has_places else last.places
+        options = [f"--{name.removesuffix('_m')} {value}" for name, value in values.items()]
+        options += [f"--camera {name}={place}" for name, place in mounts.items()]
+        options += [f"--places {','.join(places)}"] if places != self.places else []
         text = f"as in the last run of this job: {' '.join(options)}" if options else ""
-        return replace(self, **added), text
-
-
-def values_of_last_run(results: Path) -> dict[str, Any]:
-    """Return the values of the command line that a folder of results records, by field of `Overrides`.
-
-    The fields `mounts` and `places` are always there.
-    """
-    found: Any = {}
-    for folder in (results, results / PARTIAL):
-        try:
-            record = parse_checked_json((folder / RUN_FILE).read_bytes())
-            found = record[COMMAND_LINE] if COMMAND_LINE in record else _height_of_job(folder / JOB_FILES[0])
-            break
-        except (OSError, ValueError, yaml.YAMLError):  # no run, or a damaged record
-            continue
-    found = found if isinstance(found, dict) else {}
-    values = {name: found[name] for name, kinds in _PLAIN.items() if isinstance(found.get(name), kinds)}
-    mounts, places = found.get("mounts"), found.get("places")
-    return {
-        **values,
-        "mounts": mounts if isinstance(mounts, dict) else {},
-        "places": places if isinstance(places, list) else [],
-    }
-
-
-def _height_of_job(file: Path) -> dict[str, Any]:
-    """Return the height in the ``job.yaml`` of results whose version did not record the command line."""
-    document = yaml.safe_load(file.read_text(encoding="utf-8"))
-    return {"height_m": document.get("height_m")} if isinstance(document, dict) else {}
+        return replace(self, **values, last_mounts=mounts, places=places), text
 
 
 def values_to_record(job: Job, overrides: Overrides, results: Path) -> dict[str, Any]:
@@ -114,18 +113,16 @@ def values_to_record(job: Job, overrides: Overrides, results: Path) -> dict[str,
         overrides: The values of this run's command line.
         results: Folder of the results, with the record of the last run.
     """
-    last = values_of_last_run(results)
-    values = {name: getattr(job, name) for name in _PLAIN}
-    cameras = job.capture.cameras
+    last, cameras = LastRun.of_results(results), job.capture.cameras
     used = {camera.mount for camera in cameras}
-    mounts = {name: place for name, place in last["mounts"].items() if place in used}
     is_found = bool(job.capture.places) or any(camera.mount_source is not None for camera in cameras)
-    return {
+    kept = LastRun(
         **{
             name: value
-            for name, value in values.items()
-            if value is not None and (getattr(overrides, name) is not None or last.get(name) == value)
+            for name in _PLAIN
+            if (value := getattr(job, name)) == getattr(last, name) or getattr(overrides, name) is not None
         },
-        "mounts": {**mounts, **overrides.mounts},
-        "places": list(overrides.places) or (last["places"] if is_found else []),
-    }
+        mounts={name: place for name, place in {**last.mounts, **overrides.mounts}.items() if place in used},
+        places=overrides.places or (last.places if is_found else ()),
+    )
+    return kept.model_dump(mode="json", exclude_none=True)
