@@ -103,7 +103,7 @@ def _heading_lines(file: Path, rig: SkeletonModel, motion: Motion | None, frame:
     heights = [*rest[:, 2, 3], *tips[:, 2]]
     count = 0 if motion is None else len(motion.root_in_world_m)
     frames = f"{count} frame{'s' * (count != 1)}" + (f" at {motion.fps:g} Hz" if motion and count > 1 else "")
-    pose = "zero pose" if frame is None else f"frame {frame}"
+    pose = "rest pose" if frame is None else f"frame {frame}"
     return [
         f"{file.name}: {len(rig.joints)} joints, {frames}",
         f"{pose}: {describe_arm_pose(rig)}; {max(heights) - min(heights):.2f} m from top to bottom",

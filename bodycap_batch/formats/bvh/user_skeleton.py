@@ -119,6 +119,7 @@ def inspect_rig(
     skeleton, motion = read_bvh(path)
     if options.roles:
         skeleton = replace(skeleton, roles=_override_roles(path, skeleton, options.roles))
+        motion = None if motion is None else replace(motion, skeleton=skeleton)
     problem: JobError | None = None
     try:
         skeleton = _with_upright_pose(path, skeleton, motion, options.tpose_frame)
@@ -204,8 +205,9 @@ def _with_upright_pose(
         if motion is None or found is None or deviation_deg > _MAX_T_POSE_DEG:
             what = "the zero pose is no pose of a body (bones lie on one line or run back)"
             raise _no_pose_error(path, what, found, deviation_deg)
-        local = motion.local_rotation[found].copy()
-        notes = (*notes, f"the zero pose is no pose of a body; frame {found} is a T-pose and is used instead")
+        local = np.array(motion.local_rotation[found])
+        is_used = f"frame {found} is nearest to a T-pose (within {deviation_deg:.0f}°) and is used instead"
+        notes = (*notes, f"the zero pose is no pose of a body; {is_used}")
         axes = body_axes(skeleton, _centres(skeleton, local[None])) or axes
     turn = upright_rotation(axes)
     if not np.array_equal(turn, np.eye(3)):
@@ -288,9 +290,9 @@ def _check_size(path: Path, skeleton: SkeletonModel, height_m: float | None) -> 
     statures = [value for value in (_extent_m(skeleton), limbs) if value is not None]
     if not statures or any(_fits(each, height_m) for each in statures):
         return
-    contradiction = "which no person is" if height_m is None else f"but the stated height is {height_m:.3g} m"
+    but = "no person has this height" if height_m is None else f"the stated height is {height_m:.3g} m"
     raise JobError(
-        f"the skeleton is {statures[0]:.2f} m tall, {contradiction}",
+        f"the skeleton is {statures[0]:.2f} m tall, but {but}",
         path=path,
         field="skeleton",
         hint=_unit_hint(path, statures, height_m),
@@ -307,16 +309,13 @@ def _fits(stature_m: float, height_m: float | None) -> bool:
 
 def _extent_m(skeleton: SkeletonModel) -> float | None:
     """Return the height, metres, from the soles to the top of the head in the T-pose; None without them."""
-    head, feet = (
-        skeleton.index_of_role("Head"),
-        [r for r in skeleton.roles if r.endswith(("Foot", "ToeBase"))],
-    )
+    head = skeleton.index_of_role("Head")
+    feet = [joint for joint, role in enumerate(skeleton.roles) if role.endswith(("Foot", "ToeBase"))]
     if head is None or not feet:
         return None
     rest = rest_pose(skeleton)
     tips = rest[:, 2, 3] + (rest[:, 2, :3] * np.nan_to_num(skeleton.end_offsets_m)).sum(axis=1)
-    top = [tips[head], *tips[skeleton.parents == head]]
-    return float(max(top)) - float(min(tips[[skeleton.index_of_role(role) for role in feet]]))
+    return float(max([tips[head], *tips[skeleton.parents == head]]) - min(tips[feet]))
 
 
 def _unit_hint(path: Path, statures_m: Sequence[float], height_m: float | None) -> str:

@@ -214,7 +214,7 @@ def test_a_frame_replaces_a_zero_pose_that_is_no_pose(tmp_path: Path, turn: Floa
     write_bvh(tmp_path / "rig.bvh", along_one_axis(frames))
     write_bvh(tmp_path / "own.bvh", still(plain()))
     rig, _ = read_rig(tmp_path / "rig.bvh")
-    assert "frame 2 is a T-pose" in rig.notes[0]
+    assert "frame 2 is nearest to a T-pose" in rig.notes[0]
     own, found = body_of(tmp_path / "own.bvh"), body_of(tmp_path / "rig.bvh")
     assert found.roles == own.roles
     np.testing.assert_allclose(found.offsets_m[1:], own.offsets_m[1:], atol=1e-4)
@@ -285,7 +285,7 @@ def test_a_height_that_contradicts(tmp_path: Path, height_m: float, agrees: bool
 
 def test_a_small_child_is_a_person_if_its_height_is_stated(tmp_path: Path) -> None:
     write_bvh(tmp_path / "rig.bvh", still(turned(plain(), 0.4 * np.eye(3))))
-    with pytest.raises(JobError, match="no person"):
+    with pytest.raises(JobError, match="no person has this height"):
         read_rig(tmp_path / "rig.bvh")
     assert read_rig(tmp_path / "rig.bvh", RigOptions(height_m=0.72))[0].roles == plain().roles
 

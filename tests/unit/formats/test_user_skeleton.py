@@ -58,7 +58,7 @@ def test_the_t_pose_comes_from_a_frame_and_faces_the_front(tmp_path: Path) -> No
     assert not rig.warnings
     itself, _ = read_rig(tmp_path / "rig.bvh")
     np.testing.assert_allclose(rest_pose(itself), found, atol=1e-6)
-    assert "frame 1 is a T-pose" in itself.notes[0]
+    assert "frame 1 is nearest to a T-pose" in itself.notes[0]
 
 
 @pytest.mark.parametrize("factor", [0.1772, 10.0])
