@@ -149,7 +149,8 @@ def _clearness(first: SoundTrack, second: SoundTrack) -> float:
     one, two = sorted((first, second), key=lambda track: track.end_s - track.start_s)
     starts = _search_starts(one)[: sum(_SEARCHES[:2])]
     heights = [[*(peak.height for peak in peaks), 0.0, 0.0] for peaks, _ in _search(one, starts, two, None)]
-    return max(highest / max(next_one, _CHANCE_HEIGHT) for highest, next_one, *_ in heights)
+    ratios = (highest / max(next_one, _CHANCE_HEIGHT) for highest, next_one, *_ in heights)
+    return max(ratios, default=0.0)
 
 
 def measure_pair(
