@@ -21,7 +21,7 @@ from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.fill_report import FILL_FILE, write_fill_report
 from bodycap_batch.export.frame_table import write_frame_table
 from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
-from bodycap_batch.export.layout import apply_layout
+from bodycap_batch.export.layout import added_root, apply_layout
 from bodycap_batch.export.metrics import collect_metrics
 from bodycap_batch.export.motion_files import (
     points_from_motion,
@@ -108,7 +108,7 @@ def _motion_writers(
     measurement formats (C3D, TRC, NPZ) contain the solved motion.
     """
     folder, measured = inputs.out_dir, _measured_joints(inputs, motion)
-    animated = apply_layout(_with_all_joints(inputs, motion), options)
+    animated = apply_layout(_with_all_joints(inputs, motion, options), options)
     centres = points_from_motion(motion, measured)
     aligned, place = align_axes_with_bones(animated), earth_of_world(inputs)
     earth = None if place is None else place.figures()
@@ -132,10 +132,13 @@ def _motion_writers(
     }
 
 
-def _with_all_joints(inputs: ExportInputs, motion: Motion) -> Motion:
-    """Return a complete motion with the joints of the user's file that are no part of the body."""
+def _with_all_joints(inputs: ExportInputs, motion: Motion, options: ExportOptions) -> Motion:
+    """Return a complete motion with the joints of the user's file that are no part of the body.
+
+    A root on the floor that the layout adds replaces them.
+    """
     merge = inputs.merge
-    if merge is None or motion.skeleton.joints != merge.skeleton.joints:
+    if merge is None or motion.skeleton.joints != merge.skeleton.joints or added_root(motion, options):
         return motion
     return with_file_zero_pose(with_outer_joints(merge.motion))
 

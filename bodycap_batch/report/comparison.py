@@ -16,7 +16,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, runs
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.text_encoding import encoding_of_file
 from bodycap_batch.formats.atomic_files import write_text
-from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.formats.bvh import inspect_rig
 from bodycap_batch.formats.joint_positions import motion_from_positions, read_joint_positions
 from bodycap_batch.model.joint_angles import angle_curves, foot_curves
 from bodycap_batch.model.skeleton import Motion
@@ -78,7 +78,7 @@ def load_take(path: Path, name: str, start_s: float = 0.0) -> Take:
         )
     if file.suffix.lower() == ".npz":
         return Take(name=name, motion=_true_motion(file), start_s=start_s)
-    _, motion = read_bvh(file)
+    _, motion, _ = inspect_rig(file)  # the clearance of the feet needs the axes of the body
     if motion is None:
         raise JobError("the BVH file contains no frames", path=file, hint="give a BVH file with a motion")
     table = file.with_name("joints.csv")

@@ -8,7 +8,13 @@ from bodycap_batch.export.layout.resampling import resample, smooth
 from bodycap_batch.export.layout.root_motion import apply_root_mode, floor_root_name, prepend_tpose
 from bodycap_batch.model.skeleton import Motion
 
-__all__ = ["apply_layout"]
+__all__ = ["added_root", "apply_layout"]
+
+
+def added_root(motion: Motion, options: ExportOptions) -> str | None:
+    """Return the name of the root on the floor that `apply_layout` adds to a motion; None if it adds none."""
+    names = "hik" if any(motion.skeleton.bvh_channels) and options.target is None else options.names
+    return floor_root_name(names, options.root)
 
 
 def apply_layout(motion: Motion, options: ExportOptions) -> Motion:
@@ -33,5 +39,4 @@ def apply_layout(motion: Motion, options: ExportOptions) -> Motion:
         motion = rename_roles(motion, options.names)
     if options.tpose:
         motion = prepend_tpose(motion)
-    names = "hik" if is_user_skeleton and options.target is None else options.names
-    return apply_root_mode(motion, options.root, floor_root_name(names, options.root))
+    return apply_root_mode(motion, options.root, added_root(motion, options))

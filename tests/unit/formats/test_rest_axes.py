@@ -13,8 +13,9 @@ import pytest
 from bodycap_batch.cli import main
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.export.layout import apply_layout
+from bodycap_batch.export import ExportInputs, export_results
 from bodycap_batch.formats.bvh import RigOptions, read_bvh, read_rig, write_bvh
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.nominal_mounts import camera_reach, nominal_mount
@@ -22,14 +23,12 @@ from bodycap_batch.model.skeleton import (
     Motion,
     SkeletonModel,
     rest_pose,
-    with_file_zero_pose,
-    with_outer_joints,
     with_tpose_as_zero_pose,
     without_outer_joints,
 )
 from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.synthetic.clip import load_clip
-from tests.bodies import CAMERAS, reaching
+from tests.bodies import CAMERAS, merged, reaching
 
 RIGHT_ANGLES = [
     np.array([first, second, np.cross(first, second)])
@@ -118,32 +117,42 @@ def test_a_turned_rest_pose_is_the_same_body(tmp_path: Path, turn: FloatArray, w
 
 @pytest.mark.parametrize("turn", [RIGHT_ANGLES[7], *ODD_ANGLES[:1], ODD_ANGLES[5]])
 def test_results_fit_the_rig_of_the_file(tmp_path: Path, turn: FloatArray) -> None:
-    """The exported file has the hierarchy of the rig, also its root on the floor, and the solved joints."""
+    """The exported file has the hierarchy of the rig, also above the hips, and the solved joints."""
     write_bvh(tmp_path / "rig.bvh", still(turned(with_wrappers(plain()), turn)))
     body = body_of(tmp_path / "rig.bvh")
-    solved = reaching(20, body)
-    exported = with_file_zero_pose(with_outer_joints(solved))
-    motion = apply_layout(exported, ExportOptions(tpose=True))
-    write_bvh(tmp_path / "out.bvh", motion)
+    solved, clocks = merged(reaching(20, body), projected=False)
+    inputs = ExportInputs(
+        out_dir=tmp_path, maps=(), trajectories=solved.trajectories, clocks=clocks, merge=solved
+    )
+    options = ExportOptions(formats=("bvh", "glb", "csv", "npz"), tpose=True)
+    export_results(inputs, options, StageContext(work_dir=tmp_path))
     first, second = (
-        (tmp_path / name).read_text().partition("MOTION")[0].replace("-0.000000", "0.000000")
-        for name in ("rig.bvh", "out.bvh")
+        (tmp_path / name).read_text().partition("MOTION")[0] for name in ("rig.bvh", "motion.bvh")
     )
     assert [line.split()[:2] for line in first.splitlines()] == [
         line.split()[:2] for line in second.splitlines()
     ]
-    rig, back = read_bvh(tmp_path / "out.bvh")
+    rig, back = read_bvh(tmp_path / "motion.bvh")
     original, _ = read_bvh(tmp_path / "rig.bvh")
     np.testing.assert_allclose(rig.offsets_m[1:], original.offsets_m[1:], atol=1e-6)
     assert back is not None
     kept = [rig.joints.index(name) for name in body.joints]
     places = back.world_from_joint()[:, kept][..., :3, 3]
-    np.testing.assert_allclose(places[1:], solved.world_from_joint()[..., :3, 3], atol=1e-5)
+    np.testing.assert_allclose(places[1:], solved.motion.world_from_joint()[..., :3, 3], atol=1e-5)
+    # the T-pose stands on the floor, and joints above the hips keep their orientation
     stands = rest_pose(body)[:, :3, 3]
     np.testing.assert_allclose(places[0, :, 2], stands[:, 2], atol=1e-4)
     np.testing.assert_allclose(places[0] - places[0, 0], stands - stands[0], atol=1e-4)
     roots = back.world_from_joint()[1:, :2, :3, :3]
     np.testing.assert_allclose(roots, np.broadcast_to(roots[0, 0], roots.shape), atol=1e-6)
+    # a root on the floor replaces the joints above the hips
+    export_results(inputs, ExportOptions(formats=("bvh",), root="ground"), StageContext(work_dir=tmp_path))
+    rig, back = read_bvh(tmp_path / "motion.bvh")
+    assert rig.joints[:2] == ("Reference", "Hips")
+    assert back is not None
+    kept = [rig.joints.index(name) for name in body.joints]
+    places = back.world_from_joint()[:, kept][..., :3, 3]
+    np.testing.assert_allclose(places, solved.motion.world_from_joint()[..., :3, 3], atol=1e-5)
 
 
 def test_a_motion_to_render_may_have_a_turned_zero_pose(tmp_path: Path) -> None:
