@@ -13,8 +13,9 @@ from pathlib import Path
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.formats.file_completeness import first_box
 
-_XML_RATE = re.compile(rb'captureFps="(\d+(\.\d+)?)')
-"""The same rate in the XML text that Sony's cameras write into a box ``meta`` of the file."""
+_XML_RATE = re.compile(rb'captureFps="(\d+(\.\d+)?)p?"')
+"""The same rate in the XML text that Sony's cameras write into a box ``meta`` of the file. A value that ends
+in i counts half pictures."""
 _KEY = re.compile(r"(capture|sensor|shooting)[\W_]*(fps|frame[\W_]*rate)", re.IGNORECASE)
 """Metadata keys of the rate at which the pictures were taken. Android writes ``com.android.capture.fps``;
 other cameras use such words, too."""

@@ -78,7 +78,8 @@ def index_video(path: Path, threads: int = 0, part: tuple[int, int] | None = Non
             file contains fewer frames than its index lists.
     """
     missing = missing_part(path.resolve())
-    missing_end = missing.text if missing is not None and missing.readable_bytes else ""
+    is_last = part is None or part[1] >= path.stat().st_size
+    missing_end = missing.text if missing is not None and missing.readable_bytes and is_last else ""
     with open_container(path, part) as container:
         stream = video_stream(container, path)
         container_format = container.format.name

@@ -277,7 +277,7 @@ def projection_from_frame(frame: VideoFrame, path: Path) -> str:
 def spherical_error(path: Path, projection: str) -> CaptureError:
     """Return the error for a video of 360° pictures."""
     return CaptureError(
-        f"a 360° picture ({projection}), which no lens can have",
+        f"the video shows a 360° picture ({projection}), which no lens model describes",
         path=path,
         hint="export a flat view first: in the program of the camera, reframe the video to a fixed direction "
         "and a fixed field of view, without stabilisation, and use the exported file",

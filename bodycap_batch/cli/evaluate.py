@@ -31,7 +31,7 @@ class Align(StrEnum):
     NONE = "none"
 
 
-@app.command()
+@app.command(short_help="Compare results with the truth or with the pictures.")
 def evaluate(
     estimate: Annotated[
         Path,
@@ -116,8 +116,7 @@ def evaluate(
 
 def _evaluate_with_pictures(results: Path, video: Path, *, as_json: bool) -> None:
     """Print how many delivered frames of each camera the pictures confirm."""
-    from bodycap_batch.capture import open_capture
-    from bodycap_batch.cli.job_places import find_job
+    from bodycap_batch.cli.job_places import capture_of_results, find_job
     from bodycap_batch.cli.progress_display import make_progress_display
     from bodycap_batch.config.job import load_job
     from bodycap_batch.config.overrides import Overrides
@@ -125,7 +124,7 @@ def _evaluate_with_pictures(results: Path, video: Path, *, as_json: bool) -> Non
     from bodycap_batch.evaluate.picture_check import check_with_pictures, read_delivered, to_dict
 
     delivered = read_delivered(results)
-    capture = open_capture(load_job(find_job(video).file, Overrides()).capture)
+    capture = capture_of_results(load_job(find_job(video).file, Overrides()), results)
     cameras = {camera.name: camera for camera in capture.cameras}
     with make_progress_display(as_json=False) as display:
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from bodycap_batch.config.folder import PARTIAL, RUN_FILE, is_video
 
 if TYPE_CHECKING:
+    from bodycap_batch.capture import Capture
     from bodycap_batch.config.models import Job
     from bodycap_batch.config.overrides import Overrides
 
@@ -108,3 +109,25 @@ def find_store(out_dir: Path) -> Path:
 def is_store(folder: Path) -> bool:
     """Return True if a folder is a store with artefacts."""
     return (folder / "artefacts").is_dir()
+
+
+def capture_of_results(job: Job, out_dir: Path) -> Capture:
+    """Open the videos of a job with the frames, and their times, that its results list in ``frames.csv``."""
+    import csv
+    from dataclasses import replace
+
+    import numpy as np
+
+    from bodycap_batch.capture import open_capture
+    from bodycap_batch.model.copied_frames import Pictures
+
+    capture, table = open_capture(job.capture), out_dir / "frames.csv"
+    rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines())) if table.is_file() else []
+    cameras = []
+    for camera in capture.cameras:
+        listed = {int(row["frame"]): float(row["time"]) for row in rows if row["camera"] == camera.name}
+        frames = np.flatnonzero(np.isin(camera.frame_numbers, list(listed)))
+        times_s = [listed[number] for number in camera.frame_numbers[frames].tolist()]
+        pictures = Pictures(frames=frames, times_ns=np.round(np.array(times_s) * 1e9).astype(np.int64))
+        cameras.append(camera.only(pictures) if 1 < len(frames) < len(camera.frame_numbers) else camera)
+    return replace(capture, cameras=tuple(cameras))

@@ -55,7 +55,7 @@ def telemetry(
       bodycap telemetry GX010123.MP4 --picture streams.svg
       bodycap telemetry GX010123.MP4 --compare
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.capture.frame_index import index_video
+    from bodycap_batch.capture.frame_index import index_videos
     from bodycap_batch.capture.timeline import join_chapters
     from bodycap_batch.cli.telemetry_picture import draw_telemetry
     from bodycap_batch.config.folder import chapters_in
@@ -64,7 +64,7 @@ def telemetry(
     from bodycap_batch.telemetry import read_telemetry
 
     paths = chapters_in(file) if file.is_dir() else (file,)
-    videos = tuple(index_video(path) for path in paths)
+    videos = index_videos(paths)
     times_ns = join_chapters(videos, ()).times_ns
     found = read_telemetry(videos, times_ns, samples_beside(paths, file.stem, (file,)))
     if picture is not None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import threading
 import webbrowser
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.job_places import find_store, load_last_run
+from bodycap_batch.cli.job_places import capture_of_results, find_store, load_last_run
 from bodycap_batch.cli.open_report import REPORTS
 from bodycap_batch.cli.shared_options import (
     JobArgument,
@@ -23,7 +22,6 @@ from bodycap_batch.cli.terminal import print_line, print_message
 from bodycap_batch.core.errors import BodycapError, JobError
 
 if TYPE_CHECKING:
-    from bodycap_batch.capture import Capture
     from bodycap_batch.config.models import Job
     from bodycap_batch.report.frame_overlays import FrameOverlays
     from bodycap_batch.report.report_inputs import ReportInputs
@@ -75,7 +73,9 @@ def view(
             hint="run the job, or write the report with `bodycap report`",
         )
     server = make_server(
-        make_served_content(page, _shown_capture(resolved, out_dir), _StoredMarks(resolved, out_dir, store)),
+        make_served_content(
+            page, capture_of_results(resolved, out_dir), _StoredMarks(resolved, out_dir, store)
+        ),
         port,
     )
     address = f"http://{LOOPBACK}:{server.server_port}/report.html?videos"
@@ -84,27 +84,6 @@ def view(
         webbrowser.open(address)
     with server:
         server.serve_forever()
-
-
-def _shown_capture(job: Job, out_dir: Path) -> Capture:
-    """Open the videos of a job with the frames, and their times, that its results list."""
-    import csv
-
-    import numpy as np
-
-    from bodycap_batch.capture import open_capture
-    from bodycap_batch.model.copied_frames import Pictures
-
-    capture, table = open_capture(job.capture), out_dir / "frames.csv"
-    rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines())) if table.is_file() else []
-    cameras = []
-    for camera in capture.cameras:
-        listed = {int(row["frame"]): float(row["time"]) for row in rows if row["camera"] == camera.name}
-        frames = np.flatnonzero(np.isin(camera.frame_numbers, list(listed)))
-        times_s = [listed[number] for number in camera.frame_numbers[frames].tolist()]
-        pictures = Pictures(frames=frames, times_ns=np.round(np.array(times_s) * 1e9).astype(np.int64))
-        cameras.append(camera.only(pictures) if 1 < len(frames) < len(camera.frame_numbers) else camera)
-    return replace(capture, cameras=tuple(cameras))
 
 
 def _stored_inputs(job: Job, out_dir: Path, store: Path) -> ReportInputs:

@@ -208,7 +208,7 @@ def measure_sound(spec: CaptureConfig, threads: int | None = None, *, sensors: b
 
         reference = spec.reference_camera().name
         heard = measure_all(camera_pairs([name for name, usable in tracks.items() if usable]))
-        if len(heard) < len(spec.cameras):
+        if len(heard) < len(spec.cameras) and sum(mix.channels > 0 for _, mix in read) > 1:
             # The mixes of several cameras that are heard resemble each other: they need no other channels.
             lost = [
                 (camera, mix)

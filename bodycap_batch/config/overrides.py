@@ -93,8 +93,10 @@ class Overrides:
             and name not in stated
             and getattr(self, name) is None
         }
-        mounts = {name: place for name, place in last.mounts.items() if name not in self.mounts}
-        has_places = self.places or (isinstance(capture, dict) and capture.get("places"))
+        # Places to be found and stated places exclude each other. The command line decides which hold.
+        kept = {} if self.places else last.mounts
+        mounts = {name: place for name, place in kept.items() if name not in self.mounts}
+        has_places = self.places or self.mounts or (isinstance(capture, dict) and capture.get("places"))
         places = self.places if has_places else last.places
         options = [f"--{name.removesuffix('_m')} {value}" for name, value in values.items()]
         options += [f"--camera {name}={place}" for name, place in mounts.items()]

@@ -28,9 +28,12 @@ from bodycap_batch.formats.file_completeness import is_video_by_content, missing
 
 _VIDEO_NAME = re.compile(rf"({'|'.join(map(re.escape, sorted(VIDEO_SUFFIXES)))})(?![0-9a-z])", re.IGNORECASE)
 """Pattern of the end of a video's name, which something may follow: ``.mp4`` in ``torso.mp4.part``."""
-_SIDECAR_SUFFIXES = PHOTO_SUFFIXES | {".txt", ".csv", ".gcsv", ".json", ".yaml", ".yml", ".xml", ".bvh"}
+_SIDECAR_SUFFIXES = PHOTO_SUFFIXES | {
+    ".bvh", ".csv", ".gcsv", ".gpx", ".html", ".json", ".log", ".md", ".md5", ".ply", ".sha1", ".sha256",
+    ".sha512", ".srt", ".txt", ".vtt", ".xml", ".yaml", ".yml",
+}  # fmt: skip
 """Suffixes of files that are no videos although their names may contain that of a video, for example
-``torso.mp4.timestamps.txt``."""
+``torso.mp4.timestamps.txt``, or a checksum that stays when its video gets another name."""
 _HINT = (
     "copy the video again, remove this file, or state `cameras_only: true` in a job.yaml that lists the "
     "cameras to use"

@@ -65,12 +65,10 @@ class MeasuredPair:
 
     Attributes:
         rows: (M,2) indices of the matched features.
-        matches: The M matches.
         measured: The rotation between the frames; None if it is not measurable.
     """
 
     rows: IntArray
-    matches: RayMatches
     measured: Motion | None
 
 
@@ -136,19 +134,29 @@ def measure_pictures(
 def measure_pair(first: FrameFeatures | None, second: FrameFeatures | None) -> MeasuredPair:
     """Match two frames and measure their relative rotation."""
     if first is None or second is None:
-        rows = np.zeros((0, 2), dtype=np.int64)
-        nothing = RayMatches(
-            first=np.zeros((0, 3)), second=np.zeros((0, 3)), cells=rows[:, 0], noise_rad=np.zeros(0)
-        )
-        return MeasuredPair(rows=rows, matches=nothing, measured=None)
+        return MeasuredPair(rows=np.zeros((0, 2), dtype=np.int64), measured=None)
     rows = match_features(first, second)
-    matches = RayMatches(
+    return MeasuredPair(rows=rows, measured=measure_rotation(_ray_matches(first, second, rows)))
+
+
+def _ray_matches(first: FrameFeatures, second: FrameFeatures, rows: IntArray) -> RayMatches:
+    return RayMatches(
         first=first.rays[rows[:, 0]],
         second=second.rays[rows[:, 1]],
         cells=first.cells[rows[:, 0]],
         noise_rad=np.maximum(first.pixel_rad[rows[:, 0]], second.pixel_rad[rows[:, 1]]),
     )
-    return MeasuredPair(rows=rows, matches=matches, measured=measure_rotation(matches))
+
+
+def _judge_pair(
+    features: Features, frames: tuple[int, int], pair: MeasuredPair, world_from_cam: FloatArray
+) -> tuple[Motion | None, Outcome]:
+    """Compare the delivered rotation between two frames with their matches, as `judge_rotation` does."""
+    first, second = features[frames[0]], features[frames[1]]
+    if first is None or second is None:
+        return None, Outcome.UNMEASURABLE
+    expected = world_from_cam[frames[1], :3, :3].T @ world_from_cam[frames[0], :3, :3]
+    return judge_rotation(_ray_matches(first, second, pair.rows), pair.measured, expected)
 
 
 def find_right_frames(evidence: PictureEvidence, world_from_cam: FloatArray) -> RightFrames:
@@ -158,12 +166,11 @@ def find_right_frames(evidence: PictureEvidence, world_from_cam: FloatArray) -> 
         evidence: What the pictures measure.
         world_from_cam: (N,4,4) delivered poses; NaN for a frame without one.
     """
-    posed = _has_pose(world_from_cam)
+    posed = has_pose(world_from_cam)
     outcomes: dict[tuple[int, int], Outcome] = {}
     motions: dict[tuple[int, int], tuple[Motion, IntArray]] = {}
     for (first, second), pair in evidence.pairs.items():
-        expected = world_from_cam[second, :3, :3].T @ world_from_cam[first, :3, :3]
-        motion, outcome = judge_rotation(pair.matches, pair.measured, expected)
+        motion, outcome = _judge_pair(evidence.features, (first, second), pair, world_from_cam)
         outcomes[first, second] = outcome
         if motion is not None:
             motions[first, second] = motion, pair.rows[motion.inliers]
@@ -191,7 +198,8 @@ def find_right_frames(evidence: PictureEvidence, world_from_cam: FloatArray) -> 
     )
 
 
-def _has_pose(world_from_cam: FloatArray) -> BoolArray:
+def has_pose(world_from_cam: FloatArray) -> BoolArray:
+    """Return a mask (N,) of the poses (N,4,4) that are known: those of lost frames are NaN."""
     return np.asarray(np.isfinite(world_from_cam).all(axis=(1, 2)))
 
 
@@ -263,8 +271,9 @@ def _revisits(
         for other in np.argsort(distance, kind="stable")[: min(_REVISITS, np.count_nonzero(is_similar))]:
             first = int(frames[other])
             pair = measure_pair(features[first], features[second])
-            expected = world_from_cam[second, :3, :3].T @ world_from_cam[first, :3, :3]
-            outcomes[first, int(second)] = judge_rotation(pair.matches, pair.measured, expected)[1]
+            outcomes[first, int(second)] = _judge_pair(features, (first, int(second)), pair, world_from_cam)[
+                1
+            ]
     return outcomes
 
 

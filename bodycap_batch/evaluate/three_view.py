@@ -7,10 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.evaluate.two_view import Motion, Outcome, moved_along
+from bodycap_batch.evaluate.two_view import SIGMAS, Motion, Outcome, moved_along
 
-_SIGMAS = 3.0
-"""Number of standard deviations of the measurement beyond which a difference is wrong."""
 _MIN_POINTS = 10
 """Minimum number of points that are seen in all three frames. Evidence: none."""
 _MIN_CELLS = 6
@@ -21,7 +19,7 @@ _MIN_PARALLAX_DEG = 2.0
 """Minimum error of parallax (degrees) that is wrong: 7 cm at a depth of 2 m. Less is noise of delivered
 positions. """
 _MAX_SIGMA_RAD = 0.1
-"""Maximum standard deviation (radians) of the measured angle atan(first leg / second leg). With `_SIGMAS`, a
+"""Maximum standard deviation (radians) of the measured angle atan(first leg / second leg). With `SIGMAS`, a
 leg that is twice as long as its neighbour is then found."""
 _ITERATIONS = 5
 """Number of iterations of reweighted least squares."""
@@ -69,7 +67,7 @@ def judge_positions(
     error = max(
         abs(parallax[1] - parallax[0] * ends[1] / ends[0]), abs(parallax[0] - parallax[1] * ends[0] / ends[1])
     )
-    is_wrong = abs(angle - delivered) > _SIGMAS * sigma and ratio > np.log(_MIN_RATIO) and error > limit
+    is_wrong = abs(angle - delivered) > SIGMAS * sigma and ratio > np.log(_MIN_RATIO) and error > limit
     return Outcome.WRONG if is_wrong else Outcome.RIGHT
 
 

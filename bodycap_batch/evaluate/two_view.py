@@ -12,11 +12,11 @@ from bodycap_batch.model.geometry import nearest_rotation, rotation_angle_rad, s
 
 WRONG_DEG = 5.0
 """Angle (degrees) beyond which a relative rotation, or the direction to a point, is wrong."""
-_SIGMAS = 3.0
+SIGMAS = 3.0
 """Number of standard deviations of the measurement beyond which a difference is wrong."""
 _MAX_SIGMA_DEG = 5.0
 """Maximum standard deviation (degrees) of a measured rotation about any axis. A less exact measurement could
-not show a fold of 15 degrees with `_SIGMAS`."""
+not show a fold of 15 degrees with `SIGMAS`."""
 _INLIER_PX = 2.5
 """Maximum residual of an inlier, px at the pyramid level of the feature. Origin: two and a half times the
 accuracy of an ORB corner."""
@@ -154,7 +154,7 @@ def differs(measured: FloatArray, covariance: FloatArray, expected: FloatArray) 
     difference = so3_log(expected @ measured.T)
     if np.linalg.norm(difference) <= np.deg2rad(WRONG_DEG):
         return False
-    return bool(difference @ np.linalg.solve(covariance, difference) > _SIGMAS**2)
+    return bool(difference @ np.linalg.solve(covariance, difference) > SIGMAS**2)
 
 
 def _turn_hypothesis(matches: RayMatches) -> FloatArray:

@@ -22,6 +22,8 @@ NO_VIDEO = "its content is not that of a video"
 _TEXT_SUFFIXES = frozenset({".yaml", ".yml", ".json", ".bvh", ".csv"})
 _FIRST_BOXES = frozenset({b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"styp", b"uuid"})
 """Types of the boxes with which an MP4 or MOV file may start."""
+_MOVIE_BOXES = frozenset({b"ftyp", b"moov", b"mdat", b"moof"})
+"""Types of the boxes without which frames are lost. Other boxes, and what cameras append, are not needed."""
 _UNMISTAKABLE_BOXES = frozenset({b"ftyp", b"moov", b"mdat"})
 """Types of boxes by which a file is known as MP4 or MOV if its name does not say it. The other types are
 words that a text may contain at this place."""
@@ -77,14 +79,18 @@ class MissingPart:
 
 def is_video_by_content(path: Path) -> bool:
     """Return True if a file begins as a video, whatever its name is. Links are not opened."""
+    head = _head_of(path)
+    return head is not None and _begins_as_video(head)
+
+
+def _head_of(path: Path) -> bytes | None:
     try:
         if not stat.S_ISREG(path.lstat().st_mode):
-            return False
+            return None
         with path.open("rb") as stream:
-            head = stream.read(_MAX_HEAD_BYTES)
+            return stream.read(_MAX_HEAD_BYTES)
     except OSError:
-        return False
-    return _begins_as_video(head)
+        return None
 
 
 def _begins_as_video(head: bytes) -> bool:
@@ -162,7 +168,7 @@ def _packets_of(head: bytes) -> tuple[int, int] | None:
     for length in _PACKET_BYTES:
         for first in range(length):
             starts = head[first::length]
-            if len(starts) > 1 and set(starts) == {_SYNC}:
+            if len(starts) > 2 and set(starts) == {_SYNC}:
                 return first, length
     return None
 
@@ -176,15 +182,20 @@ def _missing_box(stream: BinaryIO, size: int) -> MissingPart | None:
     """
     found: set[bytes] = set()
     in_fragments = is_owed = False
+    second = 0
     for kind, start, content, end in _boxes(stream, 0, size):
         has_frames = {b"moov", b"mdat"} <= found
+        if (kind == b"" or end > size) and has_frames and not in_fragments and kind not in _MOVIE_BOXES:
+            return None
+        if kind == b"ftyp" and has_frames:
+            second = start
         if kind == b"":
             return MissingPart(text="its end is missing", readable_bytes=start if has_frames else 0)
         if end > size:
             has_index = b"moov" in found
             text = _missing_bytes(size, end) + ("" if has_index else ", and no index (moov)")
             if kind == b"mdat":
-                return MissingPart(text=text, readable_bytes=size if in_fragments else 0)
+                return MissingPart(text=text, readable_bytes=size if in_fragments else second)
             return MissingPart(text=text, readable_bytes=start if has_frames else 0)
         if kind == b"moov":
             in_fragments = any(inner[0] == b"mvex" for inner in _boxes(stream, content, end))

@@ -50,8 +50,8 @@ def read_telemetry(
         if video.part is None or video.part[0] == 0:
             chapter = _on_camera_clock(read_gopro_file(video.path, video.fps), clock)
         else:
-            note = f"{video.path.name}: the telemetry of the first of the joined recordings is used only"
-            chapter = CameraTelemetry(notes=(note,))
+            note = f"{video.path.name}: only the telemetry of the first of the joined recordings is used"
+            chapter = CameraTelemetry(notes=(note,) if chapters[-1].streams else ())
         chapters.append(_turned(chapter, video))
     joined = _joined(chapters)
     if samples is None:

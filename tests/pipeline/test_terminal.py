@@ -106,7 +106,7 @@ def test_names_in_the_lines_of_a_watcher_are_escaped(
 ) -> None:
     (bench.spool.inbox / f"{BAD}.txt").touch()
     (bench.spool.inbox / BAD).mkdir()
-    (bench.spool.inbox / BAD / "copy.part").touch()
+    (bench.spool.inbox / BAD / "torso.mp4.part").touch()
     assert main(["watch", str(bench.spool.inbox), "--once", "--settle", "0"]) == 0
     err = capfd.readouterr().err
     assert is_clean(err)

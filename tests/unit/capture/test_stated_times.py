@@ -17,7 +17,7 @@ from bodycap_batch.capture.damage import find_damage_and_copies
 from bodycap_batch.capture.frame_index import index_videos
 from bodycap_batch.capture.kept import FrameKeeper
 from bodycap_batch.capture.timeline import join_chapters
-from bodycap_batch.cli.view import _shown_capture
+from bodycap_batch.cli.job_places import capture_of_results
 from bodycap_batch.clocks.sound_track import read_sound_track
 from bodycap_batch.config import KeyframeOptions
 from bodycap_batch.config.job import load_job
@@ -410,10 +410,10 @@ def test_the_served_videos_have_the_frames_of_the_results(tmp_path: Path) -> Non
     lines = [f"torso,{number},{number / 24:.9f}" for number in range(0, COUNT, 2)]
     (tmp_path / "frames.csv").write_text("\n".join(["camera,frame,time", *lines]))
     job = load_job(folder)
-    (camera,) = _shown_capture(job, tmp_path).cameras
+    (camera,) = capture_of_results(job, tmp_path).cameras
     assert camera.frame_numbers.tolist() == list(range(0, COUNT, 2))
     assert np.abs(camera.times_ns - np.arange(0, COUNT, 2) * 1e9 / 24).max() <= 1
-    (camera,) = _shown_capture(job, folder).cameras
+    (camera,) = capture_of_results(job, folder).cameras
     assert len(camera.frame_numbers) == COUNT
 
 

@@ -130,3 +130,18 @@ def test_the_results_of_a_job_are_known_without_its_videos(walk: Path, tmp_path:
     assert results_of_job(tmp_path / "other.yaml") == tmp_path / "out" / "stairs"
     (tmp_path / "other.yaml").write_text("out: made/here\ncapture: 3\n")
     assert results_of_job(tmp_path / "other.yaml") == tmp_path / "made" / "here"
+
+
+def test_places_to_be_found_replace_the_places_of_the_last_run(tmp_path: Path) -> None:
+    walk = tmp_path / "walk"
+    walk.mkdir()
+    for name in "abc":
+        (walk / f"{name}.mp4").write_bytes(b"frames")
+    has_run(walk, mounts={"a": "torso", "b": "left_palm", "c": "right_palm"})
+    places = ("torso", "left_palm", "right_palm")
+    found = load_job(walk, Overrides(places=places)).capture
+    assert found.places == places
+    assert all(camera.role is None for camera in found.cameras)
+    has_run(walk, places=list(places))
+    stated = load_job(walk, Overrides(mounts={"a": "torso", "b": "head", "c": "hips"})).capture
+    assert not stated.places

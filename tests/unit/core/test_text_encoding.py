@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodycap_batch.capture.timeline import read_timestamps
+from bodycap_batch.capture.sidecar_times import read_timestamps
 from bodycap_batch.config.calibration import read_calibration
 from bodycap_batch.config.yaml_source import read_yaml
 from bodycap_batch.core.text_encoding import decode_text
@@ -43,7 +43,7 @@ READERS: dict[str, tuple[str, str, Callable[[Path], object]]] = {
     "job": ("job.yaml", "name: Gänge\n", lambda path: read_yaml(path).data),
     "calibration": ("calib.json", json.dumps(LENS), calibration),
     "other calibration": ("cv.yml", json.dumps(LENS).replace(",", ",\n"), calibration),
-    "timestamps": ("a.timestamps.txt", "0.0\n0.5\n", lambda path: read_timestamps(path).tolist()),
+    "timestamps": ("a.timestamps.txt", "0.0\n0.5\n", read_timestamps),
     "imu": ("a.imu.csv", "t_s,gx,gy,gz,ax,ay,az\n0,1,2,3,4,5,6\n1,1,2,3,4,5,6\n", imu),
     "gcsv": ("a.gcsv", "GYROFLOW IMU LOG\ntscale,1\nt,gx,gy,gz\n0,1,2,3\n1,4,5,6\n", imu),
     "tum": ("a.tum", "0 1 2 3 0 0 0 1\n", lambda path: read_tum(path).world_from_cam.tolist()),
