@@ -23,6 +23,7 @@ from bodycap_batch.core.errors import JobError
 from bodycap_batch.watch.web import Access, LivePage, connections
 from bodycap_batch.watch.web.job_list import JobList
 from tests.pipeline.spools import SpoolFixture, wait_for
+from tests.videos import unopened
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -482,7 +483,7 @@ def test_the_page_asks_for_the_places_of_cameras_again_where_a_job_failed_for_th
     folder = bench.spool.inbox / "walk"
     folder.mkdir()
     for name in ("GX010120.MP4", "GX010121.MP4"):
-        (folder / name).write_text(f"frames {name}")
+        (folder / name).write_bytes(unopened(f"frames {name}"))
     (folder / "IMG_1.jpg").touch()
     assert bench.run_once() == 2
     tab = browser.new_page()
