@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.mechanisms import Mechanism
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.reconstruction.incremental_mapper import opened_mapper
 from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, registered_ids
@@ -54,6 +56,8 @@ def join_models(models: Sequence[Any], context: MappingContext) -> tuple[list[An
     """
     if not models:
         return [], []
+    if not mechanisms.is_on(Mechanism.JOIN_MODELS):
+        return list(models), []
     main, rest, log = models[0], list[Any](), list[dict[str, object]]()
     for further in models[1:]:
         common = keyframe_names(main) & keyframe_names(further)
@@ -78,6 +82,7 @@ def join_models(models: Sequence[Any], context: MappingContext) -> tuple[list[An
             rest.append(further)
         else:
             main = joined
+            mechanisms.record(Mechanism.JOIN_MODELS)
     return [main, *rest], log
 
 

@@ -14,7 +14,9 @@ from typing import Any
 from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_LOST_SHARE, LEAST_POSED
 from bodycap_batch.config.models import CameraConfig, Job
 from bodycap_batch.config.mounts import MOTION_PLACES, mount_of
+from bodycap_batch.core import mechanisms
 from bodycap_batch.core.errors import BodycapError, CaptureError, EstimationError, JobError
+from bodycap_batch.core.mechanisms import Mechanism
 from bodycap_batch.core.progress import RECONSTRUCTION, Event
 from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.pipeline.inputs import (
@@ -241,7 +243,8 @@ class Flow:
             frames is not used. Frames whose pose a round withdraws, because they contradict the map, were
             wrong before and do not count as lost.
         """
-        for _ in range(self._job.registration.rounds):
+        rounds = self._job.registration.rounds if mechanisms.is_on(Mechanism.EXTENSION) else 0
+        for _ in range(rounds):
             summaries = {name: read_summary(artefact.path) for name, artefact in registrations.items()}
             wanted = {name: summary["wanted"] for name, summary in summaries.items() if summary["wanted"]}
             if not wanted:
@@ -269,9 +272,11 @@ class Flow:
         is a second pass. If the shutters displace keypoints far, the map is built again before it, from
         corrected keypoints.
         """
-        if not any(read_summary(artefact.path)["rolling"] for artefact in registrations.values()):
+        rolling = any(read_summary(artefact.path)["rolling"] for artefact in registrations.values())
+        if not rolling or not mechanisms.is_on(Mechanism.REFINEMENT):
             return scene_map, registrations
-        for number in range(_REFINEMENTS):
+        passes = _REFINEMENTS if mechanisms.is_on(Mechanism.SECOND_REFINEMENT) else 1
+        for number in range(passes):
             task = RefineTask(
                 options=self._job.map,
                 capture=self._footage(),
@@ -284,7 +289,7 @@ class Flow:
                 break
             self._map_round += 1
             again = None
-            if summary["distorted"] and number + 1 < _REFINEMENTS:
+            if summary["distorted"] and number + 1 < passes and mechanisms.is_on(Mechanism.REBUILT_MAP):
                 again = self._rebuilt(scene_map, registrations, keyframes)
             if again is None:
                 again = scene_map, self.register(scene_map, keyframes, registrations)
@@ -365,7 +370,12 @@ class Flow:
 
         Without telemetry, or if all uses are switched off, the registrations are returned unchanged.
         """
-        options = self._job.telemetry
+        off = {
+            field: False
+            for field, mechanism in (("gaps", Mechanism.GAP_FILLING), ("smoothing", Mechanism.SENSOR_PATH))
+            if not mechanisms.is_on(mechanism)
+        }
+        options = self._job.telemetry.model_copy(update=off)
         if not (options.gravity or options.smoothing or options.gaps or options.gps):
             return registrations
         cameras = [camera for camera in self._capture.cameras if camera.name in self._with_telemetry]
@@ -625,6 +635,8 @@ class Flow:
         """Yield one task for every camera with enough lost frames and enough localised frames."""
         for own in self._capture.cameras:
             summary = read_summary(registrations[own.name].path)
+            if not mechanisms.is_on(Mechanism.RECOVERY):
+                continue
             if not LEAST_POSED <= summary["localised"] <= summary["frames"] - LEAST_LOST:
                 continue
             task = self._group_task(own, self._capture.cameras, scene_map, registrations, keyframes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -122,6 +122,7 @@ class StageRecord:
             version that did not record this time.
         peak_memory_mb: Peak memory (MB) of the child process.
         artefact: Folder of the artefact, relative to the store.
+        acted: How often each mechanism of the bench acted (`bodycap_batch.core.mechanisms`), by name.
     """
 
     stage: str
@@ -132,3 +133,4 @@ class StageRecord:
     cpu_seconds: float | None
     peak_memory_mb: float
     artefact: str
+    acted: Mapping[str, int] = field(default_factory=dict)

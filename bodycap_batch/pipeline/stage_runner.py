@@ -117,6 +117,7 @@ class StageRunner:
                 cpu_seconds=artefact.made.get("cpu_seconds"),
                 peak_memory_mb=float(artefact.made["peak_memory_mb"]),
                 artefact=artefact.path.relative_to(self._settings.store.root).as_posix(),
+                acted=artefact.made.get("acted", {}),
             )
         )
         return artefact

@@ -724,3 +724,12 @@ def test_places_that_the_motion_does_not_show_are_asked_for(bench: Bench) -> Non
     )
     reused = {stage.stage for stage in summary.stages if stage.reused}
     assert {"keyframes", "map", "registration"} <= reused
+
+
+def test_a_mechanism_that_is_switched_off_is_part_of_every_key(
+    done: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BODYCAP_WITHOUT", "join_models")
+    assert done.executed() == ALL
+    monkeypatch.delenv("BODYCAP_WITHOUT")
+    assert done.executed() == []

@@ -13,8 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.mechanisms import Mechanism
 from bodycap_batch.mapping.matching.descriptors import DESCRIPTOR_NORM
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
 
@@ -123,7 +125,8 @@ def _detect_features(
     requested = count = detector.getNFeatures()
     if camera.wearer is not None:
         requested //= _WEARER_SURPLUS
-    if len(found) < _POOR_RATIO * requested:
+    if len(found) < _POOR_RATIO * requested and mechanisms.is_on(Mechanism.SECOND_DETECTION):
+        mechanisms.record(Mechanism.SECOND_DETECTION)
         sensitive = cv2.SIFT.create(
             count, contrastThreshold=_POOR_CONTRAST_THRESHOLD, enable_precise_upscale=True
         )

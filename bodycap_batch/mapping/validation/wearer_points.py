@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bodycap_batch.core import mechanisms
+from bodycap_batch.core.mechanisms import Mechanism
 from bodycap_batch.mapping.matching.database import ImageRef
 
 if TYPE_CHECKING:
@@ -70,6 +72,8 @@ def remove_points_on_wearer(model: pycolmap.Reconstruction) -> int:
     Args:
         model: A reconstruction, changed in place. What is left does not move.
     """
+    if not mechanisms.is_on(Mechanism.WEARER_POINTS):
+        return 0
     points_before = model.num_points3D()
     refs = {int(image): ImageRef.parse(model.image(image).name) for image in model.reg_image_ids()}
     sights = _sights(model, refs)
@@ -88,7 +92,9 @@ def remove_points_on_wearer(model: pycolmap.Reconstruction) -> int:
                 for image in path[start:stop]:
                     model.deregister_frame(model.image(image).frame_id)
             start = stop
-    return int(points_before - model.num_points3D())
+    removed = int(points_before - model.num_points3D())
+    mechanisms.record(Mechanism.WEARER_POINTS, removed)
+    return removed
 
 
 def _connected(points: list[set[int]], index: int) -> bool:

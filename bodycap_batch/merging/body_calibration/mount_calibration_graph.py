@@ -12,7 +12,9 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.mechanisms import Mechanism
 from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, hinges
 from bodycap_batch.merging.body.initial_poses import fill_gaps, pose_bones
 from bodycap_batch.merging.body.t_pose import with_t_pose_prior
@@ -182,7 +184,10 @@ class CalibrationGraph:
         """
         before = len(self._samples.times_ns)
         self.solve(scale)
+        if not mechanisms.is_on(Mechanism.IMPLAUSIBLE_INSTANTS):
+            return 0
         while (implausible := self._implausible_ticks()).any():
+            mechanisms.record(Mechanism.IMPLAUSIBLE_INSTANTS, int(implausible.sum()))
             self._keep_ticks(~implausible)
             self.solve(scale)
         return before - len(self._samples.times_ns)

@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.mechanisms import Mechanism
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, transform_points
 from bodycap_batch.model.scene import Map
@@ -89,6 +91,8 @@ def find_misplaced_keyframes(
         Here each loop is as short as possible: the tracks from one keyframe to the next, and the poses of
         both keyframes in the map.
     """
+    if not mechanisms.is_on(Mechanism.MISPLACED_KEYFRAMES):
+        return np.zeros(0, np.int64)
     rows = scene_map.keyframes_of(camera)
     arriving = _arriving_tracks(camera, scene_map, rows, tracks)
     lens = scene_map.cameras.get(camera)
@@ -105,7 +109,9 @@ def find_misplaced_keyframes(
         if interval.inconsistent:
             before, after = int(group[number]), int(group[number + 1])
             misplaced.add(before if shared[before] < shared[after] else after)
-    return rows[np.isin(group, sorted(misplaced))]
+    found = rows[np.isin(group, sorted(misplaced))]
+    mechanisms.record(Mechanism.MISPLACED_KEYFRAMES, len(found))
+    return found
 
 
 def _arriving_tracks(camera: str, scene_map: Map, rows: IntArray, tracks: Tracks) -> _ArrivingTracks:

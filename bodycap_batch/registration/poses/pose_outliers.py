@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, runs
+from bodycap_batch.core.mechanisms import Mechanism
 
 _MIN_SIGMAS = 8.0
 """Minimum deviation of an outlier, in standard deviations of the camera centres. Evidence: none."""
@@ -76,6 +78,8 @@ def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArra
     Returns:
         Mask (N,) of the frames whose pose is an outlier. The mask does not depend on the scale of the map.
     """
+    if not mechanisms.is_on(Mechanism.POSE_OUTLIERS):
+        return np.zeros(len(centres), dtype=bool)
     size = np.linalg.norm(_second_differences(centres, sigma)[0], axis=1)
     in_run = np.zeros(len(centres), dtype=bool)
     for length in _RUN_LENGTHS:
@@ -84,7 +88,9 @@ def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArra
     centres = np.where(in_run[:, None], np.nan, centres)
     backwards = _outliers_after_gaps(centres[::-1], sigma[::-1])[::-1]
     ends = _outliers_after_gaps(centres, sigma) | backwards
-    return np.asarray(in_run | _single_outliers(centres, sigma, times_ns) | ends)
+    found = np.asarray(in_run | _single_outliers(centres, sigma, times_ns) | ends)
+    mechanisms.record(Mechanism.POSE_OUTLIERS, int(found.sum()))
+    return found
 
 
 def _single_outliers(centres: FloatArray, sigma: FloatArray, times_ns: IntArray) -> BoolArray:

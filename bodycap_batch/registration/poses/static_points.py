@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray
+from bodycap_batch.core.mechanisms import Mechanism
 from bodycap_batch.model.scene import Map
 from bodycap_batch.model.static_span import MIN_STATIC_SPAN_NS
 
@@ -27,6 +29,8 @@ def static_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
     points, all points are treated as static.
     """
     count = len(scene_map.points)
+    if not mechanisms.is_on(Mechanism.STATIC_POINTS):
+        return np.ones(count, dtype=bool)
     rows = scene_map.keyframes_of(camera.name)
     is_own = np.isin(scene_map.obs_keyframe, rows)
     point = scene_map.obs_point[is_own]
@@ -43,4 +47,7 @@ def static_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
     is_usable = len(observing) > 0 and bool(
         (static_seen[observing] >= _MIN_STATIC_POINTS).mean() >= _MIN_KEYFRAME_RATIO
     )
-    return static if is_usable else np.ones(count, dtype=bool)
+    if not is_usable:
+        return np.ones(count, dtype=bool)
+    mechanisms.record(Mechanism.STATIC_POINTS, int((~static).sum()))
+    return np.asarray(static)
