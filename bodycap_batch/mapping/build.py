@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,11 +23,6 @@ from bodycap_batch.mapping.inputs import (
     make_mapping_context,
 )
 from bodycap_batch.mapping.intrinsics.intrinsics_check import find_misfit_intrinsics
-from bodycap_batch.mapping.intrinsics.readout_pairs import (
-    doubtful_groups,
-    estimate_from_pairs,
-    sampled_keyframes,
-)
 from bodycap_batch.mapping.intrinsics.readout_profile import estimate_from_matches
 from bodycap_batch.mapping.intrinsics.readout_time import Readout, map_with_readouts
 from bodycap_batch.mapping.intrinsics.recalibration import recalibrate_if_misfit
@@ -66,8 +61,6 @@ from bodycap_batch.model.scene import KeyframeSelection, MapResult
 
 WORKSPACE = "workspace"
 """Name of the folder of a map's database, in the work folder."""
-_TRIAL = "trial"
-"""Name of the folder, in the work folder, with the features from which readout times are estimated."""
 _MIN_MOTION_PX = 2.0
 """Minimum motion of the picture of a camera that moves, px of an image with a long side of 640 px. Evidence:
 docs/decisions/mapping.md."""
@@ -216,8 +209,7 @@ def build_map_once(
     workspace = context.work_dir / WORKSPACE
     workspace.mkdir(parents=True, exist_ok=True)
     estimated = with_gyroscopes(estimate_from_matches(capture, selections), selections)
-    judged, earlier = _judged_by_pairs(capture, selections, estimated, options, context, earlier)
-    readouts = {**known_readouts(capture), **judged}
+    readouts = {**known_readouts(capture), **estimated}
     used = {**readouts, **possible_readouts(capture, selections, readouts), **earlier.readouts}
     shutters = turning_shutters(capture, selections, used)
     write_shutters(workspace, shutters)
@@ -256,7 +248,8 @@ def build_map_once(
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
     removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
-    log |= _readouts_log(readouts, [name for name in judged if judged[name] != estimated[name]])
+    if readouts:
+        log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
     unknown = unknown_shutters(capture, selections, readouts)
     log = MapDiagnostics(
         misfit_factors=misfits, misplaced=misplaced, unknown_shutters=unknown, details=log
@@ -267,57 +260,6 @@ def build_map_once(
     ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
     refused = refused or add_flip_hint(check_consistency(max(ratios)), flips)
     return result, refused
-
-
-def _readouts_log(readouts: Mapping[str, Readout], by_pairs: Collection[str]) -> dict[str, object]:
-    """Return the log entries of the readout times for which keypoints are corrected.
-
-    Args:
-        readouts: The readout times by camera name.
-        by_pairs: Names of the cameras whose readout times pairs of keyframes determined.
-    """
-    log: dict[str, object] = {}
-    if readouts:
-        log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
-    if by_pairs:
-        log["readouts_by_keyframe_pairs"] = sorted(by_pairs)
-    return log
-
-
-def _judged_by_pairs(
-    capture: Capture,
-    selections: Sequence[KeyframeSelection],
-    readouts: Mapping[str, Readout],
-    options: MapOptions,
-    context: StageContext,
-    earlier: EarlierResults,
-) -> tuple[dict[str, Readout], EarlierResults]:
-    """Estimate undetermined readout times that may displace keypoints far from pairs of keyframes.
-
-    Args:
-        capture: All cameras.
-        selections: Keyframes of each camera.
-        readouts: Readout times from matches between adjacent frames, by camera name.
-        options: The stage's options.
-        context: Work folder, threads, progress.
-        earlier: What earlier maps give. Cameras with an earlier readout time are left out.
-
-    Returns:
-        The readout times by camera name; the earlier results with the features that were extracted here.
-    """
-    out = dict(readouts)
-    unknown = {name: item for name, item in readouts.items() if name not in earlier.readouts}
-    extracted: dict[str, Path] = {}
-    for number, names in enumerate(doubtful_groups(capture, selections, unknown)):
-        folder = context.work_dir / _TRIAL / str(number)
-        folder.mkdir(parents=True, exist_ok=True)
-        own = sampled_keyframes(selections, names)
-        add_keyframes(folder, _keyframes_of(folder, capture, own, {}, earlier), options, context)
-        refs = [ImageRef(item.camera, int(frame)) for item in own for frame in item.frames]
-        generator = PairGenerator(folder, refs, frame_times_ns(capture), options, context)
-        out |= estimate_from_pairs(folder, capture, own, readouts, context, generator)
-        extracted |= dict.fromkeys(names, folder)
-    return out, replace(earlier, features={**extracted, **earlier.features})
 
 
 def _keyframes_of(

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pycolmap
 import pytest
 
 from bodycap_batch.capture import open_capture
@@ -16,8 +14,6 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.core.errors import CaptureError, EstimationError
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build_map, extend_map
-from bodycap_batch.mapping.intrinsics.readout_time import Readout
-from bodycap_batch.mapping.matching.database import DATABASE_NAME, read_image_ids
 from bodycap_batch.model.geometry import Similarity, align_points, rotation_angle_rad, so3_exp
 from bodycap_batch.model.scene import FrameStatus, Map
 from bodycap_batch.registration import register_frames
@@ -150,31 +146,6 @@ def test_the_same_capture_gives_the_same_map(estimated: Estimated, tmp_path: Pat
     assert first.gauge == second.gauge
     for field in ("points", "map_from_cam", "colors", "obs_px", "obs_point", "point_error_px"):
         assert np.array_equal(getattr(first, field), getattr(second, field))
-
-
-def test_a_readout_time_that_pairs_determine_corrects_the_map(
-    estimated: Estimated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    names = [camera.name for camera in estimated.capture.cameras]
-    asked: list[tuple[str, int]] = []
-
-    def from_pairs(workspace: Path, *arguments: Any) -> dict[str, Readout]:
-        with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
-            asked.extend((ref.camera, ref.frame) for ref in read_image_ids(database))
-        return {name: Readout(0.008, 0.001, "estimated", 0.008) for name in names}
-
-    unknown = {name: Readout(0.0, 0.005, "not determined: too even", 0.012) for name in names}
-    for function, answer in (
-        ("estimate_from_matches", lambda *arguments: unknown),
-        ("doubtful_groups", lambda *arguments: [names]),
-        ("estimate_from_pairs", from_pairs),
-    ):
-        monkeypatch.setattr(f"bodycap_batch.mapping.build.{function}", answer)
-    result = build_map(estimated.capture, estimated.selections, MapOptions(), context(tmp_path))
-    assert result.maps[0].readout_s == dict.fromkeys(names, 0.008)
-    assert result.log["readouts_by_keyframe_pairs"] == sorted(names)
-    frames = {(item.camera, int(frame)) for item in estimated.selections for frame in item.frames}
-    assert set(asked) == frames, "the features of all keyframes"
 
 
 def test_points_have_the_grey_of_the_walls(estimated: Estimated) -> None:
