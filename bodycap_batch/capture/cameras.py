@@ -25,7 +25,6 @@ from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.copied_frames import Pictures
-from bodycap_batch.model.wearer_view import WearerView
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
@@ -68,8 +67,6 @@ class CaptureCamera:
             Empty if the video was not yet searched for damage.
         kept: Stored copies of frames at the work size. They are read instead of the video. None if there are
             no copies.
-        wearer: The wearer's body in each frame. The room is not visible there. None if it is unknown, or if
-            it covers little of the pictures.
         threads: Number of threads of the decoder. For 0, the number is taken from the environment variable
             OMP_NUM_THREADS. If this variable is not set, all processors are used.
         given: Intrinsics that were given, if the map contradicted them and `camera` replaces them; else None.
@@ -91,7 +88,6 @@ class CaptureCamera:
     mask: BoolArray | None = field(default=None, repr=False)
     damaged: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64), repr=False)
     kept: KeptFrames | None = field(default=None, repr=False)
-    wearer: WearerView | None = field(default=None, repr=False)
     threads: int = 0
     given: Camera | None = None
 
@@ -118,24 +114,12 @@ class CaptureCamera:
             nominal_fps=1e9 / float(np.median(np.diff(pictures.times_ns))),
         )
 
-    def is_unmasked(self, px: npt.NDArray[Any], frame: int | IntArray) -> BoolArray:
-        """Find the pixels at which the room is visible.
+    def is_unmasked(self, px: npt.NDArray[Any]) -> BoolArray:
+        """Return a mask (N,) of the pixels at which the camera's mask is True, or absent.
 
         Args:
             px: (N,2) pixels at the work size, with COLMAP's origin.
-            frame: Index of the frame of all pixels, or (N,) index of the frame of each pixel.
-
-        Returns:
-            A mask (N,) that is False where the camera's mask is False, and where the wearer's body is.
         """
-        visible = self._in_mask(px)
-        if self.wearer is not None:
-            frames = np.broadcast_to(np.asarray(frame, dtype=np.int64), len(px))
-            visible &= ~self.wearer.covers(np.asarray(px, dtype=np.float64), frames)
-        return visible
-
-    def _in_mask(self, px: npt.NDArray[Any]) -> BoolArray:
-        """Return a mask (N,) of the pixels (N,2) at which the camera's mask is True, or absent."""
         if self.mask is None:
             return np.ones(len(px), dtype=bool)
         column = np.clip(px[:, 0].astype(int), 0, self.mask.shape[1] - 1)

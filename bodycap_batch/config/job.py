@@ -40,6 +40,7 @@ from bodycap_batch.config.origins import LoadedJob, Source
 from bodycap_batch.config.overrides import NO_HEIGHT, Overrides
 from bodycap_batch.config.places import Places
 from bodycap_batch.config.resolved_camera import ResolvedCamera, resolved_camera, with_found_calibrations
+from bodycap_batch.config.retired_options import without_retired_options
 from bodycap_batch.config.rules import missing_files, problems_in, skeleton_of
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.config.unfinished_videos import refuse_missing_cameras
@@ -131,7 +132,7 @@ def load_job_with_origins(
     alone = policy is not None and policy.folder is None and not full.is_dir()
     try:
         full = _job_source(full, policy)
-        source = _read_source(full, limits or Limits())
+        source, retired = without_retired_options(_read_source(full, limits or Limits()))
         overrides, kept = overrides or Overrides(), ""
         if policy is None:
             results = _stated_results(full, source, overrides)
@@ -139,7 +140,7 @@ def load_job_with_origins(
         places = Places(overrides.mounts, overrides.places, overrides.last_mounts)
         stated = _stated_job(full, source, places, alone=alone)
         loaded = _resolved_job(stated, overrides, prepare, policy, is_draft=is_draft)
-        return replace(loaded, warnings=(*loaded.warnings, kept)) if kept else loaded
+        return replace(loaded, warnings=(*loaded.warnings, *retired, *([kept] if kept else ())))
     except PermissionError as error:
         kind = JobError if error.filename == str(full) else CaptureError
         raise kind(

@@ -145,14 +145,6 @@ class RegistrationOptions(Options):
             "visible points"
         ),
     )
-    wearer_mask: Literal["auto", "off"] = Field(
-        "auto",
-        description=(
-            "auto: where the solved body covers more than 15 % of the pictures of a camera that lost frames, "
-            "map and registration are repeated without the wearer, and the result with more localised frames "
-            "is used; off: they are not repeated"
-        ),
-    )
 
 
 MARKER_COUNTS = {

@@ -83,25 +83,18 @@ NOTHING_EARLIER = EarlierResults()
 """There is no earlier map."""
 
 
-def earlier_results(
-    capture: Capture, refined: MapResult | None, unmasked: MapResult | None
-) -> EarlierResults:
-    """Return what earlier maps of a capture give for a new one.
+def earlier_results(capture: Capture, refined: MapResult | None) -> EarlierResults:
+    """Return what an earlier map of a capture gives for a new one.
 
     Args:
         capture: All cameras.
         refined: A map of the same pictures, in which rolling shutters were found. The keypoints are corrected
-            for its readout times, and all features are taken from it.
-        unmasked: A map for which no wearer was known. The features of the cameras without a known wearer are
-            taken from it, if there is no refined map.
+            for its readout times, and all features are taken from it. None if there is no such map.
     """
-    if refined is not None:
-        names = [camera.name for camera in capture.cameras]
-        return EarlierResults(dict.fromkeys(names, refined.workspace), readouts_of_maps(refined.maps))
-    if unmasked is not None:
-        names = [camera.name for camera in capture.cameras if camera.wearer is None]
-        return EarlierResults(dict.fromkeys(names, unmasked.workspace))
-    return NOTHING_EARLIER
+    if refined is None:
+        return NOTHING_EARLIER
+    names = [camera.name for camera in capture.cameras]
+    return EarlierResults(dict.fromkeys(names, refined.workspace), readouts_of_maps(refined.maps))
 
 
 def build_map(

@@ -5,13 +5,12 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_LOST_SHARE, LEAST_POSED
+from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_POSED
 from bodycap_batch.config.models import CameraConfig, Job
 from bodycap_batch.config.mounts import MOTION_PLACES, mount_of
 from bodycap_batch.core import mechanisms
@@ -59,7 +58,6 @@ from bodycap_batch.tasks.report import REPORT
 from bodycap_batch.tasks.rig import RIG
 from bodycap_batch.tasks.sound import SOUND, SoundTask, known_from_sound
 from bodycap_batch.tasks.stage import Stage, read_summary
-from bodycap_batch.tasks.wearer import WEARER, WearerTask
 
 _REFINEMENTS = 2
 """Maximum number of passes of the correction of rolling shutters. Evidence: docs/decisions/mapping.md."""
@@ -88,8 +86,6 @@ class Flow:
         self._threads = settings.threads
         self._cameras: dict[str, str] = {}
         self._map_round = 0
-        self._wearer: Artefact | None = None
-        self._first_map: Artefact | None = None
         self._with_telemetry = frozenset[str]()
         self._with_gyro = frozenset[str]()
         self._with_blur = frozenset[str]()
@@ -177,7 +173,6 @@ class Flow:
             capture=self._footage(),
             keyframes=refs_by_camera(keyframes),
             refined=optional_ref(refined),
-            unmasked=optional_ref(self._first_map),
         )
         body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
         later: list[Stage[Any]] = [REGISTRATION, CLOCKS, *body, EXPORT, REPORT]
@@ -425,50 +420,6 @@ class Flow:
         task = FillTask(mode=self._job.fill, merge=artefact_ref(merged))
         return self.runner.run(make_task(FILL, task, threads=self._threads))
 
-    def find_wearer(self, results: StageResults) -> Artefact | None:
-        """Find the wearer's body in the pictures of each camera.
-
-        Returns:
-            The artefact; None if the body covers little of the pictures of every camera that lost frames.
-        """
-        assert results.map is not None
-        assert results.clocks is not None
-        assert results.filled is not None
-        summaries = {name: read_summary(artefact.path) for name, artefact in results.registrations.items()}
-        lossy = {
-            name
-            for name, summary in summaries.items()
-            if summary["localised"] < (1.0 - LEAST_LOST_SHARE) * summary["frames"]
-        }
-        if not lossy:
-            return None
-        task = WearerTask(
-            map=artefact_ref(results.map),
-            registrations=refs_by_camera(results.registrations),
-            clocks=artefact_ref(results.clocks),
-            merge=artefact_ref(results.filled),
-        )
-        artefact = self.runner.run(make_task(WEARER, task))
-        return artefact if lossy.intersection(read_summary(artefact.path)["masked"]) else None
-
-    @contextmanager
-    def without_wearer(self, wearer: Artefact, scene_map: Artefact | None) -> Iterator[None]:
-        """Leave out the wearer's body, as `find_wearer` found it, in all tasks that run in this context.
-
-        The notes of these tasks are held back until `runner.release_notes`.
-
-        Args:
-            wearer: The wearer's body in the pictures.
-            scene_map: The map of the first pass. Its features are used again where they stay the same.
-        """
-        self._wearer, self._first_map = wearer, scene_map
-        self._map_round += 1
-        with self.runner.held_notes():
-            try:
-                yield
-            finally:
-                self._wearer = self._first_map = None
-
     def export(self, results: StageResults) -> Artefact:
         """Write the result files and return their artefact.
 
@@ -536,8 +487,8 @@ class Flow:
         return self.runner.run(make_task(CLOCKS, task))
 
     def _footage(self, cameras: Sequence[CameraConfig] | None = None) -> CaptureRef:
-        """Return the videos of all or some cameras, with the wearer's body in them if it is known."""
-        return replace(capture_ref(self._capture, self._cameras, cameras), wearer=optional_ref(self._wearer))
+        """Return the videos of all or some cameras."""
+        return capture_ref(self._capture, self._cameras, cameras)
 
     def _start_sound(self) -> Future[Artefact]:
         """Compare sound and sensors of the cameras, beside the keyframes if there are threads for both."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -25,11 +24,9 @@ from bodycap_batch.pipeline.results import (
     stored_name,
     write_results_file,
 )
-from bodycap_batch.pipeline.second_pass import repeat_without_wearer
 from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.pipeline.stage_results import StageResults
 from bodycap_batch.report.summary import ResultSummary, summary_of_folder
-from bodycap_batch.runner.task_runner import always
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.store.checked_json import checked_json
 from bodycap_batch.tasks.order import STAGE_ORDER
@@ -109,43 +106,13 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     flow.check()
     yield "check"
     results.stage = "keyframes"
-    results.keyframes = flow.keyframes()
+    results.keyframes = keyframes = flow.keyframes()
     yield "keyframes"
-    yield from _run_pass(job, flow, results)
-    repeat_without_wearer(
-        job, flow, results, lambda second, goes_on: deque(_run_pass(job, flow, second, goes_on), maxlen=0)
-    )
-    yield "fill"
-    results.preview = flow.start_preview(results) if job.export.preview else None
-    results.exported = flow.export(results)
-    yield "export"
-    results.reported = flow.report(results)
-    yield "report"
-    if results.preview is not None:
-        results.previewed = results.preview.result()
-        yield "preview"
-
-
-def _run_pass(
-    job: Job, flow: Flow, results: StageResults, goes_on: Callable[[], bool] = always
-) -> Iterator[str]:
-    """Run the stages from the map to `fill`, and yield the name of each stage but `fill`.
-
-    Args:
-        job: The job.
-        flow: The stages of the job.
-        results: Receives the artefacts of the stages.
-        goes_on: Called after all frames were registered against the map for the first time; False ends the
-            pass.
-    """
-    keyframes = results.keyframes
     results.stage = "map"
     results.map = scene_map = flow.map(keyframes)
     yield "map"
     results.stage = "registration"
-    results.tracked = results.registrations = found = flow.register(scene_map, keyframes)
-    if not goes_on():
-        return
+    results.registrations = found = flow.register(scene_map, keyframes)
     scene_map, found = flow.extend_map(scene_map, found, keyframes)
     results.map, found = flow.refine_map(scene_map, found, keyframes)
     found = flow.solve_rigs(results.map, found, keyframes)
@@ -160,6 +127,15 @@ def _run_pass(
     if results.merged is not None:
         results.stage = "fill"
         results.filled = flow.fill(results.merged)
+    yield "fill"
+    results.preview = flow.start_preview(results) if job.export.preview else None
+    results.exported = flow.export(results)
+    yield "export"
+    results.reported = flow.report(results)
+    yield "report"
+    if results.preview is not None:
+        results.previewed = results.preview.result()
+        yield "preview"
 
 
 def _run_until(

@@ -31,7 +31,6 @@ class StageResults:
         stage: Name of the running stage, or of the last stage that ran.
         keyframes: The artefact of each camera's keyframes, by camera name.
         map: The artefact of the map.
-        tracked: The registration of each camera against the first map, by camera name.
         registrations: The registration of each camera after all further steps, by camera name.
         job: The job with the places that were found from the motion; None before they are looked for.
         clocks: The artefact of the clocks of all cameras.
@@ -48,7 +47,6 @@ class StageResults:
     stage: str = "check"
     keyframes: Mapping[str, Artefact] = field(default_factory=dict)
     map: Artefact | None = None
-    tracked: Mapping[str, Artefact] = field(default_factory=dict)
     registrations: Mapping[str, Artefact] = field(default_factory=dict)
     job: Job | None = None
     clocks: Artefact | None = None

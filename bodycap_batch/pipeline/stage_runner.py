@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,7 +45,6 @@ class StageRunner:
         self._references = References(settings.store, logs.parent)
         self._frame_counts = (0, 0)
         self._noted: set[str] = set()
-        self._held: list[tuple[str, str]] | None = None
         self._opened = ExitStack()
 
     def __enter__(self) -> StageRunner:
@@ -156,26 +155,8 @@ class StageRunner:
         for note in read_summary(artefact.path).get("notes", []):
             self.note(note, stage)
 
-    @contextmanager
-    def held_notes(self) -> Iterator[None]:
-        """Hold back the notes of all tasks that run in this context. Notes that are not released are lost."""
-        self._held = []
-        try:
-            yield
-        finally:
-            self._held = None
-
-    def release_notes(self) -> None:
-        """Send the notes that were held back so far, because the results of their tasks are used."""
-        held, self._held = self._held or [], None
-        for text, stage in held:
-            self.note(text, stage)
-
     def note(self, text: str, stage: str = "") -> None:
         """Send a note to the listener; a note that was sent before is not repeated."""
-        if self._held is not None:
-            self._held.append((text, stage))
-            return
         if text not in self._noted:
             self._noted.add(text)
             self._settings.listener(Event(kind="note", stage=stage, what=f"note: {text}"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from bodycap_batch.config.models import Activity, CaptureConfig
 
@@ -52,18 +51,14 @@ class CaptureRef:
         config: The resolved capture block of the job, with the task's cameras only.
         digests: For each camera name, the digest of everything that the camera's frames depend on. Empty if a
             video cannot be read.
-        wearer: The artefact of the stage `wearer`, which says where the wearer's body is in the pictures. The
-            room is not visible there. None in the first pass, in which that is unknown.
     """
 
     config: CaptureConfig
     digests: Mapping[str, str]
-    wearer: ArtefactRef | None = None
 
-    def key_content(self) -> dict[str, Any]:
-        """Return the digest of each camera, and that of the wearer's body in the pictures, if it is known."""
-        body = {} if self.wearer is None else {"wearer": self.wearer.digest}
-        return {**self.digests, **body}
+    def key_content(self) -> Mapping[str, str]:
+        """Return the digest of each camera only: where the videos are stored does not change a result."""
+        return self.digests
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

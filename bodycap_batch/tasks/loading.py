@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from bodycap_batch.capture import Capture, KeptFrames
     from bodycap_batch.model.camera_clock import CaptureClocks
     from bodycap_batch.model.scene import KeyframeSelection, MapResult, Registration
-    from bodycap_batch.model.wearer_view import WearerView
 
 CLOCKS_NAME = "clocks"
 """Name of the file, without suffix, that holds the clocks of a capture."""
@@ -48,25 +47,8 @@ def load_capture(
             selection = load_keyframes(artefact.path)
             camera = replace(camera.only(selection.pictures), damaged=selection.damaged)  # noqa: PLW2901
         clock = camera.clock if clocks is None else clocks.cameras.get(camera.name, camera.clock)
-        wearer = _load_wearer(capture.wearer, camera.name)
-        cameras.append(replace(camera, kept=_kept_frames(artefact), clock=clock, wearer=wearer))
+        cameras.append(replace(camera, kept=_kept_frames(artefact), clock=clock))
     return replace(opened, cameras=tuple(cameras))
-
-
-def _load_wearer(wearer: ArtefactRef | None, camera: str) -> WearerView | None:
-    """Return the wearer's body in the pictures of a camera; None if this camera is not masked."""
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.wearer_view import WearerView
-
-    name = wearer_name(camera)
-    if wearer is None or not (wearer.path / f"{name}.json").exists():
-        return None
-    return read_dataclass(WearerView, wearer.path, name)
-
-
-def wearer_name(camera: str) -> str:
-    """Return the name of the file, without suffix, with the wearer's body in the pictures of a camera."""
-    return f"wearer_{camera}"
 
 
 def _kept_frames(keyframes: ArtefactRef | None) -> KeptFrames | None:

@@ -30,15 +30,12 @@ class MapTask:
         refined: An earlier map of the same pictures, in which rolling shutters were found. The new map is
             built from its features, with keypoints that are corrected for the shutters. None in the first
             round.
-        unmasked: A map of the same keyframes from the pass in which no wearer was known. The features of the
-            cameras that are not masked are taken from it. None in the first pass.
     """
 
     options: MapOptions
     capture: CaptureRef
     keyframes: Mapping[str, ArtefactRef]
     refined: ArtefactRef | None = None
-    unmasked: ArtefactRef | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,8 +81,7 @@ def run_map(task: MapTask, context: StageContext, files: Path) -> None:
     selections = [load_keyframes(artefact.path) for artefact in task.keyframes.values()]
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
     refined = None if task.refined is None else load_map(task.refined.path)
-    unmasked = None if task.unmasked is None else load_map(task.unmasked.path)
-    earlier = earlier_results(capture, refined, unmasked)
+    earlier = earlier_results(capture, refined)
     result = build_map(capture, selections, task.options, context, earlier=earlier)
     _save_map(result, files)
 

@@ -15,8 +15,6 @@ _DURING_REGISTRATION = frozenset({"extend", "refine", "rig", "recover", "clocks"
 """Further stages that may run up to the merge. They extend and refine the map, solve the cameras of a rig
 together, recover lost frames, determine the clocks, find the places of cameras from the motion, and use the
 inertial sensors."""
-_AFTER_FILL = frozenset({"wearer"})
-"""Further stages that run after `fill`. They find the wearer in the pictures, for a second pass."""
 
 
 def stages_from(stage: StageName) -> frozenset[str]:
@@ -26,6 +24,4 @@ def stages_from(stage: StageName) -> frozenset[str]:
         later |= BESIDE_KEYFRAMES
     if "registration" in later:
         later |= _DURING_REGISTRATION
-    if "fill" in later:
-        later |= _AFTER_FILL
     return frozenset(later)

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from bodycap_batch.capture import CaptureCamera
     from bodycap_batch.model.scene import MapResult, Registration
 
-NOT_ROUNDS = omitted_from_key("rounds", "wearer_mask")
-"""Metadata of a dataclass field; it omits the options `rounds` and `wearer_mask` from the artefact's key.
-They set which rounds run, and do not change the result of a single round."""
+NOT_ROUNDS = omitted_from_key("rounds")
+"""Metadata of a dataclass field; it omits the option `rounds` from the artefact's key. It sets which rounds
+run, and does not change the result of a single round."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,7 +22,6 @@ from bodycap_batch.tasks.rig import RIG
 from bodycap_batch.tasks.sound import SOUND
 from bodycap_batch.tasks.stage import Stage
 from bodycap_batch.tasks.synth import SYNTH
-from bodycap_batch.tasks.wearer import WEARER
 
 STAGES: Mapping[str, Stage[Any]] = {
     stage.name: stage
@@ -42,7 +41,6 @@ STAGES: Mapping[str, Stage[Any]] = {
         INERTIAL,
         MERGE,
         FILL,
-        WEARER,
         EXPORT,
         REPORT,
         PREVIEW,

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import json
 import os
-import re
 import sys
 import time
 from collections.abc import Mapping
@@ -21,12 +19,11 @@ Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
- "masked": [cameras], "without_wearer": localised frames, of each camera or {camera: frames},
  "unused": {camera: reason}, "rolling": true, "late": number of maps,
  "corrected" | "corrected_before" | "distorted": [cameras] in refined maps,
  "fail_rebuilt": true, "telemetry": [cameras],
  "real": [stages that are no stand-ins]}.
- "fail" may be a list of stages; "fail_second" is one that fails without the wearer."""
+ "fail" may be a list of stages."""
 
 
 def give_orders(folder: Path, **values: Any) -> None:
@@ -43,18 +40,11 @@ def orders() -> dict[str, Any]:
 
 
 def made_of(value: Any) -> Any:
-    """Replace every reference to an artefact in a value by the content of the artefact.
-
-    The wearer is made of all stages of the first pass, which quotes in quotes would make enormous: a digest
-    stands for it.
-    """
+    """Replace every reference to an artefact in a value by the content of the artefact."""
     if isinstance(value, Mapping):
         if value.keys() == {"path", "digest"}:
             return made_of(value["path"])
-        parts = {key: made_of(part) for key, part in value.items() if key not in ("video", "out", "job")}
-        if parts.get("wearer"):
-            parts["wearer"] = hashlib.sha256(parts["wearer"].encode()).hexdigest()
-        return parts
+        return {key: made_of(part) for key, part in value.items() if key not in ("video", "out", "job")}
     if isinstance(value, list):
         return [made_of(part) for part in value]
     if isinstance(value, str) and (Path(value) / "made_of.txt").is_file():
@@ -80,9 +70,6 @@ def stage(name: str) -> Any:
             raise EstimationError(f"{name} does not work out", hint="film more")
         if name == "map" and arguments.get("refined") and orders().get("fail_rebuilt"):
             raise EstimationError("no map from corrected keypoints", hint="film more")
-        repeats = re.search(r'"wearer\\*": \\*"', json.dumps(made_of(arguments))) is not None
-        if repeats and orders().get("fail_second") == name:
-            raise EstimationError(f"{name} does not work out without the wearer", hint="film more")
         if name == "check" and any("unreadable" in text for text in videos(arguments["job"])):
             raise CaptureError("the file cannot be read as a video", hint="copy the video again")
         if orders().get("fill") == name:
@@ -132,9 +119,6 @@ def registered(options: Json, arguments: Json, files: Path) -> None:
     wanted = [*orders().get("wanted", []), *[[]] * 9][again]
     localised = [*orders().get("localised", []), *[10] * 9][again]
     camera = arguments["capture"]["config"]["cameras"][0]["name"]
-    if arguments["capture"]["wearer"] is not None:
-        without = orders()["without_wearer"]
-        localised = without[camera] if isinstance(without, dict) else without
     rolling = bool(orders().get("rolling"))
     frames = localised + orders().get("lost", {}).get(camera, 0)
     values = {
@@ -185,11 +169,6 @@ def merged(options: Json, arguments: Json, files: Path) -> None:
     )
 
 
-def found_wearer(options: Json, arguments: Json, files: Path) -> None:
-    masked = orders().get("masked", [])
-    (files / "summary.json").write_text(json.dumps({"masked": masked, "shares": dict.fromkeys(masked, 0.4)}))
-
-
 def exported(options: Json, arguments: Json, files: Path) -> None:
     results = files / "results"
     (results / "trajectories").mkdir(parents=True)
@@ -229,7 +208,6 @@ EXTRA = {
     "refine": refined,
     "recover": recovered,
     "merge": merged,
-    "wearer": found_wearer,
     "export": exported,
     "places": placed,
     "report": reported,
@@ -251,7 +229,6 @@ NAMES = (
     "inertial",
     "merge",
     "fill",
-    "wearer",
     "export",
     "preview",
     "report",

@@ -108,15 +108,6 @@ def test_the_stored_results_are_those_of_the_last_run(bench: Bench) -> None:
     }
 
 
-def test_the_stored_results_are_those_without_the_wearer_if_they_are_better(bench: Bench) -> None:
-    bench.order(lost={"torso": 10}, localised=[30], masked=["torso"], without_wearer=40)
-    bench.run()
-    last = stages_of_last_run(bench)
-    assert found_again(bench, bench.job()) == {
-        name: last[name] for name in ("map", "clocks", "merge", "fill")
-    }
-
-
 def test_the_results_of_a_job_whose_places_were_found_are_stored_for_both_jobs(bench: Bench) -> None:
     bench.order(places=FOUND)
     job = unplaced_job(bench)

@@ -31,9 +31,6 @@ _CONTRAST_THRESHOLD = 0.02
 """Contrast threshold of the detector. It is half of OpenCV's default, because blurred walls and ceilings
 have little contrast. Evidence: docs/decisions/mapping.md."""
 
-_WEARER_SURPLUS = 3
-"""Number of features that are detected for each feature that is kept, if the wearer's body is left out.
-Many of them lie on the body. Evidence: none."""
 _POOR_RATIO = 0.5
 """Fraction of the maximum number of features below which a frame is poor in features. Features of such a
 frame are detected again in the full frame, with `_POOR_CONTRAST_THRESHOLD`. Evidence:
@@ -71,26 +68,22 @@ def extract_features(
     import cv2
 
     detectors = [
-        cv2.SIFT.create(
-            count * (1 if camera.wearer is None else _WEARER_SURPLUS),
-            contrastThreshold=_CONTRAST_THRESHOLD,
-            enable_precise_upscale=True,
-        )
+        cv2.SIFT.create(count, contrastThreshold=_CONTRAST_THRESHOLD, enable_precise_upscale=True)
         for _ in range(context.threads)
     ]
     if context.threads == 1:
         for index, rgb in camera.read(frames, colour=True):
             context.check_cancelled()
-            yield index, _detect_features(detectors[0], camera, index, rgb)
+            yield index, _detect_features(detectors[0], camera, rgb)
         return
     free: SimpleQueue[Any] = SimpleQueue()
     for detector in detectors:
         free.put(detector)
 
-    def work(index: int, rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
+    def work(rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
         detector = free.get()
         try:
-            return _detect_features(detector, camera, index, rgb)
+            return _detect_features(detector, camera, rgb)
         finally:
             free.put(detector)
 
@@ -98,7 +91,7 @@ def extract_features(
         waiting: deque[tuple[int, Future[SiftFeatures]]] = deque()
         for index, rgb in camera.read(frames, colour=True):
             context.check_cancelled()
-            waiting.append((index, pool.submit(work, index, rgb)))
+            waiting.append((index, pool.submit(work, rgb)))
             if len(waiting) > 2 * context.threads:
                 frame, job = waiting.popleft()
                 yield frame, job.result()
@@ -106,9 +99,7 @@ def extract_features(
             yield frame, job.result()
 
 
-def _detect_features(
-    detector: Any, camera: CaptureCamera, frame: int, rgb: npt.NDArray[np.uint8]
-) -> SiftFeatures:
+def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
     """Return the features of one RGB image (H,W,3) that lie where the room is visible.
 
     Features are detected in a reduced image. If there are few, for example on a bare ceiling, they are
@@ -122,10 +113,8 @@ def _detect_features(
     whole = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     grey = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
     found, raw = detector.detectAndCompute(grey, None)
-    requested = count = detector.getNFeatures()
-    if camera.wearer is not None:
-        requested //= _WEARER_SURPLUS
-    if len(found) < _POOR_RATIO * requested and mechanisms.is_on(Mechanism.SECOND_DETECTION):
+    count = detector.getNFeatures()
+    if len(found) < _POOR_RATIO * count and mechanisms.is_on(Mechanism.SECOND_DETECTION):
         mechanisms.record(Mechanism.SECOND_DETECTION)
         sensitive = cv2.SIFT.create(
             count, contrastThreshold=_POOR_CONTRAST_THRESHOLD, enable_precise_upscale=True
@@ -139,11 +128,7 @@ def _detect_features(
     pixels = (np.array([keypoint.pt for keypoint in found]) + CV2_PIXEL_OFFSET_PX) * scale
     shape = np.array([(keypoint.size * scale[0] / 2.0, np.radians(keypoint.angle)) for keypoint in found])
     keypoints = np.column_stack([pixels, shape]).astype(np.float32)
-    is_masked = camera.mask is not None or camera.wearer is not None
-    keep = camera.is_unmasked(keypoints[:, :2], frame) if is_masked else np.ones(len(found), dtype=bool)
-    if camera.wearer is not None and keep.sum() > requested:
-        response = np.where(keep, [keypoint.response for keypoint in found], -np.inf)
-        keep[np.argsort(-response, kind="stable")[requested:]] = False
+    keep = camera.is_unmasked(keypoints[:, :2])
     keypoints = keypoints[keep]
     column = np.clip(keypoints[:, 0].astype(int), 0, width - 1)
     row = np.clip(keypoints[:, 1].astype(int), 0, height - 1)

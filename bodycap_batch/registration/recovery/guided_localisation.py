@@ -203,7 +203,7 @@ class GuidedLocaliser:
         readout_ratio: Readout time as a fraction of the frame interval.
         shutter: The rolling shutter with the rotation of the camera from matches between adjacent frames.
             None: the rotation is unknown, or the shutter is global.
-        is_unmasked: Function from pixels (N,2) and a frame index to a mask (N,) of the pixels at which the
+        is_unmasked: Function from pixels (N,2) to a mask (N,) of the pixels at which the
             room is visible.
     """
 
@@ -213,7 +213,7 @@ class GuidedLocaliser:
     exposure_ratio: float
     readout_ratio: float = 0.0
     shutter: TurningShutter | None = None
-    is_unmasked: Callable[[FloatArray, int], BoolArray]
+    is_unmasked: Callable[[FloatArray], BoolArray]
 
     def localise(
         self,
@@ -331,7 +331,7 @@ class GuidedLocaliser:
         if len(rows) < _MIN_MATCHES:
             return None
         matches = match_patches(self.patches, view, rows, level)
-        matches = matches.select(self.is_unmasked(matches.px, view.frame))
+        matches = matches.select(self.is_unmasked(matches.px))
         return self._solve(view, matches, level) if len(matches.point) >= _MIN_MATCHES else None
 
     def _solve(self, view: PredictedView, matches: PatchMatches, level: SearchLevel) -> PoseEstimate | None:

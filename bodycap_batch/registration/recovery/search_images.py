@@ -144,5 +144,5 @@ def estimate_exposure(camera: CaptureCamera, localiser: GuidedLocaliser, path: T
             matches = match_patches(
                 localiser.patches, replace(view, exposure_ratio=ratio), rows, _EXPOSURE_LEVEL
             )
-            totals[number] += matches.score[localiser.is_unmasked(matches.px, frame)].sum()
+            totals[number] += matches.score[localiser.is_unmasked(matches.px)].sum()
     return _EXPOSURE_CANDIDATES[int(np.argmax(totals))]

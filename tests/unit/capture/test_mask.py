@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,6 @@ from bodycap_batch.capture.masks import read_mask
 from bodycap_batch.config.job import load_job
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.optical_flow import detect_corners
-from bodycap_batch.model.wearer_view import WearerView
 from bodycap_batch.pipeline.inputs import camera_digest
 from bodycap_batch.store.digests import FileDigests
 from tests.videos import textured_frame, write_video
@@ -79,7 +77,7 @@ def test_a_repainted_mask_is_another_input(tmp_path: Path) -> None:
         return camera_digest(capture, capture.cameras[0], FileDigests(tmp_path / "digests"))
 
     capture = open_capture(load_job(tmp_path / "job.yaml").capture)
-    assert capture.cameras[0].is_unmasked(np.array([[10.0, 10.0], [63.9, 47.9]]), 0).all()
+    assert capture.cameras[0].is_unmasked(np.array([[10.0, 10.0], [63.9, 47.9]])).all()
     first = digest("job.yaml")
     assert first != digest("plain.yaml")
     assert first == digest("job.yaml")
@@ -87,29 +85,4 @@ def test_a_repainted_mask_is_another_input(tmp_path: Path) -> None:
     _write(tmp_path / "mask.png", mask)
     assert digest("job.yaml") != first
     capture = open_capture(load_job(tmp_path / "job.yaml").capture)
-    assert capture.cameras[0].is_unmasked(np.array([[10.0, 10.0], [63.9, 47.9]]), 0).tolist() == [False, True]
-
-
-def test_the_wearer_is_masked_in_the_frames_that_show_the_body(tmp_path: Path) -> None:
-    write_video(tmp_path / "torso.mp4", [textured_frame(index) for index in range(2)])
-    (tmp_path / "job.yaml").write_text(
-        "capture: {cameras: [{name: torso, video: torso.mp4}]}\nskeleton: none\n"
-    )
-    (camera,) = open_capture(load_job(tmp_path / "job.yaml").capture).cameras
-    lens = camera.camera
-    # A limb across the left part of the second picture.
-    left = -0.4 * lens.width_px / lens.focal_px
-    ends = np.array([[[[0.0, 0.0, -1.0]] * 2], [[[left, -1.0, 1.0], [left, 1.0, 1.0]]]])
-    view = WearerView(
-        camera="torso",
-        lens=lens,
-        world_from_cam=np.tile(np.eye(4), (2, 1, 1)),
-        ends_in_cam_m=ends,
-        radius_m=np.full((2, 1, 2), 0.05),
-    )
-    camera = replace(camera, wearer=view)
-    px = np.array([[0.1, 0.5], [0.9, 0.5]]) * (lens.width_px, lens.height_px)
-    assert camera.is_unmasked(px, 0).tolist() == [True, True]
-    assert camera.is_unmasked(px, 1).tolist() == [False, True]
-    assert camera.is_unmasked(px, np.array([1, 0])).tolist() == [False, True]
-    assert camera.is_unmasked(px, np.array([0, 1])).tolist() == [True, True]
+    assert capture.cameras[0].is_unmasked(np.array([[10.0, 10.0], [63.9, 47.9]])).tolist() == [False, True]

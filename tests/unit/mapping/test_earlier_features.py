@@ -34,10 +34,13 @@ FRAMES = np.array([0, 2, 3, 5])
 class _Blots:
     """A camera whose pictures are irregular blots; it records which frames are read."""
 
-    name, mask, wearer = "torso", None, None
+    name = "torso"
 
     def __init__(self) -> None:
         self.read_frames: list[int] = []
+
+    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
+        return np.ones(len(px), dtype=bool)
 
     def read(self, frames: np.ndarray, *, colour: bool) -> Any:
         assert colour
@@ -111,18 +114,13 @@ def test_only_pictures_that_the_earlier_map_lacks_are_read(tmp_path: Path) -> No
 
 
 def test_features_are_taken_from_a_map_of_the_same_pictures() -> None:
-    capture: Any = SimpleNamespace(
-        cameras=[SimpleNamespace(name="torso", wearer="mask"), SimpleNamespace(name="palm", wearer=None)]
-    )
+    capture: Any = SimpleNamespace(cameras=[SimpleNamespace(name="torso"), SimpleNamespace(name="palm")])
     scene = SimpleNamespace(readout_s={"palm": 0.02}, readout_sigma_s={"palm": 0.001}, cameras={})
     refined: Any = SimpleNamespace(workspace=Path("refined"), maps=[scene])
-    unmasked: Any = SimpleNamespace(workspace=Path("unmasked"), maps=[scene])
-    nothing = earlier_results(capture, None, None)
+    nothing = earlier_results(capture, None)
     assert (nothing.features, nothing.readouts) == ({}, {})
-    first = earlier_results(capture, None, unmasked)
-    assert (first.features, first.readouts) == ({"palm": Path("unmasked")}, {}), "the torso has another mask"
-    for found in (earlier_results(capture, refined, None), earlier_results(capture, refined, unmasked)):
-        assert found.features == {"torso": Path("refined"), "palm": Path("refined")}
-        assert {name: (each.seconds, each.sigma_s) for name, each in found.readouts.items()} == {
-            "palm": (0.02, 0.001)
-        }
+    found = earlier_results(capture, refined)
+    assert found.features == {"torso": Path("refined"), "palm": Path("refined")}
+    assert {name: (each.seconds, each.sigma_s) for name, each in found.readouts.items()} == {
+        "palm": (0.02, 0.001)
+    }

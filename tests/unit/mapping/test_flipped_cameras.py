@@ -59,14 +59,14 @@ LEFT_OR_TORSO = MapDiagnostics(undecided_groups=((("left",), ("torso",)),))
 class _Pan:
     """A camera that pans along the wall from `start`; its picture may be mirrored or upside down."""
 
-    mask = None
-    wearer = None
-
     def __init__(
         self, name: str, start: int, *, mirrored: bool = False, upside_down: bool = False, count: int = 6
     ) -> None:
         self.frames = np.arange(count)
         self.name, self._start, self._mirrored, self._turned = name, start, mirrored, upside_down
+
+    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
+        return np.ones(len(px), dtype=bool)
 
     def read(self, frames: np.ndarray, *, colour: bool) -> Iterator[tuple[int, np.ndarray]]:
         assert colour

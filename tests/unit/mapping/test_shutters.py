@@ -70,10 +70,12 @@ class _Pan:
     """A camera that pans along the wall."""
 
     mask = None
-    wearer = None
 
     def __init__(self, name: str) -> None:
         self.name = name
+
+    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
+        return np.ones(len(px), dtype=bool)
 
     def read(self, frames: np.ndarray, *, colour: bool) -> Any:
         assert colour

@@ -22,11 +22,9 @@ class _Blobs:
     """A camera with dark blobs at whole pixels; each frame is shifted by one pixel more."""
 
     def __init__(self, hidden_left_px: float = 0.0) -> None:
-        self.mask = object() if hidden_left_px else None
         self._hidden = hidden_left_px
-        self.wearer: object | None = None
 
-    def is_unmasked(self, px: np.ndarray, _frame: int) -> np.ndarray:
+    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
         return px[:, 0] >= self._hidden
 
     def read(self, frames: np.ndarray, *, colour: bool) -> Iterator[tuple[int, np.ndarray]]:
@@ -98,33 +96,3 @@ def test_frames_with_few_features_are_searched_in_full_size(
         assert len(with_second_search.keypoints) > 2 * max(1, len(without.keypoints))
     else:
         assert np.array_equal(with_second_search.keypoints, without.keypoints)
-
-
-class _Noise(_Blobs):
-    """A camera whose picture is smooth noise, so that no two features are equally strong."""
-
-    def __init__(self, hidden_left_px: float) -> None:
-        super().__init__(hidden_left_px)
-        self.mask = None
-        self.wearer = object() if hidden_left_px else None
-
-    def read(self, frames: np.ndarray, *, colour: bool) -> Iterator[tuple[int, np.ndarray]]:
-        assert colour
-        noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3)).astype(np.uint8)
-        for frame in map(int, frames):
-            yield frame, cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 3.0), None, 0, 255, cv2.NORM_MINMAX)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_as_many_features_are_found_beside_the_wearer(tmp_path: Path, threads: int) -> None:
-    def beside(hidden: float) -> SiftFeatures:
-        context = StageContext(work_dir=tmp_path, threads=threads)
-        (item,) = extract_features(cast(CaptureCamera, _Noise(hidden)), np.array([0]), 60, context)
-        return item[1]
-
-    # A keypoint with several directions has as many equally strong features, which all are kept.
-    assert 60 <= len(beside(0.0).keypoints) < 70
-    found = beside(320.0)
-    # Without further detections, only about half of the 60 features would be left.
-    assert len(found.keypoints) == len(found.descriptors) == len(found.rgb) == 60
-    assert found.keypoints[:, 0].min() >= 320.0

@@ -40,7 +40,6 @@ from bodycap_batch.tasks.sound import SoundTask
 from bodycap_batch.tasks.stages import STAGES
 from bodycap_batch.tasks.synth import SynthTask
 from bodycap_batch.tasks.typed_json import from_json, key_inputs, key_options, to_json
-from bodycap_batch.tasks.wearer import WearerTask
 
 
 def tasks(folder: Path) -> dict[str, Any]:
@@ -146,7 +145,6 @@ def tasks(folder: Path) -> dict[str, Any]:
             footage=BoardFootage(capture=capture, keyframes=stored),
         ),
         "fill": FillTask(mode="rest", merge=scene_map),
-        "wearer": WearerTask(map=scene_map, registrations=stored, clocks=scene_map, merge=scene_map),
         "export": ExportTask(
             options=ExportOptions(formats=("bvh", "ply")),
             map=scene_map,
