@@ -13,7 +13,6 @@ from bodycap_batch.model.inertial_camera import InertialCamera
 from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.relative_pose import RelativePose
 from bodycap_batch.model.scene import KeyframeSelection, Map, Trajectory
-from bodycap_batch.overlay import LostFrameViews
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +37,6 @@ class ExportInputs:
             cameras.
         inertial: What the inertial sensor of each camera gives, by camera name. Only cameras with telemetry
             have an entry.
-        lost_views: What the lost frames of each camera see, by camera name. Cameras may be missing.
         log: Diagnostics of mapping as plain JSON values without run times and file paths. They are written to
             ``metrics.json``.
     """
@@ -54,7 +52,6 @@ class ExportInputs:
     row_fraction: Mapping[str, FloatArray] = field(default_factory=dict)
     relative_poses: tuple[RelativePose, ...] = ()
     inertial: Mapping[str, InertialCamera] = field(default_factory=dict)
-    lost_views: Mapping[str, LostFrameViews] = field(default_factory=dict)
     log: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -14,7 +14,7 @@ from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.tum import seconds_text
 from bodycap_batch.model.scene import FrameStatus
 
-COLUMNS = ("camera", "frame", "time", "common_time", "status", "reason", "inliers", "error", "sees")
+COLUMNS = ("camera", "frame", "time", "common_time", "status", "reason", "inliers", "error")
 LOST = "LOST"
 
 
@@ -24,7 +24,7 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
     Times are in seconds. Errors are in pixels at the work size (the image size that all stages work at). The
     column `status` is KEYFRAME, REGISTERED, RIG, INERTIAL or LOST. RIG means that the pose was derived from
     other cameras of the rig, INERTIAL that it was derived from the inertial sensor. For a lost frame, the
-    column `reason` holds the value of `FrameStatus`, and the column `sees` that of `LostView`.
+    column `reason` holds the value of `FrameStatus`.
 
     Args:
         path: Path of the file to write.
@@ -37,8 +37,6 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     for trajectory in trajectories_in_target_frames(inputs):
-        views = inputs.lost_views.get(trajectory.camera)
-        seen = {} if views is None else views.by_frame()
         common = inputs.clocks[trajectory.camera].common_times_ns(trajectory.times_ns)
         for index, status in enumerate(trajectory.status):
             error = trajectory.error_px[index]
@@ -51,7 +49,6 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
                     *_status_and_reason(status),
                     int(trajectory.inliers[index]),
                     f"{error:.3f}" if np.isfinite(error) else "",
-                    seen.get(index, ""),
                 )
             )
     write_text(path, text.getvalue())

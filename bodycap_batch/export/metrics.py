@@ -152,7 +152,7 @@ def _camera_metrics(
         errors: For each map, the (M,) reprojection errors of its observations, pixels at the work size.
     """
     name = trajectory.camera
-    registered, views = trajectory.registered, inputs.lost_views.get(name)
+    registered = trajectory.registered
     own_observations = [
         (
             np.array([camera == name for camera in scene.keyframe_camera], dtype=bool)[scene.obs_keyframe],
@@ -169,7 +169,6 @@ def _camera_metrics(
         "frames_registered": int(registered.sum()),
         "coverage": float(registered.mean()) if len(registered) else 0.0,
         "status": dict(sorted(Counter(status.value for status in trajectory.status).items())),
-        "lost_frames_see": {} if views is None else dict(sorted(Counter(views.view).items())),
         "keyframes_selected": sum(selected) if selected else None,
         "keyframes": sum(scene.keyframe_camera.count(name) for scene in inputs.maps),
         "points": sum(len(np.unique(scene.obs_point[own])) for own, scene in own_observations),

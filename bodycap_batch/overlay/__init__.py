@@ -4,7 +4,6 @@ from bodycap_batch.overlay.bone_motion import BoneMotion, Bones, bones_from_moti
 from bodycap_batch.overlay.bone_projection import BoneLine, project_bones
 from bodycap_batch.overlay.camera_views import CameraView, ObservedPoints, make_camera_views
 from bodycap_batch.overlay.drawing import Colour, RgbImage, draw_overlay
-from bodycap_batch.overlay.lost_frame_views import LostFrameViews, LostView, predict_lost_views
 
 __all__ = [
     "BoneLine",
@@ -12,13 +11,10 @@ __all__ = [
     "Bones",
     "CameraView",
     "Colour",
-    "LostFrameViews",
-    "LostView",
     "ObservedPoints",
     "RgbImage",
     "bones_from_motion",
     "draw_overlay",
     "make_camera_views",
-    "predict_lost_views",
     "project_bones",
 ]

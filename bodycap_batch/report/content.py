@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +10,6 @@ import numpy as np
 from bodycap_batch.model.measured_parts import BODY_PARTS, PartState, part_states
 from bodycap_batch.model.merge_data import MergeResult, filled_joints
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
-from bodycap_batch.overlay import LostView
 from bodycap_batch.report.drawn_scene import DrawnScene, common_times_s
 from bodycap_batch.report.figures.before_after import draw_before_and_after, find_unoptimised_bones
 from bodycap_batch.report.figures.camera_landmark_matrix import draw_camera_landmark_matrix
@@ -137,7 +135,6 @@ def _motion_curves(inputs: ReportInputs, budget: PageBudget) -> str:
 
 _CAUSE_CRITERIA = {
     LossCause.DARK: f"the mean brightness of the lost frame is below {DARK_BRIGHTNESS:.0f} of 255",
-    LossCause.WEARER: "according to the solved body, mostly the wearer is in the picture",
     LossCause.FAST: f"just before or after the lost frames, the camera turned more than {FAST_DEG:.0f}° per "
     "frame",
     LossCause.BLUR: f"the sharpness is below {BLUR_SHARPNESS_RATIO * 100:.0f} % of the sharpness of the "
@@ -183,31 +180,10 @@ def _cameras(
                 "registered": 0 if path is None else int(path.registered.sum()),
                 "losses": len(camera_losses),
                 "notes": () if inputs.capture is None else inputs.capture.camera(name).notes,
-                "sees": _lost_frames_see(inputs, name),
                 "causes": [(cause.value, frames) for cause, frames in causes.get(name, {}).items()],
             }
         )
     return sections
-
-
-_VIEW_WORDS = {
-    LostView.MAP: ("should see a part of the map", "should see a part of the map"),
-    LostView.WEARER: ("sees mostly the wearer", "see mostly the wearer"),
-    LostView.NOTHING: ("sees nothing of the map", "see nothing of the map"),
-    LostView.UNKNOWN: ("has no reliable predicted pose", "have no reliable predicted pose"),
-}
-"""Words for what one lost frame sees, and for what several see."""
-
-
-def _lost_frames_see(inputs: ReportInputs, camera: str) -> list[tuple[int, str]]:
-    """Return the number of lost frames of a camera, and what they see, for each kind that occurs."""
-    views = inputs.lost_views.get(camera)
-    counts = Counter(() if views is None else views.view)
-    return [
-        (counts[view], words[0] if counts[view] == 1 else words[1])
-        for view, words in _VIEW_WORDS.items()
-        if counts[view]
-    ]
 
 
 def _time_span(inputs: ReportInputs) -> tuple[float, float]:
@@ -261,10 +237,6 @@ def _facts(diagnosed: DiagnosedLoss) -> str:
         parts.append(f"turned {diagnosed.loss.turn_deg:.0f}° per frame")
     if diagnosed.appearance is not None:
         parts.append(f"{diagnosed.appearance.corners} corners")
-    if diagnosed.loss.sees is not LostView.UNKNOWN:
-        parts.append(f"{diagnosed.loss.map_points:.0f} map points should be visible")
-    if np.isfinite(diagnosed.loss.body_share):
-        parts.append(f"the body covers {diagnosed.loss.body_share:.0%}")
     return ", ".join(parts)
 
 

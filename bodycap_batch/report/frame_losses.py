@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from bodycap_batch.core.arrays import FloatArray, runs
 from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.scene import FrameStatus, Trajectory
-from bodycap_batch.overlay import LostFrameViews, LostView
 from bodycap_batch.report.drawn_scene import common_times_s
 from bodycap_batch.report.frame_pictures import FrameAppearance
 from bodycap_batch.report.report_inputs import ReportInputs
@@ -40,7 +38,6 @@ class LossCause(StrEnum):
     """The likely cause of a lost interval, derived from measurements."""
 
     DARK = "too dark"
-    WEARER = "the wearer before the camera"
     FAST = "fast turn"
     BLUR = "motion blur"
     PLAIN = "plain surfaces"
@@ -67,9 +64,6 @@ class FrameLoss:
             frames; NaN if unknown.
         turn_deg: Largest rotation between two successive registered frames near the interval, degrees; NaN if
             there are no such frames.
-        sees: What most frames of the interval see, according to their predicted poses.
-        body_share: Median share of the wearer's body in the pictures, 0 to 1; NaN if it is unknown.
-        map_points: Median number of map points that the frames should see.
     """
 
     camera: str
@@ -80,9 +74,6 @@ class FrameLoss:
     reason: FrameStatus
     sharpness: float
     turn_deg: float
-    sees: LostView = LostView.UNKNOWN
-    body_share: float = float("nan")
-    map_points: float = 0.0
 
     @property
     def frame_count(self) -> int:
@@ -127,8 +118,6 @@ def likely_cause(
         return _CAUSES_OF_REASONS[loss.reason]
     if appearance is not None and appearance.is_dark:
         return LossCause.DARK
-    if loss.sees is LostView.WEARER:
-        return LossCause.WEARER
     if loss.turn_deg > FAST_DEG:
         return LossCause.FAST
     if loss.reason is FrameStatus.BLUR:
@@ -166,7 +155,6 @@ def _camera_losses(inputs: ReportInputs, path: Trajectory) -> Iterator[FrameLoss
         )
         adjacent = adjacent[np.isfinite(adjacent)]
         reasons = Counter(path.status[first:stop])
-        seen = _views_between(inputs.lost_views.get(path.camera), first, stop)
         yield FrameLoss(
             camera=path.camera,
             first=first,
@@ -178,20 +166,4 @@ def _camera_losses(inputs: ReportInputs, path: Trajectory) -> Iterator[FrameLoss
             if sharpness is not None and usual_sharpness > 0
             else float("nan"),
             turn_deg=float(adjacent.max()) if len(adjacent) else float("nan"),
-            **seen,
         )
-
-
-def _views_between(views: LostFrameViews | None, first: int, stop: int) -> dict[str, Any]:
-    """Return what the lost frames first <= frame < stop see, as fields of `FrameLoss`."""
-    if views is None:
-        return {}
-    low, high = np.searchsorted(views.frame, [first, stop]).tolist()
-    if low == high:
-        return {}
-    share = views.body_share[low:high]
-    return {
-        "sees": Counter(views.view[low:high]).most_common(1)[0][0],
-        "body_share": float(np.median(share)),
-        "map_points": float(np.median(views.points[low:high])),
-    }

@@ -228,39 +228,12 @@ def _about_losses(inputs: ReportInputs, lost: Mapping[str, Counter[LossCause]]) 
     for cause, frames in all_cameras.most_common():
         if frames < _MIN_LOST_SHARE * total:
             continue
-        if cause is LossCause.WEARER:
-            yield _turn_outwards(inputs, {name: counts[cause] for name, counts in lost.items()}, total)
-            continue
         by_camera = [f"{counts[cause]} of {name}" for name, counts in sorted(lost.items()) if counts[cause]]
         yield Recommendation(
             action=_ACTIONS[cause],
             reason=f"{frames} frames were lost where {_OBSERVATIONS[cause]} ({', '.join(by_camera)})",
             priority=1.0 + frames / total,
         )
-
-
-def _turn_outwards(inputs: ReportInputs, lost: Mapping[str, int], total: int) -> Recommendation:
-    """Recommend to turn the cameras outwards that saw mostly the wearer.
-
-    Args:
-        inputs: The results of the job.
-        lost: Number of lost frames that saw mostly the wearer, by camera name.
-        total: Number of frames of all cameras.
-    """
-    seconds = {}
-    for registration in inputs.registrations:
-        path = registration.trajectory
-        if frames := lost.get(path.camera, 0):
-            seconds[path.camera] = frames * float(np.median(np.diff(path.seconds)))
-    names = " and ".join(sorted(seconds))
-    saw = "; ".join(
-        f"{name} saw mostly the wearer for {length:.1f} s" for name, length in sorted(seconds.items())
-    )
-    return Recommendation(
-        action=f"Turn {names} outwards, away from the wearer's body.",
-        reason=f"{saw}, and those frames were lost",
-        priority=1.0 + sum(lost.values()) / total,
-    )
 
 
 def count_shared_points(maps: tuple[Map, ...], cameras: tuple[str, ...]) -> IntArray:

@@ -11,7 +11,6 @@ from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.scene import KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.model.skeleton import Mount
-from bodycap_batch.overlay import LostFrameViews
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,7 +28,6 @@ class ReportInputs:
         merge: The result of merging: the body in the world; None if there is no body.
         mounts: The mounts that were assumed before the body was solved.
         metrics: The content of ``metrics.json``; None if there are no metrics.
-        lost_views: What the lost frames of each camera see, by camera name. Cameras may be missing.
         capture: The opened videos; None if they cannot be opened.
         failure: The error that stopped the job: ``type``, ``message``, ``hint`` and the error's other fields;
             None if no error stopped the job.
@@ -49,7 +47,6 @@ class ReportInputs:
     merge: MergeResult | None = None
     mounts: tuple[Mount, ...] = ()
     metrics: Mapping[str, Any] | None = None
-    lost_views: Mapping[str, LostFrameViews] = field(default_factory=dict)
     capture: Capture | None = None
     failure: Mapping[str, Any] | None = None
     max_gap_s: float = 1.0

@@ -47,7 +47,6 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
     from bodycap_batch.export import LEFT_OUT, ExportInputs, export_results
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.merge_data import MergeResult
-    from bodycap_batch.overlay.lost_frame_views import predict_lost_views
 
     scene = load_map(task.map.path)
     paths = paths_of(task.registrations.values())
@@ -66,7 +65,6 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
         row_fraction=found.row_fraction,
         inertial=found.inertial,
         relative_poses=found.relative_poses(paths, task.segments),
-        lost_views=predict_lost_views(found.trajectories, scene.maps, found.clocks, merge),
         log={**scene.log, "reach": read_summary(task.clocks.path)["distances"]},
     )
     export_results(inputs, task.options, context)

@@ -74,7 +74,6 @@ def load_inputs(task: ReportTask, threads: int = 0) -> ReportInputs:
     """
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.camera_clock import CaptureClocks, FrameTiming
-    from bodycap_batch.overlay.lost_frame_views import predict_lost_views
     from bodycap_batch.report import ReportInputs
 
     paths = paths_of(task.registrations.values())
@@ -85,22 +84,19 @@ def load_inputs(task: ReportTask, threads: int = 0) -> ReportInputs:
     }
     clocks = CaptureClocks(reference="") if task.clocks is None else load_clocks(task.clocks)
     maps = () if task.map is None else load_map(task.map.path).maps
-    timed, merge = clocks.with_timing(timings), _load_merge(task.merge)
-    trajectories = [found.trajectory for found in registrations]
     return ReportInputs(
         name=task.name,
         cameras=tuple(camera.name for camera in task.capture.config.cameras),
         maps=maps,
         registrations=tuple(registrations),
-        clocks=timed,
+        clocks=clocks.with_timing(timings),
         reference_camera=clocks.reference,
         selections=tuple(load_keyframes(artefact.path) for artefact in task.keyframes.values()),
-        merge=merge,
+        merge=_load_merge(task.merge),
         mounts=() if task.body is None else load_body(task.body)[1],
         metrics=None
         if task.export is None
         else json.loads((task.export.path / RESULTS_FOLDER / "metrics.json").read_text(encoding="utf-8")),
-        lost_views=predict_lost_views(trajectories, maps, timed, merge),
         capture=_open_capture(task, clocks, threads),
         failure=task.failure,
         max_gap_s=task.max_gap_s,

@@ -21,7 +21,6 @@ from bodycap_batch.model.geometry import interpolate_pose
 from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Trajectory
-from bodycap_batch.overlay import LostFrameViews, LostView
 from bodycap_batch.pipeline.stage_results import StageResults, report_task
 from bodycap_batch.report import ReportInputs
 from bodycap_batch.report.content import _CAUSE_CRITERIA
@@ -45,7 +44,7 @@ from bodycap_batch.report.verdict import judge
 from bodycap_batch.report.viewer_data import make_viewer_data
 from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.report import load_inputs
-from tests.reports import report_inputs, written
+from tests.reports import written
 from tests.videos import textured_frame, write_video
 
 
@@ -682,49 +681,6 @@ def test_recommendations_follow_from_measurements(inputs: ReportInputs) -> None:
         for each in recommend_changes(inputs, {"torso": Counter({LossCause.PLAIN: 1})})
     )
     assert any("skeleton" in each.how for each in recommendations)
-
-
-def _seeing(inputs: ReportInputs, camera: str, view: LostView) -> ReportInputs:
-    """Return the results with the view of each lost frame of one camera."""
-    path = inputs.path(camera)
-    assert path is not None
-    lost = np.flatnonzero(~path.localised)
-    views = LostFrameViews(
-        camera=camera,
-        frame=lost,
-        view=(view,) * len(lost),
-        points=np.full(len(lost), 120),
-        body_share=np.full(len(lost), 0.9 if view is LostView.WEARER else 0.1),
-    )
-    return replace(inputs, lost_views={camera: views})
-
-
-def test_a_camera_that_saw_the_wearer_gets_the_advice_to_turn_it_outwards(tmp_path: Path) -> None:
-    inputs = report_inputs(lost=slice(20, 50))
-    seeing = _seeing(inputs, "left_palm", LostView.WEARER)
-    losses = {loss.camera: loss for loss in find_frame_losses(seeing)}
-    assert likely_cause(losses["left_palm"], None, None) is LossCause.WEARER
-    assert likely_cause(losses["torso"], None, None) is not LossCause.WEARER
-    broken = replace(losses["left_palm"], reason=FrameStatus.DAMAGED)
-    assert likely_cause(broken, None, None) is LossCause.DAMAGED
-    first = recommend_changes(seeing, {"left_palm": Counter({LossCause.WEARER: 30})})[0]
-    assert first.action == "Turn left_palm outwards, away from the wearer's body."
-    assert "left_palm saw mostly the wearer for 1.0 s" in first.reason
-    page = written(seeing, tmp_path)
-    assert "30 lost frames see mostly the wearer" in page
-    assert first.action.replace("'", "&#39;") in page
-
-
-def test_lost_frames_that_see_the_map_are_separated_from_those_that_see_nothing(tmp_path: Path) -> None:
-    inputs = report_inputs(lost=slice(20, 50))
-    for view, words in (
-        (LostView.MAP, "30 lost frames should see a part of the map"),
-        (LostView.NOTHING, "30 lost frames see nothing of the map"),
-        (LostView.UNKNOWN, "30 lost frames have no reliable predicted pose"),
-    ):
-        assert words in written(_seeing(inputs, "torso", view), tmp_path)
-    single = _seeing(report_inputs(lost=slice(20, 21)), "torso", LostView.NOTHING)
-    assert "1 lost frame sees nothing of the map" in written(single, tmp_path)
 
 
 @pytest.mark.parametrize(
