@@ -260,10 +260,6 @@ class TelemetryOptions(Options):
         True,
         description="the inertial sensors give the clocks of cameras whose sound does not",
     )
-    search: bool = Field(
-        True,
-        description="lost frames are searched again near the poses that the inertial sensor gives",
-    )
     smoothing: bool = Field(
         True,
         description="the poses of the pictures are solved again together with the inertial samples, and "

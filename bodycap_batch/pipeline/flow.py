@@ -591,8 +591,6 @@ class Flow:
             if not LEAST_POSED <= summary["localised"] <= summary["frames"] - LEAST_LOST:
                 continue
             task = self._group_task(own, self._capture.cameras, scene_map, registrations, keyframes)
-            if self._job.telemetry.search and own.name in self._with_telemetry:
-                task = replace(task, with_sensor=True, samples=self._samples)
             yield make_task(RECOVER, task, camera=own.name, threads=min(self._threads, _MAX_RECOVERY_THREADS))
 
     def _group_task(

@@ -4,7 +4,6 @@ from bodycap_batch.registration.poses.contradicted import withdraw_contradicted_
 from bodycap_batch.registration.poses.rig_members import RegisteredCamera
 from bodycap_batch.registration.poses.turning_tracks import with_rotation
 from bodycap_batch.registration.recovery.recover import RecoveryInputs, recover_lost_frames
-from bodycap_batch.registration.recovery.sensor_search import search_near_sensor
 from bodycap_batch.registration.stage import register_frames, register_in_rig
 
 __all__ = [
@@ -13,7 +12,6 @@ __all__ = [
     "recover_lost_frames",
     "register_frames",
     "register_in_rig",
-    "search_near_sensor",
     "with_rotation",
     "withdraw_contradicted_poses",
 ]

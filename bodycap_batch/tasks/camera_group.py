@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from bodycap_batch.config.options import RegistrationOptions
-from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, FileRef
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.registration import NOT_ROUNDS
 
 
@@ -23,9 +23,6 @@ class CameraGroupTask:
         registrations: The registration of each camera, by camera name, in the order of `cameras`.
         offsets_s: Stated clock offset of each camera that shares a trigger, seconds, by camera name. Empty if
             the cameras share no trigger.
-        with_sensor: True to search the lost frames of the first camera near the poses of its inertial sensor.
-        samples: The files with inertial samples beside the videos, by camera name. A camera without a file
-            has its samples in the video, or none. Empty if they are not used.
     """
 
     options: RegistrationOptions = field(metadata=NOT_ROUNDS)
@@ -35,5 +32,3 @@ class CameraGroupTask:
     map: ArtefactRef
     registrations: Mapping[str, ArtefactRef]
     offsets_s: Mapping[str, float]
-    with_sensor: bool = False
-    samples: Mapping[str, FileRef] = field(default_factory=dict)

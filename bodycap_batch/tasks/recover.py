@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.inputs import paths_of
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import RIG_POSES
 from bodycap_batch.tasks.registration import save_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
-
-if TYPE_CHECKING:
-    from bodycap_batch.capture import CaptureCamera
-    from bodycap_batch.config.models import CameraConfig
-    from bodycap_batch.telemetry.streams import CameraTelemetry
 
 _MEMORY_MB = 900
 """Memory to reserve (MB) for a recovery task. Recovery holds a limited number of keyframes and frames in
@@ -31,7 +24,6 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
     from bodycap_batch.registration import (
         RecoveryInputs,
         recover_lost_frames,
-        search_near_sensor,
         with_rotation,
     )
 
@@ -54,29 +46,9 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
         misplaced=scene.diagnostics.misplaced.get(task.cameras[0], ()),
     )
     registration = recover_lost_frames(load_registration(paths[0]), inputs, task.options, context)
-    if task.with_sensor:
-        configs = task.capture.config.cameras
-        telemetry = _telemetry(capture.cameras[0], configs[0])
-        others = (
-            (load_registration(path).trajectory, _telemetry(camera, config))
-            for camera, config, path in zip(capture.cameras[1:], configs[1:], paths[1:], strict=True)
-        )
-        registration = search_near_sensor(registration, inputs, telemetry, task.options, context, others)
     save_registration(registration, capture.cameras[0], files, rolling=read_summary(paths[0])["rolling"])
     if in_rig:
         write_dataclass(read_dataclass(RigPoses, paths[0], RIG_POSES), files, RIG_POSES)
-
-
-def _telemetry(camera: CaptureCamera, config: CameraConfig) -> CameraTelemetry:
-    """Return the telemetry of a camera; without samples if they cannot be read."""
-    from bodycap_batch.telemetry import read_telemetry
-    from bodycap_batch.telemetry.comparison import all_times_ns
-    from bodycap_batch.telemetry.streams import CameraTelemetry
-
-    try:
-        return read_telemetry(camera.videos, all_times_ns(camera, config), config.samples)
-    except CaptureError:  # the stage that uses the sensors reports it
-        return CameraTelemetry()
 
 
 RECOVER = Stage(

@@ -343,7 +343,7 @@ def test_a_round_that_withdraws_wrong_poses_loses_no_frames(
 @pytest.mark.parametrize("name", ["torso.imu.csv", "torso.gcsv"])
 def test_sensors_are_used_where_there_are_samples(bench: Bench, name: str) -> None:
     (bench.folder / name).write_text("samples")
-    after = {"telemetry": {"tracking": False, "search": False}}
+    after = {"telemetry": {"tracking": False}}
     assert set(bench.executed(**after)) == {*ALL, "inertial torso"}
     used = json.loads((bench.out / "result.ply").read_text())["registrations"]
     assert {camera: json.loads(content)[0] for camera, content in used.items()} == {
@@ -366,7 +366,7 @@ def test_sensors_are_used_where_the_video_has_telemetry(bench: Bench) -> None:
 
 def test_the_sensors_of_all_cameras_help_each_other(bench: Bench) -> None:
     bench.order(telemetry=["torso", "left_palm"])
-    after = {"telemetry": {"tracking": False, "search": False, "blur": False}}
+    after = {"telemetry": {"tracking": False, "blur": False}}
     assert {"inertial torso", "inertial left_palm"} <= set(bench.executed(**after))
     (bench.folder / "torso.imu.csv").write_text("samples")
     assert {"inertial torso", "inertial left_palm"} <= set(bench.executed(**after))
@@ -398,7 +398,7 @@ def test_telemetry_that_is_switched_off_changes_nothing(bench: Bench) -> None:
     assert (
         bench.executed(
             telemetry=dict.fromkeys(
-                ("gravity", "blur", "tracking", "gps", "search", "smoothing", "gaps", "clocks"), False
+                ("gravity", "blur", "tracking", "gps", "smoothing", "gaps", "clocks"), False
             )
         )
         == []
