@@ -47,9 +47,6 @@ after the longer time is kept. Unit: 1. Evidence: none."""
 _MIN_RELATIVE_SURVIVAL = 0.5
 """Minimum ratio of a candidate's track survival to the oldest candidate's track survival. A candidate with a
 smaller ratio is not selected as keyframe. Evidence: none."""
-_SHARP_BLUR_PX = 1.5
-"""Predicted blur, px of an image with a long side of 640 px, up to which the measured sharpness alone counts.
-Evidence: none."""
 _NOISE_SAMPLES = 20_000
 """Approximate number of samples from which the tracking noise is estimated. Each sample is one corner tracked
 forward and backward. More samples do not change the estimate."""
@@ -70,7 +67,6 @@ class _Candidate:
         sharpness: Sharpness of the frame, arbitrary unit.
         survival: Fraction of the last keyframe's corners that are still tracked in the frame.
         shot: The frame as it was read from the video.
-        blur_px: Predicted motion blur, pixels of an image with a long side of 640 px; NaN if it is unknown.
     """
 
     index: int
@@ -78,12 +74,6 @@ class _Candidate:
     sharpness: float
     survival: float
     shot: FrameCandidate
-    blur_px: float = float("nan")
-
-    def quality(self) -> tuple[float, float]:
-        """Return the order of candidates: the least blur first, then the greatest sharpness."""
-        blur_px = self.blur_px if np.isfinite(self.blur_px) else 0.0
-        return -max(blur_px, _SHARP_BLUR_PX), self.sharpness
 
 
 @dataclass(slots=True)
@@ -218,7 +208,6 @@ def select_keyframes(
     keeper: FrameKeeper | None = None,
     *,
     with_matches: bool = False,
-    blur_px: FloatArray | None = None,
 ) -> KeyframeSelection:
     """Select the keyframes of one camera: the frames from which the map is built.
 
@@ -234,9 +223,6 @@ def select_keyframes(
         keeper: Writes copies of frames. Every frame and every keyframe are passed to the keeper. None: no
             copies are written.
         with_matches: True to match adjacent frames also if the camera has a global shutter.
-        blur_px: (N,) predicted motion blur of each frame, pixels of an image with a long side of 640 px; NaN
-            where it is unknown. If a keyframe is due, the frame with the least blur is selected. None: it is
-            unknown for all frames.
 
     Returns:
         The frame indices of the keyframes, the sharpness of every frame, the tracking noise and the damaged
@@ -260,7 +246,6 @@ def select_keyframes(
     tracker = _KeyframeTracker(camera.camera, _coarse_mask(camera))
     matcher = _frame_matcher(camera, tracker.mask, with_matches=with_matches)
     recent: deque[_Candidate] = deque(maxlen=options.window)
-    blur_of = _unknown_blur if blur_px is None else blur_px.__getitem__
     see, keep = (_ignore, _ignore) if keeper is None else (keeper.add_frame, keeper.add_keyframe)
     is_damaged = np.ones(count, dtype=bool)
     for shot in camera.frame_candidates():
@@ -277,7 +262,7 @@ def select_keyframes(
             tracker.restart(image)
         else:
             change_px[index], shift_px[index] = tracker.change_px, tracker.shift_px
-            recent.append(_Candidate(index, image, sharp[index], tracker.survival(), shot, blur_of(index)))
+            recent.append(_Candidate(index, image, sharp[index], tracker.survival(), shot))
             gap_s = times_s[index] - times_s[selected[-1]]
             if _is_due(tracker, gap_s, limit_px, options):
                 change = max(1.0 - tracker.survival(), tracker.parallax_px() / limit_px)
@@ -314,7 +299,6 @@ def select_keyframes(
         frozen=frozen,
         motion_px=tracker.motion_px(),
         matches=matcher.matches(),
-        blur_px=np.zeros(0) if blur_px is None else blur_px,
     ).only(find_pictures(change_px, shift_px, camera.times_ns))
 
 
@@ -405,11 +389,6 @@ def _median_distance(before: Pixels, after: Pixels) -> float:
     return float(np.median(np.linalg.norm(after - before, axis=1)))
 
 
-def _unknown_blur(_: int) -> float:
-    """Return the blur of a frame without telemetry."""
-    return float("nan")
-
-
 def _ignore(_: FrameCandidate) -> None:
     """Do nothing."""
 
@@ -422,7 +401,7 @@ def _restart_at_sharpest(recent: deque[_Candidate], tracker: _KeyframeTracker) -
         tracker: Tracker that is restarted at the returned candidate, then advanced to the newest frame.
     """
     usable = [frame for frame in recent if frame.survival >= _MIN_RELATIVE_SURVIVAL * recent[0].survival]
-    best = max(usable, key=_Candidate.quality)
+    best = max(usable, key=lambda frame: frame.sharpness)
     tracker.restart(best.image)
     while recent and recent[0].index <= best.index:
         recent.popleft()

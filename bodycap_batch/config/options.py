@@ -245,10 +245,6 @@ class TelemetryOptions(Options):
     """Uses of the inertial sensors of the cameras. Without telemetry, these options have no effect."""
 
     gravity: bool = Field(True, description="the accelerometers determine the vertical of the world")
-    blur: bool = Field(
-        True,
-        description="exposure times and gyroscopes predict the motion blur, and keyframes are selected by it",
-    )
     tracking: bool = Field(
         True,
         description="the gyroscopes measure how the cameras turn from frame to frame and from row to row",

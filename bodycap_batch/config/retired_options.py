@@ -11,7 +11,7 @@ from bodycap_batch.config.yaml_source import YamlSource
 
 RETIRED_OPTIONS = {
     "registration": ("wearer_mask",),
-    "telemetry": ("search",),
+    "telemetry": ("search", "blur"),
 }
 """Names of the options that have no effect any more, by the name of their block."""
 

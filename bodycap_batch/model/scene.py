@@ -74,11 +74,6 @@ class FrameStatus(StrEnum):
         )
 
 
-MUCH_BLUR_PX = 12.0
-"""Predicted motion blur, px of an image with a long side of 640 px, above which a frame is called blurred:
-half the window of the tracker. Evidence: none."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeyframeSelection:
     """The keyframes that were selected from one camera's video.
@@ -97,8 +92,6 @@ class KeyframeSelection:
             side of 640 px. It is infinity if it is unknown.
         matches: Matches between adjacent frames; None if the camera is known to have a global shutter and
             no telemetry is used.
-        blur_px: (N,) predicted motion blur of each frame, pixels of an image with a long side of 640 px; NaN
-            where it is unknown. An empty array means that no blur is known.
         gyro: Angular velocities that the gyroscope of the camera measured; None if it cannot be used.
         pictures: The frames that are no copies of the frame before; None if the video has no copies. Then all
             indices in this selection count these frames only.
@@ -114,7 +107,6 @@ class KeyframeSelection:
     motion_px: float = float("inf")
     matches: FrameMatches | None = None
     gyro: GyroRates | None = None
-    blur_px: FloatArray = field(default_factory=lambda: np.zeros(0))
     pictures: Pictures | None = None
 
     def __post_init__(self) -> None:
@@ -124,9 +116,6 @@ class KeyframeSelection:
         if len(self.frozen) == 0:
             object.__setattr__(self, "frozen", np.zeros(self.frame_count, dtype=bool))
         set_array(self, "frozen", (self.frame_count,), np.bool_)
-        if len(self.blur_px) == 0:
-            object.__setattr__(self, "blur_px", np.full(self.frame_count, np.nan))
-        set_array(self, "blur_px", (self.frame_count,), finite=False)
         if len(self.frames) and (
             self.frames[0] < 0 or self.frames[-1] >= self.frame_count or (np.diff(self.frames) <= 0).any()
         ):
@@ -156,7 +145,6 @@ class KeyframeSelection:
             damaged=index[self.damaged[kept[self.damaged]]],
             frozen=self.frozen[kept],
             matches=matches,
-            blur_px=self.blur_px[kept],
             pictures=pictures,
         )
 

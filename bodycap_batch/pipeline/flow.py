@@ -88,7 +88,6 @@ class Flow:
         self._map_round = 0
         self._with_telemetry = frozenset[str]()
         self._with_gyro = frozenset[str]()
-        self._with_blur = frozenset[str]()
         self._samples: Mapping[str, FileRef] = {}
 
     def __enter__(self) -> Flow:
@@ -121,8 +120,6 @@ class Flow:
         self._with_telemetry = frozenset(summary.get("telemetry", ())) | self._samples.keys()
         if self._job.telemetry.tracking:
             self._with_gyro = self._with_telemetry
-        if self._job.telemetry.blur:
-            self._with_blur = frozenset(summary.get("telemetry", ()))
         self.runner.report_notes(artefact, "check")
         if len(self._capture.cameras) > 1:
             self._sound = self._start_sound()
@@ -142,12 +139,7 @@ class Flow:
                     options=self._job.keyframes,
                     capture=capture_ref(capture, self._cameras, [camera]),
                     with_gyro=camera.name in self._with_gyro,
-                    with_blur=camera.name in self._with_blur,
-                    samples=(
-                        self._samples.get(camera.name)
-                        if camera.name in self._with_gyro | self._with_blur
-                        else None
-                    ),
+                    samples=self._samples.get(camera.name) if camera.name in self._with_gyro else None,
                 ),
                 camera=camera.name,
                 threads=threads,

@@ -14,11 +14,7 @@ from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, w
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import CaptureCamera
-    from bodycap_batch.model.scene import KeyframeSelection
     from bodycap_batch.telemetry.streams import CameraTelemetry
-
-_MANY_BLURRED = 0.2
-"""Minimum share of blurred frames for a note to the user. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,7 +25,6 @@ class KeyframesTask:
         options: The stage's options.
         capture: The video of the camera.
         with_gyro: True to use the gyroscope of the camera for its rotation.
-        with_blur: True to predict the motion blur from the exposure times and the gyroscope.
         samples: The file with inertial samples beside the video; None if the samples are in the video, or if
             they are not used.
     """
@@ -37,40 +32,27 @@ class KeyframesTask:
     options: KeyframeOptions
     capture: CaptureRef
     with_gyro: bool = False
-    with_blur: bool = False
     samples: FileRef | None = None
 
 
 def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> None:
     """Select the keyframes; store them with copies of decoded frames and notes for the user."""
-    import numpy as np
-
     from bodycap_batch.capture.damage import damage_notes
     from bodycap_batch.capture.kept import KEPT_NAME, FrameKeeper
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.keyframes import select_keyframes
     from bodycap_batch.model.copied_frames import copied_notes
     from bodycap_batch.model.frozen_frames import frozen_notes
-    from bodycap_batch.model.optical_flow import pixel_scale
-    from bodycap_batch.telemetry.blur import predicted_blur_px
     from bodycap_batch.telemetry.camera_rates import relate_gyro
 
     camera = load_capture(task.capture, threads=context.threads).cameras[0]
     size = camera.camera
     telemetry, telemetry_notes = _telemetry(camera, task)
-    blur_px = None
-    if telemetry is not None and task.with_blur:
-        seconds = np.asarray(camera.times_ns * 1e-9, dtype=np.float64)
-        blur_px = predicted_blur_px(seconds, size, telemetry)
-    if blur_px is not None:
-        blur_px = blur_px / pixel_scale(size.width_px, size.height_px)
     with FrameKeeper(files, size.width_px, size.height_px, camera.should_keep_all) as keeper:
-        selection = select_keyframes(
-            camera, task.options, context, keeper, with_matches=task.with_gyro, blur_px=blur_px
-        )
+        selection = select_keyframes(camera, task.options, context, keeper, with_matches=task.with_gyro)
     copies = copied_notes(camera.times_ns, selection.pictures)
     camera = camera.only(selection.pictures)
-    if telemetry is not None and task.with_gyro:
+    if telemetry is not None:
         assert selection.matches is not None
         selection = replace(selection, gyro=relate_gyro(camera, selection.matches, telemetry).rates)
     if (kept := keeper.kept_frames()) is not None:
@@ -78,7 +60,7 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     write_dataclass(selection, files, "keyframes")
     notes = [f"{camera.name}: {note}" for note in [*copies, *damage_notes(camera, selection.damaged)]]
     notes += frozen_notes(camera.name, selection.frozen, camera.common_times_ns() / 1e9)
-    notes += [*telemetry_notes, *_blur_notes(camera.name, selection)]
+    notes += telemetry_notes
     write_summary(files, frames=selection.frame_count, keyframes=len(selection.frames), notes=notes)
 
 
@@ -88,28 +70,13 @@ def _telemetry(camera: CaptureCamera, task: KeyframesTask) -> tuple[CameraTeleme
     from bodycap_batch.telemetry import read_telemetry
     from bodycap_batch.telemetry.comparison import all_times_ns
 
-    if not (task.with_gyro or task.with_blur):
+    if not task.with_gyro:
         return None, []
     try:
         config = task.capture.config.cameras[0]
         return read_telemetry(camera.videos, all_times_ns(camera, config), config.samples), []
     except CaptureError as error:
         return None, [f"{camera.name}: {error.one_line}; its samples are not used"]
-
-
-def _blur_notes(camera: str, selection: KeyframeSelection) -> list[str]:
-    """Return a note if the motion blurs many frames of a camera."""
-    import numpy as np
-
-    from bodycap_batch.model.scene import MUCH_BLUR_PX
-
-    blurred = float(np.mean(selection.blur_px > MUCH_BLUR_PX))
-    if blurred < _MANY_BLURRED:
-        return []
-    return [
-        f"{camera}: in {100 * blurred:.0f} % of the frames, the camera turns so fast that the exposure time "
-        f"blurs them by more than {MUCH_BLUR_PX:.0f} px (of 640); use a shorter exposure time"
-    ]
 
 
 KEYFRAMES = Stage(

@@ -130,11 +130,3 @@ class CameraTelemetry:
     def accelerometer(self) -> Stream | None:
         """Specific force (N,3), m/s²; None if there is none."""
         return self.streams.get(ACCELEROMETER)
-
-    @property
-    def exposure(self) -> Stream | None:
-        """Exposure time (N,1) of the frames, seconds; None if there is none.
-
-        The number of samples may differ from that of the frames by one: samples belong to the nearest frame.
-        """
-        return self.streams.get(EXPOSURE)

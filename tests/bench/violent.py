@@ -32,13 +32,13 @@ from bodycap_batch.synthetic.imu_options import ImuOptions
 from tests.bench import ours
 from tests.bench.rows import Row
 
-USES = ("gravity", "blur", "tracking", "gps", "smoothing", "gaps")
+USES = ("gravity", "tracking", "gps", "smoothing", "gaps")
 PLAIN = "without"
 """Name of the job without any use of the telemetry."""
 JOBS = {
     PLAIN: (),
-    "tracking": ("gravity", "blur", "tracking", "gps"),
-    "smoothing": ("gravity", "blur", "tracking", "gps", "smoothing"),
+    "tracking": ("gravity", "tracking", "gps"),
+    "smoothing": ("gravity", "tracking", "gps", "smoothing"),
     "with": USES,
 }
 """Uses of the telemetry by name of the job; the middle ones run with ``--separate``."""

@@ -366,7 +366,7 @@ def test_sensors_are_used_where_the_video_has_telemetry(bench: Bench) -> None:
 
 def test_the_sensors_of_all_cameras_help_each_other(bench: Bench) -> None:
     bench.order(telemetry=["torso", "left_palm"])
-    after = {"telemetry": {"tracking": False, "blur": False}}
+    after = {"telemetry": {"tracking": False}}
     assert {"inertial torso", "inertial left_palm"} <= set(bench.executed(**after))
     (bench.folder / "torso.imu.csv").write_text("samples")
     assert {"inertial torso", "inertial left_palm"} <= set(bench.executed(**after))
@@ -397,9 +397,7 @@ def test_telemetry_that_is_switched_off_changes_nothing(bench: Bench) -> None:
     (bench.folder / "torso.imu.csv").write_text("samples")
     assert (
         bench.executed(
-            telemetry=dict.fromkeys(
-                ("gravity", "blur", "tracking", "gps", "smoothing", "gaps", "clocks"), False
-            )
+            telemetry=dict.fromkeys(("gravity", "tracking", "gps", "smoothing", "gaps", "clocks"), False)
         )
         == []
     )

@@ -13,7 +13,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.geometry import interpolate_pose, invert
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.rotation_path import RotationPath
-from bodycap_batch.model.scene import MUCH_BLUR_PX, FrameStatus, KeyframeSelection, Map, Trajectory
+from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Trajectory
 from bodycap_batch.registration.poses.batched_pnp import find_inliers
 from bodycap_batch.registration.poses.observations import PointReliability, RigMember, RigObservations
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, FramePose, solve_poses
@@ -244,7 +244,7 @@ def _frame_statuses(poses: Sequence[FramePose], selection: KeyframeSelection) ->
     """Return the status of each frame.
 
     The status is DAMAGED if a frame without a pose is damaged, and FROZEN if it is frozen. It is BLUR if a
-    frame has too few tracks, and is much less sharp than the frames around it or has a large predicted blur.
+    frame has too few tracks, and is much less sharp than the frames around it.
     """
     statuses, sharpness = [], selection.sharpness
     damaged = frozenset(selection.damaged.tolist())
@@ -256,8 +256,7 @@ def _frame_statuses(poses: Sequence[FramePose], selection: KeyframeSelection) ->
             status = FrameStatus.FROZEN
         elif status is FrameStatus.FEW_TRACKS:
             nearby = sharpness[max(0, index - _BLUR_WINDOW_FRAMES) : index + _BLUR_WINDOW_FRAMES + 1]
-            is_blurred = sharpness[index] < BLUR_SHARPNESS_RATIO * np.median(nearby)
-            if is_blurred or selection.blur_px[index] > MUCH_BLUR_PX:
+            if sharpness[index] < BLUR_SHARPNESS_RATIO * np.median(nearby):
                 status = FrameStatus.BLUR
         statuses.append(status)
     return statuses

@@ -12,6 +12,7 @@ from bodycap_batch.capture.timeline import join_chapters
 from bodycap_batch.formats.gpmf import Damage, gopro_model, read_items
 from bodycap_batch.telemetry import read_telemetry
 from bodycap_batch.telemetry.gopro import gopro_telemetry, has_telemetry_track, read_gpmf_payloads
+from bodycap_batch.telemetry.streams import EXPOSURE
 from tests.gpmf import Sensor, header, item, nested, payloads, raw, with_wide_offsets, write_gopro
 from tests.videos import textured_frame
 
@@ -113,7 +114,7 @@ def test_a_lost_payload_is_a_gap_and_moves_no_later_sample():
 def test_a_lost_payload_of_a_stream_without_counters_is_a_gap():
     exposure = nested("STRM", item("SHUT", "f", [0.001] * 30))
     track = payloads(Sensor(), 12, extra=[exposure])
-    stream = _read(track[:5] + track[6:]).exposure
+    stream = _read(track[:5] + track[6:]).streams[EXPOSURE]
     assert stream.rate_hz == pytest.approx(FPS, rel=1e-6)
     assert stream.gaps_s[0] == pytest.approx((5.005 - 1 / FPS, 6.006), abs=1e-6)
 
