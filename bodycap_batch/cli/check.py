@@ -49,7 +49,7 @@ def check(  # noqa: PLR0913, PLR0917 - the flags a user types
     report = check_path(find_job(job).file, make_overrides(out, skeleton, height, camera, activity, places))
     if report.ready and report.job is not None:
         capture = report.job.capture
-        clocks = describe_clocks(capture, sensors=report.job.telemetry.clocks)
+        clocks = describe_clocks(capture)
         notes = (*report.notes, *clocks, *telemetry_notes(capture))
         report = replace(report, notes=notes)
     if as_json:

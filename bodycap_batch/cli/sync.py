@@ -28,12 +28,11 @@ def sync(
         typer.Option(metavar="FILE.svg", help="Draw the correlations and the offsets along time."),
     ] = None,
 ) -> None:
-    """Find the clock offsets of the cameras from sound or sensors.
+    """Find the clock offsets of the cameras from their sound.
 
     Prints the offset and the drift of each camera's clock relative to the torso's camera, and the lines for
-    the job file. Inertial sensors are used where the sound does not decide. Where neither decides, the clocks
-    of the last run of the job are shown; the run estimates them from the motion. Nothing in the job is
-    changed.
+    the job file. Where the sound does not decide, the clocks of the last run of the job are shown; the run
+    estimates them from the motion. Nothing in the job is changed.
 
     \b
     Example:
@@ -53,9 +52,7 @@ def sync(
             path=job,
             hint="give a folder or a job with the videos of all cameras",
         )
-    estimates = with_clocks_of_run(
-        estimate_clocks(capture, sensors=loaded.telemetry.clocks), results_folder(loaded)
-    )
+    estimates = with_clocks_of_run(estimate_clocks(capture), results_folder(loaded))
     if picture is not None:
         write_text(picture, draw_clocks(estimates))
     _require_clocks(estimates, job)
@@ -70,7 +67,7 @@ def with_clocks_of_run(estimates: ClockEstimates, results: Path) -> ClockEstimat
     """Return the clocks, completed by those that the last run of the job estimated from the motion.
 
     Args:
-        estimates: The clocks that were estimated from sound and sensors.
+        estimates: The clocks that were estimated from the sound.
         results: Folder of the results of the job. It may be missing.
     """
     try:
@@ -135,7 +132,7 @@ def _figures(clock: ClockEstimate) -> str:
 
 
 def _require_clocks(estimates: ClockEstimates, job: Path) -> None:
-    """Raise an error if neither sound nor sensors give the clock of a camera."""
+    """Raise an error if the sound gives the clock of no camera."""
     from bodycap_batch.core.errors import EstimationError
     from bodycap_batch.model.camera_clock import ESTIMATED_SOURCES
 
@@ -144,7 +141,7 @@ def _require_clocks(estimates: ClockEstimates, job: Path) -> None:
         return
     reasons = "; ".join(f"{clock.camera}: {', '.join(clock.reasons)}" for clock in others)
     raise EstimationError(
-        f"neither sound nor inertial sensors of any camera agree with {estimates.reference} ({reasons})",
+        f"the sound of no camera agrees with that of {estimates.reference} ({reasons})",
         path=job,
         hint="check that all videos are of the same recording and have sound; otherwise clap once in view of "
         "all cameras and state offset_s",

@@ -67,22 +67,21 @@ def clock_notes(clocks: CaptureClocks) -> list[str]:
     ]
 
 
-def describe_clocks(spec: CaptureConfig, threads: int | None = None, *, sensors: bool = True) -> list[str]:
+def describe_clocks(spec: CaptureConfig, threads: int | None = None) -> list[str]:
     """Return a sentence for the user about the clock of each camera.
 
-    The clocks are those that are stated, or that the sound or the inertial sensors determine.
+    The clocks are those that are stated, or that the sound determines.
 
     Args:
         spec: The capture block of a job, as returned by `load_job`.
         threads: Number of cameras or pairs that are worked on at the same time; None for all processors.
-        sensors: Whether the inertial sensors are used.
 
     Raises:
         CaptureError: A video or its timestamps cannot be used.
     """
     if len(spec.cameras) < 2:
         return []
-    estimates = estimate_clocks(spec, threads, sensors=sensors)
+    estimates = estimate_clocks(spec, threads)
     clocks = decide_clocks(spec, estimates)
     base_s = clocks.cameras[clocks.reference].offset_s
     lines = []
@@ -93,7 +92,7 @@ def describe_clocks(spec: CaptureConfig, threads: int | None = None, *, sensors:
         elif not clock.is_known:
             reasons = "; ".join(estimates.camera(name).reasons)
             text = (
-                f"{name}: neither sound nor sensors give the clock offset ({reasons}); the run estimates "
+                f"{name}: the sound does not give the clock offset ({reasons}); the run estimates "
                 "the offset from the motion"
             )
         lines.append("; ".join([text, *(clock.notes if clock.is_known else ())]))
@@ -159,7 +158,7 @@ def _clock_of(
 
 def _estimated_clock(estimate: ClockEstimate, base_s: float) -> ClockRelation:
     if estimate.source not in ESTIMATED_SOURCES or estimate.offset_s is None:
-        why = "; ".join(estimate.reasons) or "neither sound nor sensors nor the motion determine it"
+        why = "; ".join(estimate.reasons) or "neither the sound nor the motion determines it"
         return ClockRelation(
             drift_sigma_ppm=CRYSTAL_SIGMA_PPM,
             source="none",

@@ -1,9 +1,9 @@
-"""Estimate the clocks of all cameras of a capture from their sound and their inertial sensors."""
+"""Estimate the clocks of all cameras of a capture from their sound."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from bodycap_batch.capture.frame_index import index_videos
 from bodycap_batch.capture.timeline import join_chapters
-from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM, ClockPair
+from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM
 from bodycap_batch.clocks.container_times import (
     ContainerTime,
     ExpectedOffset,
@@ -32,14 +32,10 @@ from bodycap_batch.clocks.joint_offsets import (
 from bodycap_batch.clocks.pair_offsets import MAX_DRIFT_PPM, PairOffset, measure_channels
 from bodycap_batch.clocks.phase_correlation import PEAK_WIDTH_S
 from bodycap_batch.clocks.recorders import Recorder
-from bodycap_batch.clocks.sensor_offsets import SensorOffset, measure_sensor_offset
-from bodycap_batch.clocks.sensor_signals import SensorTrack, sensor_track
 from bodycap_batch.clocks.sound_track import SoundTrack, read_channels, read_sound_track
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera_clock import ClockSource
-from bodycap_batch.telemetry import read_telemetry
 
 STATED_SIGMA_S = 1.0 / 30.0
 """Standard deviation of a stated offset, seconds. Origin: a clap is found to a frame or so in each video."""
@@ -62,11 +58,10 @@ class ClockEstimate:
         sigma_s: Standard deviation of the offset, seconds; None if it is unknown.
         drift_ppm: Drift, parts per million; 0 if it was not measured.
         drift_sigma_ppm: Standard deviation of the drift.
-        source: ``sound``; ``sensors``: the inertial sensors; ``motion``; ``stated``: in the job or the
-            calibration; ``common``: the reference camera, and cameras with the same trigger; ``none``:
-            unknown.
+        source: ``sound``; ``motion``; ``stated``: in the job or the calibration; ``common``: the reference
+            camera, and cameras with the same trigger; ``none``: unknown.
         covariance: (2,2) covariance of offset (seconds) and drift (ppm); None if it is unknown.
-        reasons: Why sound and sensors give no clock, and notes about the sound.
+        reasons: Why the sound gives no clock, and notes about the sound.
         contradictions: What contradicts the clock.
         is_contradicted: True if the motion contradicts the clock.
         against_stated: How the motion contradicts the stated offset; empty if it does not.
@@ -133,9 +128,6 @@ class Recording:
         first_frame_s: Time of the first frame on the clock of the camera, seconds.
         end_s: End of the sound, or of the pictures without usable sound, on the clock of the camera, seconds.
         frames: Number of frames.
-        sensor_start_s: Start of the signals of the inertial sensor on the clock of the camera, seconds; None
-            if they are not used.
-        sensor_problem: Reason why the inertial sensor cannot be used; empty if it can be used.
     """
 
     camera: str
@@ -147,25 +139,20 @@ class Recording:
     first_frame_s: float
     end_s: float
     frames: int
-    sensor_start_s: float | None = None
-    sensor_problem: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SoundEvidence:
-    """What the sound of all cameras, and their inertial sensors, say about their clocks.
+    """What the sound of all cameras says about their clocks.
 
     Attributes:
         recordings: The recording of each camera, in the order of the capture.
         pairs: What the sound of each pair of cameras gives, with the correlation curve and the offsets of the
             windows.
-        sensor_pairs: What the inertial sensors of each pair of cameras give. Only measured if the sound does
-            not determine all clocks.
     """
 
     recordings: tuple[Recording, ...] = ()
     pairs: tuple[PairOffset, ...] = ()
-    sensor_pairs: tuple[SensorOffset, ...] = ()
 
     def expected(self) -> dict[tuple[str, str], ExpectedOffset | None]:
         """Return the offset of each pair of cameras according to the containers."""
@@ -173,13 +160,12 @@ class SoundEvidence:
         return {pair: expected_offset(start[pair[0]], start[pair[1]]) for pair in camera_pairs(list(start))}
 
 
-def measure_sound(spec: CaptureConfig, threads: int | None = None, *, sensors: bool = True) -> SoundEvidence:
-    """Compare the sound of all pairs of cameras, and their inertial sensors if the sound is not enough.
+def measure_sound(spec: CaptureConfig, threads: int | None = None) -> SoundEvidence:
+    """Compare the sound of all pairs of cameras.
 
     Args:
         spec: The capture block of a job, as returned by `load_job`.
         threads: Number of cameras or pairs that are worked on at the same time; None for all processors.
-        sensors: Whether the inertial sensors are compared.
 
     Raises:
         CaptureError: A video or its timestamps cannot be used.
@@ -217,7 +203,7 @@ def measure_sound(spec: CaptureConfig, threads: int | None = None, *, sensors: b
             ]
             tracks |= zip((mix.camera for _, mix in lost), pool.map(_read_channels, lost), strict=True)
             pairs = camera_pairs([name for name, usable in tracks.items() if usable])
-            heard = measure_all(
+            measure_all(
                 [
                     pair
                     for pair in pairs
@@ -225,53 +211,12 @@ def measure_sound(spec: CaptureConfig, threads: int | None = None, *, sensors: b
                     and (pair not in measured or any(len(tracks[name]) > 1 for name in pair))
                 ]
             )
-        found = SoundEvidence(
+        return SoundEvidence(
             recordings=tuple(
                 _with_channel(each, tracks[each.camera], measured.values()) for each in found.recordings
             ),
             pairs=tuple(measured[pair] for pair in camera_pairs(list(tracks)) if pair in measured),
         )
-        if not sensors or len(heard) == len(spec.cameras):
-            return found
-        return _with_sensors(found, list(pool.map(_read_sensor, spec.cameras)), heard)
-
-
-def _with_sensors(
-    found: SoundEvidence, tracks: Sequence[SensorTrack], heard: Collection[str]
-) -> SoundEvidence:
-    """Return the evidence with that of the inertial sensors.
-
-    Args:
-        found: What the sound says.
-        tracks: The signals of the sensor of each camera.
-        heard: Cameras whose clocks the sound relates to that of the reference camera.
-    """
-    by_camera = {track.camera: track for track in tracks}
-    recordings = tuple(_with_sensor(each, by_camera[each.camera]) for each in found.recordings)
-    usable = [name for name, track in by_camera.items() if not track.problem]
-    pairs = tuple(
-        measure_sensor_offset(by_camera[first], by_camera[second])
-        for first, second in camera_pairs(usable)
-        if first not in heard or second not in heard
-    )
-    return replace(found, recordings=recordings, sensor_pairs=pairs)
-
-
-def _with_sensor(recording: Recording, track: SensorTrack) -> Recording:
-    """Return a recording with the start of the signals of its sensor, or why these cannot be used."""
-    start_s = None if track.problem else track.start_s
-    return replace(recording, sensor_start_s=start_s, sensor_problem=track.problem)
-
-
-def _read_sensor(config: CameraConfig) -> SensorTrack:
-    """Return the signals of the inertial sensor of a camera; a problem if its samples cannot be read."""
-    videos = index_videos(config.video, 1)
-    times_ns = join_chapters(videos, config.timestamps).times_ns
-    try:
-        telemetry = read_telemetry(videos, times_ns, config.samples)
-    except CaptureError as error:
-        return SensorTrack(camera=config.name, problem=str(error))
-    return sensor_track(config.name, telemetry)
 
 
 def _offset_through(
@@ -296,20 +241,17 @@ def _offset_through(
     return middle_s - reach_s, middle_s + reach_s
 
 
-def estimate_clocks(
-    spec: CaptureConfig, threads: int | None = None, *, sensors: bool = True
-) -> ClockEstimates:
-    """Estimate the clocks of all cameras of a capture from their sound, or else from their inertial sensors.
+def estimate_clocks(spec: CaptureConfig, threads: int | None = None) -> ClockEstimates:
+    """Estimate the clocks of all cameras of a capture from their sound.
 
     Args:
         spec: The capture block of a job, as returned by `load_job`.
         threads: Number of cameras or pairs that are worked on at the same time; None for all processors.
-        sensors: Whether the inertial sensors are used.
 
     Raises:
         CaptureError: A video or its timestamps cannot be used.
     """
-    return combine_evidence(spec, measure_sound(spec, threads, sensors=sensors))
+    return combine_evidence(spec, measure_sound(spec, threads))
 
 
 def _read_recording(config: CameraConfig) -> tuple[Recording, SoundTrack]:
@@ -366,7 +308,7 @@ def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstim
 
     Args:
         spec: The capture block of a job, as returned by `load_job`.
-        evidence: What the sound and the sensors say; empty for a capture with one camera.
+        evidence: What the sound says; empty for a capture with one camera.
     """
     reference = spec.reference_camera().name
     if not evidence.recordings:
@@ -388,11 +330,6 @@ def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstim
         starts_s,
         {name: _floor_s(recordings[reference], recordings[name]) for name in starts_s},
     )
-    sensed = _clocks_with_sensors(reference, evidence, joint.clocks)
-    found: dict[str, tuple[JointClock, ClockSource]] = {
-        **{name: (clock, "sound") for name, clock in joint.clocks.items()},
-        **{name: (clock, "sensors") for name, clock in sensed.items()},
-    }
     stated = stated_offsets(spec, reference)
     triggered = _triggered_with(spec, reference)
     clocks = []
@@ -413,73 +350,19 @@ def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstim
             )  # fmt: skip
             continue
         reasons = recording.notes
-        best = found.get(name)
+        best = joint.clocks.get(name)
         if best is not None:
             contradictions += _stated_contradictions(stated.get(name), best)
-        if name in joint.clocks:
             contradictions += _date_contradictions(name, accepted, expected)
         else:
-            silent = _why_none(name, reference, recordings, pairs, expected)
-            reasons = (*silent, *_why_unsensed(name, reference, evidence, sensed), *reasons)
+            reasons = (*_why_none(name, reference, recordings, pairs, expected), *reasons)
         clocks.append(_camera_clock(name, best, stated.get(name), name in triggered, reasons, contradictions))
     return ClockEstimates(reference=reference, cameras=tuple(clocks), pairs=pairs)
 
 
-def _clocks_with_sensors(
-    reference: str, evidence: SoundEvidence, heard: Mapping[str, JointClock]
-) -> dict[str, JointClock]:
-    """Return the clocks of cameras that the sound does not relate to the reference camera, but sensors do.
-
-    Args:
-        reference: Name of the reference camera.
-        evidence: What the sound and the sensors say.
-        heard: Clocks that the sound determines.
-    """
-    sensed = [pair for pair in evidence.sensor_pairs if pair.accepted]
-    if not sensed:
-        return {}
-    pairs: list[ClockPair] = [*(pair for pair in evidence.pairs if pair.accepted), *sensed]
-    starts_s = {
-        each.camera: start_s
-        for each in evidence.recordings
-        for start_s in (each.sound_start_s, each.sensor_start_s)
-        if start_s is not None
-    }
-    clocks = solve_clocks(reference, pairs, starts_s).clocks
-    least_s = min(pair.sigma_s for pair in sensed)
-    return {name: _at_least(clock, least_s) for name, clock in clocks.items() if name not in heard}
-
-
-def _at_least(clock: JointClock, sigma_s: float) -> JointClock:
-    """Return a clock whose offset has at least a standard deviation, seconds.
-
-    A limb that follows the trunk is late in all pairs of its camera, so the mean of several pairs is as late.
-    Evidence: docs/decisions/clocks.md.
-    """
-    missing_s2 = max(0.0, sigma_s**2 - clock.sigma_s**2)
-    return replace(clock, covariance=clock.covariance + np.diag([missing_s2, 0.0]))
-
-
-def _why_unsensed(
-    name: str, reference: str, evidence: SoundEvidence, sensed: Mapping[str, JointClock]
-) -> list[str]:
-    """Return why the inertial sensors give no clock for a camera; nothing if no camera has a sensor."""
-    recordings = {recording.camera: recording for recording in evidence.recordings}
-    if name in sensed or all(each.sensor_start_s is None for each in recordings.values()):
-        return []
-    for camera in (name, reference):
-        if recordings[camera].sensor_problem:
-            return [f"inertial sensor of {camera}: {recordings[camera].sensor_problem}"]
-    return [
-        f"inertial sensors of {pair.first} and {pair.second}: {pair.reason}"
-        for pair in evidence.sensor_pairs
-        if {pair.first, pair.second} == {name, reference} and not pair.accepted
-    ]
-
-
 def _camera_clock(
     name: str,
-    clock: tuple[JointClock, ClockSource] | None,
+    clock: JointClock | None,
     stated_s: float | None,
     is_triggered: bool,
     reasons: Sequence[str],
@@ -497,15 +380,14 @@ def _camera_clock(
     if is_triggered:
         return replace(unknown, offset_s=stated_s or 0.0, sigma_s=0.0, drift_sigma_ppm=0.0, source="common")
     if clock is not None:
-        found, source = clock
         return replace(
             unknown,
-            offset_s=found.offset_s,
-            sigma_s=found.sigma_s,
-            drift_ppm=found.drift_ppm if found.drift_measured else 0.0,
-            drift_sigma_ppm=found.drift_sigma_ppm,
-            source=source,
-            covariance=found.covariance,
+            offset_s=clock.offset_s,
+            sigma_s=clock.sigma_s,
+            drift_ppm=clock.drift_ppm if clock.drift_measured else 0.0,
+            drift_sigma_ppm=clock.drift_sigma_ppm,
+            source="sound",
+            covariance=clock.covariance,
         )
     if stated_s is not None:
         return replace(unknown, offset_s=stated_s, sigma_s=STATED_SIGMA_S, source="stated")
@@ -554,20 +436,18 @@ def describe_contradiction(
     allowed_s = max(_MAX_SIGMAS * sigma_s, tolerance_s)
     if abs(stated_s - found_s) <= allowed_s:
         return ""
-    verb = "give" if source == "sensors" else "gives"
-    text = f"offset_s is stated as {stated_s:.4f} s, but the {source} {verb} {found_s:.4f} ± {sigma_s:.4f} s"
+    text = f"offset_s is stated as {stated_s:.4f} s, but the {source} gives {found_s:.4f} ± {sigma_s:.4f} s"
     turned = abs(stated_s + found_s)
     if turned <= max(allowed_s, _TURNED_TOLERANCE_S) < abs(stated_s - found_s):
-        text += f"; with the sign turned the {source} {'agree' if source == 'sensors' else 'agrees'}"
+        text += f"; with the sign turned the {source} agrees"
     return text
 
 
-def _stated_contradictions(stated_s: float | None, found: tuple[JointClock, ClockSource]) -> list[str]:
-    """Return how a clock from a source contradicts the stated offset, if there is one."""
+def _stated_contradictions(stated_s: float | None, clock: JointClock) -> list[str]:
+    """Return how a clock from the sound contradicts the stated offset, if there is one."""
     if stated_s is None:
         return []
-    clock, source = found
-    text = describe_contradiction(stated_s, source, clock.offset_s, clock.sigma_s)
+    text = describe_contradiction(stated_s, "sound", clock.offset_s, clock.sigma_s)
     return [text] if text else []
 
 

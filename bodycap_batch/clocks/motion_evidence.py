@@ -1,20 +1,18 @@
-"""Add what the motion says about the clocks to what sound and inertial sensors say."""
+"""Add what the motion says about the clocks to what the sound says."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM
 from bodycap_batch.clocks.estimate import ClockEstimate, ClockEstimates, Recording, SoundEvidence
-from bodycap_batch.clocks.joint_offsets import WAY_SIGMA_S, JointClock, connected_cameras
+from bodycap_batch.clocks.joint_offsets import WAY_SIGMA_S, JointClock
 from bodycap_batch.clocks.motion_offsets import MotionClocks
 from bodycap_batch.clocks.pair_offsets import PairOffset
 
-_GIVEN_BY: Mapping[str, str] = {"sound": "sound gives", "sensors": "inertial sensors give"}
-"""Beginning of a sentence about an offset, by its source."""
 _MAX_SIGMAS = 3.0
 """Maximum difference of sound and motion, in standard deviations."""
 _MAX_DIFFERENCE_S = 1.0 / 30.0
@@ -38,40 +36,34 @@ def add_motion(
     evidence: SoundEvidence,
     stated_s: Mapping[str, float] | None = None,
 ) -> ClockEstimates:
-    """Return the clocks from sound and sensors, completed and checked by the motion.
+    """Return the clocks from the sound, completed and checked by the motion.
 
-    - A clock that neither determines is taken from the motion.
+    - A clock that the sound does not determine is taken from the motion.
     - A clock that is related by sound only to cameras with a clock from the motion is taken from both.
     - If the sound is known only as well as the motion (unlike cameras), the mean of both is used.
-    - The mean of inertial sensors and motion is used. If they contradict each other, the clock is unknown.
     - A contradiction between sound and motion is noted, and so is a stated offset that fits the motion much
       worse than another one.
 
     Args:
-        estimates: The clocks that were estimated from sound and sensors.
+        estimates: The clocks that were estimated from the sound.
         motion: The clocks that were estimated from the motion, with the same reference camera.
         evidence: What the sound says, with the numbers of frames of the videos.
         stated_s: Stated offset of each camera relative to the reference camera, seconds, by camera name.
     """
     recordings = {recording.camera: recording for recording in evidence.recordings}
-    found, contradicted = {}, list[str]()
+    found = {}
     for estimate in estimates.cameras:
         clock = motion.clocks.get(estimate.camera)
         if estimate.camera == estimates.reference or estimate.source == "common":
             found[estimate.camera] = estimate
         elif estimate.source == "sound":
             found[estimate.camera] = _compared(estimate, clock)
-        elif estimate.source == "sensors":
-            compared = _compared(estimate, clock)
-            found[estimate.camera] = _unknown(compared) if compared.is_contradicted else compared
-            contradicted += [estimate.camera] if compared.is_contradicted else []
         elif clock is not None:
             reference = recordings.get(estimates.reference)
             found[estimate.camera] = _from_motion(estimate, clock, reference, recordings.get(estimate.camera))
         else:
             reason = motion.reasons.get(estimate.camera, "the motion does not determine the offset")
             found[estimate.camera] = replace(estimate, reasons=(*estimate.reasons, f"motion: {reason}"))
-    _remove_connected(found, contradicted, estimates.pairs)
     _complete_from_sound(found, estimates.pairs)
     for name, offset_s in (stated_s or {}).items():
         text = _against_stated(motion, name, offset_s)
@@ -80,17 +72,8 @@ def add_motion(
     return replace(estimates, cameras=tuple(found[each.camera] for each in estimates.cameras))
 
 
-def _unknown(estimate: ClockEstimate) -> ClockEstimate:
-    """Return an unknown clock instead of one that is contradicted."""
-    return replace(
-        estimate, offset_s=None, sigma_s=None, drift_ppm=0.0, drift_sigma_ppm=CRYSTAL_SIGMA_PPM,
-        source="none", covariance=None, is_contradicted=False, contradictions=(),
-        reasons=(*estimate.reasons, *estimate.contradictions),
-    )  # fmt: skip
-
-
 def _compared(estimate: ClockEstimate, clock: JointClock | None) -> ClockEstimate:
-    """Return the clock from sound or sensors, compared with the clock from the motion."""
+    """Return the clock from the sound, compared with the clock from the motion."""
     if clock is None or estimate.offset_s is None or estimate.sigma_s is None:
         return estimate
     difference_s = clock.offset_s - estimate.offset_s
@@ -98,16 +81,13 @@ def _compared(estimate: ClockEstimate, clock: JointClock | None) -> ClockEstimat
     if abs(difference_s) > max(_MAX_SIGMAS * sigma_s, _MAX_DIFFERENCE_S):
         text = (
             f"the motion gives an offset of {clock.offset_s:.3f} ± {clock.sigma_s:.3f} s, but the "
-            f"{_GIVEN_BY[estimate.source]} {estimate.offset_s:.3f} ± {estimate.sigma_s:.3f} s"
+            f"sound gives {estimate.offset_s:.3f} ± {estimate.sigma_s:.3f} s"
         )
         return replace(estimate, contradictions=(*estimate.contradictions, text), is_contradicted=True)
     if estimate.sigma_s < 0.5 * clock.sigma_s:
         return estimate
     weight = estimate.sigma_s**2 / (estimate.sigma_s**2 + clock.sigma_s**2)
     mean_sigma_s = estimate.sigma_s * clock.sigma_s / sigma_s
-    if estimate.source == "sensors":
-        # Both are late where a limb follows the trunk, so their mean is not more exact than the better one.
-        mean_sigma_s = min(estimate.sigma_s, clock.sigma_s)
     return replace(
         estimate,
         offset_s=estimate.offset_s + weight * difference_s,
@@ -189,21 +169,6 @@ def _common_start_probability(difference_s: float, sigma_s: float, prior: float)
     density = np.exp(-0.5 * (difference_s / sigma_s) ** 2) / (np.sqrt(2.0 * np.pi) * sigma_s)
     odds = prior / (1.0 - prior) * density * _START_RANGE_S
     return float(odds / (1.0 + odds))
-
-
-def _remove_connected(
-    found: dict[str, ClockEstimate], contradicted: Sequence[str], pairs: Sequence[PairOffset]
-) -> None:
-    """Make clocks from sensors unknown, in place, if sound relates their cameras to a contradicted one.
-
-    They follow from the same samples.
-    """
-    accepted = [pair for pair in pairs if pair.accepted]
-    for camera in contradicted:
-        for name in connected_cameras(camera, accepted):
-            if found[name].source == "sensors":
-                reason = f"it follows from the clock of {camera}, which the motion contradicts"
-                found[name] = _unknown(replace(found[name], reasons=(*found[name].reasons, reason)))
 
 
 def _complete_from_sound(found: dict[str, ClockEstimate], pairs: tuple[PairOffset, ...]) -> None:

@@ -252,10 +252,6 @@ class TelemetryOptions(Options):
     gps: bool = Field(
         True, description="GPS positions give the place of the world on the Earth; the scale is not changed"
     )
-    clocks: bool = Field(
-        True,
-        description="the inertial sensors give the clocks of cameras whose sound does not",
-    )
     smoothing: bool = Field(
         True,
         description="the poses of the pictures are solved again together with the inertial samples, and "

@@ -11,7 +11,7 @@ from bodycap_batch.config.yaml_source import YamlSource
 
 RETIRED_OPTIONS = {
     "registration": ("wearer_mask",),
-    "telemetry": ("search", "blur"),
+    "telemetry": ("search", "blur", "clocks"),
 }
 """Names of the options that have no effect any more, by the name of their block."""
 

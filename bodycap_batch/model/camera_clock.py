@@ -10,13 +10,13 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 
-ClockSource = Literal["sound", "sensors", "motion", "stated", "common", "none"]
-"""What determined a clock. ``sensors``: the inertial sensors. ``motion``: the solved paths. ``stated``: the
+ClockSource = Literal["sound", "motion", "stated", "common", "none"]
+"""What determined a clock. ``motion``: the solved paths. ``stated``: the
 job or the calibration file. ``common``: the reference camera, and cameras that share its clock. ``none``:
 nothing, so the clock is unknown."""
 
 
-ESTIMATED_SOURCES: tuple[ClockSource, ...] = ("sound", "sensors", "motion")
+ESTIMATED_SOURCES: tuple[ClockSource, ...] = ("sound", "motion")
 """Sources of clocks that are estimated and have a standard deviation."""
 
 

@@ -483,10 +483,8 @@ class Flow:
         return capture_ref(self._capture, self._cameras, cameras)
 
     def _start_sound(self) -> Future[Artefact]:
-        """Compare sound and sensors of the cameras, beside the keyframes if there are threads for both."""
-        sensors = self._job.telemetry.clocks and len(self._with_telemetry) > 1
-        samples = self._samples if sensors else {}
-        task = make_task(SOUND, SoundTask(capture=self._footage(), sensors=sensors, samples=samples))
+        """Compare the sound of the cameras, beside the keyframes if there are threads for both."""
+        task = make_task(SOUND, SoundTask(capture=self._footage()))
         if self._threads > 1:
             return self.runner.start(task)
         done = Future[Artefact]()
@@ -499,7 +497,7 @@ class Flow:
 
     @property
     def sound(self) -> Future[Artefact] | None:
-        """The artefact of the sound and sensors; None before the check, or if there is only one camera."""
+        """The artefact of the sound; None before the check, or if there is only one camera."""
         return self._sound
 
     def _apply_sound_offsets(self) -> None:
@@ -512,7 +510,7 @@ class Flow:
         for camera in self._capture.cameras:
             if camera.offset_s is None:
                 note = (
-                    f"{camera.name}: neither the job nor sound or sensors give its clock, so start_s and "
+                    f"{camera.name}: neither the job nor the sound gives its clock, so start_s and "
                     "end_s do not apply to it and all its frames are used; state offset_s to use a part of it"
                 )
                 self._settings.listener(Event(kind="note", stage="clocks", what=f"note: {note}"))

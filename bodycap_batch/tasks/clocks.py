@@ -39,7 +39,7 @@ class ClocksTask:
         stated: What is stated about the clock of each camera, by camera name.
         common: Whether the job says that all clocks agree (`capture.clocks`).
         rig: Whether cameras on one segment share a trigger (`capture.rig`).
-        sound: What sound and inertial sensors say; None if there is only one camera.
+        sound: What the sound says; None if there is only one camera.
         map: The map.
         registrations: The registration of each camera, by camera name.
         reach: Distances between cameras that the body permits.

@@ -1,15 +1,14 @@
-"""The task that compares sound and inertial sensors of the cameras, and the clocks that follow."""
+"""The task that compares the sound of the cameras, and the clocks that follow."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bodycap_batch.config.models import CaptureConfig
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.tasks.inputs import CaptureRef, FileRef
+from bodycap_batch.tasks.inputs import CaptureRef
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
 
 if TYPE_CHECKING:
@@ -21,18 +20,13 @@ SOUND_NAME = "sound"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SoundTask:
-    """Compare the sound of all pairs of cameras, and their inertial sensors.
+    """Compare the sound of all pairs of cameras.
 
     Attributes:
         capture: The videos of all cameras.
-        sensors: Whether the inertial sensors are compared if the sound does not determine all clocks.
-        samples: The files with inertial samples beside the videos, by name. A camera without a file has its
-            samples in the video. Empty if the sensors are not compared.
     """
 
     capture: CaptureRef
-    sensors: bool
-    samples: Mapping[str, FileRef]
 
 
 def run_sound(task: SoundTask, context: StageContext, files: Path) -> None:
@@ -41,7 +35,7 @@ def run_sound(task: SoundTask, context: StageContext, files: Path) -> None:
     from bodycap_batch.formats.dataclass_files import write_dataclass
 
     context.check_cancelled()
-    found = measure_sound(task.capture.config, context.threads, sensors=task.sensors)
+    found = measure_sound(task.capture.config, context.threads)
     write_dataclass(found, files, SOUND_NAME)
     write_summary(files)
 

@@ -1,4 +1,4 @@
-"""Measure the clocks from sound, motion and inertial sensors: ``python -m tests.bench clocks``.
+"""Measure the clocks from sound and motion: ``python -m tests.bench clocks``.
 
 Pairs of generated recordings, encoded with AAC at 16 kHz, each with its own room response, band, gain, cloth
 noise and clock. The ratio is the power of the sound over that of the cloth noise in 200 to 6000 Hz: at +6 dB
@@ -27,7 +27,7 @@ from bodycap_batch.clocks.pair_offsets import measure_pair
 from bodycap_batch.clocks.sound_track import RATE_HZ, SoundPiece, SoundTrack, read_sound_file
 from bodycap_batch.config.job import load_job
 from bodycap_batch.synthetic.sound import Microphone, Samples, make_scene, record, write_sound
-from tests.bench import motion_clocks, sensor_clocks
+from tests.bench import motion_clocks
 from tests.bench.rows import DATA
 
 RATIOS_DB = (6.0, 0.0, -6.0)
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--json", type=Path, help="file for all outcomes as JSON")
-    parser.add_argument("--only", choices=("sound", "motion", "sensors"), help="run only one source")
+    parser.add_argument("--only", choices=("sound", "motion"), help="run only one source")
     parser.add_argument(
         "--stored", type=Path, nargs="*", default=[], help="folders of trajectories for the motion (TUM)"
     )
@@ -85,11 +85,7 @@ def main(arguments: Sequence[str]) -> int:
     if options.only in (None, "motion"):
         lines, bad = motion_clocks.run(options.data, options.share, options.seed, options.stored)
         print("\n".join(lines))
-    if options.only in (None, "sensors"):
-        lines, wrong = sensor_clocks.run(options.data, options.share, options.seed)
-        print("\n".join(lines))
-        bad += wrong
-    if options.only in ("motion", "sensors"):
+    if options.only == "motion":
         return 1 if bad else 0
     chosen = [
         case

@@ -380,25 +380,12 @@ def test_samples_are_an_input_of_the_keyframes_of_their_camera(bench: Bench) -> 
     assert "keyframes left_palm" not in executed
 
 
-def test_samples_of_two_cameras_are_compared_for_their_clocks(bench: Bench) -> None:
-    bench.run()
-    (bench.folder / "torso.imu.csv").write_text("samples")
-    assert "sound" not in bench.executed(), "one sensor has nothing to be compared with"
-    (bench.folder / "left_palm.imu.csv").write_text("samples")
-    assert "sound" in bench.executed()
-    (bench.folder / "left_palm.imu.csv").write_text("other samples")
-    assert "sound" in bench.executed()
-    assert "sound" not in bench.executed(telemetry={"clocks": False})
-
-
 def test_telemetry_that_is_switched_off_changes_nothing(bench: Bench) -> None:
     bench.run()
     before = {name: data for name, data in bench.results().items() if name != "job.yaml"}
     (bench.folder / "torso.imu.csv").write_text("samples")
     assert (
-        bench.executed(
-            telemetry=dict.fromkeys(("gravity", "tracking", "gps", "smoothing", "gaps", "clocks"), False)
-        )
+        bench.executed(telemetry=dict.fromkeys(("gravity", "tracking", "gps", "smoothing", "gaps"), False))
         == []
     )
     assert {name: data for name, data in bench.results().items() if name != "job.yaml"} == before

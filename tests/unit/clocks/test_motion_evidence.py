@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -44,35 +42,6 @@ def moved(
 def added(estimate: ClockEstimate, motion: MotionClocks, evidence: SoundEvidence = EMPTY, **stated_s: float):
     estimates = ClockEstimates(reference="torso", cameras=(REFERENCE, estimate))
     return add_motion(estimates, motion, evidence, stated_s).camera("palm")
-
-
-def test_sensors_and_motion_give_a_mean():
-    found = added(replace(sound(1.0, 0.025), source="sensors"), moved(1.02, 0.025))
-    assert (found.source, found.offset_s) == ("sensors", pytest.approx(1.01))
-    # The lag of a limb is in both.
-    assert found.sigma_s == pytest.approx(0.025)
-    assert found.covariance is not None
-    assert np.sqrt(found.covariance[0, 0]) == pytest.approx(0.025)
-
-
-def test_sensors_and_motion_that_contradict_each_other_give_no_clock():
-    found = added(replace(sound(1.0, 0.025), source="sensors"), moved(1.5, 0.02))
-    assert (found.source, found.offset_s, found.sigma_s, found.covariance) == ("none", None, None, None)
-    assert "but the inertial sensors give 1.000" in found.reasons[-1]
-
-
-def test_a_contradicted_sensor_clock_does_not_come_back_through_the_sound():
-    sensed = replace(sound(1.0, 0.025), source="sensors")
-    heard = PairOffset(
-        first="palm", second="head", accepted=True, offset_s=0.0, sigma_s=0.001, drift_ppm=0.0,
-        drift_sigma_ppm=10.0, pivot_s=5.0,
-    )  # fmt: skip
-    estimates = ClockEstimates(
-        reference="torso", cameras=(REFERENCE, sensed, replace(sensed, camera="head")), pairs=(heard,)
-    )
-    found = add_motion(estimates, moved(1.5, 0.02), EMPTY, {})
-    assert [found.camera(name).source for name in ("palm", "head")] == ["none", "none"]
-    assert "which the motion contradicts" in found.camera("head").reasons[-1]
 
 
 def recordings(*frames: int) -> SoundEvidence:

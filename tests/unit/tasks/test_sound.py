@@ -11,7 +11,6 @@ from bodycap_batch.clocks import measure_sound
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.formats.dataclass_files import write_dataclass
 from bodycap_batch.tasks.sound import SOUND_NAME, known_from_sound, load_sound
-from tests.shaken import write_samples
 from tests.sounds import heard, scene, write_video_with_sound
 
 SECONDS = 6.0
@@ -50,21 +49,3 @@ def test_one_camera_has_no_sound_to_compare() -> None:
     assert load_sound(None).recordings == ()
     alone = CaptureConfig(cameras=(CameraConfig(name="torso", video=(Path("torso.mp4"),), offset_s=0.0),))
     assert known_from_sound(alone, None).cameras[0].offset_s == 0.0
-
-
-def test_inertial_samples_select_the_frames_of_silent_cameras(tmp_path: Path) -> None:
-    for name in ("torso", "left_palm"):
-        write_video_with_sound(tmp_path / f"{name}.mp4", None, seconds=SECONDS)
-    cameras = tuple(
-        CameraConfig(
-            name=name,
-            video=(tmp_path / f"{name}.mp4",),
-            offset_s=offset_s,
-            samples=write_samples(tmp_path, name, body=5, start_s=start_s, seconds=12.0),
-        )
-        for name, start_s, offset_s in (("torso", 2.0, 0.0), ("left_palm", 3.4, None))
-    )
-    spec = CaptureConfig(cameras=cameras, start_s=2.0, end_s=4.0)
-    for sensors, offset_s in ((True, pytest.approx(1.4, abs=0.05)), (False, None)):
-        write_dataclass(measure_sound(spec, sensors=sensors), tmp_path, SOUND_NAME)
-        assert known_from_sound(spec, tmp_path).cameras[1].offset_s == offset_s

@@ -122,8 +122,6 @@ def tasks(folder: Path) -> dict[str, Any]:
         ),
         "sound": SoundTask(
             capture=capture,
-            sensors=True,
-            samples={"torso": FileRef(path=folder / "torso.imu.csv", digest="of the samples")},
         ),
         "clocks": ClocksTask(
             capture=capture,
