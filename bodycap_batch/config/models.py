@@ -243,8 +243,7 @@ class CaptureConfig(_Block):
     )
     rig: Literal["free", "synced"] = Field(
         "free",
-        description="synced: the cameras on one segment are fixed rigidly to each other, and one hardware "
-        "trigger exposes all of these cameras",
+        description="synced: one hardware trigger exposes the cameras on one segment, so they have one clock",
     )
     clocks: Literal["auto", "common"] = Field(
         "auto",

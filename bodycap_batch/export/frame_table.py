@@ -22,8 +22,8 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
     """Write one line for each frame of each camera, and return the path of the file.
 
     Times are in seconds. Errors are in pixels at the work size (the image size that all stages work at). The
-    column `status` is KEYFRAME, REGISTERED, RIG, INERTIAL or LOST. RIG means that the pose was derived from
-    other cameras of the rig, INERTIAL that it was derived from the inertial sensor. For a lost frame, the
+    column `status` is KEYFRAME, REGISTERED, INERTIAL or LOST. INERTIAL means that the pose was derived
+    from the inertial sensor. For a lost frame, the
     column `reason` holds the value of `FrameStatus`.
 
     Args:

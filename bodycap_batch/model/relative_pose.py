@@ -78,13 +78,6 @@ class RelativePose:
         return self.instants >= MIN_INSTANTS and self.spread_rad < _MAX_SPREAD_RATIO * self.explained_rad
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RigPoses:
-    """The poses of the cameras of a rig relative to another camera of the rig."""
-
-    relative: tuple[RelativePose, ...]
-
-
 def estimate_relative_pose(first: Trajectory, second: Trajectory, offset_ns: int) -> RelativePose:
     """Estimate the mean pose of a second camera relative to a first camera, robustly.
 
@@ -155,41 +148,6 @@ def mean_rotation(rotations: FloatArray) -> FloatArray:
     return np.asarray(mean)
 
 
-def match_instants(first_ns: IntArray, second_ns: IntArray) -> IntArray:
-    """Match each frame of a second camera with the frame of a first camera at the same instant.
-
-    Args:
-        first_ns: (F,) common times of the first camera's frames, nanoseconds, increasing.
-        second_ns: (N,) common times of the second camera's frames, nanoseconds, increasing.
-
-    Returns:
-        (N,) index of the first camera's frame for each frame of the second camera; -1 if there is none.
-    """
-    if len(first_ns) < 2:
-        return np.full(len(second_ns), -1, dtype=np.int64)
-    after = np.clip(np.searchsorted(first_ns, second_ns), 1, len(first_ns) - 1)
-    previous_is_nearer = second_ns - first_ns[after - 1] < first_ns[after] - second_ns
-    frame = np.where(previous_is_nearer, after - 1, after)
-    is_same = np.abs(first_ns[frame] - second_ns) < _SAME_INSTANT_RATIO * _frame_interval_ns(first_ns)
-    return np.asarray(np.where(is_same, frame, -1), dtype=np.int64)
-
-
 def _frame_interval_ns(times_ns: IntArray) -> float:
     """Return the median frame interval in nanoseconds."""
     return float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0.0
-
-
-def not_rigid_note(relative: RelativePose) -> str:
-    """Return a note for the user: why two cameras are not treated as a rig, although the job says so."""
-    pair = " and ".join(relative.cameras)
-    if relative.instants < MIN_INSTANTS:
-        return (
-            f"{pair} are not treated as a rig: they have only {relative.instants} common frames in one "
-            "map, which is too few to determine their relative pose"
-        )
-    found_deg, expected_deg = np.degrees(relative.spread_rad), np.degrees(relative.explained_rad)
-    return (
-        f"{pair} are not treated as a rig: their relative rotation varies by {found_deg:.2f} degrees, but "
-        f"in a rig it would vary by only {expected_deg:.2f} degrees. Check offset_s, and check that one "
-        "trigger exposes both cameras"
-    )

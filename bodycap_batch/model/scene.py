@@ -32,8 +32,6 @@ class FrameStatus(StrEnum):
 
     KEYFRAME: The frame is a keyframe of the map.
     REGISTERED: The pose was estimated from the frame's own observations.
-    RIG: The pose was computed from other cameras of a hardware-synchronised rig, because the frame itself has
-        too few observations.
     INERTIAL: The frame itself gave no pose. The pose follows from the inertial sensor of the camera, between
         localised frames before and after.
     BLUR: Lost; too few tracks reach the frame, and the image is blurred.
@@ -50,7 +48,6 @@ class FrameStatus(StrEnum):
 
     KEYFRAME = "KEYFRAME"
     REGISTERED = "REGISTERED"
-    RIG = "RIG"
     INERTIAL = "INERTIAL"
     BLUR = "BLUR"
     FEW_TRACKS = "FEW_TRACKS"
@@ -69,7 +66,6 @@ class FrameStatus(StrEnum):
         return self in (
             FrameStatus.KEYFRAME,
             FrameStatus.REGISTERED,
-            FrameStatus.RIG,
             FrameStatus.INERTIAL,
         )
 

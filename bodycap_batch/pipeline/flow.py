@@ -36,7 +36,6 @@ from bodycap_batch.runner import NotStored, Task
 from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, Preload
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.tasks.body import camera_distances
-from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.check import CHECK, CheckTask
 from bodycap_batch.tasks.clocks import (
     CLOCKS,
@@ -52,10 +51,9 @@ from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE, ExtendTask, MapTask
 from bodycap_batch.tasks.merge import MERGE, BoardFootage, MergeTask
 from bodycap_batch.tasks.places import PLACES, PlacesTask
 from bodycap_batch.tasks.preview import PREVIEW
-from bodycap_batch.tasks.recover import RECOVER
+from bodycap_batch.tasks.recover import RECOVER, RecoverTask
 from bodycap_batch.tasks.registration import REGISTRATION, RegistrationTask
 from bodycap_batch.tasks.report import REPORT
-from bodycap_batch.tasks.rig import RIG
 from bodycap_batch.tasks.sound import SOUND, SoundTask, known_from_sound
 from bodycap_batch.tasks.stage import Stage, read_summary
 
@@ -306,13 +304,6 @@ class Flow:
         rebuilt, again = self.extend_map(rebuilt, again, keyframes)
         return (rebuilt, again) if _posed_frames(again) >= _posed_frames(registrations) else None
 
-    def solve_rigs(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
-        """Solve the poses of each synchronised rig again, from the observations of all cameras of the rig."""
-        solved = self.runner.run_all(self._rig_tasks(scene_map, registrations, keyframes))
-        for artefact in solved.values():
-            self.runner.report_notes(artefact, "registration")
-        return {**registrations, **solved}
-
     def recover(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
         """Recover the lost frames of each camera that has enough lost frames and enough localised frames."""
         recovered = self.runner.run_all(self._recovery_tasks(scene_map, registrations, keyframes))
@@ -562,14 +553,6 @@ class Flow:
         )
         return self.runner.run(make_task(EXTEND, task, map_round=self._map_round, threads=self._threads))
 
-    def _rig_tasks(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> Iterator[Task]:
-        """Yield one task for every camera of a synchronised rig."""
-        rigs = self._capture.segments() if self._capture.rig == "synced" else []
-        for own, cameras in ((own, rig) for rig in rigs for own in rig):
-            task = self._group_task(own, cameras, scene_map, registrations, keyframes)
-            offsets_s = {camera.name: camera.offset_s or 0.0 for camera in cameras}
-            yield make_task(RIG, replace(task, offsets_s=offsets_s), camera=own.name)
-
     def _recovery_tasks(
         self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
     ) -> Iterator[Task]:
@@ -580,29 +563,17 @@ class Flow:
                 continue
             if not LEAST_POSED <= summary["localised"] <= summary["frames"] - LEAST_LOST:
                 continue
-            task = self._group_task(own, self._capture.cameras, scene_map, registrations, keyframes)
+            ordered = [own, *(camera for camera in self._capture.cameras if camera.name != own.name)]
+            names = [camera.name for camera in ordered]
+            task = RecoverTask(
+                options=self._job.registration,
+                cameras=tuple(names),
+                capture=self._footage(ordered),
+                keyframes=refs_by_camera({name: keyframes[name] for name in names}),
+                map=artefact_ref(scene_map),
+                registrations=refs_by_camera({name: registrations[name] for name in names}),
+            )
             yield make_task(RECOVER, task, camera=own.name, threads=min(self._threads, _MAX_RECOVERY_THREADS))
-
-    def _group_task(
-        self,
-        own: CameraConfig,
-        cameras: Sequence[CameraConfig],
-        scene_map: Artefact,
-        registrations: ByCamera,
-        keyframes: ByCamera,
-    ) -> CameraGroupTask:
-        """Return the task that solves the poses of camera `own` from all `cameras`, with `own` first."""
-        ordered = [own, *(camera for camera in cameras if camera.name != own.name)]
-        names = [camera.name for camera in ordered]
-        return CameraGroupTask(
-            options=self._job.registration,
-            cameras=tuple(names),
-            capture=self._footage(ordered),
-            keyframes=refs_by_camera({name: keyframes[name] for name in names}),
-            map=artefact_ref(scene_map),
-            registrations=refs_by_camera({name: registrations[name] for name in names}),
-            offsets_s={},
-        )
 
 
 def _read_ahead(stages: Sequence[Stage[Any]]) -> None:

@@ -115,7 +115,6 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     results.registrations = found = flow.register(scene_map, keyframes)
     scene_map, found = flow.extend_map(scene_map, found, keyframes)
     results.map, found = flow.refine_map(scene_map, found, keyframes)
-    found = flow.solve_rigs(results.map, found, keyframes)
     results.registrations = flow.recover(results.map, found, keyframes)
     results.job = job = flow.find_places(results.map, results.registrations)
     results.clocks = flow.clocks(results.map, results.registrations)

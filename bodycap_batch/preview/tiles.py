@@ -185,9 +185,7 @@ def describe_status(status: FrameStatus, points: ObservedPoints | None) -> tuple
         return f"lost: {_LOSS_REASONS.get(status, status.value)}", RED
     if status is FrameStatus.INERTIAL:
         return "pose from the inertial sensor", AMBER
-    name = {FrameStatus.KEYFRAME: "keyframe", FrameStatus.RIG: "pose from the other camera of the rig"}.get(
-        status, ""
-    )
+    name = "keyframe" if status is FrameStatus.KEYFRAME else ""
     if not len(points.px):  # recovery stores no observations for the frames that it poses
         return name or "found again", AMBER
     text = f"{len(points.px)} points, {float(points.error_px.mean()):.1f} px"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -12,27 +11,19 @@ from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.relative_pose import RelativePose
 from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration
 from bodycap_batch.registration.poses.keyframe_requests import request_keyframes
-from bodycap_batch.registration.poses.map_error import with_map_error, without_map_error
+from bodycap_batch.registration.poses.map_error import with_map_error
 from bodycap_batch.registration.poses.misplaced_keyframes import (
     find_misplaced_keyframes,
     map_without_keyframes,
 )
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, FramePose
-from bodycap_batch.registration.poses.rig_members import (
-    RegisteredCamera,
-    estimate_relative_poses,
-    initial_rig_poses,
-    rig_members,
-)
 from bodycap_batch.registration.poses.trajectory import (
     acceptance_criteria,
     build_trajectory,
     solve_camera,
-    solve_rig,
 )
 from bodycap_batch.registration.poses.turning_tracks import rotation_of_camera, turn_tracks
 from bodycap_batch.registration.recovery.path_smoothing import smooth_if_final
@@ -100,57 +91,6 @@ def register_frames(
         wanted_keyframes=np.union1d(requested, np.setdiff1d(misplaced, already_requested)),
         tried_keyframes=offered,
     )
-
-
-def register_in_rig(
-    own: RegisteredCamera,
-    others: Sequence[RegisteredCamera],
-    maps: Sequence[Map],
-    selection: KeyframeSelection,
-    options: RegistrationOptions,
-    threads: int = 1,
-) -> tuple[Registration, list[RelativePose]]:
-    """Estimate the pose of every frame of one camera with the observations of all cameras of its rig.
-
-    The relative pose of two cameras is the robust mean over all instants at which both cameras have a pose.
-    A camera is excluded if the number of these instants is too small, or if the relative pose scatters too
-    much between these instants.
-
-    Args:
-        own: The camera with its registration.
-        others: The other cameras on the same body segment, exposed at the same instants.
-        maps: The maps that the camera was registered against.
-        selection: The keyframes of the camera.
-        options: Minimum number of inliers and maximum relative sigma of a pose.
-        threads: Number of threads that solve frames. The result does not depend on it.
-
-    Returns:
-        The registration with poses from all cameras of the rig, and the relative pose of each other camera.
-
-    Source: generalised cameras, Pless, "Using many cameras as one", CVPR 2003.
-    """
-    own_alone, *others_alone = (_without_map_error(each, maps) for each in (own, *others))
-    relative_poses = estimate_relative_poses(own_alone, others_alone)
-    members = rig_members(own, others, relative_poses)
-    gauge = own.registration.trajectory.gauge
-    scene_map = next((scene for scene in maps if scene.gauge == gauge), None)
-    if scene_map is None or len(members) == 1:
-        return own.registration, relative_poses
-    criteria = acceptance_criteria(own.camera, selection, options)
-    for member in members:
-        turned = turn_tracks(member.camera.name, scene_map, member.tracks, member.rotation)
-        misplaced = find_misplaced_keyframes(member.camera.name, scene_map, turned, criteria)
-        scene_map = map_without_keyframes(scene_map, misplaced)
-    start = initial_rig_poses(own, others, members)
-    poses = solve_rig(members, scene_map, start, criteria, threads)
-    trajectory = smooth_if_final(build_trajectory(own.camera, scene_map.gauge, poses, selection))
-    return replace(own.registration, trajectory=with_map_error(trajectory, maps)), relative_poses
-
-
-def _without_map_error(camera: RegisteredCamera, maps: Sequence[Map]) -> RegisteredCamera:
-    """Return a camera whose poses have the covariances that follow from an exact map."""
-    path = without_map_error(camera.registration.trajectory, maps)
-    return replace(camera, registration=replace(camera.registration, trajectory=path))
 
 
 def _track_without_misplaced(

@@ -12,7 +12,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, FileRef
 from bodycap_batch.tasks.loading import load_registration
-from bodycap_batch.tasks.registered_cameras import INERTIAL_CAMERA, RIG_POSES
+from bodycap_batch.tasks.registered_cameras import INERTIAL_CAMERA
 from bodycap_batch.tasks.registration import save_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
 
@@ -48,7 +48,6 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
     from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
     from bodycap_batch.inertial import use_sensor
     from bodycap_batch.model.camera_clock import FrameTiming
-    from bodycap_batch.model.relative_pose import RigPoses
     from bodycap_batch.telemetry import read_telemetry
     from bodycap_batch.telemetry.comparison import all_times_ns
     from bodycap_batch.telemetry.streams import CameraTelemetry
@@ -80,8 +79,6 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
     camera = replace(camera, nominal_fps=read_dataclass(FrameTiming, before, "timing").nominal_fps)
     save_registration(registration, camera, files, rolling=read_summary(before)["rolling"], notes=notes)
     write_dataclass(found.camera, files, INERTIAL_CAMERA)
-    if (before / f"{RIG_POSES}.json").exists():
-        write_dataclass(read_dataclass(RigPoses, before, RIG_POSES), files, RIG_POSES)
 
 
 INERTIAL = Stage(

@@ -11,10 +11,9 @@ STAGE_ORDER: tuple[StageName, ...] = get_args(StageName)
 """The stages of a job in the order in which they run."""
 BESIDE_KEYFRAMES = frozenset({"sound"})
 """Further stages that run at the same time as the keyframes."""
-_DURING_REGISTRATION = frozenset({"extend", "refine", "rig", "recover", "clocks", "places", "inertial"})
-"""Further stages that may run up to the merge. They extend and refine the map, solve the cameras of a rig
-together, recover lost frames, determine the clocks, find the places of cameras from the motion, and use the
-inertial sensors."""
+_DURING_REGISTRATION = frozenset({"extend", "refine", "recover", "clocks", "places", "inertial"})
+"""Further stages that may run up to the merge. They extend and refine the map, recover lost frames, determine
+the clocks, find the places of cameras from the motion, and use the inertial sensors."""
 
 
 def stages_from(stage: StageName) -> frozenset[str]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from bodycap_batch.config.options import RegistrationOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.tasks.camera_group import CameraGroupTask
-from bodycap_batch.tasks.inputs import paths_of
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.registered_cameras import RIG_POSES
-from bodycap_batch.tasks.registration import save_registration
+from bodycap_batch.tasks.registration import NOT_ROUNDS, save_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
 
 _MEMORY_MB = 900
@@ -17,10 +18,29 @@ _MEMORY_MB = 900
 memory, about half a megabyte for each image."""
 
 
-def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> None:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecoverTask:
+    """Recover the lost frames of one camera with the help of the other cameras.
+
+    Attributes:
+        options: Options of the stage `registration`.
+        cameras: Names of the cameras. The first camera is the one to recover; the other cameras help.
+        capture: The videos of these cameras, in the order of `cameras`.
+        keyframes: The selected keyframes of each camera, by camera name.
+        map: The map.
+        registrations: The registration of each camera, by camera name, in the order of `cameras`.
+    """
+
+    options: RegistrationOptions = field(metadata=NOT_ROUNDS)
+    cameras: tuple[str, ...]
+    capture: CaptureRef
+    keyframes: Mapping[str, ArtefactRef]
+    map: ArtefactRef
+    registrations: Mapping[str, ArtefactRef]
+
+
+def run_recover(task: RecoverTask, context: StageContext, files: Path) -> None:
     """Recover the lost frames of the task's first camera; store all poses of this camera."""
-    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
-    from bodycap_batch.model.relative_pose import RigPoses
     from bodycap_batch.registration import (
         RecoveryInputs,
         recover_lost_frames,
@@ -31,7 +51,6 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
     paths = paths_of(task.registrations.values())
     scene = load_map(task.map.path)
-    in_rig = (paths[0] / f"{RIG_POSES}.json").exists()
     selections = {name: load_keyframes(item.path) for name, item in task.keyframes.items()}
     inputs = RecoveryInputs(
         capture=capture,
@@ -42,18 +61,15 @@ def run_recover(task: CameraGroupTask, context: StageContext, files: Path) -> No
         ),
         maps=scene.maps,
         selection=selections[task.cameras[0]],
-        in_rig=in_rig,
         misplaced=scene.diagnostics.misplaced.get(task.cameras[0], ()),
     )
     registration = recover_lost_frames(load_registration(paths[0]), inputs, task.options, context)
     save_registration(registration, capture.cameras[0], files, rolling=read_summary(paths[0])["rolling"])
-    if in_rig:
-        write_dataclass(read_dataclass(RigPoses, paths[0], RIG_POSES), files, RIG_POSES)
 
 
 RECOVER = Stage(
     name="recover",
-    task=CameraGroupTask,
+    task=RecoverTask,
     function=run_recover,
     libraries=(*VISION_LIBRARIES, "pycolmap"),
     modules=(*VISION_MODULES, "pycolmap"),

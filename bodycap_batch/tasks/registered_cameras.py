@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from bodycap_batch.model.relative_pose import RelativePose
     from bodycap_batch.model.scene import Map, Trajectory
 
-RIG_POSES = "rig"
-"""Name of the file, without suffix, that holds the relative poses of a rig's cameras."""
-
 INERTIAL_CAMERA = "inertial"
 """Name of the file, without suffix, that holds what the inertial sensor of a camera gives."""
 
@@ -80,34 +77,21 @@ class RegisteredCameras:
             inertial=inertial,
         )
 
-    def relative_poses(
-        self, paths: Sequence[Path], segments: Sequence[Sequence[str]]
-    ) -> tuple[RelativePose, ...]:
+    def relative_poses(self, segments: Sequence[Sequence[str]]) -> tuple[RelativePose, ...]:
         """Return the relative pose of every pair of cameras that are mounted on the same body segment.
 
         Args:
-            paths: The folder of each camera's registration artefact. If a rig was solved, its artefacts hold
-                relative poses that were estimated before. These stored poses are preferred.
             segments: For each body segment with several cameras, the names of these cameras.
 
         Returns:
             The relative poses. A pair with an unknown clock has none.
         """
-        from bodycap_batch.formats.dataclass_files import read_dataclass
-        from bodycap_batch.model.relative_pose import RigPoses, estimate_relative_pose
+        from bodycap_batch.model.relative_pose import estimate_relative_pose
 
         trajectory_of = {trajectory.camera: trajectory for trajectory in self.trajectories}
-        stored = {
-            relative.cameras: relative
-            for path in paths
-            if (path / f"{RIG_POSES}.json").exists()
-            for relative in read_dataclass(RigPoses, path, RIG_POSES).relative
-        }
         out = []
         for pair in (pair for names in segments for pair in combinations(sorted(names), 2)):
-            if pair in stored:
-                out.append(stored[pair])
-            elif all(self.clocks[name].is_known for name in pair):
+            if all(self.clocks[name].is_known for name in pair):
                 first, second = (self._on_common_clock(trajectory_of[name]) for name in pair)
                 out.append(estimate_relative_pose(first, second, 0))
         return tuple(out)

@@ -18,7 +18,6 @@ from bodycap_batch.tasks.preview import PREVIEW
 from bodycap_batch.tasks.recover import RECOVER
 from bodycap_batch.tasks.registration import REGISTRATION
 from bodycap_batch.tasks.report import REPORT
-from bodycap_batch.tasks.rig import RIG
 from bodycap_batch.tasks.sound import SOUND
 from bodycap_batch.tasks.stage import Stage
 from bodycap_batch.tasks.synth import SYNTH
@@ -33,7 +32,6 @@ STAGES: Mapping[str, Stage[Any]] = {
         EXTEND,
         REFINE,
         REGISTRATION,
-        RIG,
         RECOVER,
         SOUND,
         CLOCKS,

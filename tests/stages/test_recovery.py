@@ -248,7 +248,6 @@ def test_a_registration_without_a_map_stays_as_it_is(
         registrations=(),
         maps=(_map(pictures),),
         selection=_selection(),
-        in_rig=False,
     )
     assert recover.recover_lost_frames(lost, inputs, RegistrationOptions(), context) is lost
 
@@ -660,12 +659,14 @@ def test_poses_from_tracking_among_misplaced_keyframes_are_withdrawn_before_the_
         return registration
 
     monkeypatch.setattr(recover, "find_lost_poses", find)
+    monkeypatch.setattr(
+        recover, "prepare_recovery", lambda own, _, scene_map, *__: (scene_map, own.registration)
+    )
     inputs = recover.RecoveryInputs(
         capture=Capture(cameras=(cast(CaptureCamera, video),)),
         registrations=(RegisteredCamera(camera=cast(CaptureCamera, video), registration=tracked),),
         maps=(scene,),
         selection=_selection(),
-        in_rig=True,
         misplaced=(29, 30),
     )
     recover.recover_lost_frames(tracked, inputs, RegistrationOptions(), context)

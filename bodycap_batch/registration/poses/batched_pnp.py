@@ -10,7 +10,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp, transform_points
+from bodycap_batch.model.geometry import make_transform, so3_exp, transform_points
 from bodycap_batch.model.reprojection_derivatives import (
     common_error_ratio,
     picture_cells,
@@ -54,8 +54,6 @@ _SMALLEST_NOISE_PX2 = 1e-12
 """Smallest variance of an observation, px². It prevents singular equations for a frame without inliers."""
 _UNUSABLE = 1e5
 """Residual in pixels, or depth, that stands for "no usable value". It exceeds every limit."""
-_MEMBER_SHIFT = 20
-"""Number of bits of the number of a cell of the picture. The number of the camera of a rig is above them."""
 _MIN_OBSERVATIONS = 3
 """Minimum number of observations for a pose. Each observation gives two residuals, and a pose has six
 unknowns."""
@@ -88,9 +86,6 @@ class Observations:
         px_from_ray: (M,2,2) derivative of the pixel with respect to the ray.
         weight: (M,) inverse variance of each observation, relative to the inverse variance of the best
             observations.
-        member: (M,) index of the observing camera of a rig; None for a single camera.
-        cam_from_rig: (C,4,4) poses of the cameras in the rig; None for a single camera. If they are given,
-            the estimated poses are the poses of the rig.
         rates: How the angular velocities of a rolling shutter's frames move the observations; None if all
             observations are from one instant.
     """
@@ -100,8 +95,6 @@ class Observations:
     rays: FloatArray
     px_from_ray: FloatArray
     weight: FloatArray
-    member: IntArray | None = None
-    cam_from_rig: FloatArray | None = None
     rates: RateErrors | None = None
 
     def rows(self, frame: int) -> slice:
@@ -117,26 +110,10 @@ class Observations:
             rays=self.rays[rows],
             px_from_ray=self.px_from_ray[rows],
             weight=self.weight[rows],
-            member=None if self.member is None else self.member[rows],
-            cam_from_rig=self.cam_from_rig,
             rates=None
             if self.rates is None
             else RateErrors(self.rates.leverage_s[rows], self.rates.sigma[rows]),
         )
-
-    def camera_poses(self, rows: IntArray, poses: FloatArray) -> FloatArray:
-        """Return the poses of the observing cameras, given the poses of the frames.
-
-        Args:
-            rows: (N,) row indices of observations.
-            poses: (N,4,4) cam_from_gauge, or rig_from_gauge, of the frame of each observation.
-
-        Returns:
-            Poses cam_from_gauge (N,4,4) of the observing cameras.
-        """
-        if self.member is None or self.cam_from_rig is None:
-            return poses
-        return np.asarray(self.cam_from_rig[self.member[rows]] @ poses)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -264,8 +241,6 @@ def evaluate_poses(
         redundancy = np.maximum(2 * counted - 6, 1)
         quality.variance_px2[chosen] = np.add.reduceat(used * error_px**2, starts) / redundancy
         cell = picture_cells(observations.rays[rows])
-        if observations.member is not None:
-            cell = cell + (observations.member[rows] << _MEMBER_SHIFT)
         quality.common_px2[chosen] = common_error_ratio(
             residual, jacobian, used, cell, owner, _inverse_or_nan(information)
         )
@@ -432,33 +407,13 @@ def linearise(
     Args:
         observations: The observations.
         rows: (N,) row indices of the observations to use.
-        cam_from_gauge: (N,4,4) pose of the frame of each row; rig_from_gauge if `observations` are from a
-            rig.
+        cam_from_gauge: (N,4,4) pose of the frame of each row.
 
     Returns:
         Residuals (2,N) in pixels; derivatives (2,6,N), rotation first; depths (N,).
     """
     residual, (a, b, inverse, z), px_from_ray = _residuals(observations, rows, cam_from_gauge)
-    jacobian = pose_derivatives(a, b, inverse, px_from_ray)
-    if observations.member is not None and observations.cam_from_rig is not None:
-        _camera_to_rig_jacobian(jacobian, observations.member[rows], observations.cam_from_rig)
-    return residual, jacobian, z
-
-
-def _camera_to_rig_jacobian(jacobian: FloatArray, member: IntArray, cam_from_rig: FloatArray) -> None:
-    """Convert derivatives with respect to a camera's pose to derivatives with respect to the rig's pose.
-
-    Args:
-        jacobian: (2,6,N) derivatives, changed in place; rotation first.
-        member: (N,) index of the observing camera.
-        cam_from_rig: (C,4,4) poses of the cameras in the rig.
-
-    Source: the adjoint map of SE(3), as in Sola, Deray, Atchuthan, "A micro Lie theory for state estimation
-        in robotics", 2018; rotation first.
-    """
-    for number, pose in enumerate(cam_from_rig):
-        columns = np.flatnonzero(member == number)
-        jacobian[:, :, columns] = np.einsum("dim,ik->dkm", jacobian[:, :, columns], se3_adjoint(pose))
+    return residual, pose_derivatives(a, b, inverse, px_from_ray), z
 
 
 def _residuals(
@@ -470,7 +425,7 @@ def _residuals(
         Residuals (2,N) as in `linearise`; a tuple of four arrays (N,): x/z, y/z, 1/z and z; px_from_ray
         (2,2,N). For unusable observations px_from_ray is 0.
     """
-    x, y, z = transform_points(observations.camera_poses(rows, cam_from_gauge), observations.points[rows]).T
+    x, y, z = transform_points(cam_from_gauge, observations.points[rows]).T
     in_front = z > 1e-9
     inverse = 1.0 / np.where(in_front, z, 1.0)
     a, b = x * inverse, y * inverse

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform
 from bodycap_batch.model.scene import FrameStatus
@@ -61,8 +60,8 @@ class FramePose:
     """The estimated pose of one frame, or the reason why the frame has no pose.
 
     Attributes:
-        status: Status of the frame. A frame with the status `REGISTERED`, `KEYFRAME` or `RIG` has a pose. Any
-            other status is the reason why the frame has no pose.
+        status: Status of the frame. A frame with the status `REGISTERED` or `KEYFRAME` has a pose. Any other
+            status is the reason why the frame has no pose.
         gauge_from_cam: (4,4) pose; None if the frame has no pose.
         covariance: (6,6) covariance as in `Trajectory`, if the map had no error; None if the frame has no
             pose.
@@ -84,20 +83,20 @@ class FramePose:
 
 
 def solve_poses(
-    lenses: Sequence[Camera],
+    lens: Camera,
     observations: Observations,
     px: FloatArray,
     start: FloatArray,
     criteria: AcceptanceCriteria,
     threads: int = 1,
 ) -> list[FramePose]:
-    """Estimate the poses of all frames of a camera or a rig from the observed map points.
+    """Estimate the poses of all frames of a camera from the observed map points.
 
     Each initial pose is refined. A frame without an initial pose, or with a low inlier weight ratio, is
     solved again from a RANSAC pose. The result with the higher inlier weight ratio is kept.
 
     Args:
-        lenses: The camera model, or the models of all cameras of the rig.
+        lens: The camera model.
         observations: (M) observations, ordered by frame.
         px: (M,2) observed pixels of these observations.
         start: (F,4,4) initial poses cam_from_gauge; NaN for a frame without an initial pose.
@@ -119,7 +118,7 @@ def solve_poses(
         chosen = own.weight >= MIN_COUNTED_WEIGHT
         if chosen.sum() < criteria.min_inliers:
             chosen[:] = True
-        start_pose = _ransac(lenses, own, chosen, px[observations.rows(frame)], criteria)
+        start_pose = ransac_pose(lens, own.points[chosen], px[observations.rows(frame)][chosen], criteria)
         if start_pose is not None:
             refined = refine_poses(own, start_pose[None], criteria.max_error_px)
             solved[frame] = max(
@@ -128,69 +127,6 @@ def solve_poses(
                 key=lambda pose: pose.inlier_weight_ratio,
             )
     return solved
-
-
-def _ransac(
-    lenses: Sequence[Camera],
-    observations: Observations,
-    chosen: BoolArray,
-    px: FloatArray,
-    criteria: AcceptanceCriteria,
-) -> FloatArray | None:
-    """Return the RANSAC pose (4,4) of one frame from the chosen observations; None if RANSAC fails.
-
-    If several cameras of a rig observe the chosen points, the pose of the rig is estimated from all these
-    cameras.
-    """
-    points, px = observations.points[chosen], px[chosen]
-    if observations.member is None or observations.cam_from_rig is None:
-        return ransac_pose(lenses[0], points, px, criteria)
-    member = observations.member[chosen]
-    if len(np.unique(member)) > 1:
-        return _ransac_rig_pose(lenses, observations.cam_from_rig, member, points, px, criteria)
-    pose = ransac_pose(lenses[member[0]], points, px, criteria)
-    return None if pose is None else np.asarray(invert(observations.cam_from_rig[member[0]]) @ pose)
-
-
-def _ransac_rig_pose(
-    lenses: Sequence[Camera],
-    cam_from_rig: FloatArray,
-    member: IntArray,
-    points: FloatArray,
-    px: FloatArray,
-    criteria: AcceptanceCriteria,
-) -> FloatArray | None:
-    """Return the pose rig_from_gauge (4,4) of a rig from map points that its cameras see.
-
-    Args:
-        lenses: (C) camera models.
-        cam_from_rig: (C,4,4) poses of the cameras in the rig.
-        member: (N,) index of the camera that sees each point.
-        points: (N,3) map points in the gauge.
-        px: (N,2) observed pixels.
-        criteria: The inlier limit and the seed.
-
-    Returns:
-        The pose, or None if RANSAC fails.
-
-    Source: Hee Lee et al., "Minimal solutions for pose estimation of a multi-camera system", ISRR 2013, as in
-        COLMAP.
-    """
-    import pycolmap
-
-    options = pycolmap.RANSACOptions()
-    options.max_error = criteria.max_error_px
-    options.random_seed = criteria.seed
-    options.max_num_trials = _MAX_TRIALS
-    rig_poses = [pycolmap.Rigid3d(pose[:3]) for pose in cam_from_rig]
-    cameras = [lens.to_pycolmap() for lens in lenses]
-    found = pycolmap.estimate_generalized_absolute_pose(
-        px, points, member.tolist(), rig_poses, cameras, options
-    )
-    if found is None:
-        return None
-    matrix = np.asarray(found["rig_from_world"].matrix())
-    return make_transform(matrix[:, :3], matrix[:, 3])
 
 
 def ransac_pose(
@@ -229,7 +165,7 @@ def accept_poses(
 
     Args:
         observations: Observations of F frames.
-        cam_from_gauge: (F,4,4) poses of the frames, or poses rig_from_gauge of a rig.
+        cam_from_gauge: (F,4,4) poses of the frames.
         criteria: The conditions that a pose must meet.
         threads: Number of threads. The result does not depend on it.
 

@@ -15,7 +15,7 @@ from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Trajectory
 from bodycap_batch.registration.poses.batched_pnp import find_inliers
-from bodycap_batch.registration.poses.observations import PointReliability, RigMember, RigObservations
+from bodycap_batch.registration.poses.observations import CameraObservations, PointReliability
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, FramePose, solve_poses
 from bodycap_batch.registration.poses.pose_outliers import (
     ISOLATED_INLIER_FACTOR,
@@ -69,61 +69,39 @@ def solve_camera(
     threads: int = 1,
     rotation: RotationPath | None = None,
 ) -> list[FramePose]:
-    """Estimate the pose of every frame of a camera from the observed map points; see `solve_rig`.
+    """Estimate the pose of every frame of a camera from the map points that it observes.
 
-    The solution starts from poses that are interpolated between the keyframes. `rotation` is the rotation of
-    a camera with a rolling shutter from matches between adjacent frames; None if it is unknown.
-    """
-    count = len(camera.times_ns)
-    member = RigMember(
-        camera=camera,
-        tracks=tracks,
-        cam_from_rig=np.eye(4),
-        rig_frame=np.arange(count),
-        rotation=rotation,
-    )
-    rows = scene_map.keyframes_of(camera.name)
-    start = _interpolated_keyframe_poses(scene_map.keyframe_frame[rows], scene_map.map_from_cam[rows], count)
-    return solve_rig([member], scene_map, start, criteria, threads)
-
-
-def solve_rig(
-    members: Sequence[RigMember],
-    scene_map: Map,
-    start: FloatArray,
-    criteria: AcceptanceCriteria,
-    threads: int = 1,
-) -> list[FramePose]:
-    """Estimate the pose of every frame of a rig from the map points that its cameras observe at that instant.
-
-    Wrongly matched points, and points that move with the wearer, disagree with the poses of most frames.
-    After a first solution, all frames are solved again with new weights. The weight of each point is
-    multiplied by the squared fraction of its observations that agree with a pose. Observations of a rolling
-    shutter are moved to the instant of the middle row.
+    The solution starts from poses that are interpolated between the keyframes. Wrongly matched points, and
+    points that move with the wearer, disagree with the poses of most frames. After a first solution, all
+    frames are solved again with new weights. The weight of each point is multiplied by the squared fraction
+    of its observations that agree with a pose. Observations of a rolling shutter are moved to the instant of
+    the middle row.
 
     Args:
-        members: The cameras of the rig. The first camera is at the origin of the rig, and its frames are the
-            frames of the rig.
+        camera: The camera.
         scene_map: The map.
-        start: (F,4,4) initial poses rig_from_map; NaN for a frame without an initial pose.
+        tracks: Tracked observations in the frames of the camera, ordered by frame.
         criteria: The conditions that a pose must meet.
         threads: Number of threads that solve chunks of frames. The result does not depend on it.
-
-    Returns:
-        The poses of the first camera. A pose has the status `FrameStatus.RIG` if the first camera alone has
-        too few inliers.
+        rotation: The rotation of a camera with a rolling shutter from matches between adjacent frames; None
+            if it is unknown.
     """
-    rig = RigObservations.create(members, scene_map)
-    unknown = np.full_like(start, np.nan) if rig.rolling else None
-    solution = _solve(rig, start, criteria, threads, path=unknown)
-    for _ in range(_REPEATS_ROLLING if rig.rolling else _REPEATS):
+    rows = scene_map.keyframes_of(camera.name)
+    start = _interpolated_keyframe_poses(
+        scene_map.keyframe_frame[rows], scene_map.map_from_cam[rows], len(camera.times_ns)
+    )
+    seen = CameraObservations(camera, tracks, scene_map, rotation)
+    is_rolling = bool(seen.readout_s)
+    solution = _solve(
+        seen, start, criteria, threads, path=np.full_like(start, np.nan) if is_rolling else None
+    )
+    for _ in range(_REPEATS_ROLLING if is_rolling else _REPEATS):
         poses = pose_array(solution.poses)
         start = np.where(np.isfinite(poses), invert(poses), start)
-        path = poses if rig.rolling else None
-        solution = _solve(rig, start, criteria, threads, solution.reliability, path)
+        path = poses if is_rolling else None
+        solution = _solve(seen, start, criteria, threads, solution.reliability, path)
     accepted = _require_static_inliers(solution.poses, solution.static)
-    times_ns = rig.members[0].camera.times_ns
-    return _reject_outliers(_assign_status(accepted, rig, solution.own_inliers, criteria), times_ns, criteria)
+    return _reject_outliers(_with_keyframe_status(accepted, scene_map, rows), camera.times_ns, criteria)
 
 
 @dataclass(slots=True)
@@ -134,17 +112,15 @@ class _Solution:
         poses: Pose of each frame.
         reliability: How often each point agreed with a pose.
         static: (F,) number of inliers on static points.
-        own_inliers: (F,) number of inliers of the first camera.
     """
 
     poses: list[FramePose]
     reliability: PointReliability
     static: IntArray
-    own_inliers: IntArray
 
 
 def _solve(
-    rig: RigObservations,
+    seen: CameraObservations,
     start: FloatArray,
     criteria: AcceptanceCriteria,
     threads: int,
@@ -156,50 +132,40 @@ def _solve(
     The observations of a long video do not fit into memory together.
 
     Args:
-        rig: The cameras of the rig and the map.
-        start: (F,4,4) initial poses rig_from_map; NaN for a frame without an initial pose.
+        seen: The observations of the camera.
+        start: (F,4,4) initial poses cam_from_map; NaN for a frame without an initial pose.
         criteria: The conditions that a pose must meet.
         threads: Number of threads that solve chunks of frames.
         reliability: Reliability of each point in the previous solution; None for the first solution.
-        path: (F,4,4) poses map_from_rig for the correction of the rolling shutter; None for a global shutter.
+        path: (F,4,4) poses map_from_cam for the correction of the rolling shutter; None for a global shutter.
     """
-    count = len(start)
-    out = _Solution(
-        [], PointReliability.zero(rig.static.size), np.zeros(count, np.int64), np.zeros(count, np.int64)
-    )
-    for block in rig.blocks():
+    out = _Solution([], PointReliability.zero(seen.static.size), np.zeros(len(start), np.int64))
+    for block in seen.blocks():
         px, rates = (None, None) if path is None else block.px_at_mid_row(path)
         observations, frames = block.observations(px, reliability, rates), block.frames
         observed_px = block.px if px is None else px
-        poses = solve_poses(rig.lenses, observations, observed_px, start[frames], criteria, threads)
+        poses = solve_poses(seen.lens, observations, observed_px, start[frames], criteria, threads)
         solved = pose_array(poses)
         agrees = find_inliers(observations, invert(solved), criteria.max_error_px, threads)
         has_pose = np.asarray(np.isfinite(solved).all(axis=(1, 2)))[block.frame - frames.start]
         out.poses.extend(poses)
-        out.reliability.add(block.point_keys, has_pose, agrees)
+        out.reliability.add(block.point, has_pose, agrees)
         out.static[frames] = block.count_by_frame(agrees & block.static)
-        out.own_inliers[frames] = block.count_by_frame(agrees & (block.member == 0))
     return out
 
 
-def _assign_status(
-    poses: list[FramePose], rig: RigObservations, own_inliers: IntArray, criteria: AcceptanceCriteria
-) -> list[FramePose]:
-    """Set the status of keyframes, and of frames whose pose depends on other cameras of the rig.
+def _with_keyframe_status(poses: list[FramePose], scene_map: Map, rows: IntArray) -> list[FramePose]:
+    """Set the status of the keyframes.
 
     Args:
         poses: Pose of each frame.
-        rig: The cameras of the rig and the map.
-        own_inliers: (F,) number of inliers of the first camera.
-        criteria: The conditions of a pose. Only the minimum number of inliers is used.
+        scene_map: The map.
+        rows: (K,) row indices of the camera's keyframes in the map.
     """
-    rows = rig.scene_map.keyframes_of(rig.members[0].camera.name)
-    status = dict.fromkeys(rig.scene_map.keyframe_frame[rows].tolist(), FrameStatus.KEYFRAME)
-    if len(rig.members) > 1:
-        status |= dict.fromkeys(np.flatnonzero(own_inliers < criteria.min_inliers).tolist(), FrameStatus.RIG)
+    keyframes = frozenset(scene_map.keyframe_frame[rows].tolist())
     return [
-        replace(pose, status=status.get(frame, pose.status))
-        if pose.status is FrameStatus.REGISTERED
+        replace(pose, status=FrameStatus.KEYFRAME)
+        if frame in keyframes and pose.status is FrameStatus.REGISTERED
         else pose
         for frame, pose in enumerate(poses)
     ]
@@ -252,7 +218,7 @@ def _frame_statuses(poses: Sequence[FramePose], selection: KeyframeSelection) ->
         status = pose.status
         if index in damaged and not status.localised:
             status = FrameStatus.DAMAGED
-        elif selection.frozen[index] and status not in (FrameStatus.NO_MAP, FrameStatus.RIG):
+        elif selection.frozen[index] and status is not FrameStatus.NO_MAP:
             status = FrameStatus.FROZEN
         elif status is FrameStatus.FEW_TRACKS:
             nearby = sharpness[max(0, index - _BLUR_WINDOW_FRAMES) : index + _BLUR_WINDOW_FRAMES + 1]

@@ -11,7 +11,7 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.inertial import camera_rotation
 from bodycap_batch.model.rotation_path import RotationPath, rotate_to_mid_row
 from bodycap_batch.model.scene import KeyframeSelection, Map, Registration, Trajectory
-from bodycap_batch.registration.poses.rig_members import RegisteredCamera
+from bodycap_batch.registration.poses.registered_camera import RegisteredCamera
 from bodycap_batch.registration.tracking.klt import Tracks
 
 

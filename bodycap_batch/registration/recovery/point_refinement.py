@@ -51,10 +51,9 @@ def remove_weak_boundary_poses(path: Trajectory, min_inliers: int) -> Trajectory
 
     Returns:
         The trajectory, or `path` itself if no pose is removed. Frames whose pose was removed have the status
-        `UNCONFIRMED`. Poses with the status `RIG` are kept.
+        `UNCONFIRMED`.
     """
     weak = path.inliers < _WELL_SUPPORTED_FACTOR * min_inliers
-    weak &= np.array([status is not FrameStatus.RIG for status in path.status], dtype=bool)
     has_pose = path.localised
     for start, stop in lost_intervals(has_pose):
         has_pose[_first_supported(weak, start - 1, -1) + 1 : start] = False

@@ -17,7 +17,7 @@ from bodycap_batch.registration.poses.misplaced_keyframes import (
     find_misplaced_keyframes,
     map_without_keyframes,
 )
-from bodycap_batch.registration.poses.rig_members import RegisteredCamera
+from bodycap_batch.registration.poses.registered_camera import RegisteredCamera
 from bodycap_batch.registration.poses.trajectory import (
     acceptance_criteria,
     build_trajectory,
@@ -66,8 +66,7 @@ def prepare_recovery(
     Weak poses are removed from all cameras. The map points are refined with the remaining poses.
 
     Args:
-        own: The camera to recover, with a registration from this camera alone. A registration from all
-            cameras of its rig is not permitted.
+        own: The camera to recover, with its registration.
         others: Trajectories of the other cameras.
         scene_map: The map.
         selection: The keyframes of the camera.

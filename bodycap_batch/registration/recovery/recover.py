@@ -21,7 +21,7 @@ from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
 from bodycap_batch.registration.poses.map_error import with_map_error, without_map_error
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
 from bodycap_batch.registration.poses.pose_outliers import ISOLATED_INLIER_FACTOR, isolated_poses
-from bodycap_batch.registration.poses.rig_members import RegisteredCamera
+from bodycap_batch.registration.poses.registered_camera import RegisteredCamera
 from bodycap_batch.registration.poses.turning_tracks import with_rotation
 from bodycap_batch.registration.recovery.accepted_poses import accepted_pose, with_poses
 from bodycap_batch.registration.recovery.guided_localisation import GuidedLocaliser, PoseEstimate, fuse
@@ -84,8 +84,6 @@ class RecoveryInputs:
             holds only one of them at a time, so an iterable may load them one after another.
         maps: The maps that the cameras were registered against.
         selection: The keyframes of the camera to recover.
-        in_rig: True if the poses were estimated from all cameras of a rig. The preparation is then skipped,
-            because it would estimate the poses again from one camera alone.
         misplaced: Frame indices of the keyframes of the camera to recover that contradict the map.
     """
 
@@ -93,7 +91,6 @@ class RecoveryInputs:
     registrations: Iterable[RegisteredCamera]
     maps: Sequence[Map]
     selection: KeyframeSelection
-    in_rig: bool
     misplaced: Collection[int] = ()
 
 
@@ -103,8 +100,7 @@ def recover_lost_frames(
     """Recover the poses of one camera's lost frames.
 
     First, misregistered keyframes of all cameras are removed from the map. Second, weak poses next to lost
-    intervals are removed and the map points are refined. The second step is skipped for poses of a rig.
-    Third, the lost frames are searched.
+    intervals are removed and the map points are refined. Third, the lost frames are searched.
 
     Args:
         registration: Registration of the camera, from tracking.
@@ -130,10 +126,9 @@ def recover_lost_frames(
 
     own = with_rotation(inputs.capture.cameras[0], registration, [own_map], inputs.selection)
     scene_map = remove_misplaced_keyframes(own_map, cameras(), inputs.selection, options)
-    if not inputs.in_rig:
-        scene_map, registration = prepare_recovery(
-            own, trajectories[1:], scene_map, inputs.selection, options, context.threads
-        )
+    scene_map, registration = prepare_recovery(
+        own, trajectories[1:], scene_map, inputs.selection, options, context.threads
+    )
     registration = withdraw_contradicted_poses(registration, inputs.maps, inputs.misplaced)
     doubtful = contradicted_frames(registration.trajectory, inputs.maps, inputs.misplaced)
     known = KnownFrames(rotation=own.rotation, doubtful=doubtful)

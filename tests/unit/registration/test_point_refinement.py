@@ -72,10 +72,6 @@ def test_a_path_with_few_inliers_everywhere_is_kept() -> None:
     assert taken == [*range(LOST[0] - reach, LOST[0]), *range(LOST[-1] + 1, LOST[-1] + 1 + reach)]
 
 
-def test_frames_supported_by_a_rig_stay() -> None:
-    assert _taken(_path({17: 3}, {17: FrameStatus.RIG})) == []
-
-
 def test_a_path_without_lost_frames_stays() -> None:
     found = dict.fromkeys(LOST, FrameStatus.REGISTERED)
     assert _taken(_path(dict.fromkeys(range(COUNT), 15), found)) == []

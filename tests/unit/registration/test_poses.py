@@ -52,7 +52,7 @@ def _solve(points: np.ndarray, px: np.ndarray, start: np.ndarray | None = None) 
     """One frame alone, from a starting cam_from_gauge or from none."""
     views = make_observations(CAMERA, np.array([0, len(px)]), points, px)
     first = np.full((4, 4), np.nan) if start is None else start
-    return solve_poses([CAMERA], views, px, first[None], CRITERIA)[0]
+    return solve_poses(CAMERA, views, px, first[None], CRITERIA)[0]
 
 
 def test_pose_survives_a_third_of_wrong_points() -> None:
@@ -130,9 +130,7 @@ def test_frames_solved_together_do_not_influence_each_other() -> None:
     start = np.stack([invert(scene[2]) for scene in scenes])
     bounds = np.concatenate([[0], np.cumsum([len(part) for part in px])])
     points, pixels = np.concatenate([scene[0] for scene in scenes]), np.concatenate(px)
-    together = solve_poses(
-        [CAMERA], make_observations(CAMERA, bounds, points, pixels), pixels, start, CRITERIA
-    )
+    together = solve_poses(CAMERA, make_observations(CAMERA, bounds, points, pixels), pixels, start, CRITERIA)
     assert [pose.status for pose in together] == [
         FrameStatus.REGISTERED if len(part) > 50 else FrameStatus.FEW_TRACKS for part in px
     ]
@@ -153,7 +151,7 @@ def test_uncertain_points_have_less_weight() -> None:
 
     def solve(weight: float) -> np.ndarray:
         views = make_observations(CAMERA, np.array([0, 100]), points, seen, np.where(displaced, weight, 1.0))
-        pose = solve_poses([CAMERA], views, seen, start, CRITERIA)[0].gauge_from_cam
+        pose = solve_poses(CAMERA, views, seen, start, CRITERIA)[0].gauge_from_cam
         assert pose is not None
         return pose
 
@@ -211,7 +209,7 @@ def test_a_frame_without_inliers_of_a_rolling_shutter_has_no_pose() -> None:
     rates = RateErrors(lag_s, np.full(len(px), RATE_SIGMA))
     for wrong in (rng.permutation(points), -points):
         views = replace(make_observations(CAMERA, np.array([0, len(px)]), wrong, px), rates=rates)
-        assert solve_poses([CAMERA], views, px, invert(truth)[None], CRITERIA)[0].gauge_from_cam is None
+        assert solve_poses(CAMERA, views, px, invert(truth)[None], CRITERIA)[0].gauge_from_cam is None
 
 
 def test_the_covariance_contains_the_angular_velocity_of_a_rolling_shutter() -> None:
@@ -228,7 +226,7 @@ def test_the_covariance_contains_the_angular_velocity_of_a_rolling_shutter() -> 
         views = _with_fitted_rate(points, seen, truth, rates)
         for known in (True, False):
             chosen = replace(views, rates=None if known else rates)
-            found = solve_poses([CAMERA], chosen, seen, invert(truth)[None], CRITERIA)[0]
+            found = solve_poses(CAMERA, chosen, seen, invert(truth)[None], CRITERIA)[0]
             assert found.gauge_from_cam is not None
             assert found.covariance is not None
             off = invert(found.gauge_from_cam) @ truth

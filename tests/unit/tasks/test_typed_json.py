@@ -22,7 +22,6 @@ from bodycap_batch.config.options import (
 from bodycap_batch.pipeline.inputs import capture_ref
 from bodycap_batch.pipeline.task_keys import artefact_key, make_task
 from bodycap_batch.synthetic.options import SynthOptions
-from bodycap_batch.tasks.camera_group import CameraGroupTask
 from bodycap_batch.tasks.check import CheckTask
 from bodycap_batch.tasks.clocks import CameraDistance, ClocksTask
 from bodycap_batch.tasks.export import ExportTask
@@ -34,6 +33,7 @@ from bodycap_batch.tasks.mapping import ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import BoardFootage, MergeTask
 from bodycap_batch.tasks.places import PlacesTask
 from bodycap_batch.tasks.preview import PreviewTask
+from bodycap_batch.tasks.recover import RecoverTask
 from bodycap_batch.tasks.registration import RegistrationTask
 from bodycap_batch.tasks.report import ReportTask
 from bodycap_batch.tasks.sound import SoundTask
@@ -73,12 +73,6 @@ def tasks(folder: Path) -> dict[str, Any]:
     )
     clocks = {"torso": StatedClock(offset_s=0.1, drift_ppm=None, role="Spine1")}
     together = {"capture": capture, "keyframes": stored, "map": scene_map, "registrations": stored}
-    poses = {
-        **together,
-        "options": RegistrationOptions(rounds=2),
-        "cameras": ("torso", "head"),
-        "offsets_s": {"torso": 0.1},
-    }
     return {
         "synth": SynthTask(
             options=SynthOptions(motion=folder / "walk.bvh"),
@@ -111,8 +105,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             map=scene_map,
             previous=stored["torso"],
         ),
-        "rig": CameraGroupTask(**poses),
-        "recover": CameraGroupTask(**poses),
+        "recover": RecoverTask(**together, options=RegistrationOptions(rounds=2), cameras=("torso", "head")),
         "inertial": InertialTask(
             options=TelemetryOptions(gravity=False),
             cameras=("torso", "head"),
