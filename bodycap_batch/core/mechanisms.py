@@ -51,7 +51,6 @@ class Mechanism(StrEnum):
     STATIC_POINTS = "static_points"
     GAP_FILLING = "gap_filling"
     SENSOR_PATH = "sensor_path"
-    IMPLAUSIBLE_INSTANTS = "implausible_instants"
     LYING = "lying"
 
 

@@ -59,14 +59,11 @@ class BodyScaleReport:
         metres_per_map_unit: The scale, metres per map unit.
         relative_sigma: Sigma of the logarithm of the scale.
         costs: Pairs (scale, cost), one pair for each scale for which the calibration graph was solved.
-        implausible_instants: Number of sampled instants that were left out, because no plausible posture fits
-            their camera poses.
     """
 
     metres_per_map_unit: float
     relative_sigma: float
     costs: tuple[tuple[float, float], ...]
-    implausible_instants: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -385,7 +385,7 @@ def _scale_table(merge: Mapping[str, Any]) -> Table:
         caption="Sources of the metric scale",
         heads=("Source", "Uncertainty", "Difference from the used scale", ""),
         rows=rows,
-        note=" ".join(filter(None, (_chi_square_note(scale), _implausible_note(scale)))),
+        note=_chi_square_note(scale),
     )
 
 
@@ -428,19 +428,6 @@ def _chi_square_note(agreement: Mapping[str, Any]) -> str:
         f"The χ² of these estimates is {agreement['chi2']:.1f}; a value of about {degrees_of_freedom} is "
         "expected if all estimates are right."
     )
-
-
-def _implausible_note(scale: Mapping[str, Any]) -> str:
-    """Return a note on the instants that the calibration of the body left out; "" if there are none.
-
-    Args:
-        scale: The entry ``merge.scale`` of ``metrics.json``.
-    """
-    count = scale.get("body_alone", {}).get("implausible_instants", 0)
-    if not count:
-        return ""
-    instants = "1 sampled instant was" if count == 1 else f"{count} sampled instants were"
-    return f"{instants} left out, because no plausible posture fits the camera poses."
 
 
 def _soft_limits_table(merge: Mapping[str, Any]) -> Table:

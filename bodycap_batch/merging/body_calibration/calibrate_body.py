@@ -106,8 +106,6 @@ class BodyCalibration:
             among these cameras.
         off_hinge_m: Size of each hinge violation. The key is the role of the bone below the hinge. The value
             is the sigma of the distance between the bone's far end and the plane of the hinge, metres.
-        implausible_ticks: Number of sampled ticks that were left out, because no plausible posture fits their
-            camera poses.
     """
 
     scale: MetricScale
@@ -121,7 +119,6 @@ class BodyCalibration:
     t_pose_ns: tuple[int, int] | None
     rolls: tuple[RollSearch, ...]
     off_hinge_m: Mapping[str, float] = field(default_factory=dict)
-    implausible_ticks: int = 0
 
 
 class ReferenceCameraRoll(NamedTuple):
@@ -176,7 +173,7 @@ def calibrate_body(
     priors = inputs.mount_by_camera()
     samples = take_samples(tracks, provisional, _SAMPLES, hints.vertical, t_pose_ns)
     graph = CalibrationGraph(inputs.skeleton, bones, samples, priors, provisional, step)
-    implausible = graph.solve_without_implausible_ticks(provisional)
+    graph.solve(provisional)
     graph.widen_joint_priors()
     estimate = estimate_scale(graph, provisional)
     if graph.test_hinges():
@@ -229,7 +226,6 @@ def calibrate_body(
         t_pose_ns=t_pose_ns,
         rolls=rolls,
         off_hinge_m=graph.hinge_violation_m(),
-        implausible_ticks=implausible,
     )
 
 

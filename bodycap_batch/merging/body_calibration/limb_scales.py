@@ -79,7 +79,7 @@ def limb_scales(
     for name, own in sorted(limbs.items()):
         subset = sample_subset(skeleton, mounts, [tracks[0], *own], scale, _SAMPLES, hints)
         graph = CalibrationGraph(skeleton, subset.bones, subset.samples, mounts, scale, step)
-        graph.solve_without_implausible_ticks(scale)
+        graph.solve(scale)
         found.append(_scale_of_limb(name, graph, scale))
     return tuple(source for source in found if source is not None)
 

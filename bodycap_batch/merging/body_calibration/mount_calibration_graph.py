@@ -12,9 +12,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from bodycap_batch.core import mechanisms
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, hinges
 from bodycap_batch.merging.body.initial_poses import fill_gaps, pose_bones
 from bodycap_batch.merging.body.t_pose import with_t_pose_prior
@@ -25,7 +23,7 @@ from bodycap_batch.merging.body_calibration.hinge_test import (
     with_hinge_slack,
 )
 from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration, row_types
-from bodycap_batch.merging.body_calibration.samples import MIN_SAMPLES, CalibrationSamples
+from bodycap_batch.merging.body_calibration.samples import CalibrationSamples
 from bodycap_batch.merging.graph.attitude_factors import AttitudeFactors
 from bodycap_batch.merging.graph.error_modes import BodyModel
 from bodycap_batch.merging.graph.factors import (
@@ -51,10 +49,6 @@ JOINT_PRIOR_SCALE = 4.0
 The graph applies each prior once per sampled tick. Without the factor, these repeated priors would outweigh
 the measurements. Evidence: none.
 """
-_IMPLAUSIBLE_RATIO = 10.0
-"""A tick contains a gross error only if its cost exceeds this multiple of the median. In a capture with an
-unusual posture, or with a wrong scale, most ticks have a high cost. Evidence:
-docs/decisions/body_calibration.md."""
 POINTS_PER_MOUNT = 4
 """Number of points that represent a mount.
 
@@ -169,29 +163,6 @@ class CalibrationGraph:
             self.mounts[name] = mount_from_points(self._values, camera, points[camera])
         return float(graph.error(self._values))
 
-    def solve_without_implausible_ticks(self, scale: float) -> int:
-        """Solve the graph at a scale, and leave out the ticks at which no plausible posture fits the poses.
-
-        A gross error that the tracks still contain, for example at the end of a path, stretches the body at
-        its tick. The loss of the measurements does not reject it: it is as weak as their weights, which
-        allow for errors that successive poses share. So a single pose could shift the scale.
-
-        Args:
-            scale: Metres per map unit.
-
-        Returns:
-            The number of ticks that were left out.
-        """
-        before = len(self._samples.times_ns)
-        self.solve(scale)
-        if not mechanisms.is_on(Mechanism.IMPLAUSIBLE_INSTANTS):
-            return 0
-        while (implausible := self._implausible_ticks()).any():
-            mechanisms.record(Mechanism.IMPLAUSIBLE_INSTANTS, int(implausible.sum()))
-            self._keep_ticks(~implausible)
-            self.solve(scale)
-        return before - len(self._samples.times_ns)
-
     def widen_joint_priors(self) -> None:
         """Widen the joint rotation priors that the last solution contradicts."""
         # The ticks of a T-pose have a separate prior. They are no evidence for the posture at other ticks.
@@ -284,37 +255,6 @@ class CalibrationGraph:
             first + POINTS_PER_MOUNT * np.arange(count)[:, None] + np.arange(POINTS_PER_MOUNT),
             dtype=np.int64,
         )
-
-    def _implausible_ticks(self) -> BoolArray:
-        """Return at which ticks (K,) the last solution has a posture that contains a gross error.
-
-        Such a posture deviates more from the rest pose than the priors expect, and much more than the usual
-        posture of the capture. Ticks of a T-pose are never among them, nor are those of a camera with too few
-        others.
-        """
-        cost = self._joint_costs()
-        # The expected sum of squared rotations, in sigmas of the prior, is their number: three per joint.
-        expected = 3 * sum(bone.parent >= 0 for bone in self._bones) / (2.0 * JOINT_PRIOR_SCALE**2)
-        limit = max(expected, _IMPLAUSIBLE_RATIO * float(np.median(cost)))
-        implausible = (cost > limit) & ~self._samples.posture.t_pose
-        few = (self._samples.valid & ~implausible).sum(axis=1) < MIN_SAMPLES
-        return np.asarray(implausible & ~self._samples.valid[few].any(axis=0))
-
-    def _joint_costs(self) -> FloatArray:
-        """Return the cost (K,) of the joint and hinge factors of each tick in the last solution."""
-        graph = self._graph(self._metric_poses(self._scale), self._scale)
-        stride = BodyModel(bones=self._rest_bones, hinges=self._hinges).factors_per_tick
-        factors = range(
-            self._first_joint_factor, self._first_joint_factor + stride * self._samples.valid.shape[1]
-        )
-        costs = [float(graph.at(factor).error(self._values)) for factor in factors]
-        return np.asarray(np.reshape(costs, (-1, stride)).sum(axis=1), dtype=np.float64)
-
-    def _keep_ticks(self, keep: BoolArray) -> None:
-        """Keep some of the ticks (K,) and their solution."""
-        poses = self.poses()[keep]
-        self._samples = self._samples.at_ticks(keep)
-        self._values = self._with_mounts(values_from_poses(poses), self._scale)
 
     def _named_mount_factors(self) -> IntArray:
         """Return the factor indices of mount orientations that are assumed from the camera's name only."""

@@ -97,20 +97,6 @@ class CalibrationSamples:
             for r, m in zip(self.sigma_rad, self.sigma_map, strict=True)
         ]
 
-    def at_ticks(self, keep: BoolArray) -> CalibrationSamples:
-        """Return the samples at some of the ticks.
-
-        Args:
-            keep: (K,) True for the ticks that are kept.
-        """
-        return replace(
-            self,
-            times_ns=self.times_ns[keep],
-            map_from_cam=self.map_from_cam[:, keep],
-            valid=self.valid[:, keep],
-            posture=self.posture.at_ticks(keep),
-        )
-
 
 def take_samples(
     tracks: Sequence[CameraTrack],

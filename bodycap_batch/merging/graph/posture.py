@@ -76,20 +76,6 @@ class Posture:
             up=None, walking=none, walking_direction=np.full((count, 3), np.nan), t_pose=none, standing=none
         )
 
-    def at_ticks(self, keep: BoolArray) -> Posture:
-        """Return the posture at some of the ticks.
-
-        Args:
-            keep: (K,) True for the ticks that are kept.
-        """
-        return replace(
-            self,
-            walking=self.walking[keep],
-            walking_direction=self.walking_direction[keep],
-            t_pose=self.t_pose[keep],
-            standing=self.standing[keep],
-        )
-
 
 def find_posture(
     track: CameraTrack, times_ns: IntArray, up: FloatArray | None, t_pose_ns: tuple[int, int] | None

@@ -229,7 +229,6 @@ def _scale_report(calibration: BodyCalibration) -> ScaleReport:
             metres_per_map_unit=calibration.bones_alone.scale,
             relative_sigma=round(calibration.bones_alone.sigma_log, 5),
             costs=tuple((tried, round(cost, 4)) for tried, cost in calibration.bones_alone.costs),
-            implausible_instants=calibration.implausible_ticks,
         ),
         trunk_over_floor_m=calibration.height_over_floor_m,
         known_to=describe_scale(calibration),
