@@ -1,0 +1,1 @@
+"""Compare two versions of the program on captures and on perturbations of them."""
