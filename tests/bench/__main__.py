@@ -29,6 +29,7 @@ from tests.bench import (
     mappers,
     ours,
     peers,
+    real,
     scale,
     scaling,
     seeds,
@@ -42,6 +43,7 @@ from tests.bench import (
     viewer,
     violent,
 )
+from tests.bench.paired import command as paired
 from tests.bench.rows import DATA, LAB, Row, row_of, rows_in
 
 _WITH_OPTIONS = {
@@ -63,6 +65,8 @@ _WITH_OPTIONS = {
     "lenses": lenses.main,
     "violent": violent.main,
     "mappers": mappers.main,
+    "paired": paired.main,
+    "real": real.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
 
@@ -84,7 +88,8 @@ def main() -> int:
         "`lenses` (named profiles in the adjustment), `body` (joints without cameras), `elbows` (their "
         "flexion with a height alone), `scale` (the metric scale with a height alone), `bare` (a camera at "
         "plain surfaces), `shutter` (drawn readout times against global shutters), `mappers` (the "
-        "incremental and the global mapper), and `long` (ten minutes of three cameras)",
+        "incremental and the global mapper), `paired` (two versions on perturbed captures), `real` (the "
+        "table of the real captures), and `long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)

@@ -117,8 +117,6 @@ def all_captures(
     real: Path | None,
     drawn: Path | None,
     say: Callable[[str], None],
-    *,
-    has_withheld: bool = True,
     data: Path = DATA,
 ) -> list[BenchCapture]:
     """Return all captures that exist; absent folders are said.
@@ -127,13 +125,12 @@ def all_captures(
         real: Folder of the real captures.
         drawn: Folder of the drawn captures.
         say: Receives a sentence about each folder that is absent.
-        has_withheld: True to add the shared captures without their lens.
         data: Folder of the shared captures.
     """
     out: list[BenchCapture] = []
     if data.is_dir():
         shared = shared_captures(data)
-        out += [*shared, *(without_lens(shared) if has_withheld else ())]
+        out += [*shared, *without_lens(shared)]
     else:
         say(f"shared captures: {data} is absent, skipped")
     for what, folder, has_body in (("real", real, False), ("drawn", drawn, True)):

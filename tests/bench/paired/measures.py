@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import hashlib
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,19 +19,19 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import BodycapError
 from bodycap_batch.evaluate import TrajectoryOptions, relative_camera_error
 from bodycap_batch.evaluate.association import interpolate_truth
-from bodycap_batch.formats.tum import TimedPoses, read_tum
+from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, align_points, nearest_rotation, rotation_angle_rad
 from tests.bench.bare import robust_alignment
 from tests.bench.paired.captures import BenchCapture
 
 RIGHT_M, RIGHT_SHARE, RIGHT_DEG = 0.10, 0.02, 5.0
-"""A frame is right against the truth if its centre is within the larger of 10 cm and 2 % of the diagonal of the
-true path's box, and its rotation within 5 degrees. 10 cm is the limit of the other benchmarks; 2 % is the drift
-of a truth from wheels over a building; 5 degrees is the limit of the measure without a truth."""
+"""A frame is right against the truth if its centre is within the larger of 10 cm and 2 % of the diagonal of
+the true path's box, and its rotation within 5 degrees. 10 cm is the limit of the other benchmarks; 2 % is the
+drift of a truth from wheels over a building; 5 degrees is the limit of the measure without a truth."""
 MAX_WRONG, MIN_RIGHT = 0.02, 0.9
-"""A result is wrong if more than 2 % of its posed frames are wrong. It is right if at least 90 % of all frames
-are right and it is not wrong."""
+"""A result is wrong if more than 2 % of its posed frames are wrong. It is right if at least 90 % of all
+frames are right and it is not wrong."""
 _MAX_GAP_S = 0.1
 _PARTS = 4
 """Number of parts of each path that the alignment by the majority starts from."""
@@ -52,28 +52,36 @@ class Paths:
         times_ns: (N,) times.
         mine: (N,4,4) delivered poses.
         true: (N,4,4) true poses.
+        is_measured: True if the truth is of a tracked body, in which the camera has an unknown constant
+            rotation.
     """
 
     camera: IntArray
     times_ns: IntArray
     mine: FloatArray
     true: FloatArray
+    is_measured: bool = False
 
     def chosen(self, keep: IntArray) -> Paths:
         """Return the frames with these indices."""
-        return Paths(
-            camera=self.camera[keep], times_ns=self.times_ns[keep], mine=self.mine[keep], true=self.true[keep]
+        return replace(
+            self,
+            camera=self.camera[keep],
+            times_ns=self.times_ns[keep],
+            mine=self.mine[keep],
+            true=self.true[keep],
         )
 
     def save(self, file: Path) -> None:
         """Write the frames to a file."""
-        np.savez(file, camera=self.camera, times_ns=self.times_ns, mine=self.mine, true=self.true)
+        np.savez(file, **{name: getattr(self, name) for name in Paths.__slots__})
 
     @staticmethod
     def load(file: Path) -> Paths:
         """Read the frames from a file."""
         with np.load(file) as saved:
-            return Paths(**{name: saved[name] for name in ("camera", "times_ns", "mine", "true")})
+            arrays = {name: saved[name] for name in ("camera", "times_ns", "mine", "true")}
+            return Paths(**arrays, is_measured=bool(saved["is_measured"]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,17 +125,11 @@ def read_paths(results: Path, truth: Path) -> Paths | None:
     if sum(len(part[0]) for part in parts) < _LEAST:
         return None
     camera, times, mine_all, true_all = (np.concatenate([part[side] for part in parts]) for side in range(4))
-    return Paths(camera=camera, times_ns=times, mine=mine_all, true=true_all)
+    return Paths(camera=camera, times_ns=times, mine=mine_all, true=true_all, is_measured=truth.is_file())
 
 
-def truth_figures(paths: Paths, *, is_measured: bool) -> TruthFigures | None:
-    """Return the errors of the posed frames; None if no similarity can be computed.
-
-    Args:
-        paths: The posed frames.
-        is_measured: True if the truth is of a tracked body, in which the camera has an unknown constant
-            rotation.
-    """
+def truth_figures(paths: Paths) -> TruthFigures | None:
+    """Return the errors of the posed frames; None if no similarity can be computed."""
     try:
         aligned = _majority_alignment(paths)
         ate_m = ate(paths)
@@ -135,7 +137,9 @@ def truth_figures(paths: Paths, *, is_measured: bool) -> TruthFigures | None:
         return None
     true = paths.true[:, :3, 3]
     error_m = np.linalg.norm(aligned.apply(paths.mine[:, :3, 3]) - true, axis=1)
-    error_deg = rotation_errors_deg(paths.mine[:, :3, :3], paths.true[:, :3, :3], is_measured=is_measured)
+    error_deg = rotation_errors_deg(
+        paths.mine[:, :3, :3], paths.true[:, :3, :3], is_measured=paths.is_measured
+    )
     limit_m = max(RIGHT_M, RIGHT_SHARE * float(np.linalg.norm(np.ptp(true, axis=0))))
     right = int(((error_m <= limit_m) & (error_deg <= RIGHT_DEG)).sum())
     return TruthFigures(

@@ -138,7 +138,7 @@ def _from_frame(
 def _like(new: av.container.OutputContainer, old: VideoStream, head: VideoFrame, crf: int) -> VideoStream:
     """Add a stream with the size, the times and the orientation of another one."""
     options = {"crf": str(crf), "preset": "veryfast"}
-    stream = new.add_stream("libx264", rate=old.average_rate, options=options)
+    stream: VideoStream = new.add_stream("libx264", rate=old.average_rate, options=options)
     stream.width, stream.height = head.width, head.height
     stream.pix_fmt = head.format.name if head.format.name in _EIGHT_BITS else "yuv420p"
     stream.time_base = stream.codec_context.time_base = old.time_base
@@ -174,7 +174,9 @@ def _encode(
     if noise:
         frame.make_writable()
         plane = frame.planes[0]
-        grey = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size).astype(np.int16)
+        grey = (
+            np.frombuffer(memoryview(plane), np.uint8).reshape(plane.height, plane.line_size).astype(np.int16)
+        )
         grey += rng.integers(-noise, noise + 1, grey.shape, dtype=np.int16)
         plane.update(np.clip(grey, 0, 255).astype(np.uint8).tobytes())
     frame.pict_type = PictureType.NONE

@@ -166,14 +166,14 @@ class RunRecord:
         return RunRecord(**values)
 
 
-def folder_of(side: str, capture: BenchCapture, seed: int, work: Path) -> Path:
+def folder_of(side: str, capture: str, seed: int, work: Path) -> Path:
     """Return the folder of the record of a job."""
-    return work / "runs" / side / capture.name.replace(":", "_") / str(seed)
+    return work / "runs" / side / capture.replace(":", "_") / str(seed)
 
 
 def run(side: Side, capture: BenchCapture, seed: int, settings: RunSettings) -> RunRecord:
     """Return the stored record of a job, or run the job and store its record."""
-    folder = folder_of(side.name, capture, seed, settings.work)
+    folder = folder_of(side.name, capture.name, seed, settings.work)
     stored = RunRecord.load(folder)
     if stored is not None and (stored.pictures or not settings.has_pictures or not stored.posed):
         return stored
@@ -274,7 +274,7 @@ def _measure(side: Side, capture: BenchCapture, folder: Path) -> dict[str, Any]:
         paths = measures.read_paths(out, capture.truth)
         if paths is not None:
             paths.save(folder / PATHS)
-            values["truth"] = measures.truth_figures(paths, is_measured=capture.truth.is_file())
+            values["truth"] = measures.truth_figures(paths)
         values["inside"] = _share_inside(out, folder / "store", capture.truth)
         if capture.reference is not None:
             values["palm_m"] = measures.palm_error_m(out, capture.truth, capture.reference)
