@@ -13,8 +13,8 @@ from dataclasses import asdict
 
 from tests.bench.paired import tables
 from tests.bench.paired.captures import chosen, folder_captures
-from tests.bench.paired.command import add_run_options, write_line
-from tests.bench.paired.runs import RunSettings, run
+from tests.bench.paired.command import add_run_options, run_settings, write_line
+from tests.bench.paired.runs import run
 from tests.bench.paired.sides import make_side
 
 DAILY = (
@@ -49,15 +49,8 @@ def main(arguments: Sequence[str]) -> int:
     captures = folder_captures(options.real.resolve(), has_body=False)
     if options.daily:
         captures = [capture for capture in captures if capture.name in DAILY]
-    work = options.work.resolve()
-    work.mkdir(parents=True, exist_ok=True)
-    side = make_side(options.commit, work)
-    settings = RunSettings(
-        work=work,
-        limit_s=60.0 * options.limit,
-        threads=options.threads,
-        has_pictures=not options.no_pictures,
-    )
+    settings = run_settings(options)
+    side = make_side(options.commit, settings.work)
     records = []
     for capture in chosen(captures, options.names):
         records.append(run(side, capture, 0, settings))

@@ -293,6 +293,42 @@ def test_a_stored_record_is_not_run_again(tmp_path, capture, monkeypatch):
     assert [name for name, _ in calls] == ["a", "a", "b"]
 
 
+def test_pictures_are_measured_once_for_equal_outputs_and_again_for_another_measure(
+    tmp_path, capture, monkeypatch
+):
+    measured, measure = [], tmp_path / "evaluate"
+    measure.mkdir()
+    (measure / "a.py").write_text("1")
+
+    def pictures(out, job):
+        measured.append(out)
+        return PictureFigures(right=10, wrong=0, unmeasurable=2)
+
+    def job(side, capture, job, folder, settings):
+        (folder / "out").mkdir()
+        (folder / "out" / "run.json").write_text("{}")
+        return {"exit": 0}
+
+    monkeypatch.setattr(runs, "_MEASURE", measure)
+    monkeypatch.setattr(runs, "_run_job", job)
+    monkeypatch.setattr(runs, "_pictures", pictures)
+    monkeypatch.setattr(
+        runs, "_measure", lambda side, capture, folder: {"posed": 12, "frames": 12, "digest": side.version}
+    )
+    settings = RunSettings(work=tmp_path / "work")
+    a, b, c = (
+        Side(name=name, folder=tmp_path, version=version)
+        for name, version in (("a", "1"), ("b", "1"), ("c", "2"))
+    )
+    assert [runs.run(side, capture, 0, settings).right for side in (a, b, c, a)] == [10] * 4
+    assert len(measured) == 2
+    (measure / "a.py").write_text("2")
+    assert len([runs.run(side, capture, 0, settings) for side in (a, b)]) == len(measured) == 2
+    again = replace(settings, pictures_again=True)
+    assert len({runs.run(side, capture, 0, again).measure for side in (a, b, c)}) == 1
+    assert len(measured) == 4
+
+
 def test_a_job_at_its_time_limit_is_stopped_and_is_a_result():
     sleeping = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
     code, _ = runs._wait(sleeping, 0.3)
@@ -354,11 +390,11 @@ def test_a_capture_on_which_the_mechanism_never_acts_is_not_compared(tmp_path):
     off = Side(name="a-repair", folder=tmp_path, version="a", without=("repair",))
     on = Side(name="a", folder=tmp_path, version="a")
     for sides_of in ((on, off), (off, on)):
-        comparison, order = _compared(*sides_of, acted={"repair": 0})
+        comparison, order = _compared(*sides_of, acted={"rigs": 2})
         assert comparison.idle == {"x", "y"}
         assert [name for _, _, name in order] == ["a", "a"]
-    # It acts, or nobody knows, or the version does not know the mechanism: both run.
-    for acted in ({"repair": 1}, None, {"rigs": 0}):
+    # It acts, or nobody knows: both run.
+    for acted in ({"repair": 1, "rigs": 2}, None):
         comparison, order = _compared(on, off, acted=acted)
         assert not comparison.idle
         assert len(order) == 8
@@ -475,6 +511,18 @@ def test_a_side_is_a_commit_with_mechanisms_left_out(tmp_path, repository):
     assert sides.simpler(full, side) is side
     with pytest.raises(SystemExit, match="no such commit"):
         sides.make_side("nothing", tmp_path / "work", repository)
+
+
+def test_a_name_that_the_version_does_not_know_is_refused(tmp_path):
+    package = tmp_path / "bodycap_batch" / "core"
+    package.mkdir(parents=True)
+    for file in (package.parent / "__init__.py", package / "__init__.py"):
+        file.touch()
+    text = "import os\ndef switched_off():\n    assert os.environ['BODYCAP_WITHOUT'] == 'rigs', 'unknown'\n"
+    (package / "mechanisms.py").write_text(text)
+    sides.check_switches(Side(name="a", folder=tmp_path, version="1", without=("rigs",)))
+    with pytest.raises(SystemExit, match="unknown"):
+        sides.check_switches(Side(name="a", folder=tmp_path, version="1", without=("rigz",)))
 
 
 def test_a_changed_working_tree_is_a_side_of_its_own(tmp_path, repository):

@@ -20,7 +20,7 @@ from tests.bench.paired.captures import BenchCapture, all_captures, chosen
 from tests.bench.paired.measures import Paths
 from tests.bench.paired.perturb import perturbation
 from tests.bench.paired.runs import RunRecord, RunSettings, folder_of, run, stored_paths
-from tests.bench.paired.sides import Side, left_out, make_side, simpler
+from tests.bench.paired.sides import Side, check_switches, left_out, make_side, simpler
 
 Runs = dict[tuple[str, int], tuple[RunRecord, RunRecord]]
 
@@ -29,21 +29,17 @@ def main(arguments: Sequence[str]) -> int:
     """Run the comparison; the exit code is 1 if B is worse, or if an injected harm is not found."""
     options = _options(arguments)
     work = options.work.resolve()
-    work.mkdir(parents=True, exist_ok=True)
     captures = all_captures(options.real, options.drawn, write_line)
     sides = [make_side(text, work) for text in options.sides[: 1 if options.selftest else 2]]
+    for side in sides:
+        check_switches(side)
     names = options.sides[len(sides) :]
     if not names and not options.without_lens:
         captures = [capture for capture in captures if capture.has_lens]
     captures = chosen(captures, names)
     if options.selftest:
         return _check_harm(sides[0], captures, options.seeds, work)
-    settings = RunSettings(
-        work=work,
-        limit_s=60.0 * options.limit,
-        threads=options.threads,
-        has_pictures=not options.no_pictures,
-    )
+    settings = run_settings(options)
     a, b = sides
     write_line(f"A: {options.sides[0]} ({a.name}); B: {options.sides[1]} ({b.name})")
     if a.name == b.name:
@@ -137,10 +133,10 @@ class Comparison:
 
     @staticmethod
     def _never_acts(record: RunRecord, names: Sequence[str]) -> bool:
-        """Return True if the record counts all these mechanisms, and none of them acted."""
+        """Return True if the record states what acted, and none of these mechanisms did."""
         if record.acted is None or record.exit != 0:
             return False
-        return all(record.acted.get(name) == 0 for name in names)
+        return not any(record.acted.get(name) for name in names)
 
 
 def _write_tables(comparison: Comparison, seeds: int) -> int:
@@ -148,6 +144,7 @@ def _write_tables(comparison: Comparison, seeds: int) -> int:
     pairs = compare.pair_up(comparison.runs, _paths_in(comparison))
     outcomes, folds = compare.compare(pairs), compare.folds(pairs)
     equal = sum(pair.is_equal for pair in pairs)
+    unlike = sum(pair.a.measure != pair.b.measure for pair in pairs)
     for line in (
         "",
         *tables.pair_table(pairs),
@@ -156,6 +153,11 @@ def _write_tables(comparison: Comparison, seeds: int) -> int:
         *tables.fold_lines(folds),
         f"outputs equal byte for byte: {equal} of {len(pairs)} pairs"
         + (f"; not run, the time was over: {comparison.open}" if comparison.open else ""),
+        *(
+            [f"pictures of {unlike} pairs measured by unlike versions: add --pictures-again"]
+            if unlike
+            else []
+        ),
         *([f"never acts in: {', '.join(sorted(comparison.idle))}"] if comparison.idle else []),
         *tables.floor_lines(compare.floors([pair.b for pair in pairs])),
         *(tables.margin_lines(compare.margins(pairs)) if a.is_frozen else ()),
@@ -227,6 +229,20 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="cores of a job (1)")
     parser.add_argument("--no-pictures", action="store_true", help="do not compare with the pictures")
+    parser.add_argument(
+        "--pictures-again", action="store_true", help="repeat it where another version of the measure made it"
+    )
+
+
+def run_settings(options: argparse.Namespace) -> RunSettings:
+    """Return how jobs run, from the options of `add_run_options`."""
+    return RunSettings(
+        work=options.work.resolve(),
+        limit_s=60.0 * options.limit,
+        threads=options.threads,
+        has_pictures=not options.no_pictures,
+        pictures_again=options.pictures_again,
+    )
 
 
 def write_line(line: str) -> None:

@@ -41,7 +41,7 @@ class Pair:
         return bool(self.a.digest) and self.a.digest == self.b.digest
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Column:
     """One measure.
 
@@ -94,70 +94,53 @@ def _lens(key: str) -> Callable[[Pair], Values | None]:
     return _both(lambda run: run.lens.get(key))
 
 
-RIGHT = Column(name="right frames, points", sign=1, values=_points(lambda run: run.right))
-WRONG = Column(name="wrong frames, points", sign=-1, values=_points(lambda run: run.wrong))
-ATE = Column(name="ATE of common frames, ratio", sign=-1, is_ratio=True, values=lambda pair: pair.ates_m)
+def _of_pictures(name: str) -> Callable[[Pair], Values | None]:
+    return _points(lambda run: None if run.pictures is None else int(getattr(run.pictures, name)))
+
+
+RIGHT = Column("right frames, points", 1, _points(lambda run: run.right))
+WRONG = Column("wrong frames, points", -1, _points(lambda run: run.wrong))
+ATE = Column("ATE of common frames, ratio", -1, lambda pair: pair.ates_m, is_ratio=True)
 VERDICT = Column(
-    name="wrong verdicts, per 100 runs",
-    sign=-1,
-    values=_both(lambda run: None if run.right is None else 100.0 * bool(run.wrong_verdict)),
+    "wrong verdicts, per 100 runs",
+    -1,
+    _both(lambda run: None if run.right is None else 100.0 * bool(run.wrong_verdict)),
 )
 COLUMNS = (
     RIGHT,
     WRONG,
-    Column(
-        name="not measurable, points",
-        sign=-1,
-        values=_points(lambda run: None if run.pictures is None else run.pictures.unmeasurable),
-    ),
-    Column(name="posed frames, points", sign=1, values=_points(lambda run: run.posed)),
-    Column(
-        name="right by the pictures, points",
-        sign=1,
-        values=_points(lambda run: None if run.pictures is None else run.pictures.right),
-    ),
+    Column("posed frames, points", 1, _points(lambda run: run.posed)),
+    Column("right by the pictures, points", 1, _of_pictures("right")),
+    Column("wrong by the pictures, points", -1, _of_pictures("wrong")),
+    Column("not measurable, points", -1, _of_pictures("unmeasurable")),
     ATE,
-    Column(name="ATE of own frames, ratio", sign=-1, is_ratio=True, values=_of_truth("ate_m")),
-    Column(name="worst frame, ratio", sign=-1, is_ratio=True, values=_of_truth("worst_m")),
+    Column("ATE of own frames, ratio", -1, _of_truth("ate_m"), is_ratio=True),
+    Column("worst frame, ratio", -1, _of_truth("worst_m"), is_ratio=True),
     Column(
-        name="more than 10 cm off, points",
-        sign=-1,
-        values=_points(lambda run: None if run.truth is None else run.truth.off),
+        "more than 10 cm off, points", -1, _points(lambda run: None if run.truth is None else run.truth.off)
     ),
-    Column(name="median rotation, ratio", sign=-1, is_ratio=True, values=_of_truth("median_deg")),
-    Column(name="worst rotation, ratio", sign=-1, is_ratio=True, values=_of_truth("worst_deg")),
+    Column("median rotation, ratio", -1, _of_truth("median_deg"), is_ratio=True),
+    Column("worst rotation, ratio", -1, _of_truth("worst_deg"), is_ratio=True),
     Column(
-        name="share in the 95 % region from 95 %, points",
-        sign=-1,
-        values=_both(lambda run: None if run.inside is None else 100.0 * abs(run.inside - 0.95)),
+        "share in the 95 % region from 95 %, points",
+        -1,
+        _both(lambda run: None if run.inside is None else 100.0 * abs(run.inside - 0.95)),
     ),
-    Column(name="palms, ratio", sign=-1, is_ratio=True, values=_both(lambda run: run.palm_m)),
-    Column(name="lens at 0.2 of the width, deg", sign=-1, values=_lens("0.2")),
-    Column(name="lens at 0.4 of the width, deg", sign=-1, values=_lens("0.4")),
-    Column(name="spread of models of a lens, deg", sign=-1, values=_lens("spread")),
+    Column("palms, ratio", -1, _both(lambda run: run.palm_m), is_ratio=True),
+    Column("lens at 0.2 of the width, deg", -1, _lens("0.2")),
+    Column("lens at 0.4 of the width, deg", -1, _lens("0.4")),
+    Column("spread of models of a lens, deg", -1, _lens("spread")),
     VERDICT,
-    Column(name="finished, per 100 runs", sign=1, values=_both(lambda run: 100.0 * (run.exit == 0))),
+    Column("finished, per 100 runs", 1, _both(lambda run: 100.0 * (run.exit == 0))),
+    Column("CPU seconds, ratio", -1, _both(lambda run: run.cpu_s), is_ratio=True, is_outcome=False),
     Column(
-        name="CPU seconds, ratio",
-        sign=-1,
+        "CPU seconds per right frame, ratio",
+        -1,
+        _both(lambda run: run.cpu_s / run.right if run.right else None),
         is_ratio=True,
         is_outcome=False,
-        values=_both(lambda run: run.cpu_s),
     ),
-    Column(
-        name="CPU seconds per right frame, ratio",
-        sign=-1,
-        is_ratio=True,
-        is_outcome=False,
-        values=_both(lambda run: run.cpu_s / run.right if run.right else None),
-    ),
-    Column(
-        name="peak memory, ratio",
-        sign=-1,
-        is_ratio=True,
-        is_outcome=False,
-        values=_both(lambda run: run.memory_mb),
-    ),
+    Column("peak memory, ratio", -1, _both(lambda run: run.memory_mb), is_ratio=True, is_outcome=False),
 )
 
 

@@ -264,10 +264,10 @@ def frame_counts(results: Path) -> tuple[int, int]:
 
 
 def digest_of_results(results: Path) -> str:
-    """Return a digest of the poses, the map and the motion. Comments, which name versions, do not count."""
+    """Return a digest of poses, map, lenses and motion. Comments, which name versions, do not count."""
     digest = hashlib.sha256()
-    files = [*results.glob("trajectories/**/*.tum"), results / "map.ply", *results.glob("*.bvh")]
-    for file in sorted(path for path in files if path.exists()):
+    names = ("trajectories/**/*.tum", "map.ply", "colmap/*/cameras.bin", "*.bvh")
+    for file in sorted(path for name in names for path in results.glob(name)):
         lines = file.read_bytes().split(b"\n") if file.suffix == ".tum" else [file.read_bytes()]
         content = b"\n".join(line for line in lines if not line.startswith(b"#"))
         digest.update(f"{file.relative_to(results)} {len(content)}\n".encode() + content)

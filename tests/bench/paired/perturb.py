@@ -141,6 +141,7 @@ def _like(new: av.container.OutputContainer, old: VideoStream, head: VideoFrame,
     stream: VideoStream = new.add_stream("libx264", rate=old.average_rate, options=options)
     stream.width, stream.height = head.width, head.height
     stream.pix_fmt = head.format.name if head.format.name in _EIGHT_BITS else "yuv420p"
+    assert old.time_base is not None
     stream.time_base = stream.codec_context.time_base = old.time_base
     if old.sample_aspect_ratio:
         stream.codec_context.sample_aspect_ratio = old.sample_aspect_ratio

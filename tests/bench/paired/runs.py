@@ -22,7 +22,7 @@ from tests.bench.paired import measures
 from tests.bench.paired.captures import VIDEOS, BenchCapture
 from tests.bench.paired.measures import Paths, TruthFigures
 from tests.bench.paired.perturb import make_input
-from tests.bench.paired.sides import Side
+from tests.bench.paired.sides import Side, digest_of
 from tests.bench.rows import BODYCAP, REPOSITORY
 
 FORMAT = 1
@@ -43,6 +43,8 @@ _STOP_S = 30.0
 """Time for a job to stop by itself, seconds."""
 _PICTURE_LIMIT = 3600.0
 """Time limit of the comparison with the pictures, seconds."""
+_MEASURE = REPOSITORY / "bodycap_batch" / "evaluate"
+"""Code of the comparison with the pictures."""
 _GRADE = (
     "import json, sys; from bodycap_batch.report.verdict import judge; "
     "print(judge(json.load(open(sys.argv[1], encoding='utf-8')), None).cameras.word)"
@@ -59,12 +61,14 @@ class RunSettings:
         limit_s: Time limit of a job, seconds.
         threads: Number of cores of a job.
         has_pictures: True to compare the results with the pictures.
+        pictures_again: True to repeat this where another version of the measure made it.
     """
 
     work: Path
     limit_s: float = 1200.0
     threads: int = 1
     has_pictures: bool = True
+    pictures_again: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +105,7 @@ class RunRecord:
         palm_m: Mean error of the positions relative to the reference camera, m.
         lens: Errors of the lens, degrees, by distance from the centre; and ``spread`` of a camera's models.
         pictures: Frames by what the pictures say; None if it was not measured.
+        measure: Version of the measure that compared the result with the pictures.
     """
 
     capture: str
@@ -123,6 +128,7 @@ class RunRecord:
     palm_m: float | None = None
     lens: dict[str, float] = field(default_factory=dict)
     pictures: PictureFigures | None = None
+    measure: str = ""
 
     @property
     def right(self) -> int | None:
@@ -174,8 +180,12 @@ def folder_of(side: str, capture: str, seed: int, work: Path) -> Path:
 def run(side: Side, capture: BenchCapture, seed: int, settings: RunSettings) -> RunRecord:
     """Return the stored record of a job, or run the job and store its record."""
     folder = folder_of(side.name, capture.name, seed, settings.work)
-    stored = RunRecord.load(folder)
-    if stored is not None and (stored.pictures or not settings.has_pictures or not stored.posed):
+    stored, measure = RunRecord.load(folder), digest_of(_MEASURE)[:8] if settings.has_pictures else ""
+    if stored is not None and not (
+        settings.has_pictures
+        and stored.posed
+        and (stored.pictures is None or (settings.pictures_again and stored.measure != measure))
+    ):
         return stored
     job, videos = make_input(capture, seed, settings.work)
     if stored is None:
@@ -192,10 +202,21 @@ def run(side: Side, capture: BenchCapture, seed: int, settings: RunSettings) -> 
     values |= {"capture": capture.name, "seed": seed, "side": side.name}
     values["has_truth"] = capture.truth is not None
     if settings.has_pictures and values.get("posed"):
-        values["pictures"] = _pictures(folder / "out", job)
+        equal = _equal_run(values, measure, settings.work)
+        values["pictures"] = equal.pictures if equal else _pictures(folder / "out", job)
+        values["measure"] = measure
     record = RunRecord(**values)
     record.save(folder)
     return record
+
+
+def _equal_run(values: Mapping[str, Any], measure: str, work: Path) -> RunRecord | None:
+    """Return a stored run of another side with the same input and the same outputs, measured alike."""
+    for file in (work / "runs").glob(f"*/{values['capture'].replace(':', '_')}/{values['seed']}/{RECORD}"):
+        other = RunRecord.load(file.parent)
+        if other and other.pictures and (other.digest, other.measure) == (values["digest"], measure):
+            return other
+    return None
 
 
 def count_frames(file: Path) -> int:

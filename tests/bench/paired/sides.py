@@ -6,6 +6,7 @@ import hashlib
 import os
 import shutil
 import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,6 +77,26 @@ def make_side(text: str, work: Path, repository: Path = REPOSITORY) -> Side:
         folder = _worktree(repository, version, work / "sides" / version[:8])
     name = "-".join([folder.name, *["+".join(without)] * bool(without)])
     return Side(name=name, folder=folder, version=version, without=without)
+
+
+def check_switches(side: Side) -> None:
+    """Check that the version knows the mechanisms that are switched off.
+
+    Raises:
+        SystemExit: It does not. Without this check, a wrong name would look like a mechanism that never acts.
+    """
+    if not side.without:
+        return
+    done = subprocess.run(
+        [sys.executable, "-c", "from bodycap_batch.core.mechanisms import switched_off; switched_off()"],
+        cwd=side.folder,
+        env=side.environment(1),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode != 0:
+        raise SystemExit(f"{side.name}: {done.stderr.strip().splitlines()[-1]}")
 
 
 def left_out(a: Side, b: Side) -> tuple[Side, Side, tuple[str, ...]] | None:
