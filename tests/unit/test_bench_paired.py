@@ -108,7 +108,24 @@ def test_few_pairs_decide_nothing_unless_all_are_equal():
     assert word_of(estimate({"a": [1.0] * (LEAST_PAIRS - 1)}), 1) == "too few"
     assert word_of(estimate({"a": [0.0]}), 1) == "no difference"
     assert word_of(estimate({"a": [1.0] * 3, "b": [1.1] * 3}), 1) == "better"
+    assert word_of(estimate({"a": [1e-9] * 9}), 1) == "no difference"
     assert estimate({"a": []}) is None
+
+
+def test_the_conclusion_names_what_is_worse_and_what_is_better():
+    def said(*words):
+        columns = (compare.RIGHT, compare.WRONG, compare.ATE)
+        outcomes = [
+            compare.Outcome(column=c, found=None, word=w) for c, w in zip(columns, words, strict=True)
+        ]
+        return compare.conclusion(outcomes, [], "b", 4)
+
+    assert (
+        said("worse", "better", "no difference")
+        == "B is worse in: right frames; B is better in: wrong frames"
+    )
+    assert said("no difference", "too few", "no difference") == "not decided: too few pairs"
+    assert "after 4 seeds: the simpler side wins, which is b" in said(*["no difference"] * 3)
 
 
 # injected harm
@@ -141,6 +158,10 @@ def test_a_comparison_without_any_harm_is_equal():
     outcomes = compare.compare(pairs)
     assert {each.word for each in outcomes if each.column.is_outcome} == {"equal"}
     assert "the simpler side wins, which is b" in compare.conclusion(outcomes, [], "b", 3)
+    slower = [replace(pair, b=replace(pair.b, cpu_s=40.0)) for pair in pairs]
+    words = {each.column.name: each.word for each in compare.compare(slower)}
+    assert words["CPU seconds, ratio"] == "worse"
+    assert "equal byte for byte" in compare.conclusion(compare.compare(slower), [], "b", 3)
     assert not compare.folds(pairs)
     assert "equal" in "\n".join(tables.pair_table(pairs))
 

@@ -292,22 +292,19 @@ def conclusion(outcomes: Sequence[Outcome], found: Sequence[Fold], simpler: str,
         simpler: Name of the simpler side.
         seeds: Number of perturbations, with the input as it is.
     """
-    words = {
-        word: [each.column.name.split(",")[0] for each in outcomes if each.word == word]
-        for word in ("better", "worse", "too few", "equal")
-    }
-    if any(fold.side == "B" for fold in found):
-        words["worse"].append("folds")
-    elif found:
-        words["better"].append("folds")
+    words: dict[str, list[str]] = defaultdict(list)
+    for each in outcomes:
+        if each.column.is_outcome:
+            words[each.word].append(each.column.name.split(",")[0])
+    for fold in found:
+        words["worse" if fold.side == "B" else "better"].append(f"a fold in {fold.capture}")
     parts = [f"B is {word} in: {', '.join(words[word])}" for word in ("worse", "better") if words[word]]
     if parts:
         return "; ".join(parts)
-    if words["too few"]:
+    if words["too few"] or not outcomes:
         return "not decided: too few pairs"
-    if words["equal"]:
-        return f"outputs equal byte for byte: the simpler side wins, which is {simpler}"
-    return f"no difference in any column after {seeds} seeds: the simpler side wins, which is {simpler}"
+    what = "outputs equal byte for byte" if words["equal"] else f"no difference after {seeds} seeds"
+    return f"{what}: the simpler side wins, which is {simpler}"
 
 
 def _estimate(column: Column, pairs: Sequence[Pair]) -> Estimate | None:

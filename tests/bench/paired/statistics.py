@@ -13,6 +13,8 @@ comparison."""
 LEAST_PAIRS = 6
 """Least number of pairs for a decision: by chance, six differences have one sign with a probability of
 3 %."""
+_LEAST = 1e-6
+"""Least difference, in the unit of a column. Smaller ones come from the rounding of numbers."""
 _DRAWS = 4000
 _SEED = 0
 
@@ -79,7 +81,9 @@ def word_of(found: Estimate | None, sign: int) -> str:
         found: The difference.
         sign: 1 if more is better, -1 if less is better.
     """
-    if found is None or (found.pairs < LEAST_PAIRS and (found.mean or found.low or found.high)):
+    if found is None:
         return "too few"
     low, high = sorted((sign * found.low, sign * found.high))
-    return "better" if low > 0.0 else "worse" if high < 0.0 else "no difference"
+    if found.pairs < LEAST_PAIRS and max(-low, high, abs(found.mean)) > _LEAST:
+        return "too few"
+    return "better" if low > _LEAST else "worse" if high < -_LEAST else "no difference"

@@ -148,10 +148,11 @@ def harm_lines(results: Sequence[HarmResult]) -> list[str]:
         words = [
             f"{outcome.column.name.split(',')[0]} {outcome.word}"
             for outcome in each.outcomes
-            if outcome.word in ("better", "worse", "too few")
+            if outcome.word in ("better", "worse")
         ]
         words += [f"fold of {fold.side} in {fold.capture}, seed {fold.seed}" for fold in each.folds]
-        said = ", ".join(words) or "no difference in any column"
+        few = any(outcome.word == "too few" for outcome in each.outcomes)
+        said = ", ".join(words) or ("too few pairs" if few else "no difference in any column")
         lines.append(f"{each.name}: {'as expected' if each.is_found else 'NOT AS EXPECTED'}: {said}")
     return lines
 
