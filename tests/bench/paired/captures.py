@@ -104,7 +104,7 @@ def folder_captures(root: Path, *, has_body: bool) -> list[BenchCapture]:
             source=folder,
             truth=row.truth if _has_paths(row.truth) else None,
             lens=calibration if calibration.exists() else None,
-            arguments=row.arguments if has_body and row.arguments else ("--skeleton", "none"),
+            arguments=_body_arguments(folder, row.arguments) if has_body else ("--skeleton", "none"),
             reference=row.reference if has_body else None,
         )
         out.append(capture)
@@ -204,6 +204,11 @@ def video_times_s(file: Path) -> list[str]:
         base, rate = stream.time_base or Fraction(1), stream.average_rate or Fraction(30)
     start = pts[0] if abs(pts[0] * base * rate) <= _MAX_DELAY_FRAMES else 0
     return [f"{float((value - start) * base):.9f}" for value in pts]
+
+
+def _body_arguments(folder: Path, own: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the arguments for a capture whose job file may state the body."""
+    return own if own or (folder / "job.yaml").exists() else ("--skeleton", "none")
 
 
 def _has_paths(truth: Path) -> bool:

@@ -140,31 +140,29 @@ class Comparison:
 
 
 def _write_tables(comparison: Comparison, seeds: int) -> int:
+    """Print the tables of a comparison and its conclusion."""
     a, b = comparison.a, comparison.b
     pairs = compare.pair_up(comparison.runs, _paths_in(comparison))
     outcomes, folds = compare.compare(pairs), compare.folds(pairs)
-    equal = sum(pair.is_equal for pair in pairs)
     unlike = sum(pair.a.measure != pair.b.measure for pair in pairs)
-    for line in (
-        "",
-        *tables.pair_table(pairs),
-        "",
-        *tables.column_table(outcomes, pairs),
-        *tables.fold_lines(folds),
-        f"outputs equal byte for byte: {equal} of {len(pairs)} pairs"
-        + (f"; not run, the time was over: {comparison.open}" if comparison.open else ""),
-        *(
-            [f"pictures of {unlike} pairs measured by unlike versions: add --pictures-again"]
-            if unlike
-            else []
-        ),
-        *([f"never acts in: {', '.join(sorted(comparison.idle))}"] if comparison.idle else []),
-        *tables.floor_lines(compare.floors([pair.b for pair in pairs])),
-        *(tables.margin_lines(compare.margins(pairs)) if a.is_frozen else ()),
-    ):
-        write_line(line)
+    lines = ["", f"outputs equal byte for byte: {sum(pair.is_equal for pair in pairs)} of {len(pairs)} pairs"]
+    if pairs:
+        lines = ["", *tables.pair_table(pairs), "", *tables.column_table(outcomes, pairs), *lines]
+    lines += tables.fold_lines(folds)
+    if comparison.open:
+        lines.append(f"not run, the time was over: {comparison.open} pairs")
+    if unlike:
+        lines.append(f"pictures of {unlike} pairs measured by unlike versions: add --pictures-again")
+    if comparison.idle:
+        lines.append(f"never acts in: {', '.join(sorted(comparison.idle))}")
+    lines += tables.floor_lines(compare.floors([pair.b for pair in pairs]))
+    if a.is_frozen:
+        lines += tables.margin_lines(compare.margins(pairs))
     sentence = compare.conclusion(outcomes, folds, simpler(a, b).name, seeds)
-    write_line(sentence)
+    if not pairs and comparison.idle and not comparison.open:
+        sentence = f"it never acts on these captures: the simpler side wins, which is {simpler(a, b).name}"
+    for line in (*lines, sentence):
+        write_line(line)
     return int("B is worse" in sentence)
 
 

@@ -24,6 +24,7 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, align_points, nearest_rotation, rotation_angle_rad
 from tests.bench.bare import robust_alignment
 from tests.bench.paired.captures import BenchCapture
+from tests.bench.poses import shown_truth
 
 RIGHT_M, RIGHT_SHARE, RIGHT_DEG = 0.10, 0.02, 5.0
 """A frame is right against the truth if its centre is within the larger of 10 cm and 2 % of the diagonal of
@@ -112,7 +113,7 @@ def read_paths(results: Path, truth: Path) -> Paths | None:
 
     Cameras whose poses are in a map of their own (``trajectories/unplaced``) have no frames here.
     """
-    parts = []
+    truth, parts = shown_truth(truth), []
     for index, file in enumerate(sorted((results / "trajectories").glob("*.tum"))):
         known = truth / file.name if truth.is_dir() else truth
         if not known.exists():

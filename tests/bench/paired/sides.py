@@ -96,7 +96,7 @@ def check_switches(side: Side) -> None:
         check=False,
     )
     if done.returncode != 0:
-        raise SystemExit(f"{side.name}: {done.stderr.strip().splitlines()[-1]}")
+        raise SystemExit(f"{side.name}: {' '.join(done.stderr.split()[-60:])}")
 
 
 def left_out(a: Side, b: Side) -> tuple[Side, Side, tuple[str, ...]] | None:
