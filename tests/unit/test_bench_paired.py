@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 
 import av
@@ -327,7 +328,8 @@ def test_pictures_are_measured_once_for_equal_outputs_and_again_for_another_meas
 
     def job(side, capture, job, folder, settings):
         (folder / "out").mkdir()
-        (folder / "out" / "run.json").write_text("{}")
+        for name in runs._NEEDED:
+            (folder / "out" / name).write_text("{}")
         return {"exit": 0}
 
     monkeypatch.setattr(runs, "_MEASURE", measure)
@@ -380,14 +382,14 @@ def test_the_counts_of_all_stages_are_added_and_absent_counts_are_unknown():
     assert runs.acted({"stages": stages}) == {"repair": 3, "rigs": 0}
 
 
-def _compared(a: Side, b: Side, acted: dict | None = None, end: float | None = None):
+def _compared(a: Side, b: Side, acted: dict | None = None, end: float | None = None, work=None):
     order = []
 
     def job(side, capture, seed, settings):
         order.append((capture.name, seed, side.name))
         return replace(_record(capture.name, seed, None, acted=acted), side=side.name)
 
-    comparison = Comparison(a, b, RunSettings(work=None), end, job)
+    comparison = Comparison(a, b, RunSettings(work=work), end, job)
     comparison.run_all([BenchCapture(name=name, source=None) for name in ("x", "y")], 2, 1)
     return comparison, order
 
@@ -400,11 +402,49 @@ def test_jobs_alternate_between_the_sides_and_seeds_come_last(tmp_path):
     assert sorted(comparison.runs) == sorted(keys)
 
 
-def test_no_job_starts_when_the_time_is_over(tmp_path):
+def test_no_job_starts_when_the_time_is_over_but_stored_runs_count(tmp_path):
     a, b = (Side(name=name, folder=tmp_path, version=name) for name in "ab")
-    comparison, order = _compared(a, b, end=0.0)
+    for side in (a, b):
+        folder = runs.folder_of(side.name, "x", 1, tmp_path)
+        folder.mkdir(parents=True)
+        replace(_record("x", 1, None), side=side.name).save(folder)
+    comparison, order = _compared(a, b, end=0.0, work=tmp_path)
     assert not order
-    assert comparison.open == 4
+    assert comparison.open == 3
+    assert list(comparison.runs) == [("x", 1)]
+
+
+def test_a_pair_that_cannot_be_measured_is_reported_and_the_others_run(tmp_path, capsys):
+    def job(side, capture, seed, settings):
+        if (capture.name, side.name) == ("x", "b"):
+            raise ValueError("no such map")
+        return replace(_record(capture.name, seed, None), side=side.name)
+
+    a, b = (Side(name=name, folder=tmp_path, version=name) for name in "ab")
+    comparison = Comparison(a, b, RunSettings(work=tmp_path), None, job)
+    comparison.run_all([BenchCapture(name=name, source=tmp_path) for name in ("x", "y")], 1, 1)
+    assert list(comparison.runs) == [("y", 0)]
+    assert comparison.failed == 1
+    assert "no such map" in capsys.readouterr().out
+
+
+def test_a_stopped_comparison_stops_its_job_and_leaves_no_record(tmp_path, capture, monkeypatch):
+    monkeypatch.setattr(runs, "BODYCAP", (sys.executable, "-c", "import time; time.sleep(60)"))
+    monkeypatch.setattr(runs, "stopping", threading.Event())
+    side = Side(name="a", folder=tmp_path, version="1")
+    timer = threading.Timer(0.5, runs.stopping.set)
+    timer.start()
+    with pytest.raises(InterruptedError):
+        runs.run(side, capture, 0, RunSettings(work=tmp_path / "work"))
+    assert RunRecord.load(runs.folder_of("a", "clip", 0, tmp_path / "work")) is None
+
+
+def test_a_record_of_other_videos_is_made_again(tmp_path, capture, monkeypatch):
+    monkeypatch.setattr(runs, "_run_job", lambda *_: {"exit": 3})
+    side, settings = Side(name="a", folder=tmp_path, version="1"), RunSettings(work=tmp_path / "work")
+    assert runs.run(side, capture, 0, settings).frames == 12
+    write_video(capture.source / "head.mp4", [textured_frame(index) for index in range(9)])
+    assert runs.run(side, capture, 0, settings).frames == 9
 
 
 def test_a_capture_on_which_the_mechanism_never_acts_is_not_compared(tmp_path):

@@ -8,9 +8,11 @@ last one stopped.
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -19,7 +21,7 @@ from tests.bench.paired import compare, harm, tables
 from tests.bench.paired.captures import BenchCapture, all_captures, chosen
 from tests.bench.paired.measures import Paths
 from tests.bench.paired.perturb import perturbation
-from tests.bench.paired.runs import RunRecord, RunSettings, folder_of, run, stored_paths
+from tests.bench.paired.runs import RunRecord, RunSettings, folder_of, run, stopping, stored_paths
 from tests.bench.paired.sides import Side, check_switches, left_out, make_side, simpler
 
 Runs = dict[tuple[str, int], tuple[RunRecord, RunRecord]]
@@ -59,6 +61,7 @@ class Comparison:
         runs: The finished pairs, by capture and perturbation.
         idle: Captures on which the mechanisms that one side leaves out never acted.
         open: Number of pairs that were not run, because the time was over.
+        failed: Number of pairs that could not be measured.
     """
 
     def __init__(
@@ -81,7 +84,7 @@ class Comparison:
         self.a, self.b = a, b
         self.runs: Runs = {}
         self.idle: set[str] = set()
-        self.open = 0
+        self.open = self.failed = 0
         self._settings, self._end, self._run_job = settings, end, run_job
         self._lock = threading.Lock()
 
@@ -95,16 +98,30 @@ class Comparison:
         """
         pairs = [(capture, seed) for seed in range(seeds) for capture in captures]
         with ThreadPoolExecutor(jobs) as pool:
-            for done in [pool.submit(self._run_pair, *pair) for pair in pairs]:
-                done.result()
+            started = [pool.submit(self._run_pair, *pair) for pair in pairs]
+            try:
+                for (capture, seed), done in zip(pairs, started, strict=True):
+                    if error := done.exception():
+                        self.failed += 1
+                        write_line(f"{capture.name}, seed {seed}: not measured")
+                        write_line("".join(traceback.format_exception(error)))
+            except BaseException:
+                stopping.set()
+                pool.shutdown(cancel_futures=True)
+                raise
 
     def _run_pair(self, capture: BenchCapture, seed: int) -> None:
         with self._lock:
             if capture.name in self.idle:
                 return
         if self._end is not None and time.monotonic() >= self._end:
+            folders = [folder_of(x.name, capture.name, seed, self._settings.work) for x in (self.a, self.b)]
+            a, b = map(RunRecord.load, folders)
             with self._lock:
-                self.open += 1
+                if a and b:
+                    self.runs[capture.name, seed] = (a, b)
+                else:
+                    self.open += 1
             return
         difference = left_out(self.a, self.b)
         first = difference[0] if difference else self.a
@@ -151,6 +168,8 @@ def _write_tables(comparison: Comparison, seeds: int) -> int:
     lines += tables.fold_lines(folds)
     if comparison.open:
         lines.append(f"not run, the time was over: {comparison.open} pairs")
+    if comparison.failed:
+        lines.append(f"not measured, see above: {comparison.failed} pairs")
     if unlike:
         lines.append(f"pictures of {unlike} pairs measured by unlike versions: add --pictures-again")
     if comparison.idle:
@@ -163,7 +182,7 @@ def _write_tables(comparison: Comparison, seeds: int) -> int:
         sentence = f"it never acts on these captures: the simpler side wins, which is {simpler(a, b).name}"
     for line in (*lines, sentence):
         write_line(line)
-    return int("B is worse" in sentence)
+    return int("B is worse" in sentence or comparison.failed > 0)
 
 
 def _paths_in(comparison: Comparison) -> Callable[[RunRecord], Paths | None]:
@@ -233,7 +252,8 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run_settings(options: argparse.Namespace) -> RunSettings:
-    """Return how jobs run, from the options of `add_run_options`."""
+    """Return how jobs run, from the options of `add_run_options`. SIGTERM stops them as Ctrl-C does."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     return RunSettings(
         work=options.work.resolve(),
         limit_s=60.0 * options.limit,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,8 @@ _NOISE_CRF = 10
 _MUXER = {"movie_timescale": "90000"}
 """Units per second in which an MP4 file states the start of its streams. With FFmpeg's 1,000, a video that
 starts late is up to 0.5 ms off."""
+_writing = threading.Lock()
+"""Two captures can have the same videos, with and without their lens."""
 _EIGHT_BITS = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p")
 
 
@@ -87,11 +90,12 @@ def make_input(capture: BenchCapture, seed: int, work: Path) -> tuple[Path, Path
         if change is None or file.is_dir():
             return file
         target = work / "videos" / f"{_digest(file)}-{seed}{file.suffix.lower()}"
-        if not target.exists():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            part = target.with_name(f".{os.getpid()}-{target.name}")
-            write_perturbed(file, part, change, seed)
-            part.replace(target)
+        with _writing:
+            if not target.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                part = target.with_name(f".{os.getpid()}-{target.name}")
+                write_perturbed(file, part, change, seed)
+                part.replace(target)
         return target
 
     folder = work / "inputs" / f"{capture.name.replace(':', '_')}-{seed}"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
 import signal
 import subprocess
+import threading
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -39,6 +41,10 @@ _KEPT = (
     "motion.bvh",
 )
 """Files of a result that stay: what the measures read."""
+_NEEDED = ("run.json", "metrics.json", "frames.csv")
+stopping = threading.Event()
+"""Set if all jobs of this process are to stop. They leave no record then."""
+_POLL_S, _LEAST_CPU_S = 0.1, 1e-3
 _STOP_S = 30.0
 """Time for a job to stop by itself, seconds."""
 _PICTURE_LIMIT = 3600.0
@@ -106,6 +112,7 @@ class RunRecord:
         lens: Errors of the lens, degrees, by distance from the centre; and ``spread`` of a camera's models.
         pictures: Frames by what the pictures say; None if it was not measured.
         measure: Version of the measure that compared the result with the pictures.
+        source: Digest of the names and sizes of the videos. A record of other videos is made again.
     """
 
     capture: str
@@ -129,6 +136,7 @@ class RunRecord:
     lens: dict[str, float] = field(default_factory=dict)
     pictures: PictureFigures | None = None
     measure: str = ""
+    source: str = ""
 
     @property
     def right(self) -> int | None:
@@ -180,7 +188,10 @@ def folder_of(side: str, capture: str, seed: int, work: Path) -> Path:
 def run(side: Side, capture: BenchCapture, seed: int, settings: RunSettings) -> RunRecord:
     """Return the stored record of a job, or run the job and store its record."""
     folder = folder_of(side.name, capture.name, seed, settings.work)
-    stored, measure = RunRecord.load(folder), digest_of(_MEASURE)[:8] if settings.has_pictures else ""
+    stored, source = RunRecord.load(folder), _source_of(capture)
+    measure = digest_of(_MEASURE)[:8] if settings.has_pictures else ""
+    if stored is not None and stored.source != source:
+        stored = None
     if stored is not None and not (
         settings.has_pictures
         and stored.posed
@@ -192,14 +203,14 @@ def run(side: Side, capture: BenchCapture, seed: int, settings: RunSettings) -> 
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         values = _run_job(side, capture, job, folder, settings)
-        if (folder / "out" / "run.json").exists():
+        if all((folder / "out" / name).exists() for name in _NEEDED):
             values |= _measure(side, capture, folder)
         else:
             values["frames"] = sum(count_frames(file) for file in _videos_of(capture, videos))
         shutil.rmtree(folder / "store", ignore_errors=True)
     else:
         values = {name: getattr(stored, name) for name in RunRecord.__slots__}
-    values |= {"capture": capture.name, "seed": seed, "side": side.name}
+    values |= {"capture": capture.name, "seed": seed, "side": side.name, "source": source}
     values["has_truth"] = capture.truth is not None
     if settings.has_pictures and values.get("posed"):
         equal = _equal_run(values, measure, settings.work)
@@ -227,9 +238,13 @@ def count_frames(file: Path) -> int:
 
 
 def _videos_of(capture: BenchCapture, folder: Path) -> list[Path]:
-    return [
-        file for file in folder.iterdir() if file.suffix.lower() in VIDEOS and capture.only in ("", file.name)
-    ]
+    files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in VIDEOS]
+    return [file for file in files if capture.only in ("", file.name)]
+
+
+def _source_of(capture: BenchCapture) -> str:
+    text = " ".join(f"{file.name} {file.stat().st_size}" for file in _videos_of(capture, capture.folder))
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 def _run_job(
@@ -262,18 +277,42 @@ def _run_job(
 
 def _wait(process: subprocess.Popen[bytes], limit_s: float) -> tuple[int | None, float]:
     """Wait for a process; returns its exit code, None at the time limit, and its processor seconds."""
-    end, stage, is_late = time.monotonic() + limit_s, 0, False
-    while True:
-        found, status, used = os.wait4(process.pid, os.WNOHANG)
-        if found:
-            process.returncode = os.waitstatus_to_exitcode(status)
-            return None if is_late else process.returncode, used.ru_utime + used.ru_stime
-        if time.monotonic() > end:
-            # The job stops its tasks itself when it is asked to; they run in groups of their own.
-            is_late, end = True, time.monotonic() + _STOP_S
-            os.killpg(process.pid, signal.SIGKILL if stage else signal.SIGTERM)
-            stage += 1
-        time.sleep(0.1)
+    end = time.monotonic() + limit_s
+    try:
+        while not (ended := _ended(process)):
+            if stopping.is_set():
+                raise InterruptedError("the comparison was stopped")
+            if time.monotonic() > end:
+                return None, _stop(process)
+            time.sleep(_POLL_S)
+    except BaseException:
+        _stop(process)
+        raise
+    return process.returncode, ended
+
+
+def _stop(process: subprocess.Popen[bytes]) -> float:
+    """Stop a job and return its processor seconds. It stops its own tasks, which have groups of their own."""
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        end = time.monotonic() + _STOP_S
+        if process.returncode is None:
+            os.killpg(process.pid, number)
+        while time.monotonic() < end:
+            if ended := _ended(process):
+                return ended
+            time.sleep(_POLL_S)
+    return 0.0
+
+
+def _ended(process: subprocess.Popen[bytes]) -> float:
+    """Return the processor seconds of a process that ended, with its children; 0 while it runs."""
+    if process.returncode is not None:
+        return _LEAST_CPU_S
+    found, status, used = os.wait4(process.pid, os.WNOHANG)
+    if not found:
+        return 0.0
+    process.returncode = os.waitstatus_to_exitcode(status)
+    return max(used.ru_utime + used.ru_stime, _LEAST_CPU_S)
 
 
 def _measure(side: Side, capture: BenchCapture, folder: Path) -> dict[str, Any]:
