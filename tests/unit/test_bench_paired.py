@@ -38,7 +38,7 @@ def _paths(seed: int, noise_m: float = 0.01) -> Paths:
     noisy = centres + rng.normal(0, noise_m, centres.shape)
     mine = make_transform(world @ turns @ so3_exp(rng.normal(0, 0.002, (FRAMES, 3))), 0.4 * noisy @ world.T)
     return Paths(
-        camera=np.zeros(FRAMES, dtype=np.int64),
+        camera=np.full(FRAMES, "head"),
         times_ns=np.arange(FRAMES) * 33_333_333,
         mine=mine,
         true=true,
@@ -239,6 +239,17 @@ def test_errors_are_compared_on_the_frames_that_both_have():
     mine, other = measures.ates_of_common(a, b)
     assert mine == pytest.approx(other)
     assert measures.ates_of_common(a.chosen(np.arange(20)), b) is None
+    assert measures.ates_of_common(replace(a, camera=np.full(FRAMES, "torso")), b) is None
+
+
+def test_a_head_that_hardly_moves_needs_more_than_ten_centimetres():
+    """A path of 16 cm, at which every fifth pose is 5 cm off."""
+    paths = _paths(0)
+    small = {name: getattr(paths, name).copy() for name in ("mine", "true")}
+    for poses in small.values():
+        poses[:, :3, 3] *= 0.16 / np.linalg.norm(np.ptp(paths.true[:, :3, 3], axis=0))
+    small["mine"][::5, 2, 3] += 0.4 * 0.05
+    assert truth_figures(replace(paths, **small)).wrong == FRAMES // 5
 
 
 def test_a_verdict_is_wrong_if_it_trusts_wrong_frames_or_distrusts_right_ones():
