@@ -581,6 +581,11 @@ def test_a_side_is_a_commit_with_mechanisms_left_out(tmp_path, repository):
     assert full.name != side.name
     assert sides.left_out(full, side) == (full, side, ("repair", "rigs"))
     assert sides.simpler(full, side) is side
+    names = ",".join(f"mechanism{number}" for number in range(40))
+    many = sides.make_side(f"a-branch-{names}", tmp_path / "work", repository)
+    assert len(many.without) == 40
+    assert len(many.name) < 60
+    assert sides.simpler(many, side) is many
     with pytest.raises(SystemExit, match="no such commit"):
         sides.make_side("nothing", tmp_path / "work", repository)
 

@@ -17,6 +17,8 @@ SWITCH = "BODYCAP_WITHOUT"
 FROZEN = "d563f749"
 """Commit of version 0.2.0, against which the margins hold."""
 _PACKAGE = "bodycap_batch"
+_LONGEST = 60
+"""Longest list of mechanisms, characters, in the name of a folder."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +77,10 @@ def make_side(text: str, work: Path, repository: Path = REPOSITORY) -> Side:
     else:
         version = _git(repository, "rev-parse", "--verify", f"{commit}^{{commit}}")
         folder = _worktree(repository, version, work / "sides" / version[:8])
-    name = "-".join([folder.name, *["+".join(without)] * bool(without)])
+    left = "+".join(without)
+    if len(left) > _LONGEST:
+        left = f"{len(without)}_off_{hashlib.sha256(left.encode()).hexdigest()[:8]}"
+    name = f"{folder.name}-{left}" if left else folder.name
     return Side(name=name, folder=folder, version=version, without=without)
 
 
@@ -113,9 +118,9 @@ def left_out(a: Side, b: Side) -> tuple[Side, Side, tuple[str, ...]] | None:
 
 
 def simpler(a: Side, b: Side) -> Side:
-    """Return the side that leaves out more, or else the one with less code; the second one if equal."""
-    if a.version == b.version:
-        return a if len(a.without) > len(b.without) else b
+    """Return the side that leaves out more mechanisms, or else the one with less code; B if equal."""
+    if len(a.without) != len(b.without):
+        return max(a, b, key=lambda side: len(side.without))
     return a if a.code_lines() < b.code_lines() else b
 
 
