@@ -508,6 +508,19 @@ def test_seeds_are_unlike_and_the_first_one_is_the_input_as_it_is(tmp_path, capt
     assert not (tmp_path / "inputs").exists()
 
 
+@pytest.mark.parametrize("seed", range(1, 8))
+def test_every_seed_gives_other_pictures_to_the_job(tmp_path, capture, seed):
+    _, videos = make_input(capture, seed, tmp_path / "work")
+    given = (videos / "head.mp4").read_bytes()
+    assert given != (capture.source / "head.mp4").read_bytes()
+    # It is written once, also for the capture without its lens.
+    (capture.source / "calib.json").write_text("{}")
+    before = (videos / "head.mp4").resolve()
+    _, blind = make_input(replace(capture, name="other", has_lens=False), seed, tmp_path / "work")
+    assert (blind / "head.mp4").resolve() == before
+    assert len(list((tmp_path / "work" / "videos").iterdir())) == 1
+
+
 def test_files_beside_a_video_follow_its_start(tmp_path, capture):
     (capture.source / "head.timestamps.txt").write_text(
         "# s\n" + "".join(f"{5 + i / 30}\n" for i in range(12))

@@ -155,6 +155,11 @@ def chosen(captures: Sequence[BenchCapture], names: Sequence[str]) -> list[Bench
     return [known[name] for name in dict.fromkeys(names)] if names else list(captures)
 
 
+def is_as_it_is(capture: BenchCapture) -> bool:
+    """Return True if a job can read the folder of a capture itself: nothing of it is withheld."""
+    return capture.has_lens and not capture.only
+
+
 def lay_out(
     capture: BenchCapture, target: Path, video: Callable[[Path], Path], first: int
 ) -> tuple[Path, Path]:
@@ -169,8 +174,6 @@ def lay_out(
     Returns:
         The folder or job file for the command line, and the folder of the videos.
     """
-    if first == 0 and capture.has_lens and not capture.only and video(capture.folder) == capture.folder:
-        return capture.source, capture.folder
     target.mkdir(parents=True, exist_ok=True)
     for file in sorted(capture.folder.iterdir()):
         new = target / file.name

@@ -21,7 +21,7 @@ import numpy as np
 from av.video.frame import PictureType, VideoFrame
 from av.video.stream import VideoStream
 
-from tests.bench.paired.captures import BenchCapture, lay_out
+from tests.bench.paired.captures import BenchCapture, is_as_it_is, lay_out
 
 _CRF = 18
 """Quality of re-encoded videos (x264): no difference is visible. Origin: x264's documentation."""
@@ -85,9 +85,11 @@ def make_input(capture: BenchCapture, seed: int, work: Path) -> tuple[Path, Path
         work: Folder of the comparison.
     """
     change = perturbation(seed)
+    if change is None and is_as_it_is(capture):
+        return capture.source, capture.folder
 
     def video(file: Path) -> Path:
-        if change is None or file.is_dir():
+        if change is None:
             return file
         target = work / "videos" / f"{_digest(file)}-{seed}{file.suffix.lower()}"
         with _writing:
