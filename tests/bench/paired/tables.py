@@ -27,21 +27,24 @@ def text_table(head: Cells, rows: Iterable[Cells]) -> list[str]:
 
 
 RUN_HEAD = (
-    "capture", "frames", "posed", "right", "wrong", "unmeas.", "models", "exit", "cameras", "CPU s",
+    "capture", "frames", "posed", "right", "wrong", "by pictures", "models", "exit", "cameras", "CPU s",
     "s/right", "ATE cm", "rot. deg", "lens deg",
 )  # fmt: skip
 
 
 def run_cells(run: RunRecord) -> list[str]:
-    """Return the row of one run: right and wrong by the truth if the capture has one."""
-    unmeasurable = run.pictures.unmeasurable if run.pictures and not run.has_truth else None
+    """Return the row of one run: right and wrong by the truth if the capture has one.
+
+    ``by pictures`` are the right, the wrong and the unmeasurable frames by the pictures.
+    """
+    seen = run.pictures
     return [
         run.capture,
         str(run.frames),
         str(run.posed),
         _number(run.right),
         _number(run.wrong),
-        _number(unmeasurable),
+        f"{seen.right}/{seen.wrong}/{seen.unmeasurable}" if seen else "-",
         str(run.models),
         "limit" if run.exit is None else str(run.exit),
         (run.grade or "-") + (f" ({run.wrong_verdict})" if run.wrong_verdict else ""),
