@@ -198,6 +198,10 @@ def test_a_fold_counts_only_if_the_other_side_never_has_it():
     assert [(each.seed, each.side, each.points) for each in compare.folds(pairs)] == [(0, "B", 50.0)]
     runs_a[2] = replace(runs_a[2], pictures=folded)
     assert not compare.folds([compare.Pair(a=a, b=b) for a, b in zip(runs_a, runs_b, strict=True)])
+    # A capture that is often folded on both sides decides by its mean.
+    poor = replace(folded, wrong=20)
+    pairs = [compare.Pair(a=replace(a, pictures=poor), b=replace(a, pictures=folded)) for a in runs_a]
+    assert not compare.folds(pairs)
 
 
 # measures

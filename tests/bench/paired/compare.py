@@ -15,8 +15,8 @@ Values = tuple[float, float]
 _LEAST = 1e-6
 """Least value of which a ratio is taken."""
 FOLD = 0.05
-"""A run has a fold that the other side never has on the same capture if its fraction of wrong frames is
-larger by this much than the largest one of the other side."""
+"""A run has a fold that the other side never has if its fraction of wrong frames is larger by this much than
+the largest one of the other side on the same capture, which itself is at most this much."""
 MAX_LOST_POINTS, MAX_ATE_RATIO = 0.5, 1.05
 """Margins against version 0.2.0, in sum over all captures that are not hard."""
 
@@ -227,7 +227,8 @@ def compare(pairs: Sequence[Pair]) -> list[Outcome]:
 def folds(pairs: Sequence[Pair]) -> list[Fold]:
     """Return the runs with wrong frames that the other side has in no run of the same capture.
 
-    A single fold among many runs cannot move a mean beyond its interval, so folds are found one by one.
+    A single fold among many runs cannot move a mean beyond its interval, so folds are found one by one. Where
+    the other side has many wrong frames itself, the mean decides.
     """
     by_capture: dict[str, list[tuple[int, float, float]]] = defaultdict(list)
     for pair in pairs:
@@ -238,9 +239,9 @@ def folds(pairs: Sequence[Pair]) -> list[Fold]:
     for capture, rows in by_capture.items():
         worst = (max(row[1] for row in rows), max(row[2] for row in rows))
         for seed, a, b in rows:
-            for side, excess in (("A", a - worst[1]), ("B", b - worst[0])):
-                if excess > 100.0 * FOLD:
-                    out.append(Fold(capture=capture, seed=seed, side=side, points=excess))
+            for side, own, other in (("A", a, worst[1]), ("B", b, worst[0])):
+                if other <= 100.0 * FOLD < own - other:
+                    out.append(Fold(capture=capture, seed=seed, side=side, points=own - other))
     return out
 
 
@@ -297,7 +298,9 @@ def conclusion(outcomes: Sequence[Outcome], found: Sequence[Fold], simpler: str,
         if each.column.is_outcome:
             words[each.word].append(each.column.name.split(",")[0])
     for fold in found:
-        words["worse" if fold.side == "B" else "better"].append(f"a fold in {fold.capture}")
+        text = f"a fold in {fold.capture}"
+        if text not in words[word := "worse" if fold.side == "B" else "better"]:
+            words[word].append(text)
     parts = [f"B is {word} in: {', '.join(words[word])}" for word in ("worse", "better") if words[word]]
     if parts:
         return "; ".join(parts)
