@@ -14,7 +14,13 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.evaluate.fresh_features import FrameFeatures, detect_features
-from bodycap_batch.evaluate.right_frames import RightFrames, find_right_frames, has_pose, measure_pictures
+from bodycap_batch.evaluate.right_frames import (
+    Pictures,
+    RightFrames,
+    find_right_frames,
+    has_pose,
+    measure_pictures,
+)
 from bodycap_batch.evaluate.two_view import Outcome
 from bodycap_batch.formats.tum import TimedPoses, read_tum
 from bodycap_batch.model.camera import Camera
@@ -112,7 +118,7 @@ def _check_camera(
         features[index] = detect_features(image, delivered.lens.scaled(image.shape[1], image.shape[0]))
         progress(index // 2, count)
     evidence = measure_pictures(
-        features, has_pose(poses), lambda done, total: progress((total + done) // 2, total)
+        Pictures(features), has_pose(poses), lambda done, total: progress((total + done) // 2, total)
     )
     return find_right_frames(evidence, poses)
 

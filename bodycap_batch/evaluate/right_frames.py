@@ -11,13 +11,14 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.evaluate.breaks import contradicted_times, scale_jumps
 from bodycap_batch.evaluate.fresh_features import FrameFeatures, match_features
-from bodycap_batch.evaluate.three_view import judge_positions
+from bodycap_batch.evaluate.three_view import CommonRays, Legs, judge_legs, measure_legs
 from bodycap_batch.evaluate.two_view import (
     Motion,
     Outcome,
@@ -39,13 +40,10 @@ _STEPS = (5, 3, 2, 1)
 frames the pictures hardly tell a turn from a step to the side, and all errors have the same sign."""
 
 
-_ROTATION_VOTES = {Outcome.RIGHT: 1, Outcome.UNMEASURABLE: 0, Outcome.WRONG: -30}
-"""Votes of a pair's rotation for having its two frames in one set. A right rotation says nothing of
-positions, so its vote is small: it joins frames whose positions are not measurable."""
-_POSITION_VOTES = {Outcome.RIGHT: 10, Outcome.UNMEASURABLE: 0, Outcome.WRONG: -10}
-"""Votes of three frames' positions for having each two of them in one set. A wrong triple does not say which
-of its frames is wrong, so the votes are equal: near a leap, a frame has more right triples on its own
-side."""
+_MIN_WRONG_LINKS = 1
+"""Minimum number of wrong rotations across a break, beyond the right ones. Only one spans some lost frames."""
+_MIN_WRONG_LEGS = 2
+"""Minimum number of wrong triples across a break, beyond the right ones."""
 _REVISIT_EVERY = 15
 """Every how many frames earlier frames with a similar view are looked for."""
 _REVISIT_FRAMES = 90
@@ -73,17 +71,55 @@ class MeasuredPair:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredTriple:
+    """Three frames with the points that are seen in all of them.
+
+    Attributes:
+        common: The points.
+        measured: The legs between the frames; None if they are not measurable.
+    """
+
+    common: CommonRays
+    measured: Legs | None
+
+
+class Pictures:
+    """The features of each frame of a camera, and the pairs of frames that have been measured."""
+
+    def __init__(self, features: Features) -> None:
+        self.features = features
+        self._pairs: dict[tuple[int, int], MeasuredPair] = {}
+        self._triples: dict[tuple[int, int, int], MeasuredTriple | None] = {}
+
+    def pair(self, first: int, second: int) -> MeasuredPair:
+        """Match two frames and measure their relative rotation, once."""
+        found = self._pairs.get((first, second))
+        if found is None:
+            found = _measure_pair(self.features[first], self.features[second])
+            self._pairs[first, second] = found
+        return found
+
+    def triple(self, frames: tuple[int, int, int]) -> MeasuredTriple | None:
+        """Measure the legs between three frames, once; None if they have too few points in common."""
+        if frames not in self._triples:
+            self._triples[frames] = _measure_triple(
+                [self.features[index] for index in frames], self.pair(*frames[:2]), self.pair(*frames[1:])
+            )
+        return self._triples[frames]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PictureEvidence:
     """What the pictures of one camera measure. It depends only on which frames have a pose.
 
     Attributes:
-        features: The features of all N frames.
+        pictures: The features of all N frames.
         pairs: The pairs of frames that are `GAPS` apart.
         chains: Rotation last_from_first and its covariance across each stretch of frames without a pose, from
             the rotations between the frames in it; None if it is not measurable.
     """
 
-    features: Features
+    pictures: Pictures
     pairs: Mapping[tuple[int, int], MeasuredPair]
     chains: Mapping[tuple[int, int], tuple[FloatArray, FloatArray] | None]
 
@@ -108,12 +144,12 @@ class RightFrames:
 
 
 def measure_pictures(
-    features: Features, posed: BoolArray, progress: Callable[[int, int], None] | None = None
+    pictures: Pictures, posed: BoolArray, progress: Callable[[int, int], None] | None = None
 ) -> PictureEvidence:
     """Match the frames of one camera with each other.
 
     Args:
-        features: The features of all N frames.
+        pictures: The features of all N frames.
         posed: (N,) True for frames with a delivered pose.
         progress: Receives the number of finished frames and of all frames.
     """
@@ -124,14 +160,14 @@ def measure_pictures(
         for gap, every in GAPS.items():
             second = first + gap
             if first % every == 0 and second < len(posed) and posed[first] and posed[second]:
-                pairs[first, second] = measure_pair(features[first], features[second])
+                pairs[first, second] = pictures.pair(first, second)
     ends = np.flatnonzero(posed)
     stretches = [(int(a), int(b)) for a, b in pairwise(ends) if b - a > 1]
-    chains = {ends: _chain(features, *ends) for ends in stretches}
-    return PictureEvidence(features=features, pairs=pairs, chains=chains)
+    chains = {ends: _chain(pictures, *ends) for ends in stretches}
+    return PictureEvidence(pictures=pictures, pairs=pairs, chains=chains)
 
 
-def measure_pair(first: FrameFeatures | None, second: FrameFeatures | None) -> MeasuredPair:
+def _measure_pair(first: FrameFeatures | None, second: FrameFeatures | None) -> MeasuredPair:
     """Match two frames and measure their relative rotation."""
     if first is None or second is None:
         return MeasuredPair(rows=np.zeros((0, 2), dtype=np.int64), measured=None)
@@ -166,36 +202,41 @@ def find_right_frames(evidence: PictureEvidence, world_from_cam: FloatArray) -> 
         evidence: What the pictures measure.
         world_from_cam: (N,4,4) delivered poses; NaN for a frame without one.
     """
-    posed = has_pose(world_from_cam)
+    posed, features = has_pose(world_from_cam), evidence.pictures.features
     outcomes: dict[tuple[int, int], Outcome] = {}
-    motions: dict[tuple[int, int], tuple[Motion, IntArray]] = {}
     for (first, second), pair in evidence.pairs.items():
-        motion, outcome = _judge_pair(evidence.features, (first, second), pair, world_from_cam)
-        outcomes[first, second] = outcome
-        if motion is not None:
-            motions[first, second] = motion, pair.rows[motion.inliers]
+        outcomes[first, second] = _judge_pair(features, (first, second), pair, world_from_cam)[1]
     for (first, last), chain in evidence.chains.items():
         expected = world_from_cam[last, :3, :3].T @ world_from_cam[first, :3, :3]
         if chain is not None:
             outcomes[first, last] = Outcome.WRONG if differs(*chain, expected) else Outcome.RIGHT
         else:
             outcomes[first, last] = Outcome.UNMEASURABLE
-    outcomes |= _revisits(evidence.features, world_from_cam, posed)
-    positions = _position_outcomes(evidence.features, world_from_cam[:, :3, 3], motions)
-    votes: dict[tuple[int, int], int] = defaultdict(int)
-    for key, outcome in outcomes.items():
-        votes[key] += _ROTATION_VOTES[outcome]
-    for frames, outcome in positions.items():
-        if any(outcomes[pair] is not Outcome.RIGHT for pair in pairwise(frames)):
-            continue
-        for key in combinations(frames, 2):
-            votes[key] += _POSITION_VOTES[outcome]
-    labels = _clusters(votes, np.flatnonzero(posed))
+    outcomes |= _revisits(evidence.pictures, world_from_cam, posed)
+    legs = _position_outcomes(evidence, world_from_cam)
+    spans: dict[Outcome, list[tuple[int, int]]] = defaultdict(list)
+    for frames, (outcome, _) in legs.items():
+        spans[outcome].append((frames[0], frames[2]))
+    count = len(posed)
+    links = {each: [pair for pair, found in outcomes.items() if found is each] for each in Outcome}
+    folds = contradicted_times(links[Outcome.WRONG], links[Outcome.RIGHT], count, _MIN_WRONG_LINKS)
+    unexplained = [span for span in spans[Outcome.WRONG] if not _spans(span, folds)]
+    leaps = contradicted_times(unexplained, spans[Outcome.RIGHT], count, _MIN_WRONG_LEGS)
+    breaks = sorted({*folds, *leaps})
+    measured = [(frames, found) for frames, (_, found) in legs.items() if found is not None]
+    jumps = scale_jumps(measured, world_from_cam[:, :3, 3], breaks)
+    wrong = links[Outcome.WRONG] + spans[Outcome.WRONG] + [(time - 1, time) for time in jumps]
+    parts = np.searchsorted(sorted({*breaks, *jumps}), np.arange(count), side="right")
+    sets = _joined_parts(parts, links, spans)
     return RightFrames(
-        outcome=_frame_outcomes(labels, votes, posed),
+        outcome=_frame_outcomes(sets, links[Outcome.RIGHT], wrong, posed),
         links=Counter(outcomes.values()),
-        positions=Counter(positions.values()),
+        positions=Counter(outcome for outcome, _ in legs.values()),
     )
+
+
+def _spans(frames: tuple[int, int], times: Sequence[int]) -> bool:
+    return any(frames[0] < time <= frames[1] for time in times)
 
 
 def has_pose(world_from_cam: FloatArray) -> BoolArray:
@@ -204,45 +245,47 @@ def has_pose(world_from_cam: FloatArray) -> BoolArray:
 
 
 def _position_outcomes(
-    features: Features, centres: FloatArray, motions: Mapping[tuple[int, int], tuple[Motion, IntArray]]
-) -> dict[tuple[int, int, int], Outcome]:
-    """Compare the positions of each three frames at equal distances.
-
-    Args:
-        features: The features of all frames.
-        centres: (N,3) delivered camera centres.
-        motions: The measured motion of each pair, and the indices (K,2) of the features that follow it.
-    """
-    found: dict[tuple[int, int, int], Outcome] = {}
-    for (first, second), (before, before_rows) in motions.items():
+    evidence: PictureEvidence, world_from_cam: FloatArray
+) -> dict[tuple[int, int, int], tuple[Outcome, Legs | None]]:
+    """Compare the positions of each three frames at equal distances."""
+    found: dict[tuple[int, int, int], tuple[Outcome, Legs | None]] = {}
+    for first, second in evidence.pairs:
         frames = (first, second, 2 * second - first)
-        if frames[1:] not in motions:
+        triple = evidence.pictures.triple(frames) if frames[1:] in evidence.pairs else None
+        if triple is None:
             continue
-        after, after_rows = motions[frames[1:]]
-        _, one, two = np.intersect1d(before_rows[:, 1], after_rows[:, 0], return_indices=True)
-        chosen = (before_rows[one, 0], before_rows[one, 1], after_rows[two, 1])
-        seen = [features[index] for index in frames]
-        rays = [each.rays[row] for each, row in zip(seen, chosen, strict=True) if each is not None]
-        middle = seen[1]
-        if middle is not None and len(rays) == 3:
-            lengths = np.linalg.norm(np.diff(centres[list(frames)], axis=0), axis=1)
-            found[frames] = judge_positions(
-                rays,
-                (before, after),
-                (float(lengths[0]), float(lengths[1])),
-                middle.pixel_rad[chosen[1]],
-                middle.cells[chosen[1]],
-            )
+        poses = world_from_cam[list(frames)]
+        middle_from_world = poses[1, :3, :3].T
+        rotations = np.swapaxes(middle_from_world @ poses[[0, 2], :3, :3], 1, 2)
+        legs = np.diff(poses[:, :3, 3], axis=0) @ middle_from_world.T
+        found[frames] = judge_legs(triple.common, triple.measured, rotations, legs)
     return found
 
 
-def _chain(features: Features, first: int, last: int) -> tuple[FloatArray, FloatArray] | None:
+def _measure_triple(
+    seen: Sequence[FrameFeatures | None], before: MeasuredPair, after: MeasuredPair
+) -> MeasuredTriple | None:
+    """Measure the legs between three frames from the features of the middle one that both pairs match."""
+    if before.measured is None or after.measured is None:
+        return None
+    middle, one, two = np.intersect1d(before.rows[:, 1], after.rows[:, 0], return_indices=True)
+    chosen = (before.rows[one, 0], middle, after.rows[two, 1])
+    views = [(each, row) for each, row in zip(seen, chosen, strict=True) if each is not None]
+    common = CommonRays(
+        rays=np.stack([each.rays[row] for each, row in views]),
+        noise_rad=np.max([each.pixel_rad[row] for each, row in views], axis=0),
+        cells=views[1][0].cells[middle],
+    )
+    return MeasuredTriple(common=common, measured=measure_legs(common, (before.measured, after.measured)))
+
+
+def _chain(pictures: Pictures, first: int, last: int) -> tuple[FloatArray, FloatArray] | None:
     """Return the rotation last_from_first through the frames between, and its covariance, if it is exact."""
     rotation, sigma, turned = np.eye(3), 0.0, 0.0
     index = first
     while index < last:
         steps = (min(index + step, last) for step in _STEPS)
-        tried = ((end, measure_pair(features[index], features[end]).measured) for end in steps)
+        tried = ((end, pictures.pair(index, end).measured) for end in steps)
         end, measured = next((pair for pair in tried if pair[1] is not None), (index, None))
         if measured is None:
             return None
@@ -258,7 +301,7 @@ def _chain(features: Features, first: int, last: int) -> tuple[FloatArray, Float
 
 
 def _revisits(
-    features: Features, world_from_cam: FloatArray, posed: BoolArray
+    pictures: Pictures, world_from_cam: FloatArray, posed: BoolArray
 ) -> dict[tuple[int, int], Outcome]:
     """Compare frames with earlier ones that see the same place, if the delivered poses are right."""
     frames = np.flatnonzero(posed)[::_REVISIT_EVERY]
@@ -270,59 +313,71 @@ def _revisits(
         distance = np.where(is_similar, np.linalg.norm(centres - centres[number], axis=1), np.inf)
         for other in np.argsort(distance, kind="stable")[: min(_REVISITS, np.count_nonzero(is_similar))]:
             first = int(frames[other])
-            pair = measure_pair(features[first], features[second])
-            outcomes[first, int(second)] = _judge_pair(features, (first, int(second)), pair, world_from_cam)[
-                1
-            ]
+            ends = (first, int(second))
+            outcomes[ends] = _judge_pair(pictures.features, ends, pictures.pair(*ends), world_from_cam)[1]
     return outcomes
 
 
-def _clusters(votes: Mapping[tuple[int, int], int], frames: IntArray) -> dict[int, int]:
-    """Join frames by right links, unless more measurements contradict the union than confirm it.
+def _joined_parts(
+    parts: IntArray,
+    links: Mapping[Outcome, Sequence[tuple[int, int]]],
+    legs: Mapping[Outcome, Sequence[tuple[int, int]]],
+) -> IntArray:
+    """Join the parts of a path between its breaks again if right links across other parts outnumber wrong ones.
+
+    Neighbouring parts stay apart: there is a break between them.
+
+    Args:
+        parts: (N,) number of the part of each frame.
+        links: First and last frame of each pair, by outcome.
+        legs: First and last frame of each triple, by outcome.
 
     Returns:
-        The label of each frame.
+        The label (N,) of each frame's set.
     """
-    label = {int(frame): int(frame) for frame in frames}
-    members = {int(frame): [int(frame)] for frame in frames}
-    net: dict[int, dict[int, int]] = {int(frame): defaultdict(int) for frame in frames}
-    for (first, second), vote in votes.items():
-        net[first][second] += vote
-        net[second][first] += vote
-    for first, second in sorted(votes, key=lambda pair: (-votes[pair], pair[1] - pair[0], pair)):
-        one, two = label[first], label[second]
-        if one == two or net[one].get(two, 0) <= 0:
-            continue
-        if len(members[one]) < len(members[two]):
-            one, two = two, one
-        for frame in members[two]:
-            label[frame] = one
-        members[one] += members.pop(two)
-        for other, vote in net.pop(two).items():
-            net[other].pop(two, None)
-            if other != one:
-                net[one][other] += vote
-                net[other][one] = net[one][other]
-    return label
+    count = int(parts[-1]) + 1
+    net = np.zeros((2, count, count), dtype=np.int64)
+    for kind, spans in enumerate((links, legs)):
+        for outcome, vote in ((Outcome.RIGHT, 1), (Outcome.WRONG, -1)):
+            for first, last in spans[outcome] if outcome in spans else ():
+                net[kind, parts[first], parts[last]] += vote
+    label = np.arange(count)
+    apart = {(part, part + 1) for part in range(count - 1)}
+    for first, last in sorted(zip(*np.nonzero(net[0] > 0), strict=True), key=lambda each: -net[0][each]):
+        one, two = np.flatnonzero(label == label[first]), np.flatnonzero(label == label[last])
+        both = [(min(a, b), max(a, b)) for a in one for b in two]
+        sums = [sum(int(net[kind][pair]) for pair in both) for kind in range(2)]
+        if label[first] != label[last] and not apart & set(both) and sums[0] > 0 and sums[1] >= 0:
+            label[two] = label[first]
+    return np.asarray(label[parts])
 
 
 def _frame_outcomes(
-    labels: Mapping[int, int], votes: Mapping[tuple[int, int], int], posed: BoolArray
+    sets: IntArray, right: Sequence[tuple[int, int]], wrong: Sequence[tuple[int, int]], posed: BoolArray
 ) -> tuple[Outcome | None, ...]:
-    """Return the outcome of each frame: right in the largest set, wrong if a measurement contradicts it."""
-    sizes: dict[int, int] = defaultdict(int)
-    for cluster in labels.values():
-        sizes[cluster] += 1
-    largest = max(sizes, key=lambda cluster: (sizes[cluster], -cluster), default=-1)
-    contradicted = {labels[frame] for pair, vote in votes.items() if vote < 0 for frame in pair}
+    """Return the outcome of each frame.
+
+    The right frames are the largest group that right links join within one set. A frame of another set is
+    wrong if a measurement contradicts its group, and a frame without a link is not measurable.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    inside = np.array([pair for pair in right if sets[pair[0]] == sets[pair[1]]], dtype=np.int64).reshape(-1, 2)
+    shape = (len(posed), len(posed))
+    graph = coo_matrix((np.ones(len(inside)), (inside[:, 0], inside[:, 1])), shape=shape)
+    groups = connected_components(graph, directed=False)[1]
+    sizes = np.bincount(groups[posed], minlength=1 + int(groups.max(initial=0)))
+    largest = int(np.argmax(sizes)) if posed.any() else -1
+    own_set = sets[groups == largest][0] if posed.any() else -1
+    contradicted = {groups[frame] for pair in wrong for frame in pair}
     out: list[Outcome | None] = []
-    for frame, has_pose in enumerate(posed):
-        if not has_pose:
+    for frame, is_posed in enumerate(posed):
+        if not is_posed:
             out.append(None)
-            continue
-        cluster = labels[frame]
-        if cluster == largest and sizes[largest] > 1:
+        elif groups[frame] == largest and sizes[largest] > 1:
             out.append(Outcome.RIGHT)
         else:
-            out.append(Outcome.WRONG if cluster in contradicted else Outcome.UNMEASURABLE)
+            is_wrong = sets[frame] != own_set and groups[frame] in contradicted
+            out.append(Outcome.WRONG if is_wrong else Outcome.UNMEASURABLE)
     return tuple(out)

@@ -1,111 +1,258 @@
-"""Measure the ratio of two successive legs of a path, and compare it with delivered positions."""
+"""Measure the shape of the path through three frames, and compare it with delivered positions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.evaluate.two_view import SIGMAS, Motion, Outcome, moved_along
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.evaluate.two_view import INLIER_PX, SIGMAS, Motion, Outcome, cross
+from bodycap_batch.model.geometry import so3_exp
 
 _MIN_POINTS = 10
 """Minimum number of points that are seen in all three frames. Evidence: none."""
 _MIN_CELLS = 6
 """Minimum number of grid cells with such a point. Evidence: none."""
-_MIN_RATIO = 1.3
-"""Minimum ratio between the measured and the delivered ratio of the legs that is wrong. Evidence: none."""
 _MIN_PARALLAX_DEG = 2.0
 """Minimum error of parallax (degrees) that is wrong: 7 cm at a depth of 2 m. Less is noise of delivered
-positions. """
-_MAX_SIGMA_RAD = 0.1
-"""Maximum standard deviation (radians) of the measured angle atan(first leg / second leg). With `SIGMAS`, a
-leg that is twice as long as its neighbour is then found."""
-_ITERATIONS = 5
-"""Number of iterations of reweighted least squares."""
-_ROBUST_SIGMAS = 2.0
-"""Residual, in standard deviations, beyond which a point loses weight."""
+positions."""
+_MAX_SIGMA = 0.1
+"""Maximum standard deviation of the measured legs, relative to the length of both. With `SIGMAS`, a leg that
+is twice as long as its neighbour is then found."""
+_MIN_NOISE_PX = 0.3
+"""Minimum standard deviation (px) of a ray, so that exact synthetic matches do not claim certainty."""
+_MIN_SIGMA = 0.02
+"""Standard deviation of the measured legs, relative to the length of both, that the errors of lens and
+shutter leave. Evidence: none."""
+_EQUAL_SUPPORT = 0.8
+"""Minimum support of legs like the delivered ones, relative to the best legs, with which the pictures confirm
+them as well: a hand or a second wall moves otherwise."""
+_ITERATIONS = 8
+"""Maximum number of iterations of reweighted least squares."""
+_CONVERGED = 1e-4
+"""Length of a step after which the iterations end."""
 
 
-def judge_positions(
-    rays: Sequence[FloatArray],
-    motions: tuple[Motion, Motion],
-    legs: tuple[float, float],
-    noise_rad: FloatArray,
-    cells: IntArray,
-) -> Outcome:
-    """Compare the lengths of two successive legs with what the parallax of common points shows.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommonRays:
+    """M points that are seen in three frames, as unit viewing rays.
 
-    A leap, or an error of the path's scale, changes one leg against the other. Only the pictures give
-    rotations and directions here, so an inexact delivered rotation is not taken for an error of positions.
+    Attributes:
+        rays: (3,M,3) rays in the first, the middle and the last frame.
+        noise_rad: (M,) angle (radians) of one px.
+        cells: (M,) grid cell of each point in the middle frame.
+    """
+
+    rays: FloatArray
+    noise_rad: FloatArray
+    cells: IntArray
+
+    @property
+    def is_enough(self) -> bool:
+        """True if the points are enough for a measurement."""
+        return len(self.noise_rad) >= _MIN_POINTS and len(np.unique(self.cells)) >= _MIN_CELLS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Legs:
+    """The two legs of the path through three frames. The length of both together is 1.
+
+    Attributes:
+        rotations: (2,3,3) rotations first_from_middle and last_from_middle.
+        translations: (2,3) translations first_from_middle and last_from_middle.
+        covariance: (6,6) covariance of the translations.
+        parallax: Angle (radians) by which a usual point moves with a translation of length 1.
+        inliers: (M,) True for the points that follow these legs.
+        support: Number of grid cells with an inlier.
+    """
+
+    rotations: FloatArray
+    translations: FloatArray
+    covariance: FloatArray
+    parallax: float
+    inliers: BoolArray
+    support: int
+
+    @property
+    def sigma(self) -> float:
+        """Largest standard deviation of the translations in any direction but that of their length."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
+
+    @property
+    def log_ratio(self) -> tuple[float, float]:
+        """Logarithm of the ratio last leg / first leg, and its standard deviation."""
+        lengths = np.maximum(np.linalg.norm(self.translations, axis=1), 1e-9)
+        gradient = (self.translations * np.array([[-1.0], [1.0]]) / lengths[:, None] ** 2).ravel()
+        sigma = np.sqrt(gradient @ self.covariance @ gradient)
+        return float(np.log(lengths[1] / lengths[0])), float(sigma)
+
+
+def measure_legs(common: CommonRays, motions: tuple[Motion, Motion]) -> Legs | None:
+    """Measure the two legs of three frames; None if the pictures do not determine them.
 
     Args:
-        rays: Three arrays (M,3): unit rays of the same M points in the three frames.
+        common: Points in the three frames.
         motions: Measured motions of the second and the third frame, each from the frame before it.
-        legs: Delivered distances between the camera centres.
-        noise_rad: (M,) angle (radians) of one px.
-        cells: (M,) grid cell of each point.
     """
-    if len(noise_rad) < _MIN_POINTS or len(np.unique(cells)) < _MIN_CELLS:
-        return Outcome.UNMEASURABLE
-    angle, parallax = _leg_angle(rays, motions, noise_rad)
-    variance = 0.0
-    for index, motion in enumerate(motions):
-        values, axes = np.linalg.eigh(motion.covariance)
-        for value, axis in zip(values, axes.T, strict=True):
-            moved = list(motions)
-            moved[index] = moved_along(motion, np.sqrt(max(value, 0.0)) * axis)
-            variance += (_leg_angle(rays, moved, noise_rad)[0] - angle) ** 2
-    sigma = float(np.sqrt(variance))
+    if not common.is_enough:
+        return None
+    rotations = np.stack([motions[0].rotation.T, motions[1].rotation])
+    directions = np.stack([-rotations[0] @ motions[0].direction, motions[1].direction])
+    along = [
+        _along(common.rays[view], common.rays[1] @ rotation.T, direction)
+        for view, rotation, direction in zip((0, 2), rotations, directions, strict=True)
+    ]
+    # A point's inverse depth is its parallax along a leg over the length of this leg.
+    lengths = np.array([max(float(np.median(each)), 1e-9) for each in along])
+    if max(lengths) < np.deg2rad(_MIN_PARALLAX_DEG) / 2:
+        return None
+    return _usable(_refined(common, rotations, directions * lengths[:, None]))
+
+
+def judge_legs(
+    common: CommonRays, measured: Legs | None, rotations: FloatArray, legs: FloatArray
+) -> tuple[Outcome, Legs | None]:
+    """Compare delivered positions of three frames with the legs that the pictures show.
+
+    A leap, or an error of the path's scale, changes one leg against the other. Only the pictures give
+    rotations here, so an inexact delivered rotation is not taken for an error of positions.
+
+    Args:
+        common: Points in the three frames.
+        measured: The legs that `measure_legs` found in them.
+        rotations: (2,3,3) delivered rotations first_from_middle and last_from_middle.
+        legs: (2,3) delivered legs in the frame of the middle camera: middle − first, last − middle.
+
+    Returns:
+        The outcome, and the legs that the pictures confirm.
+    """
+    if measured is None:
+        return Outcome.UNMEASURABLE, None
+    outcome = _compare(measured, legs)
+    if outcome is not Outcome.WRONG:
+        return outcome, measured
+    nearest = _usable(_refined(common, rotations, _translations(rotations, legs)))
+    if nearest is None or nearest.support < _EQUAL_SUPPORT * measured.support:
+        return Outcome.WRONG, measured
+    outcome = _compare(nearest, legs)
+    return (Outcome.UNMEASURABLE if outcome is Outcome.WRONG else outcome), nearest
+
+
+def _usable(found: Legs) -> Legs | None:
+    enough = np.count_nonzero(found.inliers) >= _MIN_POINTS and found.support >= _MIN_CELLS
+    return found if enough and found.sigma <= _MAX_SIGMA else None
+
+
+def _translations(rotations: FloatArray, legs: FloatArray) -> FloatArray:
+    """Return the translations first_from_middle and last_from_middle (2,3) of legs in the middle frame."""
+    return np.stack([rotations[0] @ legs[0], -rotations[1] @ legs[1]])
+
+
+def _compare(measured: Legs, legs: FloatArray) -> Outcome:
     limit = np.deg2rad(_MIN_PARALLAX_DEG)
-    if sigma > _MAX_SIGMA_RAD or max(parallax) < limit:
+    true = measured.translations
+    parallax = measured.parallax * np.linalg.norm(true, axis=1)
+    if max(parallax) < limit:
         return Outcome.UNMEASURABLE
-    delivered = float(np.arctan2(legs[0], legs[1]))
-    tiny = 1e-6
-    ratio = abs(np.log(max(np.tan(angle), tiny)) - np.log(max(np.tan(delivered), tiny)))
-    ends = np.maximum(legs, tiny * max(*legs, tiny))
-    error = max(
-        abs(parallax[1] - parallax[0] * ends[1] / ends[0]), abs(parallax[0] - parallax[1] * ends[0] / ends[1])
-    )
-    is_wrong = abs(angle - delivered) > SIGMAS * sigma and ratio > np.log(_MIN_RATIO) and error > limit
-    return Outcome.WRONG if is_wrong else Outcome.RIGHT
+    given = _translations(measured.rotations, legs)
+    lengths = np.linalg.norm(given, axis=1)
+    if max(lengths) <= 0:
+        return Outcome.WRONG
+    # A leg that is seen well gives the scale of the delivered path; the other one is compared with it.
+    error = 0.0
+    for one, other in ((0, 1), (1, 0)):
+        if parallax[one] > limit / 2:
+            scale = np.linalg.norm(true[one]) / max(lengths[one], 1e-6 * lengths[other])
+            error = max(error, measured.parallax * float(np.linalg.norm(scale * given - true, axis=1).max()))
+    if error <= limit:
+        return Outcome.RIGHT
+    axis, unit = true.ravel(), given.ravel() / np.linalg.norm(given)
+    across = unit - axis * (axis @ unit)
+    angle = np.arctan2(np.linalg.norm(across), axis @ unit)
+    across *= angle / max(float(np.linalg.norm(across)), 1e-12)
+    covariance = measured.covariance + _MIN_SIGMA**2 * np.eye(6)
+    distance2 = across @ np.linalg.solve(covariance, across)
+    return Outcome.WRONG if distance2 > SIGMAS**2 else Outcome.RIGHT
 
 
-def _leg_angle(
-    rays: Sequence[FloatArray], motions: Sequence[Motion], noise_rad: FloatArray
-) -> tuple[float, tuple[float, float]]:
-    """Return atan(first leg / second leg), and the parallax (radians) of a usual point along each leg.
+def _along(seen: FloatArray, turned: FloatArray, translation: FloatArray) -> FloatArray:
+    """Return the inverse depths (M,) in units of a translation: seen ~ turned + depth · translation."""
+    moved = cross(seen, translation)
+    length2 = np.maximum(np.sum(moved**2, axis=1), 1e-12)
+    return np.asarray(-np.einsum("mi,mi->m", cross(seen, turned), moved) / length2)
 
-    The inverse depth of a point in the middle frame is its parallax along a leg over the length of this leg.
-    So the parallaxes of all points lie on one line through the origin, and its direction is the angle.
+
+def _refined(common: CommonRays, rotations: FloatArray, translations: FloatArray) -> Legs:
+    """Refine rotations and translations by reweighted least squares, with all inverse depths eliminated.
+
+    Source: the elimination is variable projection in L. Kaufman's form, BIT 1975.
     """
-    turn = motions[0].rotation.T
-    first = _parallax(rays[1], rays[0], turn, -turn @ motions[0].direction, noise_rad)
-    second = _parallax(rays[1], rays[2], motions[1].rotation, motions[1].direction, noise_rad)
-    points = np.column_stack([first[0], second[0]])
-    variances = np.column_stack([first[1], second[1]]) ** 2
-    angle = float(np.median(np.arctan2(np.maximum(points[:, 0], 0.0), np.maximum(points[:, 1], 1e-12))))
+    axis = translations.ravel() / np.linalg.norm(translations)
     for _ in range(_ITERATIONS):
-        across = np.array([np.cos(angle), -np.sin(angle)])
-        spread = np.sqrt(variances @ across**2)
-        residual = points @ across / spread
-        weight = 1.0 / (1.0 + (residual / _ROBUST_SIGMAS) ** 2) ** 2 / spread**2
-        along = points @ np.array([np.sin(angle), np.cos(angle)])
-        step = np.sum(weight * along * (points @ across)) / max(np.sum(weight * along**2), 1e-30)
-        angle = float(np.clip(angle + step, 0.0, np.pi / 2))
-    middle = np.median(np.linalg.norm(points, axis=1))
-    return angle, (float(middle * np.sin(angle)), float(middle * np.cos(angle)))
+        values, jacobian, _ = _linearised(common, rotations, axis.reshape(2, 3))
+        weights = 1.0 / (1.0 + np.sum(values**2, axis=1) / INLIER_PX**2)
+        rows = (jacobian * weights[:, None, None]).reshape(-1, 12)
+        normal = rows.T @ rows
+        # Neither the length of both legs nor, in pictures of a mere turn, their direction is determined.
+        normal[6:, 6:] += np.trace(normal) * np.outer(axis, axis)
+        normal += 1e-7 * (1.0 + np.trace(normal)) * np.eye(12)
+        step = -np.linalg.solve(normal, rows.T @ (values * weights[:, None]).ravel())
+        rotations = so3_exp(step[:6].reshape(2, 3)) @ rotations
+        axis = axis + step[6:]
+        axis /= np.linalg.norm(axis)
+        if np.linalg.norm(step) < _CONVERGED:
+            break
+    values, jacobian, depth = _linearised(common, rotations, axis.reshape(2, 3))
+    inliers = (np.linalg.norm(values, axis=1) < INLIER_PX) & (depth > -INLIER_PX * common.noise_rad)
+    noise_px = max(_MIN_NOISE_PX, 1.48 * float(np.median(np.abs(values[inliers])))) if inliers.any() else 1.0
+    rows = jacobian[inliers].reshape(-1, 12)
+    normal = rows.T @ rows + 1e-6 * np.eye(12)
+    normal[6:, 6:] += (1.0 + np.trace(normal)) * np.outer(axis, axis)
+    return Legs(
+        rotations=rotations,
+        translations=axis.reshape(2, 3),
+        covariance=noise_px**2 * np.linalg.inv(normal)[6:, 6:],
+        parallax=float(np.median(depth[inliers])) if inliers.any() else 0.0,
+        inliers=inliers,
+        support=len(np.unique(common.cells[inliers])),
+    )
 
 
-def _parallax(
-    first: FloatArray, second: FloatArray, rotation: FloatArray, direction: FloatArray, noise_rad: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the parallax (M,) of points along a translation, and its standard deviation (M,).
+def _linearised(
+    common: CommonRays, rotations: FloatArray, translations: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return residuals (M,4) in px, their Jacobian (M,4,12) and the inverse depths (M,).
 
-    Both are inverse depths in units of the translation: second ~ rotation · first + parallax · direction.
+    The parameters are both left rotation vectors and both translations. The derivative with the inverse
+    depth, which has its best value, is projected out of the Jacobian.
     """
-    turned = first @ rotation.T
-    moved = np.cross(second, direction)
-    length2 = np.maximum(np.sum(moved**2, axis=1), 1e-6)
-    parallax = -np.einsum("mi,mi->m", np.cross(second, turned), moved) / length2
-    return np.asarray(parallax), np.asarray(np.sqrt(2.0) * noise_rad / np.sqrt(length2))
+    seen, count = common.rays[[0, 2]], len(common.noise_rad)
+    axes = _tangents(seen) / common.noise_rad[None, :, None, None]
+    turned = common.rays[1] @ np.swapaxes(rotations, 1, 2)
+    moved = cross(seen, translations[:, None])
+    depth = -np.einsum("kmi,kmi->m", cross(seen, turned), moved)
+    depth = depth / np.maximum(np.einsum("kmi,kmi->m", moved, moved), 1e-12)
+    point = turned + depth[None, :, None] * translations[:, None]
+    length = np.maximum(np.linalg.norm(point, axis=2), 1e-9)[..., None, None]
+    ray = point[..., None, :] / length
+    value = np.sum(axes * ray, axis=-1, keepdims=True)
+    slope = (axes - value * ray) / length
+    jacobian = np.zeros((count, 2, 2, 12))
+    by_turn, by_shift = cross(turned[:, :, None], slope), slope * depth[None, :, None, None]
+    for view in range(2):
+        jacobian[:, view, :, 3 * view : 3 * view + 3] = by_turn[view]
+        jacobian[:, view, :, 6 + 3 * view : 9 + 3 * view] = by_shift[view]
+    by_depth = np.einsum("kmai,ki->mka", slope, translations).reshape(count, 4, 1)
+    by_depth /= np.maximum(np.linalg.norm(by_depth, axis=1, keepdims=True), 1e-12)
+    flat = jacobian.reshape(count, 4, 12)
+    flat -= by_depth * (np.swapaxes(by_depth, 1, 2) @ flat)
+    return np.swapaxes(value[..., 0], 0, 1).reshape(count, 4), flat, depth
+
+
+def _tangents(rays: FloatArray) -> FloatArray:
+    """Return two unit vectors (...,2,3) perpendicular to each unit vector (...,3)."""
+    helper = np.where(np.abs(rays[..., :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    one = cross(rays, helper)
+    one /= np.linalg.norm(one, axis=-1, keepdims=True)
+    return np.stack([one, cross(rays, one)], axis=-2)

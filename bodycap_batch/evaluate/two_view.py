@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -17,7 +17,7 @@ SIGMAS = 3.0
 _MAX_SIGMA_DEG = 5.0
 """Maximum standard deviation (degrees) of a measured rotation about any axis. A less exact measurement could
 not show a fold of 15 degrees with `SIGMAS`."""
-_INLIER_PX = 2.5
+INLIER_PX = 2.5
 """Maximum residual of an inlier, px at the pyramid level of the feature. Origin: two and a half times the
 accuracy of an ORB corner."""
 _MIN_NOISE_PX = 0.3
@@ -165,16 +165,16 @@ def _turn_hypothesis(matches: RayMatches) -> FloatArray:
     rotations = second @ np.swapaxes(first, 1, 2)
     products = np.einsum("mi,mj->mij", matches.second, matches.first).reshape(-1, 9)
     cosine = rotations.reshape(-1, 9) @ products.T
-    near = 2.0 - 2.0 * cosine < (2 * _INLIER_PX * matches.noise_rad) ** 2
+    near = 2.0 - 2.0 * cosine < (2 * INLIER_PX * matches.noise_rad) ** 2
     return np.asarray(rotations[np.argmax(_support_of(near, matches.cells))])
 
 
 def _triads(pairs: FloatArray) -> FloatArray:
     """Return a right-handed orthonormal basis (K,3,3) from each pair (K,2,3) of rays, as columns."""
     x = pairs[:, 0]
-    z = _cross(x, pairs[:, 1])
+    z = cross(x, pairs[:, 1])
     z /= np.maximum(np.linalg.norm(z, axis=1, keepdims=True), 1e-12)
-    return np.stack([x, _cross(z, x), z], axis=2)
+    return np.stack([x, cross(z, x), z], axis=2)
 
 
 def _essential_hypotheses(matches: RayMatches) -> list[FloatArray]:
@@ -182,7 +182,7 @@ def _essential_hypotheses(matches: RayMatches) -> list[FloatArray]:
     import cv2
 
     first, second = matches.first[:, :2] / matches.first[:, 2:], matches.second[:, :2] / matches.second[:, 2:]
-    threshold = _INLIER_PX * float(np.median(matches.noise_rad))
+    threshold = INLIER_PX * float(np.median(matches.noise_rad))
     essential, _ = cv2.findEssentialMat(
         first, second, np.eye(3), method=cv2.USAC_MAGSAC, prob=0.999, threshold=threshold, maxIters=1000
     )
@@ -205,7 +205,7 @@ def _refined(matches: RayMatches, rotation: FloatArray, *, turn: bool = True) ->
         residual, jacobian, _ = _epipolar(matches, rotation, direction)
         if not turn:
             jacobian[:, :3] = 0.0
-        weights = 1.0 / (1.0 + (residual / _INLIER_PX) ** 2) ** 2
+        weights = 1.0 / (1.0 + (residual / INLIER_PX) ** 2) ** 2
         normal = (jacobian * weights[:, None]).T @ jacobian
         # A direction that pictures of a mere turn do not determine stays where it is.
         normal += 1e-6 * np.trace(normal) * np.eye(5)
@@ -217,7 +217,7 @@ def _refined(matches: RayMatches, rotation: FloatArray, *, turn: bool = True) ->
             break
     rotation = nearest_rotation(rotation)
     residual, jacobian, in_front = _epipolar(matches, rotation, direction)
-    inliers = (np.abs(residual) < _INLIER_PX) & in_front
+    inliers = (np.abs(residual) < INLIER_PX) & in_front
     noise_px = (
         max(_MIN_NOISE_PX, 1.48 * float(np.median(np.abs(residual[inliers])))) if inliers.any() else 1.0
     )
@@ -234,17 +234,17 @@ def _refined(matches: RayMatches, rotation: FloatArray, *, turn: bool = True) ->
 def _translation_direction(matches: RayMatches, rotation: FloatArray) -> FloatArray:
     """Return the direction of the translation that most matches follow under a given rotation."""
     turned = matches.first @ rotation.T
-    normals = _cross(turned, matches.second)
+    normals = cross(turned, matches.second)
     lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
     rng = np.random.default_rng(1)
     chosen = rng.integers(0, len(normals), (_TRIALS, 2))
-    directions = _cross(normals[chosen[:, 0]], normals[chosen[:, 1]])
+    directions = cross(normals[chosen[:, 0]], normals[chosen[:, 1]])
     norms = np.linalg.norm(directions, axis=1, keepdims=True)
     directions = np.where(norms > 0, directions / np.maximum(norms, 1e-30), [0.0, 0.0, 1.0])
     # Distance of the second ray from the epipolar plane: normal·direction over the normal's own length.
     across = np.sqrt(np.maximum(1.0 - (directions @ turned.T) ** 2, 1e-12))
     off = np.abs(directions @ normals.T) / across
-    near = (off < _INLIER_PX * matches.noise_rad) | (lengths < _INLIER_PX * matches.noise_rad)
+    near = (off < INLIER_PX * matches.noise_rad) | (lengths < INLIER_PX * matches.noise_rad)
     index = int(np.argmax(_support_of(near, matches.cells)))
     best = directions[index]
     # The sign with which most points lie in front of both cameras.
@@ -258,7 +258,7 @@ def _parallax(turned: FloatArray, second: FloatArray, direction: FloatArray) -> 
     return np.asarray(np.einsum("mi,mi->m", second - turned, along))
 
 
-def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
+def cross(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return cross products of vectors (...,3). numpy's own function takes five times as long."""
     a, b = np.broadcast_arrays(first, second)
     return np.stack(
@@ -288,18 +288,18 @@ def _epipolar(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return Sampson's residuals (M,) in px, their Jacobian (M,5), and which points may lie in front."""
     turned = matches.first @ rotation.T
-    plane = _cross(turned, direction)
+    plane = cross(turned, direction)
     # The residual is second · (direction × turned); its gradient in the tangent planes of both rays.
     value = -np.einsum("mi,mi->m", matches.second, plane)
     across_second = plane - matches.second * np.einsum("mi,mi->m", plane, matches.second)[:, None]
-    other = _cross(matches.second, direction)
+    other = cross(matches.second, direction)
     across_first = other - turned * np.einsum("mi,mi->m", other, turned)[:, None]
     scale = np.sqrt(np.sum(across_second**2, axis=1) + np.sum(across_first**2, axis=1))
     scale = np.maximum(scale, 1e-3) * matches.noise_rad
-    jacobian_rotation = _cross(turned, other)
-    jacobian_direction = _cross(turned, matches.second) @ tangents(direction)
+    jacobian_rotation = cross(turned, other)
+    jacobian_direction = cross(turned, matches.second) @ tangents(direction)
     parallax = _parallax(turned, matches.second, direction)
-    in_front = parallax > -_INLIER_PX * matches.noise_rad * np.linalg.norm(plane, axis=1)
+    in_front = parallax > -INLIER_PX * matches.noise_rad * np.linalg.norm(plane, axis=1)
     jacobian = np.column_stack([jacobian_rotation, jacobian_direction]) / scale[:, None]
     return value / scale, jacobian, in_front
 
@@ -308,13 +308,6 @@ def _support_of(near: BoolArray, cells: IntArray) -> IntArray:
     """Return the number of grid cells in which any match is near, for each of K hypotheses (K,M)."""
     in_cell = (np.unique(cells)[None] == cells[:, None]).astype(np.float32)
     return np.asarray(np.count_nonzero(near.astype(np.float32) @ in_cell, axis=1))
-
-
-def moved_along(motion: Motion, step: FloatArray) -> Motion:
-    """Return a motion that differs by a step (5,): rotation vector, and direction in its `tangents`."""
-    direction = motion.direction + tangents(motion.direction) @ step[3:]
-    rotation = so3_exp(step[:3]) @ motion.rotation
-    return replace(motion, rotation=rotation, direction=direction / np.linalg.norm(direction))
 
 
 def angle_deg(first: FloatArray, second: FloatArray) -> float:

@@ -9,7 +9,7 @@ import pytest
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.evaluate.fresh_features import CELLS, FrameFeatures, detect_features, match_features
-from bodycap_batch.evaluate.right_frames import PictureEvidence, find_right_frames, measure_pictures
+from bodycap_batch.evaluate.right_frames import PictureEvidence, Pictures, find_right_frames, measure_pictures
 from bodycap_batch.evaluate.two_view import Outcome
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp, transform_points
@@ -64,7 +64,7 @@ def path() -> FloatArray:
 
 @pytest.fixture(scope="module")
 def evidence(path: FloatArray) -> PictureEvidence:
-    return measure_pictures(pictures(path), np.ones(FRAMES, dtype=bool))
+    return measure_pictures(Pictures(pictures(path)), np.ones(FRAMES, dtype=bool))
 
 
 def outcomes(evidence: PictureEvidence, path: FloatArray) -> np.ndarray:
@@ -125,7 +125,7 @@ def test_a_fold_across_lost_frames_is_found_from_the_rotations_between(path: Flo
     posed = np.ones(FRAMES, dtype=bool)
     posed[40:95] = False
     # Frames that are 45 apart have no pose across the gap, so only the chain of rotations can show the fold.
-    evidence = measure_pictures(pictures(path), posed)
+    evidence = measure_pictures(Pictures(pictures(path)), posed)
     delivered = np.where(posed[:, None, None], path, np.nan)
     assert find_right_frames(evidence, delivered).count(Outcome.RIGHT) == np.count_nonzero(posed)
     folded = delivered.copy()
@@ -138,7 +138,7 @@ def test_a_fold_across_lost_frames_is_found_from_the_rotations_between(path: Flo
 
 def test_without_matches_nothing_is_claimed(path: FloatArray) -> None:
     blank: list[FrameFeatures | None] = [None] * FRAMES
-    found = find_right_frames(measure_pictures(blank, np.ones(FRAMES, dtype=bool)), path)
+    found = find_right_frames(measure_pictures(Pictures(blank), np.ones(FRAMES, dtype=bool)), path)
     assert found.count(Outcome.UNMEASURABLE) == FRAMES
 
 

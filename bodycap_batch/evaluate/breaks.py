@@ -1,0 +1,131 @@
+"""Find the times at which a delivered path breaks: its rotation folds, it leaps, or its scale jumps.
+
+A break at frame t lies between the frames t−1 and t. Every measurement that spans a break contradicts the
+delivered path, and none confirms it there. So a single wrong measurement among many right ones is no break.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.evaluate.three_view import Legs
+
+_MIN_SCALE_JUMP = float(np.tan(np.deg2rad(5.0)))
+"""Minimum change of the logarithm of the scale that is wrong: 5 degrees of the direction to a point, after a
+way as long as the distance to it."""
+_SCALE_SIGMAS = 5.0
+"""Number of standard deviations of a scale jump. Evidence: 3 for one jump at a known time; the largest of the
+jumps of some hundred times exceeds 4."""
+_MAX_LOG_SIGMA = 0.3
+"""Maximum standard deviation of the logarithm of a ratio of legs that is used."""
+_MIN_RATIOS = 3
+"""Minimum number of ratios that measure a scale jump."""
+
+
+def contradicted_times(
+    wrong: Sequence[tuple[int, int]], right: Sequence[tuple[int, int]], count: int, minimum: int
+) -> list[int]:
+    """Return the fewest times that explain wrong measurements.
+
+    Args:
+        wrong: First and last frame of each measurement that contradicts the path.
+        right: First and last frame of each measurement that confirms it.
+        count: Number of frames.
+        minimum: Minimum number of wrong measurements beyond that of right ones across a break.
+    """
+    confirmed, left, found = _spanning(right, count), list(wrong), []
+    while left:
+        score = _spanning(left, count) - confirmed
+        best = np.flatnonzero(score == score.max())
+        time = int(best[len(best) // 2])
+        if score[time] < minimum:
+            break
+        found.append(time)
+        left = [(first, last) for first, last in left if not first < time <= last]
+    return sorted(found)
+
+
+def _spanning(intervals: Sequence[tuple[int, int]], count: int) -> IntArray:
+    """Return the number (count + 1,) of intervals of frames that span each time."""
+    change = np.zeros(count + 2, dtype=np.int64)
+    for first, last in intervals:
+        change[first + 1] += 1
+        change[last + 1] -= 1
+    return np.cumsum(change)[:-1]
+
+
+def scale_jumps(
+    legs: Sequence[tuple[tuple[int, int, int], Legs]], centres: FloatArray, breaks: Sequence[int]
+) -> list[int]:
+    """Return the times at which the scale of a path jumps.
+
+    Every measured ratio of two legs that spans a time is an estimate of the jump there: the share of each
+    leg that lies after the time tells by how much a jump changes the delivered ratio. Their evidence is
+    combined by least squares, and the time with the most significant jump is taken first.
+
+    Args:
+        legs: Frames and measured legs of the triples whose shape the pictures confirm or contradict.
+        centres: (N,3) delivered camera centres.
+        breaks: Times at which the path breaks otherwise. No ratio across them is used.
+    """
+    step = np.nan_to_num(np.linalg.norm(np.diff(centres, axis=0), axis=1))
+    way = np.concatenate([[0.0], np.cumsum(step)])
+    frames, difference, sigma = [], [], []
+    for triple, measured in legs:
+        lengths = np.linalg.norm(np.diff(centres[list(triple)], axis=0), axis=1)
+        value, deviation = measured.log_ratio
+        spanned = any(triple[0] < time <= triple[2] for time in breaks)
+        if min(lengths) > 0 and deviation < _MAX_LOG_SIGMA and not spanned:
+            frames.append(triple)
+            difference.append(np.log(lengths[1] / lengths[0]) - value)
+            sigma.append(deviation)
+    if not frames:
+        return []
+    spread = np.array(sigma)
+    gaps = np.diff(np.array(frames), axis=1)[:, 0]
+    for gap in np.unique(gaps):
+        # The stated deviations leave out what neighbouring frames have in common, so the data correct them.
+        normalised = np.abs(np.array(difference)[gaps == gap]) / spread[gaps == gap]
+        spread[gaps == gap] *= max(1.0, 1.48 * float(np.median(normalised)))
+    return _jumps(np.array(frames), np.array(difference), spread, way)
+
+
+def _jumps(frames: IntArray, difference: FloatArray, sigma: FloatArray, way: FloatArray) -> list[int]:
+    best, strongest = 0, 0.0
+    for time in range(int(frames.min()) + 1, int(frames.max()) + 1):
+        spans = (frames[:, 0] < time) & (time <= frames[:, 2])
+        if np.count_nonzero(spans) < _MIN_RATIOS:
+            continue
+        jump, deviation = _jump(way[frames[spans]], way[time - 1], difference[spans], sigma[spans])
+        if abs(jump) > _MIN_SCALE_JUMP and abs(jump) / deviation > strongest:
+            best, strongest = time, abs(jump) / deviation
+    if strongest < _SCALE_SIGMAS:
+        return []
+    found = [best]
+    for side in (frames[:, 2] < best, frames[:, 0] >= best):
+        if side.any():
+            found += _jumps(frames[side], difference[side], sigma[side], way)
+    return sorted(found)
+
+
+def _jump(way: FloatArray, at: float, difference: FloatArray, sigma: FloatArray) -> tuple[float, float]:
+    """Return the jump of the logarithm of the scale at one place of the way, and its standard deviation."""
+    legs = np.maximum(np.diff(way, axis=1), 1e-12)
+    after = np.clip((way[:, 1:] - at) / legs, 0.0, 1.0)
+    effect = after[:, 1] - after[:, 0]
+    # With a jump, the delivered ratio is larger by the jump times the effect.
+    order = np.argsort(np.divide(difference, effect, out=np.zeros(len(effect)), where=effect > 0.05))
+    share = np.cumsum((effect / sigma)[order] ** 2)
+    if share[-1] <= 0:
+        return 0.0, np.inf
+    middle = order[np.searchsorted(share, share[-1] / 2)]
+    jump = float(difference[middle] / max(effect[middle], 0.05))
+    for _ in range(5):
+        residual = (difference - jump * effect) / sigma
+        weight = 1.0 / (1.0 + (residual / 3.0) ** 2) ** 2 / sigma**2
+        information = float(np.sum(weight * effect**2))
+        jump = float(np.sum(weight * effect * difference)) / max(information, 1e-12)
+    return jump, float(1.0 / np.sqrt(max(information, 1e-12)))
