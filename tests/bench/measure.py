@@ -209,7 +209,7 @@ def run_camera(name: str, pictures: Pictures, path: FloatArray, cases: int) -> d
                     "what": harm.what,
                     "start": int(np.argmax(harm.moved)),
                     "found": is_found(found, harm),
-                    "kept": float(np.mean(found[larger & right])),
+                    "kept": float(np.mean(found[larger & right & np.isfinite(harm.world_from_cam[:, 0, 3])])),
                 }
             )
     return {
