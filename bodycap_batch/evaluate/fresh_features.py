@@ -41,12 +41,15 @@ class FrameFeatures:
         descriptors: (N,32) uint8 ORB descriptors.
         pixel_rad: (N,) angle (radians) that corresponds to one px of the detection image at each feature's
             pyramid level.
+        row: (N,) time at which each feature's row is exposed, relative to the middle row, in units of the
+            readout time: −0.5 to 0.5.
     """
 
     rays: FloatArray
     cells: IntArray
     descriptors: npt.NDArray[np.uint8]
     pixel_rad: FloatArray
+    row: FloatArray
 
 
 def detect_features(image: npt.NDArray[np.uint8], camera: Camera) -> FrameFeatures:
@@ -72,6 +75,7 @@ def detect_features(image: npt.NDArray[np.uint8], camera: Camera) -> FrameFeatur
             cells=nothing.astype(np.int64),
             descriptors=np.zeros((0, 32), np.uint8),
             pixel_rad=nothing,
+            row=nothing,
         )
     px = np.array([corner.pt for corner in described])
     level = np.array([corner.octave for corner in described])
@@ -85,6 +89,7 @@ def detect_features(image: npt.NDArray[np.uint8], camera: Camera) -> FrameFeatur
         cells=_cells_of(px, (image.shape[1], image.shape[0]))[usable],
         descriptors=descriptors[usable],
         pixel_rad=pixel_rad[usable],
+        row=(px[:, 0] / image.shape[1] if camera.sideways else px[:, 1] / image.shape[0])[usable] - 0.5,
     )
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,10 +37,12 @@ class DeliveredCamera:
     Attributes:
         poses: The delivered poses world_from_camera.
         lens: The delivered intrinsics.
+        readout_s: Time from the exposure of the first row to that of the last row; 0 for a global shutter.
     """
 
     poses: TimedPoses
     lens: Camera
+    readout_s: float = 0.0
 
 
 def read_delivered(results: Path) -> dict[str, DeliveredCamera]:
@@ -59,10 +62,28 @@ def read_delivered(results: Path) -> dict[str, DeliveredCamera]:
         )
     lenses = _lenses(results / "colmap")
     poses = {path.stem: read_tum(path) for path in paths}
+    readouts = _readouts(results / "metrics.json")
     return {
-        name: DeliveredCamera(poses=found, lens=lenses[name])
+        name: DeliveredCamera(
+            poses=found,
+            lens=replace(lenses[name], sideways=bool(readouts.get(name, {}).get("sideways", False))),
+            readout_s=float(readouts.get(name, {}).get("seconds") or 0.0),
+        )
         for name, found in poses.items()
         if name in lenses and len(found.times_ns)
+    }
+
+
+def _readouts(metrics: Path) -> dict[str, dict[str, Any]]:
+    """Return the readout time of each camera that the figures of a job state; empty without such figures."""
+    try:
+        mapping = json.loads(metrics.read_bytes())["mapping"]
+    except (OSError, ValueError, KeyError):
+        return {}
+    return {
+        name: readout
+        for group in (mapping.get("readouts_from_matches", {}), *mapping.get("rolling_shutter", ()))
+        for name, readout in group.items()
     }
 
 
@@ -118,7 +139,8 @@ def _check_camera(
         features[index] = detect_features(image, delivered.lens.scaled(image.shape[1], image.shape[0]))
         progress(index // 2, count)
     evidence = measure_pictures(
-        Pictures(features), has_pose(poses), lambda done, total: progress((total + done) // 2, total)
+        Pictures(features, camera.times_ns * 1e-9, delivered.readout_s),
+        has_pose(poses), lambda done, total: progress((total + done) // 2, total)
     )
     return find_right_frames(evidence, poses)
 

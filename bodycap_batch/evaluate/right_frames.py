@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -27,7 +27,7 @@ from bodycap_batch.evaluate.two_view import (
     judge_rotation,
     measure_rotation,
 )
-from bodycap_batch.model.geometry import rotation_angle_rad
+from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp, so3_log
 
 GAPS = {1: 1, 5: 1, 15: 3, 45: 3}
 """Distances in frames of the linked frames, and every how many frames a link starts."""
@@ -42,8 +42,9 @@ frames the pictures hardly tell a turn from a step to the side, and all errors h
 
 _MIN_WRONG_LINKS = 1
 """Minimum number of wrong rotations across a break, beyond the right ones. Only one spans some lost frames."""
-_MIN_WRONG_LEGS = 2
-"""Minimum number of wrong triples across a break, beyond the right ones."""
+_MIN_WRONG_LEGS = 3
+"""Minimum number of wrong triples across a break, beyond the right ones. Two triples of neighbouring frames
+span each time, so a hand that fills the picture for a moment is no break: a room shows it over other gaps, too."""
 _REVISIT_EVERY = 15
 """Every how many frames earlier frames with a similar view are looked for."""
 _REVISIT_FRAMES = 90
@@ -84,18 +85,60 @@ class MeasuredTriple:
 
 
 class Pictures:
-    """The features of each frame of a camera, and the pairs of frames that have been measured."""
+    """The features of each frame of a camera, and what has been measured between frames.
 
-    def __init__(self, features: Features) -> None:
+    With a rolling shutter, rays are moved to the time of the middle row by the rotation that the pictures
+    show between neighbouring frames.
+    """
+
+    def __init__(
+        self, features: Features, times_s: FloatArray | None = None, readout_s: float = 0.0
+    ) -> None:
+        """Take the features of all N frames.
+
+        Args:
+            features: The features of each frame.
+            times_s: (N,) times of the frames; needed only for a rolling shutter.
+            readout_s: Time from the exposure of the first row to that of the last row.
+        """
         self.features = features
         self._pairs: dict[tuple[int, int], MeasuredPair] = {}
         self._triples: dict[tuple[int, int, int], MeasuredTriple | None] = {}
+        if times_s is not None and readout_s != 0.0:
+            rows = self._correct_rows(times_s, readout_s)
+            self._pairs = {key: _measured_pair(self.features, key, matched) for key, matched in rows.items()}
+
+    def _correct_rows(self, times_s: FloatArray, readout_s: float) -> dict[tuple[int, int], IntArray]:
+        """Move the rays to the time of the middle row.
+
+        Returns:
+            The matches of each two neighbouring frames.
+        """
+        pairs = {(index, index + 1): self.pair(index, index + 1) for index in range(len(times_s) - 1)}
+        speed = np.full((len(times_s), 2, 3), np.nan)
+        for (first, second), pair in pairs.items():
+            if pair.measured is not None:
+                turn = so3_log(pair.measured.rotation) / (times_s[second] - times_s[first])
+                speed[first, 1] = speed[second, 0] = turn
+        known = np.isfinite(speed)
+        mean = np.sum(np.where(known, speed, 0.0), axis=1) / np.maximum(np.sum(known, axis=1), 1)
+        self.features = [
+            each
+            and replace(
+                each,
+                rays=np.einsum(
+                    "nij,nj->ni", so3_exp(-readout_s * each.row[:, None] * mean[index]), each.rays
+                ),
+            )
+            for index, each in enumerate(self.features)
+        ]
+        return {key: pair.rows for key, pair in pairs.items()}
 
     def pair(self, first: int, second: int) -> MeasuredPair:
         """Match two frames and measure their relative rotation, once."""
         found = self._pairs.get((first, second))
         if found is None:
-            found = _measure_pair(self.features[first], self.features[second])
+            found = _measured_pair(self.features, (first, second))
             self._pairs[first, second] = found
         return found
 
@@ -167,11 +210,12 @@ def measure_pictures(
     return PictureEvidence(pictures=pictures, pairs=pairs, chains=chains)
 
 
-def _measure_pair(first: FrameFeatures | None, second: FrameFeatures | None) -> MeasuredPair:
-    """Match two frames and measure their relative rotation."""
+def _measured_pair(features: Features, frames: tuple[int, int], rows: IntArray | None = None) -> MeasuredPair:
+    """Match two frames, if their matches are not given, and measure their relative rotation."""
+    first, second = features[frames[0]], features[frames[1]]
     if first is None or second is None:
         return MeasuredPair(rows=np.zeros((0, 2), dtype=np.int64), measured=None)
-    rows = match_features(first, second)
+    rows = match_features(first, second) if rows is None else rows
     return MeasuredPair(rows=rows, measured=measure_rotation(_ray_matches(first, second, rows)))
 
 

@@ -138,7 +138,8 @@ def judge_rotation(
     if measured is None:
         return None, Outcome.UNMEASURABLE
     unchanged = _refined(matches, expected, turn=False)
-    if unchanged.support >= _NOT_EXCLUDED * support:
+    is_majority = 2 * np.count_nonzero(measured.inliers) > len(matches.first)
+    if unchanged.support >= _NOT_EXCLUDED * support or not is_majority:
         return measured, Outcome.UNMEASURABLE
     return measured, Outcome.WRONG
 

@@ -174,12 +174,18 @@ def true_poses(truth: Path, camera: CaptureCamera) -> FloatArray:
     return found
 
 
-def read_pictures(camera: CaptureCamera, count: int) -> Pictures:
-    """Return the features of the first frames of a camera."""
+def read_pictures(camera: CaptureCamera, count: int, readout_s: float) -> Pictures:
+    """Return the features of the first frames of a camera with a known readout time."""
     features = [None] * count
     for index, image in camera.read_decodable(np.arange(count)):
         features[index] = detect_features(image, camera.camera)  # type: ignore[call-overload]
-    return Pictures(features)
+    return Pictures(features, camera.times_ns[:count] * 1e-9, readout_s)
+
+
+def true_readout_s(folder: Path) -> float:
+    """Return the true readout time of a capture's cameras; 0 if the truth names none."""
+    clocks = folder / "gt" / "clocks.json"
+    return float(json.loads(clocks.read_bytes())["rolling_shutter_s"]) if clocks.exists() else 0.0
 
 
 def judge(pictures: Pictures, world_from_cam: FloatArray) -> RightFrames:
@@ -279,9 +285,8 @@ def main(arguments: Sequence[str]) -> int:
             single = folder / "groundtruth.txt"
             truth = single if single.exists() else folder / "gt" / f"{camera.name}.tum"
             path = true_poses(truth, camera)[: options.frames]
-            row = run_camera(
-                f"{folder.name}/{camera.name}", read_pictures(camera, len(path)), path, options.cases
-            )
+            pictures = read_pictures(camera, len(path), true_readout_s(folder))
+            row = run_camera(f"{folder.name}/{camera.name}", pictures, path, options.cases)
             rows.append(row)
             print(json.dumps(row), flush=True)
     print("\n".join(lines_of(rows)))

@@ -52,6 +52,7 @@ def pictures(path: FloatArray, seed: int = 0) -> list[FrameFeatures | None]:
                 cells=row * CELLS[0] + column,
                 descriptors=descriptors,
                 pixel_rad=np.full(len(rays), PIXEL_RAD),
+                row=plane[inside, 1] / 0.96,
             )
         )
     return features
