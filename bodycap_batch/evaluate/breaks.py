@@ -21,7 +21,10 @@ _SCALE_SIGMAS = 5.0
 jumps of some hundred times exceeds 4."""
 _MAX_LOG_SIGMA = 0.3
 """Maximum standard deviation of the logarithm of a ratio of legs that is used."""
-_MIN_RATIOS = 3
+_MIN_PARALLAX_DEG = 1.0
+"""Minimum parallax (degrees) of both legs of a ratio that is used. With less, errors of corners, which hands
+and pyramid levels give in common, are a large part of a leg, and have one sign."""
+_MIN_RATIOS = 4
 """Minimum number of ratios that measure a scale jump."""
 
 
@@ -78,7 +81,9 @@ def scale_jumps(
         lengths = np.linalg.norm(np.diff(centres[list(triple)], axis=0), axis=1)
         value, deviation = measured.log_ratio
         spanned = any(triple[0] < time <= triple[2] for time in breaks)
-        if min(lengths) > 0 and deviation < _MAX_LOG_SIGMA and not spanned:
+        parallax = measured.parallax * np.linalg.norm(measured.translations, axis=1)
+        is_seen = min(lengths) > 0 and min(parallax) > np.deg2rad(_MIN_PARALLAX_DEG)
+        if is_seen and deviation < _MAX_LOG_SIGMA and not spanned:
             frames.append(triple)
             difference.append(np.log(lengths[1] / lengths[0]) - value)
             sigma.append(deviation)

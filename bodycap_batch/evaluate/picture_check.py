@@ -139,8 +139,9 @@ def _check_camera(
         features[index] = detect_features(image, delivered.lens.scaled(image.shape[1], image.shape[0]))
         progress(index // 2, count)
     evidence = measure_pictures(
-        Pictures(features, camera.times_ns * 1e-9, delivered.readout_s),
-        has_pose(poses), lambda done, total: progress((total + done) // 2, total)
+        Pictures(features, np.asarray(camera.times_ns * 1e-9), delivered.readout_s),
+        has_pose(poses),
+        lambda done, total: progress((total + done) // 2, total),
     )
     return find_right_frames(evidence, poses)
 

@@ -41,10 +41,10 @@ frames the pictures hardly tell a turn from a step to the side, and all errors h
 
 
 _MIN_WRONG_LINKS = 1
-"""Minimum number of wrong rotations across a break, beyond the right ones. Only one spans some lost frames."""
+"""Minimum number of wrong rotations across a break, beyond the right ones: only one spans some gaps."""
 _MIN_WRONG_LEGS = 3
 """Minimum number of wrong triples across a break, beyond the right ones. Two triples of neighbouring frames
-span each time, so a hand that fills the picture for a moment is no break: a room shows it over other gaps, too."""
+span each time, so a hand that fills the picture for a moment is no break."""
 _REVISIT_EVERY = 15
 """Every how many frames earlier frames with a similar view are looked for."""
 _REVISIT_FRAMES = 90
@@ -91,9 +91,7 @@ class Pictures:
     show between neighbouring frames.
     """
 
-    def __init__(
-        self, features: Features, times_s: FloatArray | None = None, readout_s: float = 0.0
-    ) -> None:
+    def __init__(self, features: Features, times_s: FloatArray | None = None, readout_s: float = 0.0) -> None:
         """Take the features of all N frames.
 
         Args:
@@ -122,14 +120,10 @@ class Pictures:
                 speed[first, 1] = speed[second, 0] = turn
         known = np.isfinite(speed)
         mean = np.sum(np.where(known, speed, 0.0), axis=1) / np.maximum(np.sum(known, axis=1), 1)
+        interval_s = np.gradient(times_s)[:, None]
+        change = np.nan_to_num(speed[:, 1] - speed[:, 0]) / interval_s
         self.features = [
-            each
-            and replace(
-                each,
-                rays=np.einsum(
-                    "nij,nj->ni", so3_exp(-readout_s * each.row[:, None] * mean[index]), each.rays
-                ),
-            )
+            each and _at_middle_row(each, readout_s * each.row, mean[index], change[index])
             for index, each in enumerate(self.features)
         ]
         return {key: pair.rows for key, pair in pairs.items()}
@@ -174,12 +168,17 @@ class RightFrames:
     Attributes:
         outcome: (N,) outcome of each frame; None for a frame without a pose.
         links: Number of pairs of frames whose rotation was compared, by outcome.
-        positions: Number of triples of frames whose positions were compared, by outcome.
+        legs: Outcome of the positions of each three frames that were compared, by the first and last frame.
     """
 
     outcome: tuple[Outcome | None, ...]
     links: Mapping[Outcome, int]
-    positions: Mapping[Outcome, int]
+    legs: Mapping[tuple[int, int], Outcome]
+
+    @property
+    def positions(self) -> Mapping[Outcome, int]:
+        """Number of triples of frames whose positions were compared, by outcome."""
+        return Counter(self.legs.values())
 
     def count(self, outcome: Outcome) -> int:
         """Return the number of frames with an outcome."""
@@ -210,6 +209,26 @@ def measure_pictures(
     return PictureEvidence(pictures=pictures, pairs=pairs, chains=chains)
 
 
+def _at_middle_row(
+    features: FrameFeatures, after_s: FloatArray, speed: FloatArray, change: FloatArray
+) -> FrameFeatures:
+    """Move rays to the time of the middle row.
+
+    Args:
+        features: The features of one frame.
+        after_s: (N,) time of each feature after that of the middle row.
+        speed: (3,) rotation of the rays, rad/s.
+        change: (3,) its change, rad/s². Half of its effect counts as noise: between frames, it varies itself.
+    """
+    quadratic = 0.5 * after_s[:, None] ** 2 * change
+    turn = so3_exp(-(after_s[:, None] * speed + quadratic))
+    return replace(
+        features,
+        rays=np.einsum("nij,nj->ni", turn, features.rays),
+        pixel_rad=np.hypot(features.pixel_rad, 0.5 * np.linalg.norm(quadratic, axis=1)),
+    )
+
+
 def _measured_pair(features: Features, frames: tuple[int, int], rows: IntArray | None = None) -> MeasuredPair:
     """Match two frames, if their matches are not given, and measure their relative rotation."""
     first, second = features[frames[0]], features[frames[1]]
@@ -230,11 +249,11 @@ def _ray_matches(first: FrameFeatures, second: FrameFeatures, rows: IntArray) ->
 
 def _judge_pair(
     features: Features, frames: tuple[int, int], pair: MeasuredPair, world_from_cam: FloatArray
-) -> tuple[Motion | None, Outcome]:
+) -> Outcome:
     """Compare the delivered rotation between two frames with their matches, as `judge_rotation` does."""
     first, second = features[frames[0]], features[frames[1]]
     if first is None or second is None:
-        return None, Outcome.UNMEASURABLE
+        return Outcome.UNMEASURABLE
     expected = world_from_cam[frames[1], :3, :3].T @ world_from_cam[frames[0], :3, :3]
     return judge_rotation(_ray_matches(first, second, pair.rows), pair.measured, expected)
 
@@ -249,7 +268,7 @@ def find_right_frames(evidence: PictureEvidence, world_from_cam: FloatArray) -> 
     posed, features = has_pose(world_from_cam), evidence.pictures.features
     outcomes: dict[tuple[int, int], Outcome] = {}
     for (first, second), pair in evidence.pairs.items():
-        outcomes[first, second] = _judge_pair(features, (first, second), pair, world_from_cam)[1]
+        outcomes[first, second] = _judge_pair(features, (first, second), pair, world_from_cam)
     for (first, last), chain in evidence.chains.items():
         expected = world_from_cam[last, :3, :3].T @ world_from_cam[first, :3, :3]
         if chain is not None:
@@ -275,7 +294,7 @@ def find_right_frames(evidence: PictureEvidence, world_from_cam: FloatArray) -> 
     return RightFrames(
         outcome=_frame_outcomes(sets, links[Outcome.RIGHT], wrong, posed),
         links=Counter(outcomes.values()),
-        positions=Counter(outcome for outcome, _ in legs.values()),
+        legs={(frames[0], frames[2]): outcome for frames, (outcome, _) in legs.items()},
     )
 
 
@@ -358,7 +377,7 @@ def _revisits(
         for other in np.argsort(distance, kind="stable")[: min(_REVISITS, np.count_nonzero(is_similar))]:
             first = int(frames[other])
             ends = (first, int(second))
-            outcomes[ends] = _judge_pair(pictures.features, ends, pictures.pair(*ends), world_from_cam)[1]
+            outcomes[ends] = _judge_pair(pictures.features, ends, pictures.pair(*ends), world_from_cam)
     return outcomes
 
 
@@ -367,7 +386,7 @@ def _joined_parts(
     links: Mapping[Outcome, Sequence[tuple[int, int]]],
     legs: Mapping[Outcome, Sequence[tuple[int, int]]],
 ) -> IntArray:
-    """Join the parts of a path between its breaks again if right links across other parts outnumber wrong ones.
+    """Join the parts of a path between its breaks again if right links between them outnumber wrong ones.
 
     Neighbouring parts stay apart: there is a break between them.
 
@@ -383,7 +402,7 @@ def _joined_parts(
     net = np.zeros((2, count, count), dtype=np.int64)
     for kind, spans in enumerate((links, legs)):
         for outcome, vote in ((Outcome.RIGHT, 1), (Outcome.WRONG, -1)):
-            for first, last in spans[outcome] if outcome in spans else ():
+            for first, last in spans.get(outcome, ()):
                 net[kind, parts[first], parts[last]] += vote
     label = np.arange(count)
     apart = {(part, part + 1) for part in range(count - 1)}
@@ -407,7 +426,9 @@ def _frame_outcomes(
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    inside = np.array([pair for pair in right if sets[pair[0]] == sets[pair[1]]], dtype=np.int64).reshape(-1, 2)
+    inside = np.array([pair for pair in right if sets[pair[0]] == sets[pair[1]]], dtype=np.int64).reshape(
+        -1, 2
+    )
     shape = (len(posed), len(posed))
     graph = coo_matrix((np.ones(len(inside)), (inside[:, 0], inside[:, 1])), shape=shape)
     groups = connected_components(graph, directed=False)[1]

@@ -31,8 +31,8 @@ _EQUAL_SUPPORT = 0.8
 """Minimum support of legs like the delivered ones, relative to the best legs, with which the pictures confirm
 them as well: a hand or a second wall moves otherwise."""
 _NOT_EXCLUDED = 0.6
-"""Minimum support of the delivered poses themselves, relative to the best legs, with which the pictures do not
-exclude them."""
+"""Minimum support of the delivered poses themselves, relative to the best legs, with which the pictures
+do not exclude them."""
 _CORRELATION = 2.0
 """Factor of the standard deviations for what neighbouring corners have in common. Evidence: without it, the
 errors of measured ratios have a median of 1.3 to 1.7 standard deviations, on captures with truth."""
@@ -238,7 +238,7 @@ def _refined(common: CommonRays, rotations: FloatArray, translations: FloatArray
     return Legs(
         rotations=rotations,
         translations=axis.reshape(2, 3),
-        covariance=(_CORRELATION * noise_px) ** 2 * np.linalg.inv(normal)[6:, 6:],
+        covariance=np.asarray((_CORRELATION * noise_px) ** 2 * np.linalg.inv(normal)[6:, 6:]),
         parallax=float(np.median(depth[inliers])) if inliers.any() else 0.0,
         inliers=inliers,
         support=len(np.unique(common.cells[inliers])),

@@ -27,8 +27,8 @@ _MIN_MATCHES = 12
 _MIN_CELLS = 8
 """Minimum number of grid cells with an inlier: a twelfth of the picture."""
 _EQUAL_SUPPORT = 0.8
-"""Minimum support of the delivered rotation, relative to the best rotation, with which the pictures confirm
-it as well. Two planar solutions of one wall, for instance, have nearly equal support."""
+"""Minimum support of the delivered rotation, relative to the best rotation, with which the pictures do
+not decide between both. Two planar solutions of one wall, for instance, have nearly equal support."""
 _NOT_EXCLUDED = 0.4
 """Minimum support of the delivered rotation, relative to the best rotation, with which the pictures do not
 exclude it: they show two motions, or a wall whose matches determine the rotation badly. Two frames cannot
@@ -110,38 +110,31 @@ def measure_rotation(matches: RayMatches) -> Motion | None:
     return _usable(max((_refined(matches, start) for start in starts), key=lambda each: each.support))
 
 
-def judge_rotation(
-    matches: RayMatches, measured: Motion | None, expected: FloatArray
-) -> tuple[Motion | None, Outcome]:
+def judge_rotation(matches: RayMatches, measured: Motion | None, expected: FloatArray) -> Outcome:
     """Compare a measured rotation with a delivered one.
+
+    A measurement is right by itself if it agrees: matches that follow another motion would not do so. It is
+    wrong only if the pictures exclude the delivered rotation, and if most matches follow another one: the
+    two solutions of one wall have nearly equal support, and a hand has the support of some matches.
 
     Args:
         matches: Fresh matches of the two frames.
         measured: The rotation that `measure_rotation` found in them.
         expected: (3,3) delivered rotation second_from_first.
-
-    Returns:
-        The motion that the matches confirm, None if there is none; the outcome.
     """
-    if measured is not None and not differs(measured.rotation, measured.rotation_covariance, expected):
-        return measured, Outcome.RIGHT
-    if len(matches.first) < _MIN_MATCHES:
-        return None, Outcome.UNMEASURABLE
-    nearest = _usable(_refined(matches, expected))
-    support = 0 if measured is None else measured.support
-    if (
-        nearest is not None
-        and nearest.support >= _EQUAL_SUPPORT * support
-        and not differs(nearest.rotation, nearest.rotation_covariance, expected)
-    ):
-        return nearest, Outcome.RIGHT
     if measured is None:
-        return None, Outcome.UNMEASURABLE
+        return Outcome.UNMEASURABLE
+    if not differs(measured.rotation, measured.rotation_covariance, expected):
+        return Outcome.RIGHT
+    if 2 * np.count_nonzero(measured.inliers) <= len(matches.first):
+        return Outcome.UNMEASURABLE
+    nearest = _usable(_refined(matches, expected))
+    is_near = nearest is not None and not differs(nearest.rotation, nearest.rotation_covariance, expected)
+    if nearest is not None and is_near and nearest.support >= _EQUAL_SUPPORT * measured.support:
+        return Outcome.UNMEASURABLE
     unchanged = _refined(matches, expected, turn=False)
-    is_majority = 2 * np.count_nonzero(measured.inliers) > len(matches.first)
-    if unchanged.support >= _NOT_EXCLUDED * support or not is_majority:
-        return measured, Outcome.UNMEASURABLE
-    return measured, Outcome.WRONG
+    is_possible = unchanged.support >= _NOT_EXCLUDED * measured.support
+    return Outcome.UNMEASURABLE if is_possible else Outcome.WRONG
 
 
 def _usable(found: Motion) -> Motion | None:

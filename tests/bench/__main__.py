@@ -27,6 +27,7 @@ from tests.bench import (
     lenses,
     long,
     mappers,
+    measure,
     ours,
     peers,
     real,
@@ -67,6 +68,7 @@ _WITH_OPTIONS = {
     "mappers": mappers.main,
     "paired": paired.main,
     "real": real.main,
+    "measure": measure.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
 
@@ -89,7 +91,8 @@ def main() -> int:
         "flexion with a height alone), `scale` (the metric scale with a height alone), `bare` (a camera at "
         "plain surfaces), `shutter` (drawn readout times against global shutters), `mappers` (the "
         "incremental and the global mapper), `paired` (two versions on perturbed captures), `real` (the "
-        "table of the real captures), and `long` (ten minutes of three cameras)",
+        "table of the real captures), `measure` (how well the pictures judge poses), and `long` (ten "
+        "minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)

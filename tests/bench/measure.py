@@ -4,7 +4,10 @@ The true poses of each camera are given to the measure as if a job had delivered
 into them. A case is found if not both sides of the error keep more than half of their frames right: at least
 half of the frames of one side are then not said to be right together with the other side. A case is drawn
 only where the measure calls more than half of each side right with the true poses, and where the error moves
-the camera.
+the camera. Leaps and scale jumps where the pictures do not measure positions (the camera turns on the spot,
+or sees too little) are counted apart, in brackets.
+
+EuRoC's pictures are not among the captures, only a part of its inertial samples and poses.
 """
 
 from __future__ import annotations
@@ -38,6 +41,8 @@ CASES = 3
 """Number of drawn cases of each kind of error, per camera."""
 _SIDE_FRAMES = 15
 """Minimum number of frames on each side of an error that lasts until the end."""
+_SPANS = 3
+"""Number of right triples that must span an error, with the true poses, for positions to be measurable."""
 _MAX_DRAWS = 40
 """Number of draws after which a case is given up: the camera hardly moves, or is not measurable."""
 
@@ -112,9 +117,9 @@ def scale_jump(path: FloatArray, rng: np.random.Generator) -> Harm | None:
     steps = steps_m(path)
     beside = steps[max(0, start - 30) : start + 30]
     # A camera that stands still on either side has no scale there.
-    if min(np.nanmedian(steps[max(0, start - 30) : start]), np.nanmedian(steps[start : start + 30])) < 0.5 * max(
-        np.nanmedian(beside), np.nanmedian(steps)
-    ):
+    if min(
+        np.nanmedian(steps[max(0, start - 30) : start]), np.nanmedian(steps[start : start + 30])
+    ) < 0.5 * max(np.nanmedian(beside), np.nanmedian(steps)):
         return None
     factor = float(rng.uniform(0.5, 0.8) if rng.random() < 0.5 else rng.uniform(1.25, 2.0))
     out = path.copy()
@@ -160,6 +165,16 @@ def is_found(right: BoolArray, harm: Harm) -> bool:
     return not all(np.mean(right[side & posed]) > 0.5 for side in (harm.moved, ~harm.moved))
 
 
+def is_measurable(harm: Harm, spans: Sequence[tuple[int, int]]) -> bool:
+    """Return True if the pictures measure positions across the error, with the true poses.
+
+    Each end of the moved stretch must be spanned by `_SPANS` right triples. Else the camera turns on the spot
+    or sees too little there, and nothing in the pictures tells its position.
+    """
+    ends = 1 + np.flatnonzero(np.diff(harm.moved.astype(int)))
+    return all(sum(first < end <= last for first, last in spans) >= _SPANS for end in ends)
+
+
 def _right(found: RightFrames) -> BoolArray:
     return np.array([outcome is Outcome.RIGHT for outcome in found.outcome])
 
@@ -179,7 +194,7 @@ def read_pictures(camera: CaptureCamera, count: int, readout_s: float) -> Pictur
     features = [None] * count
     for index, image in camera.read_decodable(np.arange(count)):
         features[index] = detect_features(image, camera.camera)  # type: ignore[call-overload]
-    return Pictures(features, camera.times_ns[:count] * 1e-9, readout_s)
+    return Pictures(features, np.asarray(camera.times_ns[:count] * 1e-9), readout_s)
 
 
 def true_readout_s(folder: Path) -> float:
@@ -200,6 +215,7 @@ def run_camera(name: str, pictures: Pictures, path: FloatArray, cases: int) -> d
     base = judge(pictures, path)
     seconds = time.process_time() - begun
     right = _right(base)
+    spans = [frames for frames, outcome in base.legs.items() if outcome is Outcome.RIGHT]
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     drawn = []
     for kind, draw in KINDS.items():
@@ -214,6 +230,7 @@ def run_camera(name: str, pictures: Pictures, path: FloatArray, cases: int) -> d
                     "kind": kind,
                     "what": harm.what,
                     "start": int(np.argmax(harm.moved)),
+                    "measurable": "fold" in kind or is_measurable(harm, spans),
                     "found": is_found(found, harm),
                     "kept": float(np.mean(found[larger & right & np.isfinite(harm.world_from_cam[:, 0, 3])])),
                 }
@@ -247,7 +264,9 @@ def lines_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     for row in rows:
         groups[row["camera"].partition("/")[0]].append(row)
     kinds = "".join(f"{kind:>26}" for kind in KINDS)
-    lines = [f"{'capture':14}{'right':>7}{'wrong':>7}{'unknown':>9}{'links wrong':>16}{'legs wrong':>14}{kinds}"]
+    lines = [
+        f"{'capture':14}{'right':>7}{'wrong':>7}{'unknown':>9}{'links wrong':>16}{'legs wrong':>14}{kinds}"
+    ]
     for name, members in [*groups.items(), ("sum", list(rows))]:
         total = {
             key: {outcome.name: sum(row[key][outcome.name] for row in members) for outcome in Outcome}
@@ -260,8 +279,10 @@ def lines_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
             line += f"{f'{wrong} of {wrong + right}':>{width}}"
         for kind in KINDS:
             cases = [case for row in members for case in row["cases"] if case["kind"] == kind]
-            hits = sum(case["found"] for case in cases)
-            line += f"{f'{hits} of {len(cases)}':>26}"
+            seen = [case["found"] for case in cases if case["measurable"]]
+            rest = [case["found"] for case in cases if not case["measurable"]]
+            text = f"{sum(seen)} of {len(seen)}" + (f" ({sum(rest)} of {len(rest)})" if rest else "")
+            line += f"{text:>26}"
         lines.append(line)
     return lines
 
