@@ -175,7 +175,7 @@ def test_one_wrong_measurement_among_right_ones_is_no_break() -> None:
 def test_rays_of_a_rolling_shutter_are_moved_to_the_middle_row() -> None:
     time, readout = np.arange(8), 0.5
     turn = so3_exp(np.column_stack([0.05 * time, 0.08 * time, 0.03 * time]))
-    path = make_transform(turn, np.column_stack([0.03 * time, 0 * time, 0 * time]))
+    path = make_transform(turn, np.zeros((8, 3)))
     seen = pictures(path, readout=readout)
     errors = []
     for shutter in (0.0, readout):
