@@ -20,6 +20,7 @@ from bodycap_batch.evaluate.breaks import contradicted_times, scale_jumps
 from bodycap_batch.evaluate.fresh_features import FrameFeatures, match_features
 from bodycap_batch.evaluate.three_view import CommonRays, Legs, judge_legs, measure_legs
 from bodycap_batch.evaluate.two_view import (
+    WRONG_DEG,
     Motion,
     Outcome,
     RayMatches,
@@ -40,8 +41,9 @@ _STEPS = (5, 3, 2, 1)
 frames the pictures hardly tell a turn from a step to the side, and all errors have the same sign."""
 
 
-_MIN_WRONG_LINKS = 1
-"""Minimum number of wrong rotations across a break, beyond the right ones: only one spans some gaps."""
+_MIN_WRONG_LINKS = 2
+"""Minimum number of wrong rotations across a break, beyond the right ones. A chain across lost frames counts
+twice: it is made of many pairs, and only one spans some gaps."""
 _MIN_WRONG_LEGS = 3
 """Minimum number of wrong triples across a break, beyond the right ones. Two triples of neighbouring frames
 span each time, so a hand that fills the picture for a moment is no break."""
@@ -100,6 +102,8 @@ class Pictures:
             readout_s: Time from the exposure of the first row to that of the last row.
         """
         self.features = features
+        self._times_s = np.arange(float(len(features))) if times_s is None else times_s
+        self._readout_s = readout_s
         self._pairs: dict[tuple[int, int], MeasuredPair] = {}
         self._triples: dict[tuple[int, int, int], MeasuredTriple | None] = {}
         if times_s is not None and readout_s != 0.0:
@@ -136,11 +140,31 @@ class Pictures:
             self._pairs[first, second] = found
         return found
 
+    def _is_steady(self, frame: int) -> bool:
+        """Return True if the camera turns by less than `WRONG_DEG` while a frame is read out.
+
+        The correction of a larger turn has an error of the size of a usual parallax.
+        """
+        if self._readout_s == 0.0:
+            return True
+        first = min(frame, len(self.features) - 2)
+        measured = self.pair(first, first + 1).measured
+        if measured is None:
+            return False
+        share = abs(self._readout_s) / float(self._times_s[first + 1] - self._times_s[first])
+        return share * float(rotation_angle_rad(measured.rotation)) < np.deg2rad(WRONG_DEG)
+
     def triple(self, frames: tuple[int, int, int]) -> MeasuredTriple | None:
         """Measure the legs between three frames, once; None if they have too few points in common."""
+        if frames not in self._triples and not all(map(self._is_steady, frames)):
+            self._triples[frames] = None
         if frames not in self._triples:
             self._triples[frames] = _measure_triple(
-                [self.features[index] for index in frames], self.pair(*frames[:2]), self.pair(*frames[1:])
+                [self.features[index] for index in frames],
+                self.pair(*frames[:2]),
+                self.pair(*frames[1:]),
+                self._readout_s,
+                np.diff(self._times_s[list(frames)]),
             )
         return self._triples[frames]
 
@@ -282,7 +306,9 @@ def find_right_frames(evidence: PictureEvidence, world_from_cam: FloatArray) -> 
         spans[outcome].append((frames[0], frames[2]))
     count = len(posed)
     links = {each: [pair for pair, found in outcomes.items() if found is each] for each in Outcome}
-    folds = contradicted_times(links[Outcome.WRONG], links[Outcome.RIGHT], count, _MIN_WRONG_LINKS)
+    chains = {each: [pair for pair in evidence.chains if outcomes[pair] is each] for each in Outcome}
+    across = {each: links[each] + chains[each] for each in Outcome}
+    folds = contradicted_times(across[Outcome.WRONG], across[Outcome.RIGHT], count, _MIN_WRONG_LINKS)
     unexplained = [span for span in spans[Outcome.WRONG] if not _spans(span, folds)]
     leaps = contradicted_times(unexplained, spans[Outcome.RIGHT], count, _MIN_WRONG_LEGS)
     breaks = sorted({*folds, *leaps})
@@ -326,18 +352,34 @@ def _position_outcomes(
 
 
 def _measure_triple(
-    seen: Sequence[FrameFeatures | None], before: MeasuredPair, after: MeasuredPair
+    seen: Sequence[FrameFeatures | None],
+    before: MeasuredPair,
+    after: MeasuredPair,
+    readout_s: float,
+    between_s: FloatArray,
 ) -> MeasuredTriple | None:
-    """Measure the legs between three frames from the features of the middle one that both pairs match."""
+    """Measure the legs between three frames from the features of the middle one that both pairs match.
+
+    Args:
+        seen: The features of the three frames.
+        before: The first and the middle frame.
+        after: The middle and the last frame.
+        readout_s: Time from the exposure of the first row to that of the last row.
+        between_s: (2,) times between the frames.
+    """
     if before.measured is None or after.measured is None:
         return None
     middle, one, two = np.intersect1d(before.rows[:, 1], after.rows[:, 0], return_indices=True)
     chosen = (before.rows[one, 0], middle, after.rows[two, 1])
     views = [(each, row) for each, row in zip(seen, chosen, strict=True) if each is not None]
+    late = np.stack([each.row[row] for each, row in views]) * readout_s
+    # The point was seen in the middle frame, and before and after it, for a time that depends on its rows.
+    elapsed = 1.0 + np.stack([(late[1] - late[0]) / between_s[0], (late[2] - late[1]) / between_s[1]])
     common = CommonRays(
         rays=np.stack([each.rays[row] for each, row in views]),
         noise_rad=np.max([each.pixel_rad[row] for each, row in views], axis=0),
         cells=views[1][0].cells[middle],
+        elapsed=elapsed,
     )
     return MeasuredTriple(common=common, measured=measure_legs(common, (before.measured, after.measured)))
 

@@ -52,11 +52,14 @@ class CommonRays:
         rays: (3,M,3) rays in the first, the middle and the last frame.
         noise_rad: (M,) angle (radians) of one px.
         cells: (M,) grid cell of each point in the middle frame.
+        elapsed: (2,M) time between the exposures of a point's rows in the middle frame and in the first and
+            last one, relative to the time between the frames. It is 1 without a rolling shutter.
     """
 
     rays: FloatArray
     noise_rad: FloatArray
     cells: IntArray
+    elapsed: FloatArray
 
     @property
     def is_enough(self) -> bool:
@@ -256,20 +259,21 @@ def _linearised(
     seen, count = common.rays[[0, 2]], len(common.noise_rad)
     axes = _tangents(seen) / common.noise_rad[None, :, None, None]
     turned = common.rays[1] @ np.swapaxes(rotations, 1, 2)
-    moved = cross(seen, translations[:, None])
+    shift = translations[:, None] * common.elapsed[..., None]
+    moved = cross(seen, shift)
     depth = -np.einsum("kmi,kmi->m", cross(seen, turned), moved)
     depth = depth / np.maximum(np.einsum("kmi,kmi->m", moved, moved), 1e-12)
-    point = turned + depth[None, :, None] * translations[:, None]
+    point = turned + depth[None, :, None] * shift
     length = np.maximum(np.linalg.norm(point, axis=2), 1e-9)[..., None, None]
     ray = point[..., None, :] / length
     value = np.sum(axes * ray, axis=-1, keepdims=True)
     slope = (axes - value * ray) / length
     jacobian = np.zeros((count, 2, 2, 12))
-    by_turn, by_shift = cross(turned[:, :, None], slope), slope * depth[None, :, None, None]
+    by_turn, by_shift = cross(turned[:, :, None], slope), slope * (depth * common.elapsed)[..., None, None]
     for view in range(2):
         jacobian[:, view, :, 3 * view : 3 * view + 3] = by_turn[view]
         jacobian[:, view, :, 6 + 3 * view : 9 + 3 * view] = by_shift[view]
-    by_depth = np.einsum("kmai,ki->mka", slope, translations).reshape(count, 4, 1)
+    by_depth = np.einsum("kmai,kmi->mka", slope, shift).reshape(count, 4, 1)
     by_depth /= np.maximum(np.linalg.norm(by_depth, axis=1, keepdims=True), 1e-12)
     flat = jacobian.reshape(count, 4, 12)
     flat -= by_depth * (np.swapaxes(by_depth, 1, 2) @ flat)
