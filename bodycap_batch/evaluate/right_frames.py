@@ -152,7 +152,7 @@ class Pictures:
         if measured is None:
             return False
         share = abs(self._readout_s) / float(self._times_s[first + 1] - self._times_s[first])
-        return share * float(rotation_angle_rad(measured.rotation)) < np.deg2rad(WRONG_DEG)
+        return bool(share * float(rotation_angle_rad(measured.rotation)) < np.deg2rad(WRONG_DEG))
 
     def triple(self, frames: tuple[int, int, int]) -> MeasuredTriple | None:
         """Measure the legs between three frames, once; None if they have too few points in common."""
