@@ -140,7 +140,7 @@ class Pictures:
             self._pairs[first, second] = found
         return found
 
-    def _is_steady(self, frame: int) -> bool:
+    def _turns_little(self, frame: int) -> bool:
         """Return True if the camera turns by less than `WRONG_DEG` while a frame is read out.
 
         The correction of a larger turn has an error of the size of a usual parallax.
@@ -156,7 +156,7 @@ class Pictures:
 
     def triple(self, frames: tuple[int, int, int]) -> MeasuredTriple | None:
         """Measure the legs between three frames, once; None if they have too few points in common."""
-        if frames not in self._triples and not all(map(self._is_steady, frames)):
+        if frames not in self._triples and not all(map(self._turns_little, frames)):
             self._triples[frames] = None
         if frames not in self._triples:
             self._triples[frames] = _measure_triple(

@@ -299,6 +299,8 @@ def main(arguments: Sequence[str]) -> int:
     rows: list[dict[str, Any]] = []
     for capture in options.captures or CAPTURES:
         folder = Path(capture) if Path(capture).is_dir() else options.data / capture
+        if options.frames <= 3 * _SIDE_FRAMES:
+            parser.error(f"--frames must exceed {3 * _SIDE_FRAMES}")
         if not folder.is_dir():
             print(f"{capture}: no such capture in {options.data}, left out")
             continue
