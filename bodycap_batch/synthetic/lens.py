@@ -209,15 +209,32 @@ def _determinant(matrices: FloatArray) -> FloatArray:
     return np.asarray(matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0])
 
 
-def ray_grid(camera: Camera) -> RayGrid:
+def project(camera: Camera, in_cam: FloatArray) -> FloatArray:
+    """Return the pixel positions (N,2), in COLMAP's pixel coordinates, of points (N,3) in the camera frame."""
+    focal, centre = focal_and_centre(camera)
+    across = np.linalg.norm(in_cam[:, :2], axis=1, keepdims=True)
+    if is_fisheye(camera.model):
+        angle = np.arctan2(across, in_cam[:, 2:])
+        plane = in_cam[:, :2] * (angle / np.maximum(across, 1e-12))
+    else:
+        plane = in_cam[:, :2] / np.maximum(in_cam[:, 2:], 1e-6)
+    return np.asarray(distortion_of(camera)(plane) * focal + centre)
+
+
+def ray_grid(camera: Camera, margin_px: int = 0) -> RayGrid:
     """Return the viewing rays through the centres of all pixels.
 
     In COLMAP's pixel coordinates, the centre of the first pixel is (0.5, 0.5).
+
+    Args:
+        camera: The camera.
+        margin_px: Width (px) of an additional border around the image.
     """
     focal, centre = focal_and_centre(camera)
     # An additional ring of pixels around the image allows central differences at all pixels.
     x, y = np.meshgrid(
-        np.arange(-1, camera.width_px + 1) + 0.5, np.arange(-1, camera.height_px + 1) + 0.5, indexing="xy"
+        *(np.arange(-1 - margin_px, side + margin_px + 1) + 0.5 for side in (camera.width_px, camera.height_px)),
+        indexing="xy",
     )
     distorted = (np.stack([x, y], axis=-1) - centre) / focal
     plane, valid = undistort(distortion_of(camera), distorted.reshape(-1, 2))

@@ -19,6 +19,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.atomic_files import store_error_from_os_error
 from bodycap_batch.formats.mp4_writer import VideoWriter
+from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.camera_renderer import CameraRenderer, MovingBody, Sensor, camera_poses_at
@@ -29,6 +30,7 @@ from bodycap_batch.synthetic.gait import Walk, WalkStyle
 from bodycap_batch.synthetic.imu import write_imu
 from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
 from bodycap_batch.synthetic.measured import disturb_poses
+from bodycap_batch.synthetic.moving_camera import MovingCamera
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
 from bodycap_batch.synthetic.pressing import find_press
@@ -199,7 +201,7 @@ def _write_camera_imu(folder: Path, options: SynthOptions, subject: Subject, mou
 class _FrameRecorder:
     """Function that renders one recorded frame of a camera. The frame depends only on the frame number."""
 
-    renderer: CameraRenderer
+    renderer: CameraRenderer | MovingCamera
     sensor: Sensor
     times_s: FloatArray
 
@@ -220,7 +222,7 @@ def _write_videos(
         for renderer, seed in zip(renderers, subject.seeds["images"].spawn(len(renderers)), strict=True):
             camera = renderer.mount.camera
             recorder = _FrameRecorder(
-                renderer=renderer,
+                renderer=video_renderer(renderer, options.camera()),
                 sensor=Sensor(options.noise, 3 * options.width * options.height, seed),
                 times_s=clocks[camera].common_s(seconds_from_ns(frame_times_ns(options, camera))),
             )
@@ -274,6 +276,13 @@ def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRende
         )
         for mount in subject.mounts
     ]
+
+
+def video_renderer(renderer: CameraRenderer, camera: Camera) -> CameraRenderer | MovingCamera:
+    """Return the renderer of a video's frames: a fast one if frames have an exposure or a readout time."""
+    if renderer.exposure_s == 0.0 and renderer.rolling_shutter_s == 0.0:
+        return renderer
+    return MovingCamera(renderer, camera)
 
 
 def walked_extent_m(options: SynthOptions, subject: Subject) -> tuple[float, float]:

@@ -36,10 +36,20 @@ class RayScene:
         Args:
             rays: (N,6) origin and direction vector of each ray.
         """
+        return self.first_hit(rays)[0]
+
+    def first_hit(self, rays: _Float32) -> tuple[IntArray, _Float32]:
+        """Return the index (N,) of the first face on each ray, or `NOTHING`, and the distances (N,).
+
+        Args:
+            rays: (N,6) origin and direction vector of each ray. The unit of the distances is the length of
+                the direction vector; the distance of `NOTHING` is infinite.
+        """
         answer = self._scene.cast_rays(self._tensor.from_numpy(rays), nthreads=1)
         faces = np.asarray(answer["primitive_ids"].numpy(), dtype=np.int64)
-        faces[~np.isfinite(answer["t_hit"].numpy())] = NOTHING
-        return faces
+        distance = np.asarray(answer["t_hit"].numpy(), dtype=np.float32)
+        faces[~np.isfinite(distance)] = NOTHING
+        return faces, distance
 
     def is_occluded(self, rays: _Float32, limit: float) -> BoolArray:
         """Return a mask (N,): True for each ray that meets a face within a maximum distance.

@@ -23,9 +23,9 @@ from bodycap_batch.synthetic.lens import RayGrid
 from bodycap_batch.synthetic.raycast import NOTHING, RayScene
 from bodycap_batch.synthetic.surfaces import Surface
 
-_NEAR_M = 0.03
+NEAR_M = 0.03
 """Minimum distance (metres) between the camera and a rendered surface."""
-_SUBPIXELS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
+SUBPIXELS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
 """Offsets (x, y; px) of the four samples of a pixel from its centre. They form a rotated grid with four
 different rows and columns."""
 
@@ -101,7 +101,7 @@ def concatenate_triangles(first: Triangles, second: Triangles) -> Triangles:
     )
 
 
-def _dot(first: Float32, second: Float32) -> Float32:
+def dot(first: Float32 | Sequence[Float32], second: Float32) -> Float32:
     """Return the scalar products (N,) of vectors (3,N)."""
     return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
 
@@ -117,7 +117,7 @@ def _in_cameras(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Texels:
+class Texels:
     """Texture coordinates of the points that N rays meet.
 
     Attributes:
@@ -146,14 +146,14 @@ class _Texels:
         out = np.empty((4, len(inverse)), np.float32)
         with np.errstate(invalid="ignore", over="ignore"):
             for index, step in enumerate((right, down)):
-                change = _dot(rows[6:], step)
-                out[2 * index] = (_dot(rows[:3], step) - at[0] * change) * inverse
-                out[2 * index + 1] = (_dot(rows[3:6], step) - at[1] * change) * inverse
+                change = dot(rows[6:], step)
+                out[2 * index] = (dot(rows[:3], step) - at[0] * change) * inverse
+                out[2 * index + 1] = (dot(rows[3:6], step) - at[1] * change) * inverse
         return out
 
 
-def _shared_filters(
-    texels: _Texels, lens: Sequence[Float32], size: tuple[int, ...], uniform: BoolArray
+def shared_filters(
+    texels: Texels, lens: Sequence[Float32], size: tuple[int, ...], uniform: BoolArray
 ) -> tuple[Filter, IntArray]:
     """Return filters for all pixels. Cells of 2×2 pixels share a filter where possible.
 
@@ -210,12 +210,13 @@ class SceneRenderer:
         tables = self._homographies(poses)
         faces, uniform = self._hit_grid(lens[0], size, poses, pose_of)
         texels = self._texels(faces, pose_of, tables, lens[0])
-        colours = self._colours(texels, *_shared_filters(texels, lens, size, uniform))
-        edge = np.flatnonzero(self._edges(faces.reshape(size)))
+        colours = self._colours(texels, *shared_filters(texels, lens, size, uniform))
+        owner = np.append(self._triangles.surface, NOTHING)[faces.reshape(size)]
+        edge = np.flatnonzero(find_edges(owner))
         if len(edge):
             rays, right, down = (part[:, edge] for part in lens)
-            near = [rays + np.float32(x) * right + np.float32(y) * down for x, y in _SUBPIXELS]
-            count = len(_SUBPIXELS)
+            near = [rays + np.float32(x) * right + np.float32(y) * down for x, y in SUBPIXELS]
+            count = len(SUBPIXELS)
             fine, fine_pose_of = np.concatenate(near, axis=1), None
             if pose_of is not None:
                 fine_pose_of = np.tile(pose_of[edge], count)
@@ -282,23 +283,23 @@ class SceneRenderer:
         else:
             turned, start = np.einsum("nij,jn->in", rotation[pose_of], rays), centre[pose_of].T
         origin_and_ray[:, 3:] = turned.T
-        origin_and_ray[:, :3] = (start + np.float32(_NEAR_M) * turned).T
+        origin_and_ray[:, :3] = (start + np.float32(NEAR_M) * turned).T
         return self._scene.first_face(origin_and_ray)
 
-    def _texels(self, faces: IntArray, pose_of: IntArray | None, tables: Float32, rays: Float32) -> _Texels:
+    def _texels(self, faces: IntArray, pose_of: IntArray | None, tables: Float32, rays: Float32) -> Texels:
         """Return the texture coordinates of rays (3,N) that meet the triangles `faces` (N,)."""
         found = np.maximum(faces, 0)
         entry = found if pose_of is None else pose_of * len(self._triangles.faces) + found
         rows = np.take(tables, entry, axis=1, mode="clip")
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            inverse = np.float32(1) / _dot(rows[6:], rays)
-            at = np.stack([_dot(rows[:3], rays), _dot(rows[3:6], rays)]) * inverse
+            inverse = np.float32(1) / dot(rows[6:], rays)
+            at = np.stack([dot(rows[:3], rays), dot(rows[3:6], rays)]) * inverse
         missed = faces < 0
         if missed.any():
             at[:, missed], inverse[missed] = 0.0, 0.0
-        return _Texels(faces=faces, rows=rows, inverse=inverse, at=at)
+        return Texels(faces=faces, rows=rows, inverse=inverse, at=at)
 
-    def _colours(self, texels: _Texels, filters: Filter, cell: IntArray | None) -> Bytes:
+    def _colours(self, texels: Texels, filters: Filter, cell: IntArray | None) -> Bytes:
         """Return the filtered and shaded colours (N,3) of N rays. Rays that meet no triangle are black."""
         colours = self._atlas.sample(texels.at, filters, cell)
         if self._shaded:
@@ -307,13 +308,17 @@ class SceneRenderer:
         colours[texels.faces < 0] = 0
         return colours
 
-    def _edges(self, faces: IntArray) -> npt.NDArray[np.bool_]:
-        """Return a mask (H,W): True for a pixel with a direct neighbour on another surface."""
-        owner = np.append(self._triangles.surface, NOTHING)[faces]
-        edge = np.zeros(owner.shape, dtype=bool)
-        across, along = owner[:, 1:] != owner[:, :-1], owner[1:] != owner[:-1]
-        edge[:, 1:] |= across
-        edge[:, :-1] |= across
-        edge[1:] |= along
-        edge[:-1] |= along
-        return edge
+
+def find_edges(owner: IntArray) -> BoolArray:
+    """Return a mask (H,W): True for a pixel with a direct neighbour on another surface.
+
+    Args:
+        owner: (H,W) number of the surface at each pixel.
+    """
+    edge = np.zeros(owner.shape, dtype=bool)
+    across, along = owner[:, 1:] != owner[:, :-1], owner[1:] != owner[:-1]
+    edge[:, 1:] |= across
+    edge[:, :-1] |= across
+    edge[1:] |= along
+    edge[:-1] |= along
+    return edge

@@ -113,6 +113,11 @@ class Wearer:
         ]
         return kept
 
+    @property
+    def parts(self) -> list[tuple[int, Triangles]]:
+        """The joint of each limb, and the limb's triangles in the frame of this joint."""
+        return [(limb.joint, limb.triangles) for limb in self._limbs]
+
     def at(self, world_from_joint: FloatArray) -> Triangles:
         """Return the triangles of all limbs in the world frame.
 

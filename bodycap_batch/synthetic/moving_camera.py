@@ -1,0 +1,330 @@
+"""Render frames with exposure and rolling shutter from one sharp image of each frame.
+
+The sharp image shows each row at the middle of its exposure, and is exact. The motion blur is the mean of
+several copies of it. In each copy, every pixel takes the colour of the point that it shows at an instant of
+the exposure. This point is found from the exact distance and from the poses of the camera and of the moving
+part at this instant. Around a jump of the distance, a pixel can show the near or the far surface. There, the
+near surface is tried first, and the surface that is found decides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import invert
+from bodycap_batch.synthetic.atlas import Bytes, Float32
+from bodycap_batch.synthetic.camera_renderer import CameraRenderer, joint_poses_at
+from bodycap_batch.synthetic.lens import RayGrid, project, ray_grid
+from bodycap_batch.synthetic.moving_scene import ROOM, Hits, MovingPart, MovingScene, rays_in_part
+from bodycap_batch.synthetic.triangle_renderer import dot
+
+_NODE_S = 0.0005
+"""Interval (seconds) of the instants at which the motion is evaluated. Poses between them are interpolated
+linearly. A rotation of 20 rad/s has an error of (0.01 rad)² / 8 then."""
+_BLUR_STEP_PX = 1.5
+"""Distance (px) that the image moves between two copies. The image is band-limited to about 1.4 px."""
+_MAX_COPIES = 24
+"""Maximum number of copies. The limit reduces the rendering time."""
+_KNOTS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+"""Instants for which the image motion is computed, as multiples of half of the exposure. It is interpolated
+linearly between them."""
+_CELL = 4
+"""Side (px) of the cells for which the image motion is computed away from jumps."""
+_JUMP_PX = 0.5
+"""Minimum difference of the image motion of neighbouring cells on different planes that counts as a jump."""
+_MARGIN_SHARE = 0.06
+"""Width of the border around the sharp image, as a share of the longer side. It serves a blur of twice this
+width."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Frame:
+    """Poses during one frame, and the size of the border of its sharp image.
+
+    Attributes:
+        node_s: (T,) instants, seconds.
+        part_from_cam: (T,P,4,4) poses of the camera in the frames of the parts at these instants.
+        row_s: (B,) middle of the exposure of each row, border included, or a single one.
+        margin: Width of the border, px.
+    """
+
+    node_s: FloatArray
+    part_from_cam: FloatArray
+    row_s: FloatArray
+    margin: int
+
+    def at(self, shift_s: float) -> FloatArray:
+        """Return the poses (P,B,4,4) for all rows, at a time relative to the middle of their exposures."""
+        place = np.interp(self.row_s + shift_s, self.node_s, np.arange(len(self.node_s)))
+        low = np.minimum(place.astype(np.int64), len(self.node_s) - 2)
+        ratio = (place - low)[:, None, None, None]
+        between = self.part_from_cam[low] * (1 - ratio) + self.part_from_cam[low + 1] * ratio
+        return np.ascontiguousarray(between.transpose(1, 0, 2, 3))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Jumps:
+    """Pixels around jumps of the image motion, and the motion of the nearest surface around each.
+
+    Attributes:
+        pixels: (Z,) indices of the pixels.
+        xy: (Z,2) their positions.
+        near: (5,Z,2) image motion of the nearest surface around each of them, at the knots.
+    """
+
+    pixels: IntArray
+    xy: Float32
+    near: Float32
+
+
+class MovingCamera:
+    """Renderer of frames with exposure and rolling shutter.
+
+    Args:
+        renderer: The renderer of single instants, with body, mount, room, exposure and readout time.
+        camera: Intrinsics of the camera.
+    """
+
+    def __init__(self, renderer: CameraRenderer, camera: Camera) -> None:
+        self._motion, self._mount, self._camera = renderer.motion, renderer.mount, camera
+        self._exposure_s, self._rolling_s = renderer.exposure_s, renderer.rolling_shutter_s
+        limbs = renderer.wearer.parts if renderer.wearer else []
+        parts = [MovingPart(ROOM, renderer.room), *(MovingPart(joint, shape) for joint, shape in limbs)]
+        self._scene = MovingScene(parts, renderer.atlas)
+        shape = self._scene.triangles
+        self._normals = shape.normal.T.astype(np.float32)
+        self._offsets = (shape.normal * shape.point).sum(axis=1).astype(np.float32)
+        share = _MARGIN_SHARE if self._exposure_s else 0.0
+        self._margin = round(share * max(camera.width_px, camera.height_px))
+        self._grid = ray_grid(camera, self._margin)
+
+    def render(self, t_s: float) -> Bytes:
+        """Return the image (H,W,3) without noise. The exposure is centred on a common time (seconds)."""
+        frame = self._frame(t_s)
+        grid = _cropped(self._grid, self._margin - frame.margin)
+        middle = frame.at(0.0)
+        image, hits = self._scene.sharp(grid, middle, self._gain(t_s))
+        if self._exposure_s == 0.0:
+            return image
+        knots = [frame.at(0.5 * self._exposure_s * knot) for knot in _KNOTS if knot != 0.0]
+        moved, jumps = self._image_motion(grid, hits, middle, knots, frame.margin)
+        blurred = _blur(image, moved, jumps)
+        inside = slice(frame.margin, blurred.shape[0] - frame.margin)
+        columns = slice(frame.margin, blurred.shape[1] - frame.margin)
+        out = np.ascontiguousarray(blurred[inside, columns])
+        out[~grid.valid[inside, columns]] = 0
+        return out
+
+    def _frame(self, t_s: float) -> _Frame:
+        """Return the poses during a frame."""
+        height = self._camera.height_px
+        rows = (np.arange(-self._margin, height + self._margin) + 0.5) / height - 0.5
+        row_s = t_s + rows * self._rolling_s if self._rolling_s else np.array([t_s])
+        half = self._exposure_s / 2
+        count = int(np.ceil((row_s[-1] - row_s[0] + 2 * half) / _NODE_S)) + 2
+        node_s = np.linspace(row_s[0] - half, row_s[-1] + half, count)
+        joints = joint_poses_at(self._motion, node_s)
+        role = self._motion.skeleton.index_of_role(self._mount.role)
+        world_from_cam = joints[:, role] @ self._mount.joint_from_cam
+        poses = [
+            world_from_cam if part.joint == ROOM else invert(joints[:, part.joint]) @ world_from_cam
+            for part in self._scene.parts
+        ]
+        return _Frame(node_s=node_s, part_from_cam=np.stack(poses, axis=1), row_s=row_s, margin=self._margin)
+
+    def _gain(self, t_s: float) -> Float32:
+        """Return the brightness factor (F,) of each triangle: moving parts are lit from above."""
+        joints = joint_poses_at(self._motion, np.array([t_s]))[0]
+        gains = []
+        for part in self._scene.parts:
+            up = part.triangles.normal @ joints[part.joint, 2, :3]
+            gains.append(np.ones(len(up)) if part.joint == ROOM else 0.75 + 0.25 * up)
+        return np.concatenate(gains).astype(np.float32)
+
+    def _image_motion(
+        self, grid: RayGrid, hits: Hits, middle: FloatArray, knots: list[FloatArray], margin: int
+    ) -> tuple[Float32, _Jumps]:
+        """Return the image motion (5,H,W,2) at the knots, px, and the pixels around its jumps.
+
+        The motion is the position in the sharp image of the point that a pixel shows at a knot, minus the
+        position of the pixel.
+        """
+        size = grid.valid.shape
+        index = np.arange(hits.faces.size).reshape(size)
+        coarse = index[_CELL // 2 :: _CELL, _CELL // 2 :: _CELL]
+
+        def motion_of(pixels: IntArray) -> Float32:
+            faces = hits.faces[pixels]
+            rays = grid.planes[:3].reshape(3, -1)[:, pixels]
+            moved = [self._moved(pixels, faces, rays, middle, knot, size, margin) for knot in knots]
+            return np.stack([*moved[:2], np.zeros_like(moved[0]), *moved[2:]])
+
+        cells = motion_of(coarse.ravel()).reshape(5, *coarse.shape, 2)
+        far = float(np.abs(cells).max())
+        plane = np.append(self._scene.triangles.plane, -1)[hits.faces[coarse]]
+        jump = _find_jumps(cells, plane)
+        whole = np.empty((5, *size, 2), np.float32)
+        # Pixel (x, y) of the image is at ((x − s) / c, (y − s) / c) of the cells.
+        scale, shift = 1.0 / _CELL, -(_CELL // 2) / _CELL
+        matrix = np.array([[scale, 0, shift], [0, scale, shift]])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        for knot in (0, 1, 3, 4):
+            cv2.warpAffine(cells[knot], matrix, size[::-1], whole[knot], flags, cv2.BORDER_REPLICATE)
+        whole[2] = 0.0
+        exact = index[_spread_to_pixels(_dilated(jump, 1), size)]
+        whole.reshape(5, -1, 2)[:, exact] = motion_of(exact)
+        radius = int(np.ceil(far / _CELL)) + 1
+        around = index[_spread_to_pixels(_dilated(jump, radius), size)]
+        y, x = np.divmod(around, size[1])
+        nearest = _nearest_cells(hits.distance[coarse], radius)
+        cell = nearest[np.minimum(y // _CELL, len(coarse) - 1), np.minimum(x // _CELL, coarse.shape[1] - 1)]
+        xy = np.stack([x, y], axis=1).astype(np.float32)
+        return whole, _Jumps(pixels=around, xy=xy, near=cells.reshape(5, -1, 2)[:, cell])
+
+    def _moved(
+        self,
+        pixels: IntArray,
+        faces: IntArray,
+        rays: Float32,
+        middle: FloatArray,
+        knot: FloatArray,
+        size: tuple[int, ...],
+        margin: int,
+    ) -> Float32:
+        """Return the image motion (N,2) of pixels at a knot. They show triangles `faces` (N,)."""
+        y, x = np.divmod(pixels, size[1])
+        found, instants = np.maximum(faces, 0), knot.shape[1]
+        part = self._scene.part_of_face[found]
+        row = y if instants > 1 else np.zeros_like(y)
+        turned, start = rays_in_part(rays, knot.reshape(-1, 4, 4), part * instants + row)
+        normal = self._normals.take(found, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far = (self._offsets.take(found) - dot(normal, start)) / dot(normal, turned)
+        point = start + far * turned
+        to_cam = invert(middle).reshape(-1, 4, 4)
+        for _ in range(2 if instants > 1 else 1):
+            direction, origin = rays_in_part(point, to_cam, part * instants + row)
+            at = project(self._camera, (direction + origin).T) - 0.5 + margin
+            row = np.clip(np.nan_to_num(np.rint(at[:, 1])), 0, size[0] - 1).astype(np.int64)
+        out = (at - np.stack([x, y], axis=1)).astype(np.float32)
+        out[(faces < 0) | (far <= 0) | ~np.isfinite(out).all(axis=1)] = 0.0
+        limit = 2.0 * max(margin, 8)
+        return np.clip(out, -limit, limit)
+
+
+def _cropped(grid: RayGrid, border: int) -> RayGrid:
+    """Return viewing rays without a border of some pixels."""
+    if border == 0:
+        return grid
+    inside = slice(border, -border), slice(border, -border)
+    return RayGrid(
+        in_cam=grid.in_cam[inside],
+        per_px_x=grid.per_px_x[inside],
+        per_px_y=grid.per_px_y[inside],
+        valid=grid.valid[inside],
+        planes=np.ascontiguousarray(grid.planes[:, inside[0], inside[1]]),
+    )
+
+
+def _find_jumps(cells: Float32, plane: IntArray) -> BoolArray:
+    """Return a mask (R,C) of the cells at which the image motion (5,R,C,2) jumps between two planes (R,C)."""
+    jump = np.zeros(plane.shape, np.bool_)
+    for axis in (0, 1):
+        difference = np.abs(np.diff(cells[[0, 4]], axis=axis + 1)).max(axis=(0, 3))
+        found = (difference > _JUMP_PX) & (np.diff(plane, axis=axis) != 0)
+        one, other = (slice(None, -1), slice(1, None))
+        jump[(one, slice(None)) if axis == 0 else (slice(None), one)] |= found
+        jump[(other, slice(None)) if axis == 0 else (slice(None), other)] |= found
+    return jump
+
+
+def _dilated(mask: BoolArray, radius: int) -> BoolArray:
+    """Return a mask (R,C) that is True within a number of cells of a True cell, across, along and between."""
+    kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+
+
+def _spread_to_pixels(mask: BoolArray, size: tuple[int, ...]) -> BoolArray:
+    """Return a mask (H,W) of the pixels in the True cells. Pixels beyond the last cell belong to it."""
+    rows = np.minimum(np.arange(size[0]) // _CELL, mask.shape[0] - 1)
+    columns = np.minimum(np.arange(size[1]) // _CELL, mask.shape[1] - 1)
+    return np.asarray(mask[rows][:, columns])
+
+
+def _nearest_cells(distance: Float32, radius: int) -> IntArray:
+    """Return the index (R,C) of the cell with the least distance (R,C) within a number of cells around each."""
+    least, nearest = distance.copy(), np.arange(distance.size).reshape(distance.shape)
+    for axis in (0, 1):
+        from_least, from_nearest = least.copy(), nearest.copy()
+        for shift in [*range(-radius, 0), *range(1, radius + 1)]:
+            here = slice(max(0, -shift), -shift if shift > 0 else None)
+            there = slice(max(0, shift), shift if shift < 0 else None)
+            to = (here, slice(None)) if axis == 0 else (slice(None), here)
+            source = (there, slice(None)) if axis == 0 else (slice(None), there)
+            nearer = from_least[source] < least[to]
+            least[to] = np.where(nearer, from_least[source], least[to])
+            nearest[to] = np.where(nearer, from_nearest[source], nearest[to])
+    return nearest
+
+
+def _blur(image: Bytes, moved: Float32, jumps: _Jumps) -> Bytes:
+    """Return the mean (H,W,3) of copies of an image that are moved by the image motion (5,H,W,2)."""
+    height, width = image.shape[:2]
+    length = np.linalg.norm(moved[4, ::8, ::8] - moved[0, ::8, ::8], axis=-1)
+    count = int(np.clip(np.ceil(np.percentile(length, 95) / _BLUR_STEP_PX), 2, _MAX_COPIES))
+    base = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+    total = np.zeros(image.shape, np.float32)
+    softness = np.zeros(2)
+    for step in (np.arange(count) + 0.5) / count * (len(_KNOTS) - 1):
+        low = int(step)
+        high = float(step - low)
+        place = cv2.addWeighted(moved[low], 1.0 - high, moved[low + 1], high, 0.0)
+        if len(jumps.pixels):
+            near = (1.0 - high) * jumps.near[low] + high * jumps.near[low + 1]
+            place.reshape(-1, 2)[jumps.pixels] = _motion_at_jumps(place, jumps.xy, near.astype(np.float32))
+        place += base
+        part = place[::8, ::8] % 1.0
+        softness += (part * (1.0 - part)).mean(axis=(0, 1)) / count
+        cv2.accumulate(
+            cv2.remap(image, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), total
+        )
+    # Linear interpolation between pixels is a blur with the variance f · (1 − f) for a fraction f of a pixel.
+    # The second derivatives undo it.
+    across, along = (softness / 2).tolist()
+    kernel = np.array([[0, -along, 0], [-across, 1 + 2 * (across + along), -across], [0, -along, 0]]) / count
+    sharpened = cv2.filter2D(total, -1, kernel, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.convertScaleAbs(np.maximum(sharpened, 0, out=sharpened)))
+
+
+def _motion_at_jumps(moved: Float32, xy: Float32, near: Float32) -> Float32:
+    """Return the image motion (Z,2) that pixels around jumps follow at one instant.
+
+    A pixel follows a surface if the surface is found at the place from which it would come. The surface that
+    is nearest around the pixel is tried first, then the one that is found instead. If that one is hidden in
+    the image by the nearest surface, the pixel takes the colour next to its border.
+
+    Args:
+        moved: (H,W,2) image motion of the surface in each pixel.
+        xy: (Z,2) positions of the pixels.
+        near: (Z,2) image motion of the surface that is nearest around each of them.
+    """
+    found = _look_up(moved, xy + near)
+    out = found.copy()
+    rest = np.flatnonzero(np.abs(found - near).max(axis=1) > _JUMP_PX)
+    if len(rest):
+        second = _look_up(moved, xy[rest] + found[rest])
+        hidden = np.abs(second - found[rest]).max(axis=1) > _JUMP_PX
+        out[rest] = np.where(hidden[:, None], near[rest], second)
+    return out
+
+
+def _look_up(moved: Float32, xy: Float32) -> Float32:
+    """Return the image motion (Z,2) at the pixels nearest to positions (Z,2)."""
+    columns = np.clip(np.rint(xy[:, 0]).astype(np.int32), 0, moved.shape[1] - 1)
+    rows = np.clip(np.rint(xy[:, 1]).astype(np.int32), 0, moved.shape[0] - 1)
+    return np.asarray(moved.reshape(-1, 2)[rows * moved.shape[1] + columns])
