@@ -94,8 +94,11 @@ class Atlas:
         """
         kinds = filters.kind if cell is None else filters.kind[cell]
         out = np.empty((at.shape[1], 3), np.uint8)
-        for kind in np.flatnonzero(np.bincount(kinds, minlength=1)).tolist():
-            pixels = np.flatnonzero(kinds == kind)
+        order = np.argsort(kinds, kind="stable")
+        counts = np.bincount(kinds, minlength=1)
+        ends = np.cumsum(counts)
+        for kind in np.flatnonzero(counts).tolist():
+            pixels = order[ends[kind] - counts[kind] : ends[kind]]
             parts = [at[0].take(pixels), at[1].take(pixels)]
             if kind % 16 > 1:
                 owner = pixels if cell is None else cell.take(pixels)

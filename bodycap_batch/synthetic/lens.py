@@ -210,7 +210,7 @@ def _determinant(matrices: FloatArray) -> FloatArray:
 
 
 def project(camera: Camera, in_cam: FloatArray) -> FloatArray:
-    """Return the pixel positions (N,2), in COLMAP's pixel coordinates, of points (N,3) in the camera frame."""
+    """Return the pixel positions (N,2) of points (N,3) in the camera frame, with COLMAP's pixel origin."""
     focal, centre = focal_and_centre(camera)
     across = np.linalg.norm(in_cam[:, :2], axis=1, keepdims=True)
     if is_fisheye(camera.model):
@@ -233,7 +233,10 @@ def ray_grid(camera: Camera, margin_px: int = 0) -> RayGrid:
     focal, centre = focal_and_centre(camera)
     # An additional ring of pixels around the image allows central differences at all pixels.
     x, y = np.meshgrid(
-        *(np.arange(-1 - margin_px, side + margin_px + 1) + 0.5 for side in (camera.width_px, camera.height_px)),
+        *(
+            np.arange(-1 - margin_px, side + margin_px + 1) + 0.5
+            for side in (camera.width_px, camera.height_px)
+        ),
         indexing="xy",
     )
     distorted = (np.stack([x, y], axis=-1) - centre) / focal

@@ -30,9 +30,6 @@ _BLUR_STEP_PX = 1.5
 """Distance (px) that the image moves between two copies. The image is band-limited to about 1.4 px."""
 _MAX_COPIES = 24
 """Maximum number of copies. The limit reduces the rendering time."""
-_KNOTS = (-1.0, -0.5, 0.0, 0.5, 1.0)
-"""Instants for which the image motion is computed, as multiples of half of the exposure. It is interpolated
-linearly between them."""
 _CELL = 4
 """Side (px) of the cells for which the image motion is computed away from jumps."""
 _JUMP_PX = 0.5
@@ -74,7 +71,7 @@ class _Jumps:
     Attributes:
         pixels: (Z,) indices of the pixels.
         xy: (Z,2) their positions.
-        near: (5,Z,2) image motion of the nearest surface around each of them, at the knots.
+        near: (2,Z,2) image motion of the nearest surface around each of them; see `_image_motion`.
     """
 
     pixels: IntArray
@@ -111,8 +108,8 @@ class MovingCamera:
         image, hits = self._scene.sharp(grid, middle, self._gain(t_s))
         if self._exposure_s == 0.0:
             return image
-        knots = [frame.at(0.5 * self._exposure_s * knot) for knot in _KNOTS if knot != 0.0]
-        moved, jumps = self._image_motion(grid, hits, middle, knots, frame.margin)
+        ends = [frame.at(sign * 0.5 * self._exposure_s) for sign in (-1.0, 1.0)]
+        moved, jumps = self._image_motion(grid, hits, middle, ends, frame.margin)
         blurred = _blur(image, moved, jumps)
         inside = slice(frame.margin, blurred.shape[0] - frame.margin)
         columns = slice(frame.margin, blurred.shape[1] - frame.margin)
@@ -147,12 +144,13 @@ class MovingCamera:
         return np.concatenate(gains).astype(np.float32)
 
     def _image_motion(
-        self, grid: RayGrid, hits: Hits, middle: FloatArray, knots: list[FloatArray], margin: int
+        self, grid: RayGrid, hits: Hits, middle: FloatArray, ends: list[FloatArray], margin: int
     ) -> tuple[Float32, _Jumps]:
-        """Return the image motion (5,H,W,2) at the knots, px, and the pixels around its jumps.
+        """Return the image motion (2,H,W,2), px, and the pixels around its jumps.
 
-        The motion is the position in the sharp image of the point that a pixel shows at a knot, minus the
-        position of the pixel.
+        The motion is the position in the sharp image of the point that a pixel shows at an instant, minus the
+        position of the pixel. With the time x, which is -1 at the start of the exposure and 1 at its end, it
+        is x times the first plus x² times the second returned part.
         """
         size = grid.valid.shape
         index = np.arange(hits.faces.size).reshape(size)
@@ -161,47 +159,46 @@ class MovingCamera:
         def motion_of(pixels: IntArray) -> Float32:
             faces = hits.faces[pixels]
             rays = grid.planes[:3].reshape(3, -1)[:, pixels]
-            moved = [self._moved(pixels, faces, rays, middle, knot, size, margin) for knot in knots]
-            return np.stack([*moved[:2], np.zeros_like(moved[0]), *moved[2:]])
+            start, end = (self._moved(pixels, faces, rays, middle, each, size, margin) for each in ends)
+            return np.stack([0.5 * (end - start), 0.5 * (end + start)])
 
-        cells = motion_of(coarse.ravel()).reshape(5, *coarse.shape, 2)
-        far = float(np.abs(cells).max())
+        cells = motion_of(coarse.ravel()).reshape(2, *coarse.shape, 2)
+        far = float(np.abs(cells).sum(axis=0).max())
         plane = np.append(self._scene.triangles.plane, -1)[hits.faces[coarse]]
         jump = _find_jumps(cells, plane)
-        whole = np.empty((5, *size, 2), np.float32)
+        whole = np.empty((2, *size, 2), np.float32)
         # Pixel (x, y) of the image is at ((x − s) / c, (y − s) / c) of the cells.
         scale, shift = 1.0 / _CELL, -(_CELL // 2) / _CELL
         matrix = np.array([[scale, 0, shift], [0, scale, shift]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        for knot in (0, 1, 3, 4):
-            cv2.warpAffine(cells[knot], matrix, size[::-1], whole[knot], flags, cv2.BORDER_REPLICATE)
-        whole[2] = 0.0
+        for coefficient, out in zip(cells, whole, strict=True):
+            cv2.warpAffine(coefficient, matrix, size[::-1], out, flags, cv2.BORDER_REPLICATE)
         exact = index[_spread_to_pixels(_dilated(jump, 1), size)]
-        whole.reshape(5, -1, 2)[:, exact] = motion_of(exact)
+        whole.reshape(2, -1, 2)[:, exact] = motion_of(exact)
         radius = int(np.ceil(far / _CELL)) + 1
         around = index[_spread_to_pixels(_dilated(jump, radius), size)]
         y, x = np.divmod(around, size[1])
         nearest = _nearest_cells(hits.distance[coarse], radius)
         cell = nearest[np.minimum(y // _CELL, len(coarse) - 1), np.minimum(x // _CELL, coarse.shape[1] - 1)]
         xy = np.stack([x, y], axis=1).astype(np.float32)
-        return whole, _Jumps(pixels=around, xy=xy, near=cells.reshape(5, -1, 2)[:, cell])
+        return whole, _Jumps(pixels=around, xy=xy, near=cells.reshape(2, -1, 2)[:, cell])
 
-    def _moved(
+    def _moved(  # noqa: PLR0913, PLR0917 - one value each
         self,
         pixels: IntArray,
         faces: IntArray,
         rays: Float32,
         middle: FloatArray,
-        knot: FloatArray,
+        then: FloatArray,
         size: tuple[int, ...],
         margin: int,
     ) -> Float32:
-        """Return the image motion (N,2) of pixels at a knot. They show triangles `faces` (N,)."""
+        """Return the image motion (N,2) of pixels at another instant. They show triangles `faces` (N,)."""
         y, x = np.divmod(pixels, size[1])
-        found, instants = np.maximum(faces, 0), knot.shape[1]
+        found, instants = np.maximum(faces, 0), then.shape[1]
         part = self._scene.part_of_face[found]
         row = y if instants > 1 else np.zeros_like(y)
-        turned, start = rays_in_part(rays, knot.reshape(-1, 4, 4), part * instants + row)
+        turned, start = rays_in_part(rays, then.reshape(-1, 4, 4), part * instants + row)
         normal = self._normals.take(found, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             far = (self._offsets.take(found) - dot(normal, start)) / dot(normal, turned)
@@ -209,12 +206,12 @@ class MovingCamera:
         to_cam = invert(middle).reshape(-1, 4, 4)
         for _ in range(2 if instants > 1 else 1):
             direction, origin = rays_in_part(point, to_cam, part * instants + row)
-            at = project(self._camera, (direction + origin).T) - 0.5 + margin
+            at = project(self._camera, (direction + origin).T.astype(np.float64)) - 0.5 + margin
             row = np.clip(np.nan_to_num(np.rint(at[:, 1])), 0, size[0] - 1).astype(np.int64)
         out = (at - np.stack([x, y], axis=1)).astype(np.float32)
-        out[(faces < 0) | (far <= 0) | ~np.isfinite(out).all(axis=1)] = 0.0
+        out[(faces < 0) | (far <= 0) | ~np.isfinite(out[:, 0] + out[:, 1])] = 0.0
         limit = 2.0 * max(margin, 8)
-        return np.clip(out, -limit, limit)
+        return np.asarray(np.clip(out, -limit, limit), dtype=np.float32)
 
 
 def _cropped(grid: RayGrid, border: int) -> RayGrid:
@@ -232,10 +229,10 @@ def _cropped(grid: RayGrid, border: int) -> RayGrid:
 
 
 def _find_jumps(cells: Float32, plane: IntArray) -> BoolArray:
-    """Return a mask (R,C) of the cells at which the image motion (5,R,C,2) jumps between two planes (R,C)."""
+    """Return a mask (R,C) of the cells at which the image motion (2,R,C,2) jumps between two planes (R,C)."""
     jump = np.zeros(plane.shape, np.bool_)
     for axis in (0, 1):
-        difference = np.abs(np.diff(cells[[0, 4]], axis=axis + 1)).max(axis=(0, 3))
+        difference = np.abs(np.diff(cells, axis=axis + 1)).sum(axis=0).max(axis=-1)
         found = (difference > _JUMP_PX) & (np.diff(plane, axis=axis) != 0)
         one, other = (slice(None, -1), slice(1, None))
         jump[(one, slice(None)) if axis == 0 else (slice(None), one)] |= found
@@ -257,7 +254,7 @@ def _spread_to_pixels(mask: BoolArray, size: tuple[int, ...]) -> BoolArray:
 
 
 def _nearest_cells(distance: Float32, radius: int) -> IntArray:
-    """Return the index (R,C) of the cell with the least distance (R,C) within a number of cells around each."""
+    """Return the index (R,C) of the cell with the least distance (R,C) in a square around each cell."""
     least, nearest = distance.copy(), np.arange(distance.size).reshape(distance.shape)
     for axis in (0, 1):
         from_least, from_nearest = least.copy(), nearest.copy()
@@ -273,20 +270,18 @@ def _nearest_cells(distance: Float32, radius: int) -> IntArray:
 
 
 def _blur(image: Bytes, moved: Float32, jumps: _Jumps) -> Bytes:
-    """Return the mean (H,W,3) of copies of an image that are moved by the image motion (5,H,W,2)."""
+    """Return the mean (H,W,3) of copies of an image that are moved by the image motion (2,H,W,2)."""
     height, width = image.shape[:2]
-    length = np.linalg.norm(moved[4, ::8, ::8] - moved[0, ::8, ::8], axis=-1)
+    length = 2.0 * np.linalg.norm(moved[0, ::8, ::8], axis=-1)
     count = int(np.clip(np.ceil(np.percentile(length, 95) / _BLUR_STEP_PX), 2, _MAX_COPIES))
     base = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
     total = np.zeros(image.shape, np.float32)
     softness = np.zeros(2)
-    for step in (np.arange(count) + 0.5) / count * (len(_KNOTS) - 1):
-        low = int(step)
-        high = float(step - low)
-        place = cv2.addWeighted(moved[low], 1.0 - high, moved[low + 1], high, 0.0)
+    for x in ((2.0 * np.arange(count) + 1.0) / count - 1.0).tolist():
+        place = cv2.addWeighted(moved[0], x, moved[1], x * x, 0.0)
         if len(jumps.pixels):
-            near = (1.0 - high) * jumps.near[low] + high * jumps.near[low + 1]
-            place.reshape(-1, 2)[jumps.pixels] = _motion_at_jumps(place, jumps.xy, near.astype(np.float32))
+            near = cv2.addWeighted(jumps.near[0], x, jumps.near[1], x * x, 0.0)
+            place.reshape(-1, 2)[jumps.pixels] = _motion_at_jumps(place, jumps.xy, near)
         place += base
         part = place[::8, ::8] % 1.0
         softness += (part * (1.0 - part)).mean(axis=(0, 1)) / count
@@ -315,12 +310,18 @@ def _motion_at_jumps(moved: Float32, xy: Float32, near: Float32) -> Float32:
     """
     found = _look_up(moved, xy + near)
     out = found.copy()
-    rest = np.flatnonzero(np.abs(found - near).max(axis=1) > _JUMP_PX)
+    rest = np.flatnonzero(_differs(found, near))
     if len(rest):
         second = _look_up(moved, xy[rest] + found[rest])
-        hidden = np.abs(second - found[rest]).max(axis=1) > _JUMP_PX
+        hidden = _differs(second, found[rest])
         out[rest] = np.where(hidden[:, None], near[rest], second)
     return out
+
+
+def _differs(one: Float32, other: Float32) -> BoolArray:
+    """Return a mask (Z,): True where image motions (Z,2) differ by more than a jump."""
+    difference = cv2.absdiff(one, other)
+    return np.asarray((difference[:, 0] > _JUMP_PX) | (difference[:, 1] > _JUMP_PX))
 
 
 def _look_up(moved: Float32, xy: Float32) -> Float32:

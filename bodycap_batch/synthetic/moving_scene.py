@@ -1,15 +1,17 @@
 """Render rigid parts that move against one another, with another instant for every row of the image.
 
-The room and each limb of the wearer are parts. Each part has its triangles in a frame of its own. Viewing rays
-are converted to this frame with the pose of the camera at the instant of the ray. So one tree of triangles
-for each part serves all instants.
+The room and each limb of the wearer are parts. Each part has its triangles in a frame of its own. Viewing
+rays are converted to this frame with the pose of the camera at the instant of the ray. So one tree of
+triangles for each part serves all instants.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
+import cv2
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
@@ -24,13 +26,20 @@ from bodycap_batch.synthetic.triangle_renderer import (
     concatenate_triangles,
     dot,
     find_edges,
-    shared_filters,
 )
+
+_Array = TypeVar("_Array", BoolArray, IntArray, Float32)
 
 ROOM = -1
 """Number of the joint of a part that does not move."""
 _CONE_MARGIN_RAD = 0.02
-"""Angle (radians) by which the cone around a part is widened, for rays that are not exactly of unit length. Evidence: none."""
+"""Angle (radians) by which the cone around a part is widened, for rays that are not exactly of unit
+length. Evidence: none."""
+
+
+_CELLS = (4, 2, 1)
+"""Sides (px) of the cells at whose corners rays are cast. Objects thinner than 2 px can be missed,
+and isolated ones smaller than 4 px."""
 
 
 class MovingPart:
@@ -97,9 +106,9 @@ class MovingScene:
         lens = [vectors[:3], vectors[3:6], vectors[6:]]
         rows = np.arange(size[0]) if part_from_cam.shape[1] > 1 else np.zeros(size[0], np.int64)
         at = np.repeat(rows, size[1])
-        hits, uniform = self._hit_grid(lens[0], size, part_from_cam, at)
-        texels = self._texels(hits.faces, at, part_from_cam, lens[0])
-        colours = self._colours(texels, *shared_filters(texels, lens, size, uniform), gain)
+        hits, smooth = self._hit_grid(lens[0], size, part_from_cam, at)
+        texel, filters, cell = self._texels_of_image(lens, hits.faces, at, part_from_cam, smooth, size)
+        colours = self._colours(texel, hits.faces, filters, cell, gain)
         surface = np.append(self.triangles.surface, NOTHING)[hits.faces.reshape(size)]
         edge = np.flatnonzero(find_edges(surface))
         if len(edge):
@@ -110,14 +119,17 @@ class MovingScene:
             found = self.hit(fine, part_from_cam, fine_at)
             texels = self._texels(found.faces, fine_at, part_from_cam, fine)
             filters = select_filter(texels.footprint(np.tile(right, count), np.tile(down, count)))
-            samples = self._colours(texels, filters, None, gain)
-            colours[edge] = samples.reshape(count, -1, 3).mean(axis=0)
+            samples = self._colours(texels.at, found.faces, filters, None, gain)
+            colours[edge] = samples.reshape(count, -1, 3).sum(axis=0, dtype=np.uint16) // count
         colours[~grid.valid.reshape(-1)] = 0
         return np.asarray(colours.reshape(*size, 3)), hits
 
     def hit(self, rays: Float32, part_from_cam: FloatArray, at: IntArray) -> Hits:
         """Return what rays (3,N) in the camera frame meet first, each at its instant `at` (N,)."""
-        faces, distance = np.full(rays.shape[1], NOTHING, np.int64), np.full(rays.shape[1], np.inf, np.float32)
+        faces, distance = (
+            np.full(rays.shape[1], NOTHING, np.int64),
+            np.full(rays.shape[1], np.inf, np.float32),
+        )
         view = rays.mean(axis=1)
         view /= max(float(np.linalg.norm(view)), 1e-9)
         widest = float(np.arccos(np.clip(dot(view, rays).min(initial=1.0), -1, 1)))
@@ -151,31 +163,68 @@ class MovingScene:
     ) -> tuple[Hits, BoolArray]:
         """Return what the rays (3,H·W) of an image meet. Only a part of the rays is cast.
 
-        Also return a mask (H·W,): True for a pixel between four cast rays that meet the same plane. The
-        distance of such a pixel is that of one of the four.
+        Rays are cast at the corners of large cells, then of smaller ones. All pixels of a cell are assumed to
+        meet the plane that all four corners meet. Also return a mask (R,C) of the large cells for which this
+        holds. The distance in such a cell is that at its first corner.
         """
         count = size[0] * size[1]
         faces, distance = np.full(count, NOTHING, np.int64), np.zeros(count, np.float32)
         index = np.arange(count).reshape(size)
-
-        def cast(at_pixels: IntArray) -> None:
-            found = self.hit(rays[:, at_pixels], part_from_cam, at[at_pixels])
-            faces[at_pixels], distance[at_pixels] = found.faces, found.distance
-
-        coarse = index[::2, ::2]
-        cast(coarse.ravel())
-        plane = np.append(self.triangles.plane, NOTHING)[faces[coarse]]
-        corners = plane[:-1, :-1], plane[:-1, 1:], plane[1:, :-1], plane[1:, 1:]
-        uniform = np.logical_and.reduce([corners[0] == other for other in corners[1:]])
         known = np.zeros(size, dtype=bool)
-        inside = uniform.repeat(2, axis=0).repeat(2, axis=1)
-        known[: inside.shape[0], : inside.shape[1]] = inside
-        owner = coarse.repeat(2, axis=0).repeat(2, axis=1)[: size[0], : size[1]]
-        faces[known.ravel()], distance[known.ravel()] = faces[owner[known]], distance[owner[known]]
-        sampled = known.copy()
-        sampled[::2, ::2] = True
-        cast(index[~sampled])
-        return Hits(faces=faces, distance=distance), known.ravel()
+        smooth = known
+        planes = np.append(self.triangles.plane, NOTHING)
+        for side in _CELLS:
+            corners = index[::side, ::side]
+            wanted = corners[~known[::side, ::side]]
+            found = self.hit(rays[:, wanted], part_from_cam, at[wanted])
+            faces[wanted], distance[wanted] = found.faces, found.distance
+            if side == 1:
+                break
+            known[::side, ::side] = True
+            plane = planes[faces[corners]]
+            one = np.ones(plane.shape, dtype=bool)
+            one[:-1, :-1] = (plane[:-1, :-1] == plane[:-1, 1:]) & (plane[:-1, :-1] == plane[1:, :-1])
+            one[:-1, :-1] &= plane[:-1, :-1] == plane[1:, 1:]
+            one[-1], one[:, -1] = False, False
+            if side == _CELLS[0]:
+                # A corner of an object can lie inside a cell, but then its edges cross the cells around it.
+                one = cv2.erode(one.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+                smooth = one
+            filled = _enlarged(one, side, size) & ~known
+            np.copyto(faces.reshape(size), _enlarged(faces[corners], side, size), where=filled)
+            np.copyto(distance.reshape(size), _enlarged(distance[corners], side, size), where=filled)
+            known |= filled
+        return Hits(faces=faces, distance=distance), smooth
+
+    def _texels_of_image(
+        self,
+        lens: list[Float32],
+        faces: IntArray,
+        at: IntArray,
+        part_from_cam: FloatArray,
+        smooth: BoolArray,
+        size: tuple[int, ...],
+    ) -> tuple[Float32, Filter, IntArray]:
+        """Return texel coordinates (2,H·W) of all pixels, filters, and the filter (H·W,) of each pixel.
+
+        In the cells of the mask `smooth` (R,C) the coordinates are interpolated between the corners, and all
+        pixels share the filter of the first corner.
+        """
+        side = _CELLS[0]
+        index = np.arange(len(faces)).reshape(size)
+        corners = index[::side, ::side].ravel()
+        single = np.flatnonzero(~_enlarged(smooth, side, size))
+        only = np.concatenate([corners, single])
+        texels = self._texels(faces[only], at[only], part_from_cam, lens[0][:, only])
+        filters = select_filter(texels.footprint(lens[1][:, only], lens[2][:, only]))
+        grid = texels.at[:, : len(corners)].reshape(2, *smooth.shape)
+        matrix = np.array([[1.0 / side, 0, 0], [0, 1.0 / side, 0]])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        texel = np.stack([cv2.warpAffine(part, matrix, size[::-1], flags=flags).ravel() for part in grid])
+        texel[:, single] = texels.at[:, len(corners) :]
+        cell = _enlarged(np.arange(len(corners)).reshape(smooth.shape), side, size).flatten()
+        cell[single] = len(corners) + np.arange(len(single))
+        return texel, filters, cell
 
     def _texels(self, faces: IntArray, at: IntArray, part_from_cam: FloatArray, rays: Float32) -> Texels:
         """Return the texture coordinates of rays (3,N) that meet triangles `faces` (N,) at instants (N,).
@@ -220,15 +269,30 @@ class MovingScene:
         out[2] = in_cam
         return out.reshape(9, -1).astype(np.float32)
 
-    def _colours(self, texels: Texels, filters: Filter, cell: IntArray | None, gain: Float32) -> Bytes:
-        """Return the filtered and shaded colours (N,3) of N rays. Rays that meet no triangle are black."""
-        colours = self._atlas.sample(texels.at, filters, cell)
-        dimmed = np.flatnonzero(texels.faces >= self._starts[1])
+    def _colours(
+        self, texel: Float32, faces: IntArray, filters: Filter, cell: IntArray | None, gain: Float32
+    ) -> Bytes:
+        """Return the filtered and shaded colours (N,3) of N rays. Rays that meet no triangle are black.
+
+        Args:
+            texel: (2,N) texel coordinates.
+            faces: (N,) indices of the triangles.
+            filters: Filters of the texture.
+            cell: (N,) index of the filter of each ray; None if ray number i uses filter number i.
+            gain: (F,) brightness factors of all triangles.
+        """
+        colours = self._atlas.sample(texel, filters, cell)
+        dimmed = np.flatnonzero(faces >= self._starts[1])
         if len(dimmed):
-            shaded = colours[dimmed] * gain[texels.faces[dimmed], None]
+            shaded = colours[dimmed] * gain[faces[dimmed], None]
             colours[dimmed] = np.clip(shaded, 0, 255).astype(np.uint8)
-        colours[texels.faces < 0] = 0
+        colours[faces < 0] = 0
         return colours
+
+
+def _enlarged(cells: _Array, side: int, size: tuple[int, ...]) -> _Array:
+    """Return an array (H,W) in which each value of an array (R,C) fills a cell of `side` pixels."""
+    return cells.repeat(side, axis=1)[:, : size[1]].repeat(side, axis=0)[: size[0]]
 
 
 def rays_in_part(rays: Float32, part_from_cam: FloatArray, at: IntArray) -> tuple[Float32, Float32]:

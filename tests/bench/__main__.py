@@ -39,6 +39,7 @@ from tests.bench import (
     solving,
     spool,
     sync,
+    synth,
     uncertainty,
     upright,
     viewer,
@@ -57,6 +58,7 @@ _WITH_OPTIONS = {
     "long": long.main,
     "clocks": clocks.main,
     "sync": sync.main,
+    "synth": synth.main,
     "body": body.main,
     "elbows": elbows.main,
     "scale": scale.main,
@@ -91,8 +93,8 @@ def main() -> int:
         "flexion with a height alone), `scale` (the metric scale with a height alone), `bare` (a camera at "
         "plain surfaces), `shutter` (drawn readout times against global shutters), `mappers` (the "
         "incremental and the global mapper), `paired` (two versions on perturbed captures), `real` (the "
-        "table of the real captures), `measure` (how well the pictures judge poses), and `long` (ten "
-        "minutes of three cameras)",
+        "table of the real captures), `measure` (how well the pictures judge poses), `synth` (seconds of a "
+        "rendered frame), and `long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)
