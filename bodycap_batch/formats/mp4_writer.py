@@ -74,12 +74,14 @@ class VideoWriter:
         colours: Colour range and colour matrix of the images given to `add_planes`, as FFmpeg's numbers, to
             be stored in the file. None to store neither.
         sound: Mono sound that starts with the first image, to be stored as AAC. None for no sound.
+        bit_rate_mbps: Mean bit rate, megabits per second, instead of a constant quality. None: `quality`
+            decides.
 
     Raises:
         StoreError: The file cannot be written.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917 - what a video consists of
         self,
         path: Path,
         fps: float,
@@ -87,6 +89,7 @@ class VideoWriter:
         quality: Quality,
         colours: tuple[int, int] | None = None,
         sound: Sound | None = None,
+        bit_rate_mbps: float | None = None,
     ) -> None:
         import av
 
@@ -106,6 +109,16 @@ class VideoWriter:
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
         self._stream.options = _ENCODER_OPTIONS[quality]
+        if bit_rate_mbps is not None:
+            self._stream.bit_rate = round(1e6 * bit_rate_mbps)
+            rate_kbps = f"{1e3 * bit_rate_mbps:.0f}k"
+            # An interval of one second between complete frames, and a buffer of one second, as phones have.
+            self._stream.options = {
+                "preset": "veryfast",
+                "maxrate": rate_kbps,
+                "bufsize": rate_kbps,
+                "g": f"{max(1, round(fps))}",
+            }
         self._stream.codec_context.thread_count = 1
         if colours is not None:
             self._stream.codec_context.color_range, self._stream.codec_context.colorspace = colours

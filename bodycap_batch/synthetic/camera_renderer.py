@@ -32,6 +32,12 @@ _SHUTTER_BANDS = 16
 the same pose."""
 
 
+_EXPOSURE_DELAY_S = 0.5
+"""Time constant (seconds) of the automatic exposure. Evidence: none."""
+_MID_GREY = 118.0
+"""Grey level that the automatic exposure makes of the mean. Origin: 18 % of the light, in sRGB."""
+
+
 class MovingBody(Protocol):
     """A body that moves: its skeleton, and its pose at any time."""
 
@@ -143,15 +149,42 @@ class Sensor:
         # Drawing a million numbers for each frame would double the rendering time. So frames share one array.
         self._normal = rng.standard_normal(size + _NOISE_SURPLUS if noise > 0 else 0, dtype=np.float32)
 
-    def record(self, image: Bytes, frame: int) -> Bytes:
+    def record(self, image: Bytes, frame: int, gain: float = 1.0) -> Bytes:
         """Return an ideal image (H,W,3) as the sensor records it.
 
-        The frame number determines the noise.
+        The frame number determines the noise. The gain multiplies light and noise.
         """
         mean = cv2.LUT(image, self._mean)
+        if gain != 1.0:
+            mean = mean * np.float32(gain)
         if len(self._normal):
             start = int(np.random.default_rng([frame, *self._seed]).integers(0, _NOISE_SURPLUS))
             normal = self._normal[start : start + self._count].reshape(image.shape)
-            noise = cv2.multiply(cv2.LUT(image, self._sigma), normal)
+            noise = cv2.multiply(cv2.LUT(image, self._sigma), normal, scale=gain)
             return np.asarray(cv2.add(mean, noise, dtype=cv2.CV_8U))
         return np.asarray(cv2.convertScaleAbs(mean))
+
+
+class AutoExposure:
+    """Gain that follows the mean brightness of the images with a delay.
+
+    Args:
+        strength: 1: the mean brightness becomes mid grey; 0: the gain is always 1.
+        interval_s: Time between two images, seconds.
+    """
+
+    def __init__(self, strength: float, interval_s: float) -> None:
+        self._strength, self._share = strength, 1.0 - np.exp(-interval_s / _EXPOSURE_DELAY_S)
+        self._log_gain: float | None = None
+
+    def gain(self, image: Bytes) -> float:
+        """Return the gain for the next ideal image (H,W,3)."""
+        # The middle of the picture counts twice.
+        height, width = image.shape[:2]
+        middle = image[height // 4 : height - height // 4, width // 4 : width - width // 4]
+        mean = (cv2.mean(image)[1] + cv2.mean(middle)[1]) / 2
+        wanted = self._strength * float(np.log(_MID_GREY / max(mean, 8.0)))
+        if self._log_gain is None:
+            self._log_gain = wanted
+        self._log_gain += self._share * (wanted - self._log_gain)
+        return float(np.exp(self._log_gain))

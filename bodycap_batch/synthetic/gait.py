@@ -41,6 +41,11 @@ wall, because a map is easy to initialise from sideways movement."""
 _TURN_S, _TURN_DEG, _SWAY_M = 5.0, 75.0, 0.02
 """Motion of a person who rotates on the spot: period (s), maximum rotation to each side (degrees), amplitude
 of the sway (m)."""
+_STILL_NOD_DEG = 22.0
+"""Nod (degrees) of a person who looks at a table. Neck and head each turn by 0.6 of it."""
+_STILL_PARTS, _STILL_SHARE, _STILL_ARMS_AHEAD = ("Bend", "Lean", "Turn", "Look", "Nod"), 0.12, 0.7
+"""Movements that are small in a person who stands still, the share that is left of them, and how far the arms
+are ahead. Evidence: none."""
 _ARM_PARTS = ("Lift", "Ahead", "Arm", "Out", "Spin", "Elbow", "Twist")
 """Names of the angles of an arm's posture, which `WalkStyle.posture` explains."""
 _SAMPLE_HZ = 50.0
@@ -135,6 +140,7 @@ class WalkStyle:
             are in front of the chest.
         presses: Times and angles at which a hand is held against the chest.
         on_the_spot: True: the person does not walk, but rotates to both sides on the spot.
+        still: True: the person stands still and faces +y. Trunk and head hardly move, the arms are ahead.
         posture: Offset (degrees) of each joint angle from the mean of all people, by name. The offset of a
             missing name is 0. Names of the trunk: ``Bend`` (forward) and ``Turn`` (about the vertical). Names
             of an arm, with the prefix ``Left`` or ``Right``: ``Lift`` (shoulder girdle up), ``Ahead``
@@ -147,6 +153,7 @@ class WalkStyle:
     arms_ahead: float = 0.0
     presses: tuple[Press, ...] = ()
     on_the_spot: bool = False
+    still: bool = False
     posture: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -166,15 +173,19 @@ class Walk:
     ) -> None:
         self.skeleton = skeleton
         self._t_pose_s = style.t_pose_s
-        self._arms_ahead = style.arms_ahead
+        self._arms_ahead = max(style.arms_ahead, _STILL_ARMS_AHEAD if style.still else 0.0)
+        self._nod_deg = _STILL_NOD_DEG if style.still else 3.0
         self._presses = style.presses
         self._posture = style.posture
         # Use separate random streams, so that a longer capture starts with the walk of a shorter capture.
         for_path, for_reaches, rng = rng.spawn(3)
-        self._route = (_draw_turns if style.on_the_spot else _draw_path)(length_s, for_path)
+        draw = _draw_stillness if style.still else _draw_turns if style.on_the_spot else _draw_path
+        self._route = draw(length_s, for_path)
         self._stride_gain = float(rng.uniform(0.92, 1.08))
         self._oscillations = {
-            name: _draw_oscillation(degrees, rng)
+            name: _draw_oscillation(
+                degrees * (_STILL_SHARE if style.still and name in _STILL_PARTS else 1.0), rng
+            )
             for name, degrees in (
                 ("LeftArm", 3.0), ("RightArm", 3.0), ("LeftOut", 3.0), ("RightOut", 3.0), ("LeftElbow", 4.0),
                 ("RightElbow", 4.0), ("LeftTwist", 5.0), ("RightTwist", 5.0), ("LeftWrist", 4.0),
@@ -253,7 +264,7 @@ class Walk:
                 share * walk_weight * wave["Lean"](t_s),
             ]
             out[name] = _rotation_about("ZXY", np.column_stack(angles))
-        look = [0.6 * walk_weight * wave["Look"](t_s), 0.6 * walk_weight * (wave["Nod"](t_s) + 3.0)]
+        look = [0.6 * walk_weight * wave["Look"](t_s), 0.6 * walk_weight * (wave["Nod"](t_s) + self._nod_deg)]
         out["Neck"] = out["Head"] = _rotation_about("ZX", np.column_stack(look))
         for side, leg_phase in (("Left", phase + np.pi), ("Right", phase)):
             self._leg(side, leg_phase, (stride * walk_weight, sidestep * walk_weight), out)
@@ -357,6 +368,15 @@ def _draw_turns(length_s: float, rng: np.random.Generator) -> CubicSpline:
     x, y = (_SWAY_M * np.sin(rate * times + phase[axis]) for axis, rate in enumerate((1.1, 0.9)))
     heading = 90.0 + _TURN_DEG * np.sin(2 * np.pi * times / _TURN_S + phase[2])
     return CubicSpline(times, np.column_stack([x, y, heading]))
+
+
+def _draw_stillness(length_s: float, rng: np.random.Generator) -> CubicSpline:
+    """Return x, y (m) and heading (degrees) over time for a person who stands still and faces +y."""
+    times = np.arange(-2.0 * _MARGIN_S, length_s + 2.0 * _MARGIN_S, 0.1)
+    phase = rng.uniform(0, 2 * np.pi, 3)
+    waves = [np.sin(rate * times + start) for rate, start in zip((1.3, 0.9, 0.7), phase, strict=True)]
+    x, y, heading = (size * wave for size, wave in zip((0.003, 0.003, 0.4), waves, strict=True))
+    return CubicSpline(times, np.column_stack([x, y, 90.0 + heading]))
 
 
 def _draw_reaches(length_s: float, t_pose_s: float, rng: np.random.Generator) -> tuple[_ArmReach, ...]:

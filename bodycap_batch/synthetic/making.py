@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import shutil
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,19 +22,26 @@ from bodycap_batch.formats.mp4_writer import VideoWriter
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
-from bodycap_batch.synthetic.camera_renderer import CameraRenderer, MovingBody, Sensor, camera_poses_at
+from bodycap_batch.synthetic.camera_renderer import (
+    AutoExposure,
+    CameraRenderer,
+    MovingBody,
+    Sensor,
+    camera_poses_at,
+)
 from bodycap_batch.synthetic.camera_sounds import CameraSounds
 from bodycap_batch.synthetic.clip import load_clip
 from bodycap_batch.synthetic.clocks import first_and_last_s, true_clocks
 from bodycap_batch.synthetic.gait import Walk, WalkStyle
+from bodycap_batch.synthetic.hand_view import with_hand_in_view
 from bodycap_batch.synthetic.imu import write_imu
 from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
 from bodycap_batch.synthetic.measured import disturb_poses
 from bodycap_batch.synthetic.moving_camera import MovingCamera
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
-from bodycap_batch.synthetic.pressing import find_press
-from bodycap_batch.synthetic.room import BareSurfaces, build_room
+from bodycap_batch.synthetic.pressing import carrying, find_press
+from bodycap_batch.synthetic.room import BareSurfaces, RoomLayout, build_room
 from bodycap_batch.synthetic.stance_walk import StanceWalk
 from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, triangles_from_surfaces
 from bodycap_batch.synthetic.truth import (
@@ -54,6 +61,10 @@ _TEXELS_PER_PIXEL_M = 0.85
 distance of 1 m covers slightly more than one pixel."""
 _MAX_TEXELS_PER_M = 500.0
 """Maximum texture detail (texels per metre). The limit saves memory."""
+
+
+_TABLE = (0.0, 0.62)
+"""Middle (x, y; metres) of the table in front of a person who stands still. The person faces +y."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,15 +113,24 @@ def draw_subject(options: SynthOptions) -> Subject:
             t_pose_s=options.t_pose_s,
             arms_ahead=options.arms_ahead,
             on_the_spot=options.on_the_spot,
-            presses=tuple(
-                find_press(mount, body, *options.pressed_s[mount.camera])
-                for mount in mounts
-                if mount.camera in options.pressed_s
+            still=options.still,
+            presses=(
+                *(
+                    find_press(mount, body, *options.pressed_s[mount.camera])
+                    for mount in mounts
+                    if mount.camera in options.pressed_s
+                ),
+                *(carrying(side.capitalize(), *span) for side, span in options.carried_s.items()),
             ),
             posture=draw_posture(options.posture_spread, np.random.default_rng(seeds["posture"])),
         )
         kind = StanceWalk if options.walk == "gait" else Walk
         motion = kind(body, length_s, style, np.random.default_rng(seeds["walk"]))
+    if options.hand_in_view:
+        mounts = tuple(
+            with_hand_in_view(mount, motion.skeleton, options.camera(), options.hand_in_view)
+            for mount in mounts
+        )
     return Subject(motion=motion, mounts=mounts, seeds=seeds)
 
 
@@ -205,8 +225,12 @@ class _FrameRecorder:
     sensor: Sensor
     times_s: FloatArray
 
+    def ideal(self, frame: int) -> Bytes:
+        """Return a frame without noise."""
+        return self.renderer.render(float(self.times_s[frame]))
+
     def __call__(self, frame: int) -> Bytes:
-        return self.sensor.record(self.renderer.render(float(self.times_s[frame])), frame)
+        return self.sensor.record(self.ideal(frame), frame)
 
 
 def _write_videos(
@@ -228,10 +252,20 @@ def _write_videos(
             )
             size = (options.width, options.height)
             heard = None if sounds is None else sounds.of_camera(camera)
+            frames = np.flatnonzero(kept[camera]).tolist()
+            exposure = AutoExposure(options.auto_exposure, 1.0 / options.fps)
+            render = recorder.ideal if options.auto_exposure else recorder
             with VideoWriter(
-                folder / f"{camera}.mp4", options.fps, size, options.quality, sound=heard
+                folder / f"{camera}.mp4",
+                options.fps,
+                size,
+                options.quality,
+                sound=heard,
+                bit_rate_mbps=options.bit_rate_mbps,
             ) as video:
-                for image in _render_in_order(pool, recorder, np.flatnonzero(kept[camera]).tolist(), context):
+                for frame, image in zip(frames, _render_in_order(pool, render, frames, context), strict=True):
+                    if options.auto_exposure:
+                        image = recorder.sensor.record(image, frame, exposure.gain(image))  # noqa: PLW2901
                     video.add(image)
                     done += 1
                     context.progress(done, total, camera)
@@ -249,11 +283,21 @@ def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRende
         furnished=options.furnished,
         repeated_posters=options.repeated_posters,
         bare=BareSurfaces(names=frozenset(options.bare), pictures=options.flat_pictures),
+        layout=RoomLayout(
+            repeats=options.room,
+            texture=options.texture,
+            table=_TABLE if options.still else None,
+        ),
     )
     images = [surface.image for surface in surfaces]
     patterned = options.clothes == "patterned"
     wearer = (
-        Wearer(subject.motion.skeleton, subject.seeds["clothes"], patterned=patterned)
+        Wearer(
+            subject.motion.skeleton,
+            subject.seeds["clothes"],
+            patterned=patterned,
+            carrying=tuple(side.capitalize() for side in options.carried_s),
+        )
         if options.body_in_view
         else None
     )
@@ -293,7 +337,7 @@ def walked_extent_m(options: SynthOptions, subject: Subject) -> tuple[float, flo
 
 
 def _render_in_order(
-    pool: ThreadPoolExecutor, recorder: _FrameRecorder, frames: list[int], context: StageContext
+    pool: ThreadPoolExecutor, recorder: Callable[[int], Bytes], frames: list[int], context: StageContext
 ) -> Iterator[Bytes]:
     """Render frames in several threads, and yield them in order.
 

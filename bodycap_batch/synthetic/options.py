@@ -156,6 +156,15 @@ class SynthOptions(Options):
         le=50,
         description="standard deviation of the image noise at medium grey, in grey levels from 0 to 255",
     )
+    auto_exposure: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description=(
+            "how far the brightness follows the mean of the pictures, with a delay of half a second; 1: the "
+            "mean becomes medium grey, 0: the brightness is constant; noise grows with the gain"
+        ),
+    )
     exposure_s: float = Field(
         0.0,
         ge=0,
@@ -249,6 +258,40 @@ class SynthOptions(Options):
         description="in the built-in walk, the person stands and turns to both sides, so that there "
         "is hardly any parallax",
     )
+    still: bool = Field(
+        False,
+        description="in the built-in walk, the person stands at a table: the head and the trunk hardly move, "
+        "and the hands do",
+    )
+    carried_s: Mapping[Literal["left", "right"], tuple[_Moment, _Moment]] = Field(
+        default_factory=dict,
+        description=(
+            "for a hand that carries a box with pictures, the start and the end (in seconds) of a time in "
+            "which it holds the box in front of the chest; before and after that, the arm hangs down"
+        ),
+    )
+    hand_in_view: float = Field(
+        0.0,
+        ge=0,
+        le=0.7,
+        description="share of the picture of a camera on a forearm that shows the hand and the sleeve of "
+        "the same arm",
+    )
+    texture: float = Field(
+        1.0,
+        ge=0,
+        le=1,
+        description="contrast of walls, floor and furniture, and density of the pictures on the walls; 1: as "
+        "in a full laboratory, 0: plain paint",
+    )
+    room: Literal["single", "bays_90", "bays_180", "bays_along", "two_rooms"] = Field(
+        "single",
+        description=(
+            "identical parts of the room; bays_90: four equal walls with equal furniture, bays_180: walls "
+            "that face each other are equal, bays_along: equal shelves and pictures along the north wall, "
+            "two_rooms: two equal rooms with a wall with two openings between them"
+        ),
+    )
     furnished: bool = Field(True, description="false: the room is empty except for pictures on the walls")
     bare: tuple[Literal["ceiling", "floor", "north", "east", "south", "west"], ...] = Field(
         (),
@@ -309,6 +352,13 @@ class SynthOptions(Options):
     quality: Literal["high", "lossless"] = Field(
         "high", description="quality of the videos; high: H.264 with CRF 16, lossless: no loss of quality"
     )
+    bit_rate_mbps: float | None = Field(
+        None,
+        ge=0.05,
+        le=200,
+        description="bit rate of each video in megabits per second, instead of a constant quality; phones "
+        "record about 0.25 bits for each pixel",
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -334,7 +384,8 @@ class SynthOptions(Options):
             raise ValueError(
                 "exposure_s and rolling_shutter_s cannot be longer than the time between two frames (1 / fps)"
             )
-        for key in ("t_pose_s", "on_the_spot"):
+        self._check_movements()
+        for key in ("t_pose_s", "on_the_spot", "still", "carried_s"):
             if self.motion is not None and getattr(self, key):
                 raise ValueError(
                     f"{key} cannot be used with motion, because the program does not change the motion of "
@@ -347,6 +398,33 @@ class SynthOptions(Options):
             )
         self._check_pressed()
         return self
+
+    def _check_movements(self) -> None:
+        """Check the options that change what the person does, and those that need another option."""
+        if self.walk == "gait" and (self.still or self.carried_s):
+            raise ValueError("walk: still and carried_s need the simple walk; leave out one of the two")
+        if self.still and self.on_the_spot:
+            raise ValueError("still cannot be used with on_the_spot; leave out one of the two")
+        for key in ("carried_s", "hand_in_view"):
+            if getattr(self, key) and not self.body_in_view:
+                raise ValueError(f"{key} cannot be seen without body_in_view; set body_in_view")
+        places = [mount_of(name) for name in self.cameras]
+        roles = [place[1] for place in places if place is not None]
+        for side, (start_s, end_s) in self.carried_s.items():
+            if f"{side.capitalize()}Hand" in roles:
+                raise ValueError(f"carried_s: the box would cover the camera on the {side} hand")
+            if end_s <= start_s:
+                raise ValueError(f"carried_s: the end of the time for {side} is not after its start")
+        if self.hand_in_view and not any(role.endswith("ForeArm") for role in roles):
+            raise ValueError("hand_in_view: there is no camera on a forearm")
+        if self.room == "two_rooms" and (self.motion is not None or self.walk != "simple"):
+            raise ValueError("room: two_rooms needs the simple built-in walk, which passes the openings")
+        if self.room != "single" and (self.bare or not self.furnished):
+            raise ValueError("room: identical parts cannot be used with bare or without furniture")
+        if self.bit_rate_mbps is not None and self.quality == "lossless":
+            raise ValueError(
+                "bit_rate_mbps cannot be used with the quality lossless; leave out one of the two"
+            )
 
     def _check_cameras_named(self) -> None:
         """Check the options that have a value for each camera, and the lengths of gaps.

@@ -37,6 +37,12 @@ prefer comfortable postures. For comparison: a camera position error of 1 cm, or
 6 degrees, has a residual of 1."""
 
 
+_CARRYING_DEG = np.array([53.0, 4.0, 74.0, 10.0, 20.0, 0.0, 0.0])
+"""The angles of `ArmAngles` of a hand that holds a thing in front of the chest, degrees."""
+_SWING_DEG, _SWING_HZ = 9.0, 0.45
+"""Amplitude (degrees) and frequency (Hz) of the movement of a carried thing. Evidence: none."""
+
+
 @dataclass(frozen=True, slots=True)
 class ArmAngles:
     """Angles of one arm over time.
@@ -97,12 +103,14 @@ class Press:
         start_s: Common time (seconds) at which the camera on the hand arrives at the chest.
         end_s: Common time (seconds) at which the camera leaves the chest.
         degrees: (7,) the angles of `ArmAngles`, in that order, from `start_s` to `end_s`, degrees.
+        swing_deg: Amplitude of a slow oscillation of shoulder and elbow about these angles, degrees.
     """
 
     side: str
     start_s: float
     end_s: float
     degrees: FloatArray
+    swing_deg: float = 0.0
 
     def weight(self, t_s: FloatArray) -> FloatArray:
         """Return the weight (T,) of the press at common times (T,).
@@ -122,7 +130,22 @@ class Press:
             name: getattr(angles, name) * (1.0 - weight) + weight * target
             for name, target in zip(names, self.degrees, strict=True)
         }
+        if self.swing_deg:
+            swing = self.swing_deg * weight
+            values["flexion"] = values["flexion"] + swing * np.sin(2 * np.pi * _SWING_HZ * t_s)
+            values["elbow"] = values["elbow"] + swing * np.cos(2 * np.pi * 0.6 * _SWING_HZ * t_s)
         return ArmAngles(**values)
+
+
+def carrying(side: str, start_s: float, end_s: float) -> Press:
+    """Return a movement in which a hand holds a thing in front of the chest.
+
+    Args:
+        side: ``Left`` or ``Right``.
+        start_s: Common time (seconds) at which the thing arrives there.
+        end_s: Common time (seconds) at which the hand goes down.
+    """
+    return Press(side=side, start_s=start_s, end_s=end_s, degrees=_CARRYING_DEG, swing_deg=_SWING_DEG)
 
 
 def find_press(mount: Mount, skeleton: SkeletonModel, start_s: float, end_s: float) -> Press:

@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.synthetic import pictures, textures
 from bodycap_batch.synthetic.lighting import light_surfaces
 from bodycap_batch.synthetic.surfaces import UINT8, Surface, box_faces, surface_facing
@@ -42,6 +43,17 @@ _FLAT_PICTURE_SPREAD = 0.7
 """Maximum distance of a flat picture from the middle of its surface, as a fraction of half the surface."""
 _FLAT_PICTURE_OFF_M = 0.012
 """Distance (metres) of a flat picture from its surface."""
+_BAY_M = 1.8
+"""Length (metres) of one of the identical bays along a wall: a shelf and the pictures above it."""
+_PARTITION_M = 0.12
+"""Thickness (metres) of the wall between two rooms."""
+_OPENING_M = (0.2, 1.95)
+"""Distances (metres) of the sides of the two openings from the middle of the wall between two rooms. The
+built-in walk passes it at 0.7 m and at 1.4 m."""
+_OPENING_TOP_M = 2.15
+"""Height (metres) of the openings."""
+_TABLE_TOP_M = 0.98
+"""Height (metres) of the table for a person who stands."""
 _PICTURE_BASES_M = (2.05, 1.25, 1.55, 1.10)
 """Minimum height (metres) of the lower edges of pictures, for each of the four walls. The pictures are above
 the furniture at the wall."""
@@ -56,11 +68,13 @@ class _Builder:
     Attributes:
         seeds: Seed sequence of all random streams.
         texels_per_m: Detail of the textures, texels per metre.
+        texture: Contrast of the textures of `textured`, and density of the pictures on the walls, 0 to 1.
         surfaces: The surfaces that have been added so far.
     """
 
     seeds: np.random.SeedSequence
     texels_per_m: float
+    texture: float = 1.0
     surfaces: list[Surface] = field(default_factory=list)
 
     def rng(self) -> np.random.Generator:
@@ -84,7 +98,10 @@ class _Builder:
         size = float(np.linalg.norm(face.across)), float(np.linalg.norm(face.down))
         if min(size) < _EDGE_M:
             texture = textures.metal
-        self.surfaces.append(replace(face, image=self.image(size, texture, detail)))
+        image = self.image(size, texture, detail)
+        if self.texture < 1.0:
+            image = textures.faded(image, self.texture, self.texels_per_m, self.rng())
+        self.surfaces.append(replace(face, image=image))
 
     def box(
         self, centre: FloatArray, size_m: tuple[float, float, float], yaw_deg: float, texture: Texture
@@ -109,6 +126,21 @@ class BareSurfaces:
 
     names: frozenset[str] = frozenset()
     pictures: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoomLayout:
+    """What repeats in a room, and how much texture it has.
+
+    Attributes:
+        repeats: ``single``, or one of the kinds of identical parts of `SynthOptions.room`.
+        texture: Contrast of the textures, and density of the pictures on the walls, 0 to 1.
+        table: Middle (x, y; metres) of a table, or None.
+    """
+
+    repeats: str = "single"
+    texture: float = 1.0
+    table: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +176,7 @@ class _Wall:
         return float(np.degrees(np.arctan2(self.right[1], self.right[0])))
 
 
-def build_room(
+def build_room(  # noqa: PLR0913 - what a room consists of
     half_extent_m: tuple[float, float],
     texels_per_m: float,
     seed: np.random.SeedSequence,
@@ -152,6 +184,7 @@ def build_room(
     furnished: bool = True,
     repeated_posters: bool = False,
     bare: BareSurfaces | None = None,
+    layout: RoomLayout | None = None,
 ) -> list[Surface]:
     """Build a furnished and lit room around a walk.
 
@@ -162,23 +195,35 @@ def build_room(
         furnished: False: the room has plain walls, floor and ceiling, and pictures on the walls only.
         repeated_posters: True: copies of only three different pictures hang at many positions.
         bare: The plain surfaces; None: no surface is plain on request.
+        layout: What repeats, and how much texture there is; None: nothing repeats, with full texture.
 
     Returns:
         The surfaces of the room. Their textures include the light of the lamps.
     """
     half = half_size_m(half_extent_m)
-    build = _Builder(seed, texels_per_m)
-    bare = bare or BareSurfaces()
+    bare, layout = bare or BareSurfaces(), layout or RoomLayout()
+    if layout.repeats == "bays_90":
+        half = [max(half)] * 2
+    build = _Builder(seed, texels_per_m, layout.texture)
     plain = bare.names if furnished else bare.names | {"ceiling", "floor", "east"}
     walls = _build_shell(build, half, plain)
     furnish = (_add_shelves, _add_desks, _add_cupboards, _add_sofa)
     for name, wall, furniture in zip(_WALL_NAMES, walls, furnish, strict=True):
-        if furnished and name not in bare.names:
+        if furnished and name not in bare.names and layout.repeats == "single":
             furniture(build, wall)
+    if layout.table is not None:
+        _add_table(build, layout.table)
+    if layout.repeats != "single":
+        return _with_repeats(build, walls, half, layout.repeats)
     _add_pictures(build, walls, repeated_posters, bare.names)
     if "ceiling" not in plain:
         _add_ceiling_fittings(build, half)
     _add_flat_pictures(build, half, walls, bare)
+    return _lit(build, half)
+
+
+def _lit(build: _Builder, half: list[float]) -> list[Surface]:
+    """Add lamps, and return all surfaces with the light on them."""
     rng = build.rng()
     count = max(2, round(half[0] / 1.7)), max(2, round(half[1] / 1.7))
     grid = np.meshgrid(*(np.linspace(-0.6, 0.6, n) * side for n, side in zip(count, half, strict=True)))
@@ -338,7 +383,7 @@ def _add_pictures(build: _Builder, walls: list[_Wall], repeated: bool, bare: fro
             tall = min(tall, HEIGHT_M - 0.08 - base)
             if along + wide > wall.length_m / 2 - 0.1:
                 break
-            if rng.uniform() < 0.85:
+            if rng.uniform() < 0.85 * build.texture:
                 kind = kinds[int(rng.integers(len(kinds)))]
                 if index == 1 and wide > 0.9:
                     kind = pictures.whiteboard
@@ -348,6 +393,127 @@ def _add_pictures(build: _Builder, walls: list[_Wall], repeated: bool, bare: fro
                 centre = wall.point_at(along + wide / 2, base + tall / 2, 0.012)
                 build.surfaces.append(surface_facing(centre, wall.normal, (wide, tall), image))
             along += wide + float(rng.uniform(0.12, 0.5))
+
+
+def _with_repeats(build: _Builder, walls: list[_Wall], half: list[float], repeats: str) -> list[Surface]:
+    """Furnish a room with identical parts, and return all lit surfaces.
+
+    Args:
+        build: Collector of the surfaces. It holds the shell, and a table if there is one.
+        walls: The walls.
+        half: Half of the room's size along x and y, metres.
+        repeats: Kind of the identical parts.
+    """
+    shell, build.surfaces = build.surfaces, []
+    furnish = (_add_shelves, _add_desks, _add_cupboards, _add_sofa)
+    if repeats == "bays_along":
+        for wall, furniture in list(zip(walls, furnish, strict=True))[1:]:
+            furniture(build, wall)
+        _add_pictures(build, walls, repeated=False, bare=frozenset({"north"}))
+        shell, build.surfaces = shell + build.surfaces, []
+        count = int(walls[0].length_m / _BAY_M)
+        bay = replace(walls[0], length_m=_BAY_M)
+        _add_shelves(build, bay)
+        _add_pictures(build, [bay], repeated=False, bare=frozenset())
+        shifts = (np.arange(count) - (count - 1) / 2) * _BAY_M
+        copies = [_shifted(face, shift * bay.right) for shift in shifts for face in build.surfaces]
+    else:
+        # Carpets would make the parts unlike; floor and ceiling are made alike by turning their images.
+        quarters = (0, 1, 2, 3) if repeats == "bays_90" else (0, 2)
+        flat = [face for face in shell if abs(face.normal[2]) > 0.5 and np.linalg.norm(face.across) > half[0]]
+        table = shell[2 + len(_CARPETS) + len(walls) :]
+        shell = [replace(face, image=_turned_alike(face.image, len(quarters))) for face in flat] + table
+        for index in range(4 // len(quarters)):
+            build.textured(_face_of(walls[index]), textures.plaster if index == 0 else textures.bricks)
+            furnish[index](build, walls[index])
+        _add_pictures(build, walls[: 4 // len(quarters)], repeated=False, bare=frozenset())
+        if repeats == "two_rooms":
+            _add_partition(build, half)
+        copies = [_turned(face, quarter) for quarter in quarters for face in build.surfaces]
+    build.surfaces = shell + copies
+    return _lit(build, half)
+
+
+def _turned_alike(image: UINT8, times: int) -> UINT8:
+    """Return an image that looks the same after a half turn, or after a quarter turn if `times` is 4."""
+    out = image.copy()
+    middle = image.shape[0] // 2
+    if times == 2:
+        out[image.shape[0] - middle :] = np.rot90(image[:middle], 2)
+        return out
+    quarter = image[:middle, : image.shape[1] - middle]
+    side = min(quarter.shape[:2])
+    quarter = quarter[:side, :side]
+    upper = np.concatenate([quarter, np.rot90(quarter, 3)], axis=1)
+    return np.asarray(np.concatenate([upper, np.rot90(upper, 2)]))
+
+
+def _turned(face: Surface, quarters: int) -> Surface:
+    """Return a copy of a rectangle, turned about the vertical in the room's middle by quarter turns."""
+    turn = np.round(so3_exp(np.array([0.0, 0.0, quarters * np.pi / 2])))
+    return replace(face, corner=turn @ face.corner, across=turn @ face.across, down=turn @ face.down)
+
+
+def _shifted(face: Surface, shift_m: FloatArray) -> Surface:
+    """Return a copy of a rectangle, shifted by a vector (3,) in metres."""
+    return replace(face, corner=face.corner + shift_m)
+
+
+def _face_of(wall: _Wall) -> Surface:
+    """Return the rectangle of a whole wall without an image."""
+    return surface_facing(
+        wall.point_at(0.0, HEIGHT_M / 2, 0.0), wall.normal, (wall.length_m, HEIGHT_M), _BLANK
+    )
+
+
+def _add_partition(build: _Builder, half: list[float]) -> None:
+    """Add half of a wall at x = 0 with two openings: the side of +x. A half turn gives the other half."""
+    near, far = _OPENING_M
+    lintel = HEIGHT_M - _OPENING_TOP_M
+    thick = _PARTITION_M / 2
+    for low, high, bottom in (
+        (-far, far, _OPENING_TOP_M),
+        (-near, near, 0.0),
+        (far, half[1], 0.0),
+        (-half[1], -far, 0.0),
+    ):
+        tall = lintel if bottom else HEIGHT_M
+        if bottom == 0.0 and low == -near:
+            tall = _OPENING_TOP_M
+        size = (thick, high - low, tall)
+        centre = np.array([thick / 2, (low + high) / 2, bottom + tall / 2])
+        faces = box_faces(centre, size, 0.0)
+        for face in [faces[0], faces[2], faces[3], faces[5]]:
+            build.textured(face, textures.plaster)
+
+
+def _add_table(build: _Builder, middle: tuple[float, float]) -> None:
+    """Add a high table with boxes, a screen and papers, for a person who stands at it."""
+    rng = build.rng()
+    centre = np.array([*middle, 0.0])
+    build.box(centre + np.array([0, 0, _TABLE_TOP_M - 0.02]), (1.5, 0.7, 0.04), 0.0, textures.planks)
+    for side in (-1, 1):
+        build.box(
+            centre + np.array([side * 0.66, 0, _TABLE_TOP_M / 2 - 0.02]),
+            (0.05, 0.6, _TABLE_TOP_M - 0.04),
+            0.0,
+            textures.metal,
+        )
+    build.box(centre + np.array([-0.42, 0.22, _TABLE_TOP_M + 0.21]), (0.52, 0.04, 0.32), 8.0, pictures.screen)
+    build.box(centre + np.array([-0.42, 0.22, _TABLE_TOP_M + 0.03]), (0.2, 0.14, 0.06), 8.0, textures.metal)
+    for x, y in ((0.12, 0.22), (0.42, 0.1), (0.6, -0.15), (-0.6, -0.1)):
+        size = rng.uniform(0.08, 0.2, 3)
+        spot = centre + np.array([x, y, _TABLE_TOP_M + size[2] / 2])
+        build.box(spot, (size[0], size[1], size[2]), float(rng.uniform(0, 90)), pictures.cardboard)
+    for x in (-0.3, 0.15):
+        sheet = box_faces(
+            centre + np.array([x, -0.15, _TABLE_TOP_M + 0.003]),
+            (0.3, 0.21, 0.006),
+            float(rng.uniform(-20, 20)),
+        )[4]
+        build.surfaces.append(
+            replace(sheet, image=build.image((0.3, 0.21), pictures.research_poster, _PICTURE_DETAIL))
+        )
 
 
 def _add_flat_pictures(build: _Builder, half: list[float], walls: list[_Wall], bare: BareSurfaces) -> None:

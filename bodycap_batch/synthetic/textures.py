@@ -71,6 +71,22 @@ def shade_image(image: Image, shade: Grey) -> Image:
     return np.asarray(cv2.multiply(image, cv2.merge([shade.astype(np.float32)] * 3), dtype=cv2.CV_8U))
 
 
+def faded(image: Image, contrast: float, scale: float, rng: np.random.Generator) -> Image:
+    """Return an image with less contrast about its mean colour, and the faint structure of paint.
+
+    Args:
+        image: (H,W,3) image.
+        contrast: 1: the image as it is; 0: paint of one colour.
+        scale: Texels per metre.
+        rng: Source of randomness.
+    """
+    height, width = image.shape[:2]
+    shade = 1.0 + 0.008 * fractal(height, width, scale * 0.8, rng, 3)
+    shade += 0.005 * rng.standard_normal((height, width), dtype=np.float32)
+    paint = tint_shade(shade, np.array(cv2.mean(image)[:3], np.float32))
+    return np.asarray(cv2.addWeighted(image, contrast, paint, 1.0 - contrast, 0.0))
+
+
 def plaster(height: int, width: int, scale: float, rng: np.random.Generator) -> Image:
     """Return the texture of a painted wall that is almost plain."""
     shade = 1.0 + 0.012 * fractal(height, width, scale * 0.8, rng, 3)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
-from bodycap_batch.model.skeleton_presets import rest_positions, split_side
+from bodycap_batch.model.skeleton_presets import rest_positions, segment_axes, split_side
 from bodycap_batch.synthetic import textures
-from bodycap_batch.synthetic.pictures import abstract
-from bodycap_batch.synthetic.surfaces import UINT8
-from bodycap_batch.synthetic.triangle_renderer import Triangles
+from bodycap_batch.synthetic.pictures import WALL_PICTURES, abstract
+from bodycap_batch.synthetic.surfaces import UINT8, Surface, box_faces
+from bodycap_batch.synthetic.triangle_renderer import Triangles, triangles_from_surfaces
 
 _RADII = {
     "Hips": (0.15, 0.14),
@@ -45,6 +45,13 @@ _PRINT_SHARE = 0.6
 """Share of the printed pattern in the colour of patterned cloth. Evidence: none."""
 _PRINT_M = 0.2
 """Side (metres) of the squares that a printed pattern consists of. All squares differ. Evidence: none."""
+_BOX_M = (0.20, 0.13, 0.16)
+"""Sizes (metres) of a carried box, in the frame of the hand: x, y, z."""
+_BOX_AHEAD_M, _BOX_OFF_M = 0.08, 0.10
+"""Position (metres) of the middle of a carried box: from the wrist along the hand, and from the hand on the
+side of the palm."""
+_BOX_TEXELS_PER_M = 700.0
+"""Detail (texels per metre) of the pictures on a carried box, which is near the cameras."""
 _CLEARANCE_M = 0.02
 """A camera outside a limb is treated as inside the limb if its distance from the limb's surface is not larger
 than this threshold. Unit: metres."""
@@ -52,10 +59,11 @@ than this threshold. Unit: metres."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Limb:
-    """One limb: a rounded cone in the frame of its joint."""
+    """One limb: a rounded cone in the frame of its joint. Or a box that the hand of the joint carries."""
 
     joint: int
     triangles: Triangles
+    carried: bool = False
 
 
 class Wearer:
@@ -65,10 +73,16 @@ class Wearer:
         skeleton: Skeleton with the true proportions.
         seed: Seed of the textures of clothes and skin.
         patterned: True: a pattern is printed on the clothes.
+        carrying: Sides (``Left``, ``Right``) of the hands that carry a box.
     """
 
     def __init__(
-        self, skeleton: SkeletonModel, seed: np.random.SeedSequence, *, patterned: bool = False
+        self,
+        skeleton: SkeletonModel,
+        seed: np.random.SeedSequence,
+        *,
+        patterned: bool = False,
+        carrying: tuple[str, ...] = (),
     ) -> None:
         self._bones = _find_bones(skeleton)
         self.images: list[UINT8] = []
@@ -82,6 +96,16 @@ class Wearer:
             image = _skin(height, width, rng) if part in _SKIN else _cloth(height, width, dye, rng)
             self.images.append(_print_pattern(image, rng) if patterned and part not in _SKIN else image)
         self._limbs: list[_Limb] = []
+        self._boxes = [_box_in_hand(skeleton, side) for side in carrying]
+        for _, faces in self._boxes:
+            rng = np.random.default_rng(seed.spawn(1)[0])
+            for face in faces:
+                tall, wide = (
+                    max(16, round(float(np.linalg.norm(edge)) * _BOX_TEXELS_PER_M))
+                    for edge in (face.down, face.across)
+                )
+                kind = WALL_PICTURES[int(rng.integers(len(WALL_PICTURES)))]
+                self.images.append(np.asarray(kind(tall, wide, _BOX_TEXELS_PER_M, rng)))
 
     def place_textures(self, origins: FloatArray) -> None:
         """Build the N limbs.
@@ -92,9 +116,17 @@ class Wearer:
         self._limbs = [
             _Limb(joint=joint, triangles=_rounded_cone(start, end, radii, image, origin, index))
             for index, ((joint, start, end, radii, _), image, origin) in enumerate(
-                zip(self._bones, self.images, origins, strict=True)
+                zip(self._bones, self.images, origins, strict=False)
             )
         ]
+        used = len(self._bones)
+        for joint, faces in self._boxes:
+            pictures = self.images[used : used + len(faces)]
+            sides = [replace(face, image=image) for face, image in zip(faces, pictures, strict=True)]
+            shape = triangles_from_surfaces(sides, origins[used : used + len(faces)])
+            shape = replace(shape, surface=shape.surface + used)
+            self._limbs.append(_Limb(joint=joint, triangles=shape, carried=True))
+            used += len(faces)
 
     def visible_from(self, mount: Mount, skeleton: SkeletonModel) -> Wearer:
         """Return the body without the limb on which a camera is mounted, if the camera is inside this limb.
@@ -106,11 +138,13 @@ class Wearer:
         centre = mount.joint_from_cam[:3, 3]
         kept = object.__new__(Wearer)
         kept._bones, kept.images = self._bones, self.images
+        kept._boxes = self._boxes
         kept._limbs = [
             limb
-            for limb, (_, start, end, radii, _) in zip(self._limbs, self._bones, strict=True)
+            for limb, (_, start, end, radii, _) in zip(self._limbs, self._bones, strict=False)
             if limb.joint != joint or _distance_to_segment(centre, start, end) > max(radii) + _CLEARANCE_M
         ]
+        kept._limbs += [limb for limb in self._limbs if limb.carried]
         return kept
 
     @property
@@ -139,6 +173,15 @@ class Wearer:
             surface=np.concatenate([part.surface for part in parts]),
             gain=np.concatenate([part.gain for part in parts]),
         )
+
+
+def _box_in_hand(skeleton: SkeletonModel, side: str) -> tuple[int, list[Surface]]:
+    """Return the joint of a hand, and the faces of a box in front of its palm, without pictures."""
+    joint = skeleton.index_of_role(f"{side}Hand")
+    along, _, outward = segment_axes(skeleton, f"{side}Hand").T
+    assert joint is not None  # The built-in body has hands.
+    centre = _BOX_AHEAD_M * along - _BOX_OFF_M * outward
+    return joint, box_faces(centre, _BOX_M, 0.0)
 
 
 _Bone = tuple[int, FloatArray, FloatArray, tuple[float, float], str]
