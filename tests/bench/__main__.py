@@ -20,6 +20,7 @@ from tests.bench import (
     batch,
     body,
     clocks,
+    drawn,
     elbows,
     field,
     inertial,
@@ -60,6 +61,7 @@ _WITH_OPTIONS = {
     "sync": sync.main,
     "synth": synth.main,
     "body": body.main,
+    "drawn": drawn.main,
     "elbows": elbows.main,
     "scale": scale.main,
     "bare": bare.main,
@@ -94,7 +96,7 @@ def main() -> int:
         "plain surfaces), `shutter` (drawn readout times against global shutters), `mappers` (the "
         "incremental and the global mapper), `paired` (two versions on perturbed captures), `real` (the "
         "table of the real captures), `measure` (how well the pictures judge poses), `synth` (seconds of a "
-        "rendered frame), and `long` (ten minutes of three cameras)",
+        "rendered frame), `drawn` (renders the drawn captures), and `long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)
