@@ -35,8 +35,11 @@ _CELL = 4
 _JUMP_PX = 0.5
 """Minimum difference of the image motion of neighbouring cells on different planes that counts as a jump."""
 _MARGIN_SHARE = 0.06
-"""Width of the border around the sharp image, as a share of the longer side. It serves a blur of twice this
-width."""
+"""Maximum width of the border around the sharp image, as a share of the longer side. It serves a blur of
+twice this width."""
+_USUAL_DISTANCE_M = 0.5
+"""Assumed distance (metres) of near objects, which determines the width of the border with the shift of the
+camera."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,6 +102,7 @@ class MovingCamera:
         share = _MARGIN_SHARE if self._exposure_s else 0.0
         self._margin = round(share * max(camera.width_px, camera.height_px))
         self._grid = ray_grid(camera, self._margin)
+        self._px_per_rad = 1.0 / float(np.linalg.norm(self._grid.per_px_x[self._grid.valid], axis=-1).min())
 
     def render(self, t_s: float) -> Bytes:
         """Return the image (H,W,3) without noise. The exposure is centred on a common time (seconds)."""
@@ -132,7 +136,25 @@ class MovingCamera:
             world_from_cam if part.joint == ROOM else invert(joints[:, part.joint]) @ world_from_cam
             for part in self._scene.parts
         ]
-        return _Frame(node_s=node_s, part_from_cam=np.stack(poses, axis=1), row_s=row_s, margin=self._margin)
+        margin = self._needed_margin(world_from_cam[np.abs(node_s - t_s) <= half + _NODE_S])
+        unused = self._margin - margin
+        return _Frame(
+            node_s=node_s,
+            part_from_cam=np.stack(poses, axis=1),
+            row_s=row_s[unused : len(row_s) - unused] if self._rolling_s else row_s,
+            margin=margin,
+        )
+
+    def _needed_margin(self, world_from_cam: FloatArray) -> int:
+        """Return the width (px) of the border that the motion (T,4,4) of the camera in an exposure needs."""
+        if self._margin == 0:
+            return 0
+        start, end = world_from_cam[0], world_from_cam[-1]
+        cosine = (np.trace(start[:3, :3].T @ end[:3, :3]) - 1) / 2
+        turn_rad = np.arccos(np.clip(cosine, -1, 1))
+        shift_rad = np.linalg.norm(end[:3, 3] - start[:3, 3]) / _USUAL_DISTANCE_M
+        needed_px = 0.5 * (turn_rad + shift_rad) * self._px_per_rad
+        return min(self._margin, int(np.ceil(min(needed_px, 1e6))) + 2)
 
     def _gain(self, t_s: float) -> Float32:
         """Return the brightness factor (F,) of each triangle: moving parts are lit from above."""
@@ -208,10 +230,10 @@ class MovingCamera:
             direction, origin = rays_in_part(point, to_cam, part * instants + row)
             at = project(self._camera, (direction + origin).T.astype(np.float64)) - 0.5 + margin
             row = np.clip(np.nan_to_num(np.rint(at[:, 1])), 0, size[0] - 1).astype(np.int64)
-        out = (at - np.stack([x, y], axis=1)).astype(np.float32)
-        out[(faces < 0) | (far <= 0) | ~np.isfinite(out[:, 0] + out[:, 1])] = 0.0
         limit = 2.0 * max(margin, 8)
-        return np.asarray(np.clip(out, -limit, limit), dtype=np.float32)
+        out = np.clip(at - np.stack([x, y], axis=1), -limit, limit)
+        out[(faces < 0) | (far <= 0) | ~np.isfinite(at[:, 0] + at[:, 1])] = 0.0
+        return out.astype(np.float32)
 
 
 def _cropped(grid: RayGrid, border: int) -> RayGrid:

@@ -469,22 +469,23 @@ def _face_of(wall: _Wall) -> Surface:
 def _add_partition(build: _Builder, half: list[float]) -> None:
     """Add half of a wall at x = 0 with two openings: the side of +x. A half turn gives the other half."""
     near, far = _OPENING_M
-    lintel = HEIGHT_M - _OPENING_TOP_M
     thick = _PARTITION_M / 2
-    for low, high, bottom in (
-        (-far, far, _OPENING_TOP_M),
-        (-near, near, 0.0),
-        (far, half[1], 0.0),
-        (-half[1], -far, 0.0),
+    paint = int(build.rng().integers(1 << 30))
+
+    def one_paint(height: int, width: int, scale: float, _: np.random.Generator) -> UINT8:
+        return textures.plaster(height, width, scale, np.random.default_rng(paint))
+
+    for low, high, bottom, top in (
+        (-far, far, _OPENING_TOP_M, HEIGHT_M),
+        (-near, near, 0.0, _OPENING_TOP_M),
+        (far, half[1], 0.0, HEIGHT_M),
+        (-half[1], -far, 0.0, HEIGHT_M),
     ):
-        tall = lintel if bottom else HEIGHT_M
-        if bottom == 0.0 and low == -near:
-            tall = _OPENING_TOP_M
-        size = (thick, high - low, tall)
-        centre = np.array([thick / 2, (low + high) / 2, bottom + tall / 2])
-        faces = box_faces(centre, size, 0.0)
-        for face in [faces[0], faces[2], faces[3], faces[5]]:
-            build.textured(face, textures.plaster)
+        centre = np.array([thick / 2, (low + high) / 2, (bottom + top) / 2])
+        faces = box_faces(centre, (thick, high - low, top - bottom), 0.0)
+        for face in (faces[0], faces[2], faces[3], faces[5]):
+            size = float(np.linalg.norm(face.across)), float(np.linalg.norm(face.down))
+            build.surfaces.append(replace(face, image=build.image(size, one_paint)))
 
 
 def _add_table(build: _Builder, middle: tuple[float, float]) -> None:

@@ -13,12 +13,12 @@ from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, concatenate_triangles
 
 EXPOSURE_S, READOUT_S = 0.012, 0.020
-FISHEYE = {"lens": "OPENCV_FISHEYE", "lens_params": (60.0, 60.0, 80.0, 48.0, 0.02, -0.005, 0.0, 0.0)}
+FISHEYE = {"lens": "OPENCV_FISHEYE", "lens_params": (48.0, 48.0, 64.0, 40.0, 0.02, -0.005, 0.0, 0.0)}
 
 
 def _options(**values):
     return SynthOptions(**{
-        "width": 160, "height": 96, "seconds": 4.0, "cameras": ("torso",), "seed": 3, "body_in_view": True,
+        "width": 128, "height": 80, "seconds": 4.0, "cameras": ("torso",), "seed": 3, "body_in_view": True,
         "arms_ahead": 1.0, "exposure_s": EXPOSURE_S, "rolling_shutter_s": READOUT_S, **values,
     })  # fmt: skip
 
@@ -49,7 +49,7 @@ def test_a_frame_is_the_mean_over_the_exposure_of_each_row(lens):
     options = _options(**lens)
     renderer = build_renderers(options, draw_subject(options))[0]
     seen = video_renderer(renderer, options.camera()).render(1.0).astype(float)
-    expected = _brute(renderer, 1.0, 5, 16)
+    expected = _brute(renderer, 1.0, 5, 13)
     still = replace(renderer, exposure_s=0.0, rolling_shutter_s=0.0).render(1.0).astype(float)
     error = np.abs(seen - expected)
     # The default noise has a standard deviation of 2 grey levels, thus a mean absolute value of 1.6.
@@ -77,7 +77,7 @@ def test_a_frame_of_one_instant_keeps_the_renderer_of_single_instants():
 def test_projecting_the_viewing_rays_gives_the_pixels_back(lens):
     camera = _options(**lens).camera()
     grid = ray_grid(camera, margin_px=3)
-    assert grid.valid.shape == (102, 166)
-    pixels = project(camera, 2.5 * grid.in_cam.reshape(-1, 3)).reshape(102, 166, 2)
-    x, y = np.meshgrid(np.arange(-3, 163) + 0.5, np.arange(-3, 99) + 0.5)
+    assert grid.valid.shape == (86, 134)
+    pixels = project(camera, 2.5 * grid.in_cam.reshape(-1, 3)).reshape(86, 134, 2)
+    x, y = np.meshgrid(np.arange(-3, 131) + 0.5, np.arange(-3, 83) + 0.5)
     assert np.abs(pixels - np.stack([x, y], axis=-1))[grid.valid].max() < 1e-6
