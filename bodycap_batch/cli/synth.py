@@ -73,6 +73,9 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap synth hard/ --set exposure_s=0.02 --set rolling_shutter_s=0.02 --set body_in_view=true
       bodycap synth hidden/ --set body_in_view=true --set "pressed_s={left_palm: [2, 4]}"
       bodycap synth cloth/ --set body_in_view=true --set clothes=patterned --set hands_inward_deg=80
+      bodycap synth paint/ --set texture=0.1 --set auto_exposure=0.8 --set bit_rate_mbps=2
+      bodycap synth equal/ --set room=two_rooms
+      bodycap synth table/ --set body_in_view=true --set still=true --set "carried_s={left: [2, 6]}"
       bodycap synth apart/ --set clocks=free --set sound=on
       bodycap synth inertial/ --set imu=true
       bodycap synth steps/ --poses --set walk=gait --seconds 30

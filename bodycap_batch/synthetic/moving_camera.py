@@ -233,7 +233,7 @@ class MovingCamera:
         limit = 2.0 * max(margin, 8)
         out = np.clip(at - np.stack([x, y], axis=1), -limit, limit)
         out[(faces < 0) | (far <= 0) | ~np.isfinite(at[:, 0] + at[:, 1])] = 0.0
-        return out.astype(np.float32)
+        return np.asarray(out, dtype=np.float32)
 
 
 def _cropped(grid: RayGrid, border: int) -> RayGrid:

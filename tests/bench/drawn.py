@@ -213,7 +213,7 @@ CAPTURES = (
     Drawn(
         name="draw21", kind="quick turns, action cameras", final=False, seed=9121, seconds=7.0,
         motion="05_06", start_s=0.2, lens="action", readout_ms=15.0, exposure_ms=7.0, size=(960, 540),
-        cameras=("head", "torso", "left_palm"), bit_rate_mbps=4.0,
+        cameras=("head", "left_palm", "right_palm"), bit_rate_mbps=4.0,
     ),
     Drawn(
         name="draw22", kind="quick turns, action cameras", final=True, seed=9222, seconds=6.0,
