@@ -44,7 +44,7 @@ def _brute(renderer, t_s, instants, bands):
     return total / instants
 
 
-@pytest.mark.parametrize("lens", [{}, pytest.param(FISHEYE, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("lens", [{}, FISHEYE])
 def test_a_frame_is_the_mean_over_the_exposure_of_each_row(lens):
     options = _options(**lens)
     renderer = build_renderers(options, draw_subject(options))[0]
