@@ -19,7 +19,7 @@ LAYERS = (
     {"config"},
     {"capture"},
     {"telemetry"},
-    {"inertial"},
+    {"inertial", "tracks"},
     {
         "keyframes", "mapping", "registration", "merging", "export", "report", "preview", "evaluate",
         "synthetic", "check", "calibration", "clocks", "camera_places", "fill",

@@ -62,3 +62,22 @@ def read_mask(path: Path, size: tuple[int, int], stored_size: tuple[int, int] | 
         )
     mask.flags.writeable = False
     return mask
+
+
+def without_regions(mask: BoolArray | None, regions: BoolArray, size: tuple[int, int]) -> BoolArray | None:
+    """Return a mask in which some regions are not part of the room.
+
+    Args:
+        mask: (H,W) True where the room is visible; None if it is visible everywhere.
+        regions: (R,C) mask of cells that divide the picture evenly, True for each cell to leave out.
+        size: Width and height of the picture, pixels.
+
+    Returns:
+        Mask (H,W), True where the room is visible; `mask` itself if there are no regions.
+    """
+    import cv2
+
+    if not regions.any():
+        return mask
+    cells = cv2.resize(regions.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) == 0
+    return np.asarray(cells if mask is None else mask & cells)

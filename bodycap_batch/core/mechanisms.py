@@ -49,6 +49,7 @@ class Mechanism(StrEnum):
     START_DEPENDENCE = "start_dependence"
     PATH_SMOOTHING = "path_smoothing"
     STATIC_POINTS = "static_points"
+    FIXED_REGIONS = "fixed_regions"
     GAP_FILLING = "gap_filling"
     SENSOR_PATH = "sensor_path"
     LYING = "lying"

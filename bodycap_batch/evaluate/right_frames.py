@@ -36,6 +36,14 @@ _LENS_ERROR = 0.02
 """Relative error of a turned angle through an error of the focal length. Evidence: none."""
 _MAX_CHAIN_SIGMA_DEG = 5.0
 """Maximum standard deviation (degrees) of a chain of rotations across lost frames."""
+_MOVING_PERCENTILE = 75.0
+"""Percentile of the displacements of matches that stands for the room."""
+_MIN_SHIFT_PX = 6.0
+"""Minimum displacement of the room (px of the measured pictures) with which fixed matches are told apart."""
+_FIXED_SHARE = 0.2
+"""Maximum displacement of a match that is fixed to the camera, as a share of that of the room. Evidence: the
+hand beside a wrist camera gave wrong legs in 25 of 38 triples of a path whose rotations agree in 365 of 367
+pairs."""
 _STEPS = (5, 3, 2, 1)
 """Distances in frames that one step of a chain may have, in the order in which they are tried. Between near
 frames the pictures hardly tell a turn from a step to the side, and all errors have the same sign."""
@@ -258,8 +266,20 @@ def _measured_pair(features: Features, frames: tuple[int, int], rows: IntArray |
     first, second = features[frames[0]], features[frames[1]]
     if first is None or second is None:
         return MeasuredPair(rows=np.zeros((0, 2), dtype=np.int64), measured=None)
-    rows = match_features(first, second) if rows is None else rows
+    if rows is None:
+        rows = _not_fixed_to_camera(first, second, match_features(first, second))
     return MeasuredPair(rows=rows, measured=measure_rotation(_ray_matches(first, second, rows)))
+
+
+def _not_fixed_to_camera(first: FrameFeatures, second: FrameFeatures, rows: IntArray) -> IntArray:
+    """Leave out matches (M,2) that stay in the picture while it moves, for example on the own hand."""
+    if len(rows) == 0:
+        return rows
+    moved_px = (
+        np.linalg.norm(first.rays[rows[:, 0]] - second.rays[rows[:, 1]], axis=1) / first.pixel_rad[rows[:, 0]]
+    )
+    room_px = float(np.percentile(moved_px, _MOVING_PERCENTILE))
+    return rows if room_px < _MIN_SHIFT_PX else np.asarray(rows[moved_px >= _FIXED_SHARE * room_px])
 
 
 def _ray_matches(first: FrameFeatures, second: FrameFeatures, rows: IntArray) -> RayMatches:

@@ -215,7 +215,9 @@ def _refined(matches: RayMatches, rotation: FloatArray, *, turn: bool = True) ->
     noise_px = (
         max(_MIN_NOISE_PX, 1.48 * float(np.median(np.abs(residual[inliers])))) if inliers.any() else 1.0
     )
-    normal = jacobian[inliers].T @ jacobian[inliers] + 1e-9 * np.eye(5)
+    normal = jacobian[inliers].T @ jacobian[inliers]
+    # What the matches do not determine has a huge variance, also with an absurd lens.
+    normal += (1e-9 + 1e-12 * np.trace(normal)) * np.eye(5)
     return Motion(
         rotation=rotation,
         direction=direction,

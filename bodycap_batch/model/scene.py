@@ -91,6 +91,8 @@ class KeyframeSelection:
         gyro: Angular velocities that the gyroscope of the camera measured; None if it cannot be used.
         pictures: The frames that are no copies of the frame before; None if the video has no copies. Then all
             indices in this selection count these frames only.
+        fixed_regions: (R,C) mask of cells that divide the picture evenly, True where the picture is fixed to
+            the camera, for example by the own hand. An empty array means that nothing is fixed.
     """
 
     camera: str
@@ -104,8 +106,10 @@ class KeyframeSelection:
     matches: FrameMatches | None = None
     gyro: GyroRates | None = None
     pictures: Pictures | None = None
+    fixed_regions: BoolArray = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
 
     def __post_init__(self) -> None:
+        set_array(self, "fixed_regions", (None, None), np.bool_)
         set_array(self, "frames", (None,), np.int64)
         set_array(self, "damaged", (None,), np.int64)
         set_array(self, "sharpness", (self.frame_count,))

@@ -39,17 +39,23 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     """Select the keyframes; store them with copies of decoded frames and notes for the user."""
     from bodycap_batch.capture.damage import damage_notes
     from bodycap_batch.capture.kept import KEPT_NAME, FrameKeeper
+    from bodycap_batch.capture.masks import without_regions
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.keyframes import select_keyframes
     from bodycap_batch.model.copied_frames import copied_notes
     from bodycap_batch.model.frozen_frames import frozen_notes
     from bodycap_batch.telemetry.camera_rates import relate_gyro
+    from bodycap_batch.tracks import fixed_notes, fixed_regions_of
 
     camera = load_capture(task.capture, threads=context.threads).cameras[0]
     size = camera.camera
     telemetry, telemetry_notes = _telemetry(camera, task)
+    regions = fixed_regions_of(camera, context)
+    in_room = without_regions(camera.mask, regions, (size.width_px, size.height_px))
+    camera = replace(camera, mask=in_room)
     with FrameKeeper(files, size.width_px, size.height_px, camera.should_keep_all) as keeper:
         selection = select_keyframes(camera, task.options, context, keeper, with_matches=task.with_gyro)
+    selection = replace(selection, fixed_regions=regions)
     copies = copied_notes(camera.times_ns, selection.pictures)
     camera = camera.only(selection.pictures)
     if telemetry is not None:
@@ -60,7 +66,7 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     write_dataclass(selection, files, "keyframes")
     notes = [f"{camera.name}: {note}" for note in [*copies, *damage_notes(camera, selection.damaged)]]
     notes += frozen_notes(camera.name, selection.frozen, camera.common_times_ns() / 1e9)
-    notes += telemetry_notes
+    notes += [*telemetry_notes, *fixed_notes(camera.name, regions)]
     write_summary(files, frames=selection.frame_count, keyframes=len(selection.frames), notes=notes)
 
 

@@ -37,6 +37,7 @@ def load_capture(
         threads: Number of threads of each video decoder; 0 lets the decoder choose.
     """
     from bodycap_batch.capture import open_capture
+    from bodycap_batch.capture.masks import without_regions
 
     opened = open_capture(capture.config, threads)
     stored = keyframes or {}
@@ -45,7 +46,12 @@ def load_capture(
         artefact = stored.get(camera.name)
         if artefact is not None:
             selection = load_keyframes(artefact.path)
-            camera = replace(camera.only(selection.pictures), damaged=selection.damaged)  # noqa: PLW2901
+            size = (camera.camera.width_px, camera.camera.height_px)
+            camera = replace(  # noqa: PLW2901
+                camera.only(selection.pictures),
+                damaged=selection.damaged,
+                mask=without_regions(camera.mask, selection.fixed_regions, size),
+            )
         clock = camera.clock if clocks is None else clocks.cameras.get(camera.name, camera.clock)
         cameras.append(replace(camera, kept=_kept_frames(artefact), clock=clock))
     return replace(opened, cameras=tuple(cameras))

@@ -1,0 +1,80 @@
+"""Tracks of points through the frames of one camera's video."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
+from bodycap_batch.model.copied_frames import Pictures
+from bodycap_batch.model.optical_flow import Pixels
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointTracks:
+    """Points that optical flow follows from frame to frame.
+
+    A track begins in a cell of the picture that has none, and ends where the point is lost. Its positions
+    depend on the pixels of the video only.
+
+    Attributes:
+        camera: Camera name.
+        width_px: Width of the picture, pixels.
+        height_px: Height of the picture, pixels.
+        first: (N+1,) index of the first observation of each frame; the last entry is M.
+        track: (M,) number of the track of each observation. In each frame, the numbers increase.
+        px: (M,2) float32 positions, px, with COLMAP's origin. They are not corrected for a rolling shutter.
+    """
+
+    camera: str
+    width_px: int
+    height_px: int
+    first: IntArray
+    track: IntArray
+    px: Pixels
+
+    def __post_init__(self) -> None:
+        set_array(self, "first", (None,), np.int64)
+        set_array(self, "track", (None,), np.int64)
+        set_array(self, "px", (len(self.track), 2), np.float32)
+        if len(self.first) == 0 or self.first[-1] != len(self.track) or (np.diff(self.first) < 0).any():
+            raise ValueError("first: the observations of the frames must follow each other")
+
+    @property
+    def frame_count(self) -> int:
+        """Number N of frames."""
+        return len(self.first) - 1
+
+    def at(self, frame: int) -> tuple[IntArray, Pixels]:
+        """Return the track numbers (K,) and the positions (K,2) of the points in a frame."""
+        own = slice(int(self.first[frame]), int(self.first[frame + 1]))
+        return self.track[own], self.px[own]
+
+    def between(self, one: int, other: int) -> tuple[Pixels, Pixels]:
+        """Return the positions (K,2) in two frames of the tracks that both frames have."""
+        tracks, px = self.at(one)
+        other_tracks, other_px = self.at(other)
+        _, rows, other_rows = np.intersect1d(tracks, other_tracks, assume_unique=True, return_indices=True)
+        return px[rows], other_px[other_rows]
+
+    def select(self, keep: BoolArray) -> PointTracks:
+        """Return the tracks with a part of the observations.
+
+        Args:
+            keep: (M,) True for each observation to keep.
+        """
+        before = np.concatenate([[0], np.cumsum(keep)])
+        return replace(self, first=before[self.first], track=self.track[keep], px=self.px[keep])
+
+    def only(self, pictures: Pictures | None) -> PointTracks:
+        """Return the tracks in the frames that are no copies; unchanged for None."""
+        if pictures is None:
+            return self
+        keep = np.zeros(len(self.track), dtype=bool)
+        for frame in pictures.frames.tolist():
+            keep[self.first[frame] : self.first[frame + 1]] = True
+        counts = np.diff(self.first)[pictures.frames]
+        return replace(
+            self, first=np.concatenate([[0], np.cumsum(counts)]), track=self.track[keep], px=self.px[keep]
+        )
