@@ -127,8 +127,10 @@ def find_fixed_regions(tracks: PointTracks, times_ns: IntArray) -> BoolArray:
         np.add.at(votes[sector], (cell[:, 1], cell[:, 0]), is_fixed.astype(np.float64))
     in_sector = (total >= _MIN_VOTES) & (votes > 0.5 * total)
     fixed = (in_sector.sum(axis=0) >= _MIN_DIRECTIONS) & (votes.sum(axis=0) > 0.5 * total.sum(axis=0))
-    closed = cv2.morphologyEx(np.pad(fixed.astype(np.uint8), 2), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    count, label, statistics, _ = cv2.connectedComponentsWithStats(closed[2:-2, 2:-2], connectivity=8)
+    # The points are about two cells apart, and those on a fixed thing stay where they are.
+    between = np.ones((5, 5), np.uint8)
+    closed = cv2.morphologyEx(np.pad(fixed.astype(np.uint8), 3), cv2.MORPH_CLOSE, between)[3:-3, 3:-3]
+    count, label, statistics, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     large = [number for number in range(1, count) if statistics[number, cv2.CC_STAT_AREA] >= _MIN_CELLS]
     # Tracks leave the border of a fixed thing: its outline is between two cells.
     grown = cv2.dilate(np.isin(label, large).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

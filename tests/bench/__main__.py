@@ -25,6 +25,7 @@ from tests.bench import (
     field,
     inertial,
     joining,
+    lens_from_tracks,
     lenses,
     long,
     mappers,
@@ -68,6 +69,7 @@ _WITH_OPTIONS = {
     "inertial": inertial.main,
     "shutter": shutter.main,
     "lenses": lenses.main,
+    "lens": lens_from_tracks.main,
     "violent": violent.main,
     "mappers": mappers.main,
     "paired": paired.main,
@@ -96,7 +98,8 @@ def main() -> int:
         "plain surfaces), `shutter` (drawn readout times against global shutters), `mappers` (the "
         "incremental and the global mapper), `paired` (two versions on perturbed captures), `real` (the "
         "table of the real captures), `measure` (how well the pictures judge poses), `synth` (seconds of a "
-        "rendered frame), `drawn` (renders the drawn captures), and `long` (ten minutes of three cameras)",
+        "rendered frame), `drawn` (renders the drawn captures), "
+        "`lens` (the lens from tracks), and `long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)

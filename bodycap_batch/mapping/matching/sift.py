@@ -31,6 +31,10 @@ _CONTRAST_THRESHOLD = 0.02
 """Contrast threshold of the detector. It is half of OpenCV's default, because blurred walls and ceilings
 have little contrast. Evidence: docs/decisions/mapping.md."""
 
+_MASK_SURPLUS = 3
+"""Number of features that are detected for each feature that is kept, if a part of the picture is left out.
+Many of them lie there: the hand beside a wrist camera has most of the texture. Evidence:
+docs/decisions/tracks.md."""
 _POOR_RATIO = 0.5
 """Fraction of the maximum number of features below which a frame is poor in features. Features of such a
 frame are detected again in the full frame, with `_POOR_CONTRAST_THRESHOLD`. Evidence:
@@ -68,13 +72,17 @@ def extract_features(
     import cv2
 
     detectors = [
-        cv2.SIFT.create(count, contrastThreshold=_CONTRAST_THRESHOLD, enable_precise_upscale=True)
+        cv2.SIFT.create(
+            count * (1 if camera.mask is None else _MASK_SURPLUS),
+            contrastThreshold=_CONTRAST_THRESHOLD,
+            enable_precise_upscale=True,
+        )
         for _ in range(context.threads)
     ]
     if context.threads == 1:
         for index, rgb in camera.read(frames, colour=True):
             context.check_cancelled()
-            yield index, _detect_features(detectors[0], camera, rgb)
+            yield index, _detect_features(detectors[0], camera, rgb, count)
         return
     free: SimpleQueue[Any] = SimpleQueue()
     for detector in detectors:
@@ -83,7 +91,7 @@ def extract_features(
     def work(rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
         detector = free.get()
         try:
-            return _detect_features(detector, camera, rgb)
+            return _detect_features(detector, camera, rgb, count)
         finally:
             free.put(detector)
 
@@ -99,11 +107,13 @@ def extract_features(
             yield frame, job.result()
 
 
-def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
+def _detect_features(
+    detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.uint8], requested: int
+) -> SiftFeatures:
     """Return the features of one RGB image (H,W,3) that lie where the room is visible.
 
     Features are detected in a reduced image. If there are few, for example on a bare ceiling, they are
-    detected in the full frame.
+    detected in the full frame. At most `requested` features are returned, the strongest ones.
     """
     import cv2
 
@@ -114,7 +124,7 @@ def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.u
     grey = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
     found, raw = detector.detectAndCompute(grey, None)
     count = detector.getNFeatures()
-    if len(found) < _POOR_RATIO * count and mechanisms.is_on(Mechanism.SECOND_DETECTION):
+    if len(found) < _POOR_RATIO * requested and mechanisms.is_on(Mechanism.SECOND_DETECTION):
         mechanisms.record(Mechanism.SECOND_DETECTION)
         sensitive = cv2.SIFT.create(
             count, contrastThreshold=_POOR_CONTRAST_THRESHOLD, enable_precise_upscale=True
@@ -129,6 +139,9 @@ def _detect_features(detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.u
     shape = np.array([(keypoint.size * scale[0] / 2.0, np.radians(keypoint.angle)) for keypoint in found])
     keypoints = np.column_stack([pixels, shape]).astype(np.float32)
     keep = camera.is_unmasked(keypoints[:, :2])
+    if keep.sum() > requested:
+        response = np.where(keep, [keypoint.response for keypoint in found], -np.inf)
+        keep[np.argsort(-response, kind="stable")[requested:]] = False
     keypoints = keypoints[keep]
     column = np.clip(keypoints[:, 0].astype(int), 0, width - 1)
     row = np.clip(keypoints[:, 1].astype(int), 0, height - 1)

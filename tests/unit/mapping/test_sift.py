@@ -23,6 +23,7 @@ class _Blobs:
 
     def __init__(self, hidden_left_px: float = 0.0) -> None:
         self._hidden = hidden_left_px
+        self.mask = None if not hidden_left_px else np.arange(640) >= np.full((480, 1), hidden_left_px)
 
     def is_unmasked(self, px: np.ndarray) -> np.ndarray:
         return px[:, 0] >= self._hidden
@@ -70,6 +71,23 @@ def test_nothing_is_found_under_a_mask(tmp_path: Path) -> None:
     assert len(found.keypoints) > 0
     assert len(found.keypoints) == len(found.descriptors) == len(found.rgb)
     assert found.keypoints[:, 0].min() >= 300.0
+
+
+def test_a_masked_picture_has_as_many_features_in_the_room_as_requested(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    noise = cv2.GaussianBlur(rng.normal(0.0, 1.0, (480, 640)), (0, 0), 4.0)
+    # The hidden left half has three times the contrast, so it holds the strongest features of the picture.
+    gain = np.where(np.arange(640) < 320, 120.0, 40.0)
+    image = np.clip(128 + gain * noise / np.abs(noise).max(), 0, 255).astype(np.uint8)
+
+    class Hand(_Blobs):
+        def read(self, frames: np.ndarray, *, colour: bool) -> Iterator[tuple[int, np.ndarray]]:
+            yield from ((int(frame), np.repeat(image[..., None], 3, axis=2)) for frame in frames)
+
+    context = StageContext(work_dir=tmp_path)
+    ((_, found),) = extract_features(cast(CaptureCamera, Hand(320.0)), np.array([0]), 400, context)
+    assert found.keypoints[:, 0].min() >= 320.0
+    assert 200 < len(found.keypoints) <= 400
 
 
 @pytest.mark.parametrize(("contrast", "searched_again"), [(60, False), (14, True)])

@@ -1,5 +1,8 @@
 """Estimate the lens of a camera from the tracks of its video, before there is a map.
 
+This is a candidate that jobs do not use yet: `python -m tests.bench lens [FOLDER...]` compares it with given
+lenses. Evidence: docs/decisions/tracks.md.
+
 Two pictures of a rigid room determine the lens together with the relative pose, if the camera turned between
 them: a wrong lens bends the lines of sight, and no pose makes them meet. One picture pair says little; all
 pairs of a video have the same lens.
@@ -7,16 +10,24 @@ pairs of a video have the same lens.
 
 from __future__ import annotations
 
+import argparse
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from bodycap_batch.capture import open_capture
+from bodycap_batch.config.job import load_job
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import so3_exp
-from bodycap_batch.model.lens_estimate import LensEstimate
 from bodycap_batch.model.optical_flow import pixel_scale, unit_directions
 from bodycap_batch.model.point_tracks import PointTracks
+from bodycap_batch.tracks import PointTracker, find_fixed_regions
+from bodycap_batch.tracks.fixed_regions import in_regions
+from tests.bench.rows import DATA
 
 _PAIRS = 36
 """Number of pairs of frames. Evidence: docs/decisions/tracks.md."""
@@ -69,6 +80,33 @@ _SIGMA_FACTOR = 3.0
 clips with known lenses, the root mean square error was three times the bootstrap's deviation."""
 _SEED = 0
 """Seed of these draws."""
+
+
+_MAX_SIGMA = 0.1
+"""Maximum relative standard deviation of a focal length that enters the map. That of the typical field of
+view, which is taken otherwise, is 0.3."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensEstimate:
+    """The lens of a camera as the tracks of its video determine it.
+
+    Attributes:
+        lens: The intrinsics; the principal point is the centre of the picture.
+        focal_sigma: Relative standard deviation of the focal length.
+        pairs: Number of pairs of frames.
+        error_px: Median distance of the points from their epipolar lines, px.
+    """
+
+    lens: Camera
+    focal_sigma: float
+    pairs: int
+    error_px: float
+
+    @property
+    def is_determined(self) -> bool:
+        """True if the tracks determine the focal length well enough for the map."""
+        return self.focal_sigma < _MAX_SIGMA
 
 
 _Poses = tuple[FloatArray, FloatArray]
@@ -386,3 +424,41 @@ def _step(poses: _Poses, rays: _Rays, error_px: float) -> _Poses:
     moved = translation + np.einsum("pij,pj->pi", tangent, change[:, 3:])
     moved /= np.linalg.norm(moved, axis=1, keepdims=True)
     return np.asarray(so3_exp(change[:, :3]) @ rotation), np.asarray(moved)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print the estimated lens of each camera of some captures beside the given one; return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench lens", description=__doc__)
+    parser.add_argument(
+        "folders", nargs="*", type=Path, help="captures (default: walk12, room12, tum_fr1_xyz)"
+    )
+    options = parser.parse_args(arguments)
+    folders = options.folders or [DATA / name for name in ("walk12", "room12", "tum_fr1_xyz")]
+    for folder in folders:
+        for camera in open_capture(load_job(folder.resolve()).capture).cameras:
+            lens = camera.camera
+            tracker = PointTracker(camera=camera.name, width_px=lens.width_px, height_px=lens.height_px)
+            for index, grey in camera.read_decodable(np.arange(len(camera.times_ns))):
+                tracker.add(index, grey)
+            every = tracker.tracks(len(camera.times_ns))
+            regions = find_fixed_regions(every, camera.times_ns)
+            fixed = in_regions(every.px, regions, (lens.width_px, lens.height_px))
+            found = estimate_lens(every.select(~fixed), camera.times_ns)
+            sys.stdout.write(f"{folder.name:16} {camera.name:16} {_line(lens, found)}\n")
+            sys.stdout.flush()
+    return 0
+
+
+def _line(given: Camera, found: LensEstimate | None) -> str:
+    """Return the estimate, and the error of the angle of a pixel at a fifth of the width from the centre."""
+    if found is None:
+        return "too little motion"
+    text = (
+        f"{found.lens.model:22} f {found.lens.focal_px:7.1f} px +- {100 * found.focal_sigma:4.1f} %, "
+        f"distortion {found.lens.params[3]:+.3f}, {found.error_px:.2f} px"
+    )
+    if given.refine:
+        return text
+    px = np.array([[given.principal_point_px[0] + 0.2 * given.width_px, given.principal_point_px[1]]])
+    angles = [float(np.linalg.norm(np.arctan(each.unproject(px)))) for each in (given, found.lens)]
+    return f"{text}; given {given.focal_px:.1f} px, angle {100 * (angles[1] / angles[0] - 1):+.1f} %"

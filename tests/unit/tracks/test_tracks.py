@@ -1,0 +1,138 @@
+"""Tracks of points, parts of the picture that are fixed to the camera, and the lens from tracks."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from bodycap_batch.capture.masks import without_regions
+from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.model.copied_frames import Pictures
+from bodycap_batch.model.optical_flow import GreyImage
+from bodycap_batch.model.point_tracks import PointTracks
+from bodycap_batch.tracks import PointTracker, find_fixed_regions, fixed_notes
+from bodycap_batch.tracks.fixed_regions import in_regions
+
+WIDTH, HEIGHT, FPS = 320, 240, 30
+
+
+def room() -> GreyImage:
+    """Return a large random texture, of which the pictures show a part."""
+    noise = np.random.default_rng(3).uniform(0, 255, (90, 120)).astype(np.float32)
+    return np.asarray(cv2.resize(noise, (960, 720), interpolation=cv2.INTER_CUBIC).clip(0, 255), np.uint8)
+
+
+def picture(texture: GreyImage, shift: FloatArray) -> GreyImage:
+    """Return the part of a texture that begins at a position (x, y), px."""
+    moved = np.array([[1.0, 0.0, -shift[0]], [0.0, 1.0, -shift[1]]])
+    return np.asarray(cv2.warpAffine(texture, moved, (WIDTH, HEIGHT)), np.uint8)
+
+
+def with_hand(image: GreyImage) -> GreyImage:
+    """Return a picture whose lower left quarter is a texture that is fixed to the camera."""
+    hand = cv2.resize(
+        np.random.default_rng(9).uniform(0, 255, (30, 40)).astype(np.float32), (WIDTH // 2, HEIGHT // 2)
+    )
+    out = image.copy()
+    out[HEIGHT // 2 :, : WIDTH // 2] = hand.astype(np.uint8)
+    return out
+
+
+def path(count: int, directions: int) -> FloatArray:
+    """Return positions (N,2), px, of a view that moves along one or two directions."""
+    time = np.arange(count) / FPS
+    x, y = 300 + 100 * np.sin(2 * np.pi * time), 240 + 80 * np.sin(2 * np.pi * time / 1.7)
+    return np.column_stack([x, y if directions == 2 else np.full(count, 240.0)])
+
+
+def tracked(images: list[GreyImage], mask: BoolArray | None = None) -> PointTracks:
+    tracker = PointTracker(camera="palm", width_px=WIDTH, height_px=HEIGHT, mask=mask)
+    for index, image in enumerate(images):
+        tracker.add(index, image)
+    return tracker.tracks(len(images))
+
+
+def times(count: int) -> np.ndarray:
+    return (np.arange(count) * 1e9 / FPS).astype(np.int64)
+
+
+def test_points_follow_the_picture_to_a_tenth_of_a_pixel() -> None:
+    texture, shifts = room(), path(20, 2)
+    tracks = tracked([picture(texture, shift) for shift in shifts])
+    first, last = tracks.between(2, 12)
+    assert len(first) > 80
+    error = last - first - (shifts[2] - shifts[12])
+    # A random texture is tracked to some hundredths of a pixel a frame.
+    assert np.median(np.linalg.norm(error, axis=1)) < 0.1
+
+
+def test_points_are_followed_through_a_sudden_turn() -> None:
+    texture = room()
+    shifts = np.array([[300.0, 240.0]] * 3 + [[400.0, 240.0]] * 3)  # 100 px, a third of the picture
+    tracks = tracked([picture(texture, shift) for shift in shifts])
+    first, last = tracks.between(2, 3)
+    assert len(first) > 40
+    assert np.median(np.abs(last - first + [100.0, 0.0])) < 0.2
+
+
+def test_masked_pixels_have_no_new_points() -> None:
+    mask = np.ones((HEIGHT, WIDTH), dtype=bool)
+    mask[:, : WIDTH // 2] = False
+    tracks = tracked([picture(room(), np.array([300.0, 240.0]))], mask)
+    assert len(tracks.px) > 50
+    assert (tracks.px[:, 0] >= WIDTH // 2).all()
+
+
+def test_the_tracks_after_a_restart_are_others() -> None:
+    image = picture(room(), np.array([300.0, 240.0]))
+    tracker = PointTracker(camera="palm", width_px=WIDTH, height_px=HEIGHT)
+    tracker.add(0, image)
+    tracker.restart()
+    tracker.add(1, image)
+    assert len(tracker.tracks(2).between(0, 1)[0]) == 0
+
+
+def test_the_frames_that_are_no_copies_keep_their_tracks() -> None:
+    tracks = tracked([picture(room(), shift) for shift in path(6, 2)])
+    pictures = Pictures(frames=np.array([0, 2, 5]), times_ns=times(6)[[0, 2, 5]])
+    kept = tracks.only(pictures)
+    assert kept.frame_count == 3
+    assert np.array_equal(kept.at(2)[1], tracks.at(5)[1])
+
+
+def test_a_hand_in_view_is_found_while_the_camera_turns() -> None:
+    texture, count = room(), 90
+    tracks = tracked([with_hand(picture(texture, shift)) for shift in path(count, 2)])
+    regions = find_fixed_regions(tracks, times(count))
+    rows, columns = regions.shape
+    # No tracks begin at the border of the hand.
+    assert regions[rows // 2 + 3 : rows - 1, 1 : columns // 2 - 6].mean() > 0.9
+    assert regions[: rows // 2 - 2].mean() < 0.02
+    assert "is left out" in fixed_notes("palm", regions)[0]
+    mask = without_regions(None, regions, (WIDTH, HEIGHT))
+    assert mask is not None
+    assert not mask[HEIGHT - 30, 40]
+    assert mask[20, 40]
+    both = np.array([[40.0, HEIGHT - 30.0], [40.0, 20.0]])
+    assert in_regions(both, regions, (WIDTH, HEIGHT)).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("directions", [1, 2])
+def test_nothing_is_fixed_in_a_picture_of_the_room(directions: int) -> None:
+    texture, count = room(), 90
+    tracks = tracked([picture(texture, shift) for shift in path(count, directions)])
+    regions = find_fixed_regions(tracks, times(count))
+    assert not regions.any()
+    assert fixed_notes("palm", regions) == []
+    assert without_regions(None, regions, (WIDTH, HEIGHT)) is None
+
+
+def test_a_thing_that_moves_in_front_of_a_still_camera_does_not_mask_the_room() -> None:
+    still, thing, count = picture(room(), np.array([300.0, 240.0])), room()[:80, :80], 90
+    images = []
+    for x, y in (path(count, 2) - [300, 240]) * 0.6 + [120, 80]:
+        image = still.copy()
+        image[int(y) : int(y) + 80, int(x) : int(x) + 80] = thing
+        images.append(image)
+    assert not find_fixed_regions(tracked(images), times(count)).any()
