@@ -8,7 +8,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from pydantic import ValidationError
 
@@ -610,11 +610,16 @@ def _out(path: Path, source: YamlSource | None, name: Any, out: Any, overrides: 
     folder = path if source is None else path.parent
     if overrides.out is not None:
         return overrides.out.resolve()
-    if isinstance(out, str | Path):
+    if isinstance(out, Path) or _is_path_text(out):
         return (folder / out).resolve()
     own = (folder.parent if _is_folder(path, source) else folder) / RESULTS
-    named = name if isinstance(name, str) and name else safe_name(_name(path, source))
+    named = name if _is_path_text(name) and name else safe_name(_name(path, source))
     return ((overrides.out_parent or own) / named).resolve()
+
+
+def _is_path_text(value: object) -> TypeGuard[str]:
+    """Return True for a text that a path can hold: without unpaired surrogates, which are refused later."""
+    return isinstance(value, str) and value.encode("utf-8", "ignore").decode() == value
 
 
 def _require_apart(job: Job, full: Path) -> None:

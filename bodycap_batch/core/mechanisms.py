@@ -114,7 +114,7 @@ def is_on(mechanism: Mechanism) -> bool:
     return mechanism not in switched_off()
 
 
-def record(mechanism: Mechanism, times: int = 1) -> None:
+def record_act(mechanism: Mechanism, times: int = 1) -> None:
     """Record that a mechanism acted: that it changed a result, `times` times."""
     if times > 0:
         _task.acted[mechanism] += times

@@ -39,7 +39,7 @@ _MAX_CHAIN_SIGMA_DEG = 5.0
 _MOVING_PERCENTILE = 75.0
 """Percentile of the displacements of matches that stands for the room."""
 _MIN_SHIFT_PX = 6.0
-"""Minimum displacement of the room (px of the measured pictures) with which fixed matches are told apart."""
+"""Minimum displacement of the room (px of the measured pictures) with which fixed matches differ from it."""
 _FIXED_SHARE = 0.2
 """Maximum displacement of a match that is fixed to the camera, as a share of that of the room. Evidence: the
 hand beside a wrist camera gave wrong legs in 25 of 38 triples of a path whose rotations agree in 365 of 367

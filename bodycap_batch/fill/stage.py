@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.fill.contacts import STAND, Contacts, find_contacts
 from bodycap_batch.fill.floor_height import FloorHeight, floor_below_legs, lifted_steps
 from bodycap_batch.fill.foot_paths import REACH_SHARE, foot_path, kept_steps, reachable_steps
@@ -82,7 +81,7 @@ def fill_motion(
         steps, floor = lifted_steps(steps, floor, world, contacts, legs)
     context.progress(2, _PROGRESS_STEPS, "pelvis")
     reclined = np.zeros(len(world))
-    may_lie = mechanisms.is_on(Mechanism.LYING)
+    may_lie = is_on(Mechanism.LYING)
     if may_lie and legs is not None and split_side(skeleton.roles[first])[0] == "":
         reclined = reclined_share(world[:, first], floor.height_m, legs[0].length_m)
     if first != 0:
@@ -95,7 +94,7 @@ def fill_motion(
     if legs is not None:
         steps, missed = _fill_legs(skeleton, legs, steps, signals, world, filled)
         if reclined.any():
-            mechanisms.record(Mechanism.LYING, int((reclined > 0.0).sum()))
+            record_act(Mechanism.LYING, int((reclined > 0.0).sum()))
             missed |= (reclined > 0.0)[:, None]
             steps = kept_steps(steps, missed)
             for leg in legs:

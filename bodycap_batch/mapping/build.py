@@ -11,10 +11,9 @@ import numpy as np
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import NO_MOTION_HINT, EstimationError
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, record_act
 from bodycap_batch.mapping.initial_models import reconstruct_with_intrinsics
 from bodycap_batch.mapping.inputs import (
     calibrated_camera_ids,
@@ -215,7 +214,7 @@ def build_map_once(
     mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, skeletal_above)
     generator = PairGenerator(workspace, refs, frame_times_ns(capture), options, context)
     skeletal = generator.reduced() if mapping.is_large(len(refs)) else generator
-    mechanisms.record(Mechanism.SKELETAL_SET, int(skeletal is not generator))
+    record_act(Mechanism.SKELETAL_SET, int(skeletal is not generator))
     tried, match_log = match_keyframes(skeletal, workspace, intrinsics_of(capture), context)
     uncalibrated = {number: name for name, number in ids.items() if capture.camera(name).camera.refine}
     models, initial_log = reconstruct_with_intrinsics(mapping, options, uncalibrated, len(skeletal.refs))

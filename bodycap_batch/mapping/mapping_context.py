@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 
@@ -44,4 +43,4 @@ class MappingContext:
         A large map is built from skeletal keyframes (the reduced set of keyframes, Snavely's skeletal set).
         If keyframes are added to a large map, only the new keyframes are adjusted.
         """
-        return keyframes > self.skeletal_above and mechanisms.is_on(Mechanism.SKELETAL_SET)
+        return keyframes > self.skeletal_above and is_on(Mechanism.SKELETAL_SET)

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.reconstruction.incremental_mapper import opened_mapper
 from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, registered_ids
@@ -56,7 +55,7 @@ def join_models(models: Sequence[Any], context: MappingContext) -> tuple[list[An
     """
     if not models:
         return [], []
-    if not mechanisms.is_on(Mechanism.JOIN_MODELS):
+    if not is_on(Mechanism.JOIN_MODELS):
         return list(models), []
     main, rest, log = models[0], list[Any](), list[dict[str, object]]()
     for further in models[1:]:
@@ -82,7 +81,7 @@ def join_models(models: Sequence[Any], context: MappingContext) -> tuple[list[An
             rest.append(further)
         else:
             main = joined
-            mechanisms.record(Mechanism.JOIN_MODELS)
+            record_act(Mechanism.JOIN_MODELS)
     return [main, *rest], log
 
 

@@ -11,10 +11,9 @@ from typing import Any
 
 from bodycap_batch.capture import Capture, CaptureCamera
 from bodycap_batch.config import MapOptions
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.inertial.camera_rotation import related_to_poses
 from bodycap_batch.mapping.inputs import calibrated_camera_ids, make_mapping_context
 from bodycap_batch.mapping.intrinsics.readout_time import (
@@ -253,14 +252,14 @@ class _Refinement:
         largest = min(_MAX_KEYFRAMES, self.mapping.skeletal_above)
         if not built_for_shutters or len(self.scene_map.keyframe_camera) > largest:
             return None
-        if not mechanisms.is_on(Mechanism.JOINT_VELOCITIES):
+        if not is_on(Mechanism.JOINT_VELOCITIES):
             return None
         model = rolling.with_exact_rates(readout_s, readout_s.keys()).corrected(readout_s)
         removed = remove_dominant_points(model)
         adjusted = rolling.adjust_with_velocities(model, readouts, self.from_matches, self.equal_cameras)
         if adjusted is None:
             return None
-        mechanisms.record(Mechanism.JOINT_VELOCITIES)
+        record_act(Mechanism.JOINT_VELOCITIES)
         adjust_robustly(model, self.mapping.mapper_options(), self.mapping.calibrated_ids)
         refined = self._finished(rolling, model, adjusted.readouts, removed)
         return replace(refined, error_scales=adjusted.error_scales)

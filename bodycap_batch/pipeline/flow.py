@@ -13,9 +13,8 @@ from typing import Any
 from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_POSED
 from bodycap_batch.config.models import CameraConfig, Job
 from bodycap_batch.config.mounts import MOTION_PLACES, mount_of
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.errors import BodycapError, CaptureError, EstimationError, JobError
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on
 from bodycap_batch.core.progress import RECONSTRUCTION, Event
 from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.pipeline.inputs import (
@@ -228,7 +227,7 @@ class Flow:
             frames is not used. Frames whose pose a round withdraws, because they contradict the map, were
             wrong before and do not count as lost.
         """
-        rounds = self._job.registration.rounds if mechanisms.is_on(Mechanism.EXTENSION) else 0
+        rounds = self._job.registration.rounds if is_on(Mechanism.EXTENSION) else 0
         for _ in range(rounds):
             summaries = {name: read_summary(artefact.path) for name, artefact in registrations.items()}
             wanted = {name: summary["wanted"] for name, summary in summaries.items() if summary["wanted"]}
@@ -258,9 +257,9 @@ class Flow:
         corrected keypoints.
         """
         rolling = any(read_summary(artefact.path)["rolling"] for artefact in registrations.values())
-        if not rolling or not mechanisms.is_on(Mechanism.REFINEMENT):
+        if not rolling or not is_on(Mechanism.REFINEMENT):
             return scene_map, registrations
-        passes = _REFINEMENTS if mechanisms.is_on(Mechanism.SECOND_REFINEMENT) else 1
+        passes = _REFINEMENTS if is_on(Mechanism.SECOND_REFINEMENT) else 1
         for number in range(passes):
             task = RefineTask(
                 options=self._job.map,
@@ -274,7 +273,7 @@ class Flow:
                 break
             self._map_round += 1
             again = None
-            if summary["distorted"] and number + 1 < passes and mechanisms.is_on(Mechanism.REBUILT_MAP):
+            if summary["distorted"] and number + 1 < passes and is_on(Mechanism.REBUILT_MAP):
                 again = self._rebuilt(scene_map, registrations, keyframes)
             if again is None:
                 again = scene_map, self.register(scene_map, keyframes, registrations)
@@ -351,7 +350,7 @@ class Flow:
         off = {
             field: False
             for field, mechanism in (("gaps", Mechanism.GAP_FILLING), ("smoothing", Mechanism.SENSOR_PATH))
-            if not mechanisms.is_on(mechanism)
+            if not is_on(mechanism)
         }
         options = self._job.telemetry.model_copy(update=off)
         if not (options.gravity or options.smoothing or options.gaps or options.gps):
@@ -559,7 +558,7 @@ class Flow:
         """Yield one task for every camera with enough lost frames and enough localised frames."""
         for own in self._capture.cameras:
             summary = read_summary(registrations[own.name].path)
-            if not mechanisms.is_on(Mechanism.RECOVERY):
+            if not is_on(Mechanism.RECOVERY):
                 continue
             if not LEAST_POSED <= summary["localised"] <= summary["frames"] - LEAST_LOST:
                 continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bodycap_batch.core import mechanisms
+from bodycap_batch.core.mechanisms import KEY_OPTION, switched_off
 from bodycap_batch.runner import Task
 from bodycap_batch.store.artefacts import ArtefactKey
 from bodycap_batch.store.code_version import Program
@@ -48,8 +48,8 @@ def artefact_key(stage: Stage[TaskT], task: TaskT) -> ArtefactKey:
 
 def _options(task: object) -> dict[str, object]:
     """Return the options of a task for its key, and the mechanisms that are switched off."""
-    off = sorted(item.value for item in mechanisms.switched_off())
-    return {**key_options(task), **({mechanisms.KEY_OPTION: off} if off else {})}
+    off = sorted(item.value for item in switched_off())
+    return {**key_options(task), **({KEY_OPTION: off} if off else {})}
 
 
 def program_of(stage: Stage[TaskT]) -> Program:

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import (
     EXIT_BUG,
@@ -30,6 +29,7 @@ from bodycap_batch.core.errors import (
     JobError,
     StoreError,
 )
+from bodycap_batch.core.mechanisms import acted, begin_task
 from bodycap_batch.core.memory import exempt_from_collection, release_memory
 from bodycap_batch.core.progress import StepProgress
 from bodycap_batch.runner.memory_limit import (
@@ -165,7 +165,7 @@ def _run(task: Task, store: Store, function: TaskFunction, parent: _Parent) -> N
     release_memory()
     exempt_from_collection()
     _reset_peak_memory()
-    mechanisms.begin_task(task.key.options)
+    begin_task(task.key.options)
     for artefact in dict.fromkeys(store.artefacts_in(task.arguments)):
         store.verify(artefact)
     with store.draft(task.key) as draft, DiskFailures(store):
@@ -183,7 +183,7 @@ def _run(task: Task, store: Store, function: TaskFunction, parent: _Parent) -> N
             "cpu_seconds": round(time.process_time() - cpu_before, 3),
             "peak_memory_mb": round(peak_memory_mb(), 1),
             "threads": task.threads,
-            "acted": mechanisms.acted(),
+            "acted": acted(),
         }
         store.commit(draft, task.key, made, before=parent.before_commit, replace=task.replaces)
     parent.messages.send("done", **made)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.model.optical_flow import Pixels, pixel_scale
 from bodycap_batch.model.point_tracks import PointTracks
 from bodycap_batch.tracks.tracker import PointTracker
@@ -63,7 +62,7 @@ def fixed_regions_of(camera: CaptureCamera, context: StageContext) -> BoolArray:
     tracker = PointTracker(
         camera=camera.name, width_px=lens.width_px, height_px=lens.height_px, mask=camera.mask
     )
-    if count < 2 or not mechanisms.is_on(Mechanism.FIXED_REGIONS):
+    if count < 2 or not is_on(Mechanism.FIXED_REGIONS):
         return find_fixed_regions(tracker.tracks(0), camera.times_ns[:0])
     stretches = [(0, count)]
     if count > _ALL_FRAMES:
@@ -79,7 +78,7 @@ def fixed_regions_of(camera: CaptureCamera, context: StageContext) -> BoolArray:
                 context.progress(done + index - start, total, "frames searched for the own hand")
         done += stop - start
     found = find_fixed_regions(tracker.tracks(count), camera.times_ns)
-    mechanisms.record(Mechanism.FIXED_REGIONS, int(found.any()))
+    record_act(Mechanism.FIXED_REGIONS, int(found.any()))
     return found
 
 

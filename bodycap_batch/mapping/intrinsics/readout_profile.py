@@ -12,9 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bodycap_batch.capture import Capture, CaptureCamera
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on
 from bodycap_batch.mapping.intrinsics.readout_time import (
     Readout,
     few_blocks_factor,
@@ -169,7 +168,7 @@ def estimate_from_matches(capture: Capture, selections: Sequence[KeyframeSelecti
     Source: Ringaby, Forssén, "Efficient video rectification and stabilisation for cell-phones", IJCV 2012,
         for the readout time from the rotation of the camera.
     """
-    if not mechanisms.is_on(Mechanism.READOUT_PROFILE):
+    if not is_on(Mechanism.READOUT_PROFILE):
         return {}
     profiles: dict[str, _Profile] = {}
     sideways: dict[str, bool] = {}

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust, sub_model
 from bodycap_batch.mapping.reconstruction.camera_motion import CameraMotion, camera_motions
@@ -239,7 +238,7 @@ def groups_of_equal_cameras(cameras: Iterable[CaptureCamera]) -> list[list[str]]
 
     These cameras may be of one model.
     """
-    if not mechanisms.is_on(Mechanism.EQUAL_CAMERAS):
+    if not is_on(Mechanism.EQUAL_CAMERAS):
         return [[camera.name] for camera in cameras]
     groups: dict[object, list[str]] = {}
     for camera in cameras:

@@ -9,9 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from bodycap_batch.capture import Capture
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.map_diagnostics import RefinedIntrinsics
 from bodycap_batch.model.scene import Map, MapResult
@@ -67,7 +66,7 @@ def _recalibrate(
             `_is_better_map`.
     """
     misfits = result.diagnostics.misfit_factors or {}
-    if not misfits or not mechanisms.is_on(Mechanism.RECALIBRATION):
+    if not misfits or not is_on(Mechanism.RECALIBRATION):
         return result
     given = {name: capture.camera(name).camera for name in misfits}
     guesses = {name: _initial_guess(given[name], misfits[name]) for name in misfits}

@@ -13,9 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.config import MapOptions
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     ImageRef,
@@ -84,13 +83,13 @@ def exclude_flipped_cameras(
         The keyframes of each remaining camera; the stage's options, in which the initial pair is removed if
         it names an excluded camera; the diagnostics on mirrored cameras.
     """
-    if len(selections) < 2 or not mechanisms.is_on(Mechanism.FLIPPED_CAMERAS):
+    if len(selections) < 2 or not is_on(Mechanism.FLIPPED_CAMERAS):
         return list(selections), options, MapDiagnostics()
     cameras = [item.camera for item in selections]
     flipped, undecided = label_cameras(cameras, _pair_evidence(workspace, selections))
     if not flipped:
         return list(selections), options, MapDiagnostics(undecided_groups=undecided)
-    mechanisms.record(Mechanism.FLIPPED_CAMERAS, len(flipped))
+    record_act(Mechanism.FLIPPED_CAMERAS, len(flipped))
     rewrite_without_cameras(workspace, flipped)
     lost = flipped & {name.rpartition(":")[0] for name in options.init_frames or ()}
     if lost:

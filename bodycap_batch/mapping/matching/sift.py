@@ -13,10 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.mapping.matching.descriptors import DESCRIPTOR_NORM
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
 
@@ -124,8 +123,8 @@ def _detect_features(
     grey = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
     found, raw = detector.detectAndCompute(grey, None)
     count = detector.getNFeatures()
-    if len(found) < _POOR_RATIO * requested and mechanisms.is_on(Mechanism.SECOND_DETECTION):
-        mechanisms.record(Mechanism.SECOND_DETECTION)
+    if len(found) < _POOR_RATIO * requested and is_on(Mechanism.SECOND_DETECTION):
+        record_act(Mechanism.SECOND_DETECTION)
         sensitive = cv2.SIFT.create(
             count, contrastThreshold=_POOR_CONTRAST_THRESHOLD, enable_precise_upscale=True
         )

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.mapping.reconstruction.conversion import camera_from_pycolmap
 from bodycap_batch.model.geometry import transform_points
 from bodycap_batch.model.reprojection_derivatives import pose_derivatives, projection_jacobian
@@ -44,7 +43,7 @@ def remove_dominant_points(model: pycolmap.Reconstruction) -> int:
     Source: Baarda, "A testing procedure for use in geodetic networks", 1968: the redundancy number of an
         observation is 1 minus its leverage.
     """
-    if not mechanisms.is_on(Mechanism.DOMINANT_POINTS):
+    if not is_on(Mechanism.DOMINANT_POINTS):
         return 0
     removed = 0
     images = set(map(int, model.reg_image_ids()))
@@ -56,7 +55,7 @@ def remove_dominant_points(model: pycolmap.Reconstruction) -> int:
         for number in sorted(dominant):
             model.delete_point3D(number)
         removed += len(dominant)
-    mechanisms.record(Mechanism.DOMINANT_POINTS, removed)
+    record_act(Mechanism.DOMINANT_POINTS, removed)
     return removed
 
 

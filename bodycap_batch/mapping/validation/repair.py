@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from bodycap_batch.core import mechanisms
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, read_image_ids
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
@@ -79,7 +78,7 @@ def repair_model(
         ids = {ref: ids[ref] for ref in keyframes}
     pairs = evaluate_pairs(context.workspace, model)
     wrong = find_wrong_images(context, model, pairs)
-    for _ in range(_ROUNDS if mechanisms.is_on(Mechanism.REPAIR) else 0):
+    for _ in range(_ROUNDS if is_on(Mechanism.REPAIR) else 0):
         registered = registered_ids(model)
         missing = set(ids.values()) - registered
         if not wrong | missing:
@@ -110,7 +109,7 @@ def repair_model(
         if sound_after < sound_before or (sound_after == sound_before and len(still_wrong) >= len(wrong)):
             break
         model, wrong, pairs = other, still_wrong, other_pairs
-        mechanisms.record(Mechanism.REPAIR)
+        record_act(Mechanism.REPAIR)
     ratio = round(inconsistent_match_ratio(pairs), 4)
     cameras = {
         int(number): ImageRef.parse(model.image(number).name).camera for number in model.reg_image_ids()
@@ -171,12 +170,12 @@ def _without_confirmed(
         pairs: The verified pairs of the model.
         wrong: Ids of the images whose matches contradict the model.
     """
-    if not mechanisms.is_on(Mechanism.SECOND_REGISTRATION):
+    if not is_on(Mechanism.SECOND_REGISTRATION):
         return set(wrong)
     max_error_px = _CONFIRMED_ERROR_RATIO * context.mapper_options().mapper.filter_max_reproj_error
     confirmed = confirm_images(context.workspace, model, wrong, image_sequences(model), max_error_px)
     acquitted = confirmed - find_misregistered_images(pairs)
-    mechanisms.record(Mechanism.SECOND_REGISTRATION, len(acquitted))
+    record_act(Mechanism.SECOND_REGISTRATION, len(acquitted))
     return set(wrong) - acquitted
 
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.model.static_span import MIN_STATIC_SPAN_NS
 
@@ -33,7 +32,7 @@ def remove_transient_points(model: pycolmap.Reconstruction, times_ns: Mapping[st
         model: A reconstruction, changed in place. The caller adjusts it afterwards.
         times_ns: Time (nanoseconds) of every frame, by camera name.
     """
-    if not mechanisms.is_on(Mechanism.TRANSIENT_POINTS):
+    if not is_on(Mechanism.TRANSIENT_POINTS):
         return 0
     refs = {int(i): ImageRef.parse(model.image(i).name) for i in model.reg_image_ids()}
     images_of = {
@@ -54,7 +53,7 @@ def remove_transient_points(model: pycolmap.Reconstruction, times_ns: Mapping[st
     ]
     for point in removed:
         model.delete_point3D(point)
-    mechanisms.record(Mechanism.TRANSIENT_POINTS, len(removed))
+    record_act(Mechanism.TRANSIENT_POINTS, len(removed))
     return len(removed)
 
 

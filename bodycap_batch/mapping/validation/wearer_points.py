@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bodycap_batch.core import mechanisms
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.mapping.matching.database import ImageRef
 
 if TYPE_CHECKING:
@@ -72,7 +71,7 @@ def remove_points_on_wearer(model: pycolmap.Reconstruction) -> int:
     Args:
         model: A reconstruction, changed in place. What is left does not move.
     """
-    if not mechanisms.is_on(Mechanism.WEARER_POINTS):
+    if not is_on(Mechanism.WEARER_POINTS):
         return 0
     points_before = model.num_points3D()
     refs = {int(image): ImageRef.parse(model.image(image).name) for image in model.reg_image_ids()}
@@ -93,7 +92,7 @@ def remove_points_on_wearer(model: pycolmap.Reconstruction) -> int:
                     model.deregister_frame(model.image(image).frame_id)
             start = stop
     removed = int(points_before - model.num_points3D())
-    mechanisms.record(Mechanism.WEARER_POINTS, removed)
+    record_act(Mechanism.WEARER_POINTS, removed)
     return removed
 
 

@@ -8,9 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray, IntArray
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.model.scene import FrameStatus, Map, Registration, Trajectory
 
 _MIN_MISPLACED = 2
@@ -39,7 +38,7 @@ def withdraw_contradicted_poses(
     inside = contradicted_frames(path, maps, misplaced) & path.localised
     if not inside.any():
         return registration
-    mechanisms.record(Mechanism.CONTRADICTED_POSES, int(inside.sum()))
+    record_act(Mechanism.CONTRADICTED_POSES, int(inside.sum()))
     status = [
         FrameStatus.CONTRADICTED if withdrawn else before
         for before, withdrawn in zip(path.status, inside, strict=True)
@@ -61,7 +60,7 @@ def contradicted_frames(path: Trajectory, maps: Sequence[Map], misplaced: Collec
         misplaced: Frame indices of the camera's keyframes that contradict the map.
     """
     scene = next((scene for scene in maps if scene.gauge == path.gauge), None)
-    if scene is None or not misplaced or not mechanisms.is_on(Mechanism.CONTRADICTED_POSES):
+    if scene is None or not misplaced or not is_on(Mechanism.CONTRADICTED_POSES):
         return np.zeros(len(path.status), dtype=bool)
     kept = scene.keyframe_frame[scene.keyframes_of(path.camera)]
     return _frames_in_blocks(len(path.status), np.asarray(kept), np.array(sorted(misplaced)))

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, transform_points
 from bodycap_batch.model.scene import Map
@@ -91,7 +90,7 @@ def find_misplaced_keyframes(
         Here each loop is as short as possible: the tracks from one keyframe to the next, and the poses of
         both keyframes in the map.
     """
-    if not mechanisms.is_on(Mechanism.MISPLACED_KEYFRAMES):
+    if not is_on(Mechanism.MISPLACED_KEYFRAMES):
         return np.zeros(0, np.int64)
     rows = scene_map.keyframes_of(camera)
     arriving = _arriving_tracks(camera, scene_map, rows, tracks)
@@ -110,7 +109,7 @@ def find_misplaced_keyframes(
             before, after = int(group[number]), int(group[number + 1])
             misplaced.add(before if shared[before] < shared[after] else after)
     found = rows[np.isin(group, sorted(misplaced))]
-    mechanisms.record(Mechanism.MISPLACED_KEYFRAMES, len(found))
+    record_act(Mechanism.MISPLACED_KEYFRAMES, len(found))
     return found
 
 

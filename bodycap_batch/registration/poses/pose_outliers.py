@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, runs
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 
 _MIN_SIGMAS = 8.0
 """Minimum deviation of an outlier, in standard deviations of the camera centres. Evidence: none."""
@@ -78,7 +77,7 @@ def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArra
     Returns:
         Mask (N,) of the frames whose pose is an outlier. The mask does not depend on the scale of the map.
     """
-    if not mechanisms.is_on(Mechanism.POSE_OUTLIERS):
+    if not is_on(Mechanism.POSE_OUTLIERS):
         return np.zeros(len(centres), dtype=bool)
     size = np.linalg.norm(_second_differences(centres, sigma)[0], axis=1)
     in_run = np.zeros(len(centres), dtype=bool)
@@ -89,7 +88,7 @@ def find_outlier_poses(centres: FloatArray, sigma: FloatArray, times_ns: IntArra
     backwards = _outliers_after_gaps(centres[::-1], sigma[::-1])[::-1]
     ends = _outliers_after_gaps(centres, sigma) | backwards
     found = np.asarray(in_run | _single_outliers(centres, sigma, times_ns) | ends)
-    mechanisms.record(Mechanism.POSE_OUTLIERS, int(found.sum()))
+    record_act(Mechanism.POSE_OUTLIERS, int(found.sum()))
     return found
 
 

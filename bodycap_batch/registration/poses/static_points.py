@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.model.scene import Map
 from bodycap_batch.model.static_span import MIN_STATIC_SPAN_NS
 
@@ -29,7 +28,7 @@ def static_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
     points, all points are treated as static.
     """
     count = len(scene_map.points)
-    if not mechanisms.is_on(Mechanism.STATIC_POINTS):
+    if not is_on(Mechanism.STATIC_POINTS):
         return np.ones(count, dtype=bool)
     rows = scene_map.keyframes_of(camera.name)
     is_own = np.isin(scene_map.obs_keyframe, rows)
@@ -49,5 +48,5 @@ def static_points(camera: CaptureCamera, scene_map: Map) -> BoolArray:
     )
     if not is_usable:
         return np.ones(count, dtype=bool)
-    mechanisms.record(Mechanism.STATIC_POINTS, int((~static).sum()))
+    record_act(Mechanism.STATIC_POINTS, int((~static).sum()))
     return np.asarray(static)

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_POSED
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.registration.recovery.guided_localisation import PoseEstimate
@@ -43,7 +42,7 @@ def smooth_weak_centres(path: Trajectory, adjustable: BoolArray | None = None) -
     Source: see `smooth_centres`.
     """
     frames_with_pose = np.flatnonzero(path.localised)
-    if len(frames_with_pose) < LEAST_POSED or not mechanisms.is_on(Mechanism.PATH_SMOOTHING):
+    if len(frames_with_pose) < LEAST_POSED or not is_on(Mechanism.PATH_SMOOTHING):
         return path
     times = times_in_intervals(path.times_ns)
     statistics = MotionStatistics.estimate(times, path.gauge_from_cam[:, :3, 3])
@@ -60,7 +59,7 @@ def smooth_weak_centres(path: Trajectory, adjustable: BoolArray | None = None) -
     matrices = path.gauge_from_cam.copy()
     for frame in sorted(weak):
         if (adjustable is None or adjustable[frame]) and smoothed.disagreement[frame] < MAX_DISAGREEMENT:
-            mechanisms.record(Mechanism.PATH_SMOOTHING)
+            record_act(Mechanism.PATH_SMOOTHING)
             matrices[frame] = invert(estimates[frame].conditioned_on_centre(smoothed.positions[frame])[0])
     return replace(path, gauge_from_cam=matrices)
 

@@ -9,9 +9,8 @@ import numpy as np
 
 from bodycap_batch.config import RegistrationOptions
 from bodycap_batch.config.lost_frames import LEAST_POSED
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.model.scene import KeyframeSelection, Map, Registration, Trajectory
 from bodycap_batch.registration.poses.misplaced_keyframes import (
     find_misplaced_keyframes,
@@ -78,7 +77,7 @@ def prepare_recovery(
         cases. First, if no pose is removed: refined points then bring no gain. Second, if the remaining poses
         do not permit a recovery. Evidence: docs/decisions/registration.md.
     """
-    if not mechanisms.is_on(Mechanism.POINT_REFINEMENT):
+    if not is_on(Mechanism.POINT_REFINEMENT):
         return scene_map, own.registration
     before = [own.registration.trajectory, *(path for path in others if path.gauge == scene_map.gauge)]
     paths = [remove_weak_boundary_poses(path, options.min_inliers) for path in before]
@@ -92,7 +91,7 @@ def prepare_recovery(
     path = remove_weak_boundary_poses(path, options.min_inliers)
     if motion_statistics(path) is None:
         return scene_map, own.registration
-    mechanisms.record(Mechanism.POINT_REFINEMENT)
+    record_act(Mechanism.POINT_REFINEMENT)
     return refined_map, replace(own.registration, trajectory=path)
 
 

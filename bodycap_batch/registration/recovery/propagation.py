@@ -8,9 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.core.mechanisms import Mechanism
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.model.geometry import interpolate_pose, invert, make_transform
 from bodycap_batch.model.optical_flow import (
     apply_homography,
@@ -210,9 +209,9 @@ class Propagation:
 
         See `GuidedLocaliser.start_dependence`.
         """
-        if not mechanisms.is_on(Mechanism.START_DEPENDENCE):
+        if not is_on(Mechanism.START_DEPENDENCE):
             return dict(estimates)
-        mechanisms.record(Mechanism.START_DEPENDENCE, len(estimates))
+        record_act(Mechanism.START_DEPENDENCE, len(estimates))
         poses = {
             frame: estimate.cam_from_map for frame, estimate in {**self.interval.poses, **estimates}.items()
         }

@@ -387,3 +387,12 @@ def test_the_marker_families_are_those_of_opencv() -> None:
         for name in names
     }
     assert held.items() <= MARKER_COUNTS.items()
+
+
+def test_a_name_that_no_path_can_hold_is_refused_with_its_field(tmp_path: Path) -> None:
+    (tmp_path / "torso.mp4").write_bytes(b"")
+    job = tmp_path / "walk.yaml"
+    job.write_text('name: "\\ud800\\udc00"\ncapture: {cameras: [{name: torso, video: torso.mp4}]}\n')
+    with pytest.raises(JobError) as caught:
+        load_job(job)
+    assert caught.value.field == "name"

@@ -37,8 +37,8 @@ def test_a_task_uses_the_switches_of_its_key_and_counts_from_zero(monkeypatch: p
     monkeypatch.setenv(mechanisms.VARIABLE, "repair")
     mechanisms.begin_task({mechanisms.KEY_OPTION: ["join_models"], "features": 512})
     assert mechanisms.switched_off() == {Mechanism.JOIN_MODELS}
-    mechanisms.record(Mechanism.REPAIR, 2)
-    mechanisms.record(Mechanism.RECOVERY, 0)
+    mechanisms.record_act(Mechanism.REPAIR, 2)
+    mechanisms.record_act(Mechanism.RECOVERY, 0)
     assert mechanisms.acted() == {"repair": 2}
     mechanisms.begin_task({})
     assert mechanisms.switched_off() == frozenset()

@@ -59,6 +59,8 @@ LEFT_OR_TORSO = MapDiagnostics(undecided_groups=((("left",), ("torso",)),))
 class _Pan:
     """A camera that pans along the wall from `start`; its picture may be mirrored or upside down."""
 
+    mask = None
+
     def __init__(
         self, name: str, start: int, *, mirrored: bool = False, upside_down: bool = False, count: int = 6
     ) -> None:

@@ -177,7 +177,7 @@ HASHED = {
     "sound": CAMERAS | {"clocks", "telemetry"},
     # The clocks stage compares the distances between the cameras with the reach of the body.
     "clocks": CAMERAS | {"clocks", "mapping", "telemetry"},
-    "keyframes": CAMERAS | {"keyframes", "telemetry"},
+    "keyframes": CAMERAS | {"keyframes", "telemetry", "tracks"},
     **dict.fromkeys(("map", "extend", "refine"), CAMERAS | {"mapping", "inertial", "telemetry"}),
     **dict.fromkeys(("registration", "rig", "recover"), CAMERAS | {"registration", "inertial", "telemetry"}),
     # Merging reads marker boards from the images, and explains a failure by mirrored cameras.
@@ -185,9 +185,7 @@ HASHED = {
     "fill": BODY | {"fill"},
     # The places of unnamed cameras follow from their paths alone.
     "places": CAMERAS | {"camera_places"},
-    "wearer": CAMERAS | {"overlay"},
-    # The table of frames says what each lost frame should see.
-    "export": BODY | {"export", "overlay"},
+    "export": BODY | {"export"},
     "report": BODY | {"report", "overlay"},
     "preview": BODY | {"preview", "overlay"},
 }
@@ -335,7 +333,7 @@ def test_code_for_output_does_not_count(copied: Path) -> None:
 
 
 def test_the_conditions_of_recovery_count(copied: Path) -> None:
-    stages = {"registration", "recover", "rig", "inertial"}  # all that store a registration
+    stages = {"registration", "recover", "inertial"}  # all that store a registration
     assert changed_by(copied / "config" / "lost_frames.py") == stages
 
 
