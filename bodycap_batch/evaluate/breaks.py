@@ -66,7 +66,7 @@ def scale_jumps(
     """Return the times at which the scale of a path jumps.
 
     Every measured ratio of two legs that spans a time is an estimate of the jump there: the share of each
-    leg that lies after the time tells by how much a jump changes the delivered ratio. Their evidence is
+    leg that lies after the time gives the change of the delivered ratio by a jump. Their evidence is
     combined by least squares, and the time with the most significant jump is taken first.
 
     Args:

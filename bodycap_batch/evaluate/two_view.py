@@ -20,6 +20,8 @@ not show a fold of 15 degrees with `SIGMAS`."""
 INLIER_PX = 2.5
 """Maximum residual of an inlier, px at the pyramid level of the feature. Origin: two and a half times the
 accuracy of an ORB corner."""
+_UNKNOWN_VARIANCE = 1e9
+"""Variance (rad²) of a direction that the matches do not determine."""
 _MIN_NOISE_PX = 0.3
 """Minimum standard deviation (px) of a feature, so that exact synthetic matches do not claim certainty."""
 _MIN_MATCHES = 12
@@ -202,7 +204,7 @@ def _refined(matches: RayMatches, rotation: FloatArray, *, turn: bool = True) ->
         weights = 1.0 / (1.0 + (residual / INLIER_PX) ** 2) ** 2
         normal = (jacobian * weights[:, None]).T @ jacobian
         # A direction that pictures of a mere turn do not determine stays where it is.
-        normal += 1e-6 * np.trace(normal) * np.eye(5)
+        normal += (1e-9 + 1e-6 * np.trace(normal)) * np.eye(5)
         step = -np.linalg.solve(normal, (jacobian * weights[:, None]).T @ residual)
         rotation = so3_exp(step[:3]) @ rotation
         direction = direction + tangents(direction) @ step[3:]
@@ -215,13 +217,15 @@ def _refined(matches: RayMatches, rotation: FloatArray, *, turn: bool = True) ->
     noise_px = (
         max(_MIN_NOISE_PX, 1.48 * float(np.median(np.abs(residual[inliers])))) if inliers.any() else 1.0
     )
-    normal = jacobian[inliers].T @ jacobian[inliers]
-    # What the matches do not determine has a huge variance, also with an absurd lens.
-    normal += (1e-9 + 1e-12 * np.trace(normal)) * np.eye(5)
+    values, vectors = np.linalg.eigh(jacobian[inliers].T @ jacobian[inliers])
+    # Directions that the matches do not determine, for example through a lens with an absurd focal length,
+    # get the variance of nothing known.
+    is_known = values > max(1.0 / _UNKNOWN_VARIANCE, 1e-12 * values[-1])
+    variance = np.where(is_known, noise_px**2 / np.where(is_known, values, 1.0), _UNKNOWN_VARIANCE)
     return Motion(
         rotation=rotation,
         direction=direction,
-        covariance=np.asarray(noise_px**2 * np.linalg.inv(normal)),
+        covariance=np.asarray((vectors * variance) @ vectors.T),
         inliers=inliers,
         support=int(_support_of(inliers[None], matches.cells)[0]),
     )

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
-from bodycap_batch.model.copied_frames import Pictures
 from bodycap_batch.model.optical_flow import Pixels
 
 
@@ -66,15 +65,3 @@ class PointTracks:
         """
         before = np.concatenate([[0], np.cumsum(keep)])
         return replace(self, first=before[self.first], track=self.track[keep], px=self.px[keep])
-
-    def only(self, pictures: Pictures | None) -> PointTracks:
-        """Return the tracks in the frames that are no copies; unchanged for None."""
-        if pictures is None:
-            return self
-        keep = np.zeros(len(self.track), dtype=bool)
-        for frame in pictures.frames.tolist():
-            keep[self.first[frame] : self.first[frame + 1]] = True
-        counts = np.diff(self.first)[pictures.frames]
-        return replace(
-            self, first=np.concatenate([[0], np.cumsum(counts)]), track=self.track[keep], px=self.px[keep]
-        )

@@ -61,7 +61,6 @@ class PointTracker:
         image: (h,w) tracked image of the newest frame: the frame with a long side of 640 px at most.
         px: (K,2) positions of the tracks in the newest frame, px of the tracked image (OpenCV's pixels).
         track: (K,) numbers of these tracks, increasing.
-        round_trip_px: (K,) distances after tracking forward and back, px of the frame; NaN for new points.
 
     Source: Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000; Shi, Tomasi, "Good
         features to track", CVPR 1994; Kalal, Mikolajczyk, Matas, "Forward-backward error", ICPR 2010.
@@ -74,7 +73,6 @@ class PointTracker:
     image: GreyImage | None = None
     px: Pixels = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     track: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
-    round_trip_px: Pixels = field(default_factory=lambda: np.zeros(0, np.float32))
     _next: int = 0
     _since_detection: int = 0
     _frames: dict[int, tuple[IntArray, Pixels]] = field(default_factory=dict)
@@ -99,9 +97,9 @@ class PointTracker:
             or not started
         ):
             self._detect(image)
-        self._frames[index] = self.track, self.frame_px()
+        self._frames[index] = self.track, self._frame_px()
 
-    def frame_px(self) -> Pixels:
+    def _frame_px(self) -> Pixels:
         """Return the positions (K,2) of the tracks in the newest frame, px of the frame (COLMAP's origin)."""
         return (self.px + np.float32(CV2_PIXEL_OFFSET_PX)) * np.float32(self._scale())
 
@@ -109,7 +107,6 @@ class PointTracker:
         """End all tracks: the next frame does not follow the newest one."""
         self.image = None
         self.px, self.track = self.px[:0], self.track[:0]
-        self.round_trip_px = self.round_trip_px[:0]
 
     def tracks(self, frame_count: int) -> PointTracks:
         """Return the tracks of all frames.
@@ -142,7 +139,7 @@ class PointTracker:
 
     def _follow(self, before: GreyImage, image: GreyImage) -> None:
         """Move the tracks into the newest image; tracks that are not found end."""
-        found, ok, error = self._track(before, image, None)
+        found, ok = self._track(before, image, None)
         if ok.sum() < _MIN_SURVIVAL * len(ok):
             motion = estimate_coarse_motion(
                 make_coarse_image(before),
@@ -154,17 +151,13 @@ class PointTracker:
                 guess = apply_homography(self.px + np.float32(CV2_PIXEL_OFFSET_PX), motion.homography)
                 again = self._track(before, image, guess - np.float32(CV2_PIXEL_OFFSET_PX))
                 if again[1].sum() > ok.sum():
-                    found, ok, error = again
+                    found, ok = again
         self.px, self.track = found[ok], self.track[ok]
-        self.round_trip_px = error[ok] * np.float32(self._scale())
         distinct = _distinct(self.px)
         self.px, self.track = self.px[distinct], self.track[distinct]
-        self.round_trip_px = self.round_trip_px[distinct]
 
-    def _track(
-        self, before: GreyImage, image: GreyImage, guess: Pixels | None
-    ) -> tuple[Pixels, BoolArray, Pixels]:
-        """Return the positions (K,2) in the newest image, whether they are found, and the errors (K,)."""
+    def _track(self, before: GreyImage, image: GreyImage, guess: Pixels | None) -> tuple[Pixels, BoolArray]:
+        """Return the positions (K,2) in the newest image, and whether they are found (K,)."""
         import cv2
 
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.03)
@@ -184,7 +177,7 @@ class PointTracker:
         last = np.array([width - 1 - _BORDER_PX, height - 1 - _BORDER_PX])
         ok = (state.ravel() > 0) & (returned_state.ravel() > 0) & (error < _MAX_ROUND_TRIP_PX)
         ok &= (found >= _BORDER_PX).all(axis=1) & (found <= last).all(axis=1)
-        return found, np.asarray(ok), error
+        return found, np.asarray(ok)
 
     def _detect(self, image: GreyImage) -> None:
         """Add the best corner of each cell that has no track."""
@@ -217,7 +210,6 @@ class PointTracker:
         new = np.column_stack([(chosen % columns) * side + column, (chosen // columns) * side + row])
         self.px = np.concatenate([self.px, new.astype(np.float32)])
         self.track = np.concatenate([self.track, np.arange(self._next, self._next + len(new))])
-        self.round_trip_px = np.concatenate([self.round_trip_px, np.full(len(new), np.nan, np.float32)])
         self._next += len(new)
 
 

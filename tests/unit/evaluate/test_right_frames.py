@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,14 @@ import pytest
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.evaluate.breaks import contradicted_times
 from bodycap_batch.evaluate.fresh_features import CELLS, FrameFeatures, detect_features, match_features
-from bodycap_batch.evaluate.right_frames import PictureEvidence, Pictures, find_right_frames, measure_pictures
-from bodycap_batch.evaluate.two_view import Outcome
+from bodycap_batch.evaluate.right_frames import (
+    PictureEvidence,
+    Pictures,
+    _not_fixed_to_camera,
+    find_right_frames,
+    measure_pictures,
+)
+from bodycap_batch.evaluate.two_view import Outcome, RayMatches, _refined
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import (
     interpolate_pose,
@@ -211,3 +218,31 @@ def test_features_of_a_picture_are_spread_and_found_again() -> None:
     )
     # A shift of 12 px of 500 px; half a pixel of ORB's corners.
     assert np.median(shift) == pytest.approx(12 / 500, abs=0.5 / 500)
+
+
+def test_matches_on_the_own_hand_are_left_out(path: FloatArray) -> None:
+    first, second = pictures(path)[:2]
+    assert first is not None
+    assert second is not None
+    turn = so3_exp([0.0, 0.1, 0.0])
+    turned = replace(second, rays=first.rays @ turn.T, pixel_rad=first.pixel_rad)
+    rays = turned.rays.copy()
+    rays[::3] = first.rays[::3]  # a third of the matches is on a hand that is fixed to the camera
+    rows = np.column_stack([np.arange(len(rays))] * 2)
+    kept = _not_fixed_to_camera(first, replace(turned, rays=rays), rows)
+    assert not set(kept[:, 0].tolist()) & set(range(0, len(rays), 3))
+    assert len(kept) == len(rays) - len(range(0, len(rays), 3))
+    # If the camera stands still, all of it stays in the picture.
+    assert len(_not_fixed_to_camera(first, first, rows)) == len(rows)
+    assert len(_not_fixed_to_camera(first, first, rows[:0])) == 0
+
+
+def test_what_matches_do_not_determine_is_uncertain_and_no_error() -> None:
+    """Through a lens with an absurd focal length, all rays lie on one line and no translation is seen."""
+    x = np.random.default_rng(2).uniform(-1e-3, 1e-3, 80)
+    rays = np.column_stack([x, np.zeros(80), np.ones(80)])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    matches = RayMatches(first=rays, second=rays, cells=np.arange(80), noise_rad=np.full(80, 1e-9))
+    measured = _refined(matches, np.eye(3), turn=False)
+    assert np.isfinite(measured.covariance).all()
+    assert measured.covariance.diagonal().max() > 1e6

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
 import cv2
 import numpy as np
 import pytest
 
+from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.masks import without_regions
+from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray, FloatArray
-from bodycap_batch.model.copied_frames import Pictures
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.optical_flow import GreyImage
 from bodycap_batch.model.point_tracks import PointTracks
-from bodycap_batch.tracks import PointTracker, find_fixed_regions, fixed_notes
+from bodycap_batch.tracks import PointTracker, find_fixed_regions, fixed_notes, fixed_regions_of
 from bodycap_batch.tracks.fixed_regions import in_regions
 
 WIDTH, HEIGHT, FPS = 320, 240, 30
@@ -93,14 +100,6 @@ def test_the_tracks_after_a_restart_are_others() -> None:
     assert len(tracker.tracks(2).between(0, 1)[0]) == 0
 
 
-def test_the_frames_that_are_no_copies_keep_their_tracks() -> None:
-    tracks = tracked([picture(room(), shift) for shift in path(6, 2)])
-    pictures = Pictures(frames=np.array([0, 2, 5]), times_ns=times(6)[[0, 2, 5]])
-    kept = tracks.only(pictures)
-    assert kept.frame_count == 3
-    assert np.array_equal(kept.at(2)[1], tracks.at(5)[1])
-
-
 def test_a_hand_in_view_is_found_while_the_camera_turns() -> None:
     texture, count = room(), 90
     tracks = tracked([with_hand(picture(texture, shift)) for shift in path(count, 2)])
@@ -136,3 +135,38 @@ def test_a_thing_that_moves_in_front_of_a_still_camera_does_not_mask_the_room() 
         image[int(y) : int(y) + 80, int(x) : int(x) + 80] = thing
         images.append(image)
     assert not find_fixed_regions(tracked(images), times(count)).any()
+
+
+def wrist_camera(count: int, read: list[int]) -> CaptureCamera:
+    """Return a wrist camera with a hand in view; it records which frames are read."""
+    texture, shifts = room(), path(count, 2)
+
+    def read_decodable(indices: np.ndarray) -> Generator[tuple[int, GreyImage], None, None]:
+        for index in indices.tolist():
+            read.append(index)
+            yield index, with_hand(picture(texture, shifts[index]))
+
+    lens = SimpleNamespace(width_px=WIDTH, height_px=HEIGHT)
+    camera = SimpleNamespace(
+        name="palm", camera=lens, mask=None, times_ns=times(count), read_decodable=read_decodable
+    )
+    return cast(CaptureCamera, camera)
+
+
+@pytest.mark.parametrize(("count", "most"), [(90, 90), (1500, 600)])
+def test_a_long_video_is_searched_in_even_parts(count: int, most: int, tmp_path: Path) -> None:
+    read: list[int] = []
+    regions = fixed_regions_of(wrist_camera(count, read), StageContext(work_dir=tmp_path))
+    assert len(read) == most
+    assert read[-1] == count - 1
+    assert regions[regions.shape[0] // 2 + 3 : -1, 1 : regions.shape[1] // 2 - 6].mean() > 0.9
+
+
+def test_nothing_is_read_if_the_mechanism_is_switched_off(tmp_path: Path) -> None:
+    read: list[int] = []
+    mechanisms.begin_task({mechanisms.KEY_OPTION: ["fixed_regions"]})
+    try:
+        assert not fixed_regions_of(wrist_camera(90, read), StageContext(work_dir=tmp_path)).any()
+    finally:
+        mechanisms.begin_task({})
+    assert read == []
