@@ -69,6 +69,8 @@ class CaptureCamera:
             no copies.
         threads: Number of threads of the decoder. For 0, the number is taken from the environment variable
             OMP_NUM_THREADS. If this variable is not set, all processors are used.
+        lens_sigma: Relative standard deviation of the focal length, if `camera` was estimated from the tracks
+            of the video. The lens is constant until the last adjustment of the map. 0 for another lens.
         given: Intrinsics that were given, if the map contradicted them and `camera` replaces them; else None.
     """
 
@@ -90,6 +92,7 @@ class CaptureCamera:
     kept: KeptFrames | None = field(default=None, repr=False)
     threads: int = 0
     given: Camera | None = None
+    lens_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         count = len(self.frame_numbers)

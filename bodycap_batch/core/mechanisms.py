@@ -50,6 +50,8 @@ class Mechanism(StrEnum):
     PATH_SMOOTHING = "path_smoothing"
     STATIC_POINTS = "static_points"
     FIXED_REGIONS = "fixed_regions"
+    LENS_FROM_TRACKS = "lens_from_tracks"
+    NEIGHBOUR_MATCHES = "neighbour_matches"
     GAP_FILLING = "gap_filling"
     SENSOR_PATH = "sensor_path"
     LYING = "lying"

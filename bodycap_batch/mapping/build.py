@@ -11,6 +11,7 @@ import numpy as np
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import NO_MOTION_HINT, EstimationError
 from bodycap_batch.core.mechanisms import Mechanism, record_act
@@ -20,6 +21,7 @@ from bodycap_batch.mapping.inputs import (
     frame_times_ns,
     intrinsics_of,
     make_mapping_context,
+    with_estimated_lenses,
 )
 from bodycap_batch.mapping.intrinsics.intrinsics_check import find_misfit_intrinsics
 from bodycap_batch.mapping.intrinsics.readout_profile import estimate_from_matches
@@ -36,14 +38,12 @@ from bodycap_batch.mapping.intrinsics.shutters import (
 )
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
-    CameraKeyframes,
-    ImageRef,
     add_camera,
-    add_keyframes,
-    count_with_features,
+    count_features,
     read_camera_ids,
 )
 from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint, exclude_flipped_cameras
+from bodycap_batch.mapping.matching.keyframe_features import CameraKeyframes, add_keyframes
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.model_joining import join_models
@@ -52,7 +52,7 @@ from bodycap_batch.mapping.reconstruction.model_files import write_models
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
-from bodycap_batch.mapping.validation.repair import remove_without_adjustment, repair_model
+from bodycap_batch.mapping.validation.repair import left_contradicted, remove_without_adjustment, repair_model
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.rotation_path import TurningShutter
@@ -130,6 +130,7 @@ def build_map(
     Source: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016 (COLMAP).
     """
     _require_motion(selections)
+    capture = with_estimated_lenses(capture, selections)
     result, refused = build_map_once(capture, selections, options, context, skeletal_above, earlier)
     # A map that is built again has the same features.
     used = replace(earlier, features={item.camera: context.work_dir / WORKSPACE for item in selections})
@@ -209,7 +210,8 @@ def build_map_once(
     add_keyframes(workspace, keyframes, options, context)
     selections, options, flips = exclude_flipped_cameras(workspace, selections, options)
     ids = read_camera_ids(workspace)
-    refs = [ImageRef(item.camera, int(frame)) for item in selections for frame in item.frames]
+    features = count_features(workspace)
+    refs = sorted(features)
     calibrated_ids = calibrated_camera_ids(capture, ids)
     mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, skeletal_above)
     generator = PairGenerator(workspace, refs, frame_times_ns(capture), options, context)
@@ -225,18 +227,18 @@ def build_map_once(
         resected: Sequence[set[int] | None] = [None] * len(models)
         if skeletal is not generator:
             resected, log["placed"] = resect_remaining(models, generator, tried, mapping)
-        log["unconfirmed_points"] = finalise_models(models, mapping, capture, resected)
-        models[0], log["contradicting"], _ = remove_without_adjustment(models[0], mapping)
+        log["unconfirmed_points"] = finalise_models(models, mapping, resected)
+        models[0], log["contradicting"], ratio = remove_without_adjustment(models[0], mapping)
         # A removed keyframe may have connected others with the room.
         log["unconfirmed_points"] += sum(map(remove_points_on_wearer, models))
     attempts = log.get("initial_candidates", log["initial_pair_ladder"])
     # A keyframe of a covered lens shows nothing, so it cannot be part of a map.
-    textured = count_with_features(workspace, refs, MIN_RESECTION_INLIERS)
+    textured = sum(count >= MIN_RESECTION_INLIERS for count in features.values())
     refused = add_flip_hint(check_coverage(models, len(refs), textured, attempts, options), flips)
     if refused is not None and not models:
         raise refused
     write_models(workspace, models)
-    calibrated = {number: name for name, number in ids.items() if capture.camera(name).calibrated}
+    calibrated = {number: name for name, number in ids.items() if number in mapping.given_ids}
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
     removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
@@ -247,11 +249,13 @@ def build_map_once(
         misfit_factors=misfits, misplaced=misplaced, unknown_shutters=unknown, details=log
     ).to_log()
     result = make_result(models, workspace, log)
-    corrected = {name: used[name] for name in shutters}
-    result = replace(result, maps=tuple(map_with_readouts(item, corrected) for item in result.maps))
-    ratios = [log[step]["contradicted_share"] for step in ("repair", "placed") if step in log]
-    refused = refused or add_flip_hint(check_consistency(max(ratios)), flips)
-    return result, refused
+    result = _with_readouts(result, {name: used[name] for name in shutters})
+    return result, refused or add_flip_hint(check_consistency(left_contradicted(log["repair"], ratio)), flips)
+
+
+def _with_readouts(result: MapResult, readouts: Mapping[str, Readout]) -> MapResult:
+    """Return a map whose keypoints were corrected for readout times, by camera name."""
+    return replace(result, maps=tuple(map_with_readouts(item, readouts) for item in result.maps))
 
 
 def _keyframes_of(
@@ -279,8 +283,16 @@ def _keyframes_of(
             capture.camera(item.camera),
             ids[item.camera],
             np.asarray(item.frames),
+            _usable_sharpness(item),
             shutters.get(item.camera),
             earlier.features.get(item.camera),
         )
         for item in selections
     ]
+
+
+def _usable_sharpness(selection: KeyframeSelection) -> FloatArray:
+    """Return the sharpness (N,) of each frame of a video, NaN for a damaged or a frozen frame."""
+    sharpness = np.where(selection.frozen, np.nan, selection.sharpness)
+    sharpness[selection.damaged] = np.nan
+    return sharpness

@@ -17,22 +17,28 @@ from bodycap_batch.mapping.inputs import (
     frame_times_ns,
     intrinsics_of,
     make_mapping_context,
+    with_map_lenses,
 )
 from bodycap_batch.mapping.intrinsics.readout_time import map_with_readouts
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
 from bodycap_batch.mapping.intrinsics.shutters import read_shutters, readouts_of_maps
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
-    CameraKeyframes,
     ImageRef,
-    add_keyframes,
+    count_features,
     read_camera_ids,
     read_image_ids,
 )
+from bodycap_batch.mapping.matching.keyframe_features import CameraKeyframes, add_keyframes
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.re_registration import re_register_images
-from bodycap_batch.mapping.reconstruction.model_files import read_model, registered_ids, write_models
+from bodycap_batch.mapping.reconstruction.model_files import (
+    model_order,
+    read_model,
+    registered_ids,
+    write_models,
+)
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
@@ -64,11 +70,11 @@ def extend_map(
         skeletal_above: Maximum number of keyframes of a map that is not large (`MappingContext.is_large`).
 
     Returns:
-        The extended models, each in a new gauge.
+        The extended models, largest first, each in a new gauge.
     """
     import pycolmap
 
-    capture = with_map_intrinsics(capture, previous)
+    capture = with_map_intrinsics(with_map_lenses(capture, previous), previous)
     workspace = context.work_dir / "workspace"
     shutil.copytree(previous.workspace, workspace)
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
@@ -83,11 +89,15 @@ def extend_map(
             capture.camera(name),
             ids[name],
             np.array(sorted(ref.frame for ref in new if ref.camera == name)),
-            shutters.get(name),
+            shutter=shutters.get(name),
         )
         for name in names
     ]
-    add_keyframes(workspace, keyframes, options, context)
+    counts = count_features(workspace)
+    for item in keyframes:
+        richest = max(number for ref, number in counts.items() if ref.camera == item.camera.name)
+        more = options.model_copy(update={"features": max(options.features, richest)})
+        add_keyframes(workspace, [item], more, context)
     generator = PairGenerator(workspace, new, frame_times_ns(capture), options, context)
     _, match_log = match_keyframes(generator, workspace, intrinsics_of(capture), context)
     calibrated_ids = calibrated_camera_ids(capture, ids)
@@ -103,12 +113,13 @@ def extend_map(
         models.append(model)
         removed += cut
         resected.append(registered_ids(model) - kept if mapping.is_large(len(kept)) else None)
-    transient = finalise_models(models, mapping, capture, resected)
+    transient = finalise_models(models, mapping, resected)
     for number, model in enumerate(models):
         models[number], names, _ = remove_without_adjustment(model, mapping)
         removed += names
         # A removed keyframe may have connected others with the room.
         transient += remove_points_on_wearer(models[number])
+    models.sort(key=model_order)
     write_models(workspace, models)
     entry = {
         "new_keyframes": len(new),

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.mechanisms import Mechanism, record_act
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.mapping_context import MappingContext
+from bodycap_batch.mapping.matching.database import read_camera_ids
 from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
+from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.optical_flow import pixel_scale
+from bodycap_batch.model.scene import KeyframeSelection, MapResult
 
 
 def make_mapping_context(
@@ -42,6 +47,12 @@ def make_mapping_context(
         stage=stage,
         frame_numbers={camera.name: camera.frame_numbers for camera in capture.cameras},
         skeletal_above=skeletal_above,
+        times_ns=frame_times_ns(capture),
+        lens_sigma={
+            number: capture.camera(name).lens_sigma
+            for name, number in read_camera_ids(workspace).items()
+            if capture.camera(name).lens_sigma
+        },
     )
 
 
@@ -75,3 +86,50 @@ def calibrated_camera_ids(capture: Capture, ids: Mapping[str, int]) -> list[int]
         ids: Database ids of all cameras in the database, by camera name.
     """
     return sorted(number for name, number in ids.items() if capture.camera(name).calibrated)
+
+
+def with_estimated_lenses(capture: Capture, selections: Sequence[KeyframeSelection]) -> Capture:
+    """Return the capture with the lenses that the tracks determine, as if they were given.
+
+    Args:
+        capture: All cameras.
+        selections: The keyframes of the cameras, with the lens that their tracks determine.
+    """
+    lenses = {
+        item.camera: (item.lens.lens, item.lens.focal_sigma)
+        for item in selections
+        if item.lens is not None and item.lens.is_determined and capture.camera(item.camera).camera.refine
+    }
+    record_act(Mechanism.LENS_FROM_TRACKS, len(lenses))
+    return _with_lenses(capture, lenses)
+
+
+def with_map_lenses(capture: Capture, previous: MapResult) -> Capture:
+    """Return the capture with the lenses of an earlier map, for the cameras whose lens is not given."""
+    mapped = {name: camera for item in reversed(previous.maps) for name, camera in item.cameras.items()}
+    unknown = {item.name for item in capture.cameras if item.camera.refine}
+    return _with_lenses(capture, {name: (mapped[name], 0.0) for name in sorted(unknown & mapped.keys())})
+
+
+def _with_lenses(capture: Capture, lenses: Mapping[str, tuple[Camera, float]]) -> Capture:
+    """Return the capture with lenses that were not given.
+
+    Args:
+        capture: All cameras.
+        lenses: By camera name, the intrinsics and the relative standard deviation of the focal length. With
+            0, the intrinsics stay constant.
+    """
+    if not lenses:
+        return capture
+    cameras = tuple(
+        replace(
+            item,
+            camera=replace(lenses[item.name][0], refine=False, sideways=item.camera.sideways),
+            calibrated=True,
+            lens_sigma=lenses[item.name][1],
+        )
+        if item.name in lenses
+        else item
+        for item in capture.cameras
+    )
+    return replace(capture, cameras=cameras)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,9 @@ class MappingContext:
         stage: Threads, progress, cancellation.
         frame_numbers: `CaptureCamera.frame_numbers` of each camera, by camera name.
         skeletal_above: Maximum number of keyframes of a map that is not large (`is_large`).
+        times_ns: Times of all frames of each camera, nanoseconds, by camera name.
+        lens_sigma: By database id, the relative standard deviation of the focal length of those calibrated
+            cameras whose lens was estimated from tracks. The last adjustment refines it.
     """
 
     workspace: Path
@@ -36,6 +39,13 @@ class MappingContext:
     stage: StageContext
     frame_numbers: Mapping[str, IntArray]
     skeletal_above: int = SKELETAL_ABOVE
+    times_ns: Mapping[str, IntArray] = field(default_factory=dict)
+    lens_sigma: Mapping[int, float] = field(default_factory=dict)
+
+    @property
+    def given_ids(self) -> frozenset[int]:
+        """Database ids of the calibrated cameras whose lens was given."""
+        return frozenset(self.calibrated_ids) - self.lens_sigma.keys()
 
     def is_large(self, keyframes: int) -> bool:
         """Return whether a map of `keyframes` keyframes is too large for repeated global adjustments.

@@ -87,7 +87,7 @@ def join_models(models: Sequence[Any], context: MappingContext) -> tuple[list[An
 
 def _misregistered(model: Any, context: MappingContext) -> int:
     """Return the number of misregistered images of a model."""
-    return len(find_wrong_images(context, model, evaluate_pairs(context.workspace, model)))
+    return len(find_wrong_images(context, model, evaluate_pairs(context.workspace, model, context.times_ns)))
 
 
 def _joined(main: Any, further: Any, context: MappingContext) -> Any | None:

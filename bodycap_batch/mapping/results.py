@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.capture import Capture
+import numpy as np
+
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.mapping.inputs import frame_times_ns
+from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robustly
@@ -20,41 +22,85 @@ from bodycap_batch.mapping.validation.transient_points import remove_transient_p
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.scene import MapResult
 
+_LENS_SIGMAS = 3.0
+"""Maximum change of a focal length by the last adjustment, in standard deviations of that of the tracks. The
+errors are 1.5 stated standard deviations, so this is 2 true ones. Evidence: docs/decisions/tracks.md."""
 
-def finalise_models(
-    models: list[Any], context: MappingContext, capture: Capture, resected: Sequence[set[int] | None]
-) -> int:
+
+def finalise_models(models: list[Any], context: MappingContext, resected: Sequence[set[int] | None]) -> int:
     """Remove transient points, points on the wearer and dominant points, and adjust robustly, in place.
 
-    A further model that is left without points is removed from the list: its keyframes saw nothing but
-    transient points, or contradict each other. The largest model stays.
+    A model that is left without points is removed from the list: its keyframes saw nothing but transient
+    points, or contradict each other. The last adjustment of the largest model refines the lenses that tracks
+    determined (`_adjust_with_lenses`). The other models keep these lenses.
 
     Args:
         models: Reconstructions, the largest first. The list and the reconstructions are changed in place.
         context: Workspace, mapper options.
-        capture: All cameras.
         resected: For each model, the ids of the images to adjust: the images that were resected after the
             model's last robust adjustment. None: all images of the model are adjusted.
 
     Returns:
         Number of points removed from all models.
     """
-    times_ns = frame_times_ns(capture)
     total = 0
-    empty = set[int]()
+    kept = list[Any]()
+    lenses = dict[int, Any]()
     for number, (model, image_ids) in enumerate(zip(models, resected, strict=True)):
         context.stage.progress(number, len(models), "maps adjusted")
         total += remove_points_on_wearer(model)
-        total += remove_transient_points(model, times_ns)
+        total += remove_transient_points(model, context.times_ns)
         total += remove_dominant_points(model)
-        if number and not model.num_points3D():
-            empty.add(number)
+        if not model.num_points3D():
             continue
         only = None if image_ids is None else image_ids & registered_ids(model)
         if only is None or only:
-            adjust_robustly(model, context.mapper_options(), context.calibrated_ids, only)
-    models[:] = [model for number, model in enumerate(models) if number not in empty]
+            kept.append(_adjusted(model, context, lenses, only))
+        else:
+            kept.append(model)
+        lenses |= {
+            number: kept[-1].camera(number).params for number in kept[-1].cameras if number not in lenses
+        }
+    if not kept:
+        raise EstimationError(
+            "the map is empty: no point of the room was seen long enough from different places",
+            hint="move the cameras sideways past things with texture that do not move by themselves",
+        )
+    models[:] = kept
     return total
+
+
+def _adjusted(
+    model: Any, context: MappingContext, known: Mapping[int, Any], only: Collection[int] | None
+) -> Any:
+    """Return a model after its last robust adjustment.
+
+    The focal length that tracks determine has a standard deviation. A map that is small, or that bends, may
+    determine another one with ease. If the two are too far apart, the lens of the tracks stays.
+
+    Args:
+        model: A reconstruction. It may be changed in place.
+        context: Mapper options, and the cameras whose lens tracks determined.
+        known: Parameters of the lenses that a larger model determined, by camera id.
+        only: Ids of the images to adjust; None: all images.
+    """
+    settings, held = context.mapper_options(), set(context.calibrated_ids)
+    for number in context.lens_sigma.keys() & known.keys() & set(model.cameras):
+        model.camera(number).params = known[number]
+    free = context.lens_sigma.keys() & set(model.cameras) - known.keys()
+    before = {number: model.camera(number).mean_focal_length() for number in free}
+    with_free = copy.deepcopy(model) if free else model
+    adjust_robustly(with_free, settings, sorted(held - free), only)
+    contradicted = {
+        number
+        for number in free
+        if abs(np.log(with_free.camera(number).mean_focal_length() / before[number]))
+        > _LENS_SIGMAS * context.lens_sigma[number]
+    }
+    if not contradicted:
+        return with_free
+    adjust_robustly(model, settings, sorted(held - free | contradicted), only)
+    return model
 
 
 def misplaced_frames(names: Collection[str], models: Sequence[Any]) -> dict[str, tuple[int, ...]]:

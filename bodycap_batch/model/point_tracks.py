@@ -57,11 +57,15 @@ class PointTracks:
         _, rows, other_rows = np.intersect1d(tracks, other_tracks, assume_unique=True, return_indices=True)
         return px[rows], other_px[other_rows]
 
-    def select(self, keep: BoolArray) -> PointTracks:
-        """Return the tracks with a part of the observations.
+    def outside(self, regions: BoolArray) -> PointTracks:
+        """Return the tracks without the observations in some regions.
 
         Args:
-            keep: (M,) True for each observation to keep.
+            regions: (R,C) mask of cells that divide the picture evenly, True for each cell to leave out.
         """
+        shape = np.array([regions.shape[1], regions.shape[0]])
+        cell = (self.px / np.array([self.width_px, self.height_px]) * shape).astype(np.int64)
+        cell = np.clip(cell, 0, shape - 1)
+        keep = ~regions[cell[:, 1], cell[:, 0]]
         before = np.concatenate([[0], np.cumsum(keep)])
         return replace(self, first=before[self.first], track=self.track[keep], px=self.px[keep])

@@ -19,6 +19,7 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.copied_frames import Pictures
 from bodycap_batch.model.frame_matches import FrameMatches
 from bodycap_batch.model.gyro_rates import GyroRates
+from bodycap_batch.model.lens_estimate import LensEstimate
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 
 _FEATURE_STRIDE = 1 << 24
@@ -93,6 +94,8 @@ class KeyframeSelection:
             indices in this selection count these frames only.
         fixed_regions: (R,C) mask of cells that divide the picture evenly, True where the picture is fixed to
             the camera, for example by the own hand. An empty array means that nothing is fixed.
+        lens: The lens as the tracks of the video determine it; None for a given lens, or with too little
+            motion.
     """
 
     camera: str
@@ -107,6 +110,7 @@ class KeyframeSelection:
     gyro: GyroRates | None = None
     pictures: Pictures | None = None
     fixed_regions: BoolArray = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    lens: LensEstimate | None = None
 
     def __post_init__(self) -> None:
         set_array(self, "fixed_regions", (None, None), np.bool_)

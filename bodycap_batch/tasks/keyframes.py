@@ -14,6 +14,8 @@ from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, w
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import CaptureCamera
+    from bodycap_batch.core.arrays import BoolArray
+    from bodycap_batch.model.lens_estimate import LensEstimate
     from bodycap_batch.telemetry.streams import CameraTelemetry
 
 
@@ -45,17 +47,17 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     from bodycap_batch.model.copied_frames import copied_notes
     from bodycap_batch.model.frozen_frames import frozen_notes
     from bodycap_batch.telemetry.camera_rates import relate_gyro
-    from bodycap_batch.tracks import fixed_notes, fixed_regions_of
+    from bodycap_batch.tracks import fixed_notes
 
     camera = load_capture(task.capture, threads=context.threads).cameras[0]
     size = camera.camera
     telemetry, telemetry_notes = _telemetry(camera, task)
-    regions = fixed_regions_of(camera, context)
+    regions, lens = regions_and_lens(camera, context)
     in_room = without_regions(camera.mask, regions, (size.width_px, size.height_px))
     camera = replace(camera, mask=in_room)
     with FrameKeeper(files, size.width_px, size.height_px, camera.should_keep_all) as keeper:
         selection = select_keyframes(camera, task.options, context, keeper, with_matches=task.with_gyro)
-    selection = replace(selection, fixed_regions=regions)
+    selection = replace(selection, fixed_regions=regions, lens=lens)
     copies = copied_notes(camera.times_ns, selection.pictures)
     camera = camera.only(selection.pictures)
     if telemetry is not None:
@@ -68,6 +70,27 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     notes += frozen_notes(camera.name, selection.frozen, camera.common_times_ns() / 1e9)
     notes += [*telemetry_notes, *fixed_notes(camera.name, regions)]
     write_summary(files, frames=selection.frame_count, keyframes=len(selection.frames), notes=notes)
+
+
+def regions_and_lens(camera: CaptureCamera, context: StageContext) -> tuple[BoolArray, LensEstimate | None]:
+    """Return the regions that are fixed to the camera, and the lens of a camera that needs one."""
+    import numpy as np
+
+    from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
+    from bodycap_batch.tracks import estimate_lens, find_fixed_regions, track_video
+
+    regions = np.zeros((1, 1), dtype=bool)
+    wants_lens = camera.camera.refine and is_on(Mechanism.LENS_FROM_TRACKS)
+    if not wants_lens and not is_on(Mechanism.FIXED_REGIONS):
+        return regions, None
+    tracks = track_video(camera, context)
+    if is_on(Mechanism.FIXED_REGIONS):
+        regions = find_fixed_regions(tracks, camera.times_ns)
+        record_act(Mechanism.FIXED_REGIONS, int(regions.any()))
+    if not wants_lens:
+        return regions, None
+    context.progress(0, 0, "estimating the lens")
+    return regions, estimate_lens(tracks.outside(regions), camera.times_ns)
 
 
 def _telemetry(camera: CaptureCamera, task: KeyframesTask) -> tuple[CameraTelemetry | None, list[str]]:

@@ -1,6 +1,8 @@
-"""Follow points through every frame of a video, and find what the tracks show without a map."""
+"""Follow points through a video, and find what the tracks show without a map."""
 
-from bodycap_batch.tracks.fixed_regions import find_fixed_regions, fixed_notes, fixed_regions_of
+from bodycap_batch.tracks.fixed_regions import find_fixed_regions, fixed_notes
+from bodycap_batch.tracks.lens import estimate_lens
 from bodycap_batch.tracks.tracker import PointTracker
+from bodycap_batch.tracks.video import track_video
 
-__all__ = ["PointTracker", "find_fixed_regions", "fixed_notes", "fixed_regions_of"]
+__all__ = ["PointTracker", "estimate_lens", "find_fixed_regions", "fixed_notes", "track_video"]

@@ -4,18 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
+from bodycap_batch.core.arrays import BoolArray, IntArray
 from bodycap_batch.model.optical_flow import Pixels, pixel_scale
 from bodycap_batch.model.point_tracks import PointTracks
-from bodycap_batch.tracks.tracker import PointTracker
 
-_ALL_FRAMES = 600
-"""Maximum number of frames that are searched. Of a longer video, even parts are searched."""
-_STRETCH_FRAMES = 30
-"""Number of successive frames of such a part: three times the time over which motion is compared."""
 _WINDOW_S = 1.0 / 3.0
 """Time, seconds, over which the motion of points is compared. Evidence: docs/decisions/tracks.md."""
 _CELL_PX = 16.0
@@ -46,40 +38,6 @@ _MIN_CELLS = 3
 travel."""
 _MAX_MASKED = 0.75
 """Maximum share of the picture that may be fixed to the camera. If it is more, the camera stood still."""
-
-
-def fixed_regions_of(camera: CaptureCamera, context: StageContext) -> BoolArray:
-    """Follow points through a video, or through parts of a long one, and find what is fixed to the camera.
-
-    Args:
-        camera: The camera with its video.
-        context: Progress and cancellation.
-
-    Returns:
-        (R,C) mask of cells, as of `find_fixed_regions`.
-    """
-    count, lens = len(camera.times_ns), camera.camera
-    tracker = PointTracker(
-        camera=camera.name, width_px=lens.width_px, height_px=lens.height_px, mask=camera.mask
-    )
-    if count < 2 or not is_on(Mechanism.FIXED_REGIONS):
-        return find_fixed_regions(tracker.tracks(0), camera.times_ns[:0])
-    stretches = [(0, count)]
-    if count > _ALL_FRAMES:
-        starts = np.linspace(0, count - _STRETCH_FRAMES, _ALL_FRAMES // _STRETCH_FRAMES).astype(int)
-        stretches = [(start, start + _STRETCH_FRAMES) for start in starts.tolist()]
-    done, total = 0, sum(stop - start for start, stop in stretches)
-    for start, stop in stretches:
-        tracker.restart()
-        for index, grey in camera.read_decodable(np.arange(start, stop)):
-            context.check_cancelled()
-            tracker.add(index, grey)
-            if index % 30 == 0:
-                context.progress(done + index - start, total, "frames searched for the own hand")
-        done += stop - start
-    found = find_fixed_regions(tracker.tracks(count), camera.times_ns)
-    record_act(Mechanism.FIXED_REGIONS, int(found.any()))
-    return found
 
 
 def fixed_notes(camera: str, regions: BoolArray) -> list[str]:
@@ -134,13 +92,6 @@ def find_fixed_regions(tracks: PointTracks, times_ns: IntArray) -> BoolArray:
     # Tracks leave the border of a fixed thing: its outline is between two cells.
     grown = cv2.dilate(np.isin(label, large).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return np.asarray(grown if grown.mean() <= _MAX_MASKED else np.zeros(shape, dtype=bool))
-
-
-def in_regions(px: Pixels | FloatArray, regions: BoolArray, size_px: tuple[int, int]) -> BoolArray:
-    """Return whether pixels (N,2) are in cells of a mask (R,C) of a picture of the given width and height."""
-    shape = np.array([regions.shape[1], regions.shape[0]])
-    cell = np.clip((px / np.array(size_px) * shape).astype(np.int64), 0, shape - 1)
-    return np.asarray(regions[cell[:, 1], cell[:, 0]])
 
 
 def _pairs(times_ns: IntArray) -> list[tuple[int, int]]:

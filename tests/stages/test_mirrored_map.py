@@ -15,7 +15,7 @@ from bodycap_batch.config import KeyframeOptions, MapOptions
 from bodycap_batch.config.job import load_job
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build, build_map
-from bodycap_batch.mapping.matching.database import CameraKeyframes
+from bodycap_batch.mapping.matching.keyframe_features import CameraKeyframes
 from bodycap_batch.model.scene import KeyframeSelection
 from tests.rooms import stroll, write_capture
 from tests.stages.conftest import context

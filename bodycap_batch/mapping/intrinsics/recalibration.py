@@ -126,6 +126,7 @@ def with_intrinsics_to_refine(capture: Capture, cameras: Mapping[str, Camera]) -
                 item,
                 camera=replace(cameras[item.name], sideways=item.camera.sideways),
                 calibrated=False,
+                lens_sigma=0.0,
                 given=item.given or item.camera,
             )
             if item.name in cameras

@@ -271,7 +271,8 @@ class _MapperRun:
 
         Among the images that fit, the image that observes most of the map is registered. If none fits, an
         image is registered from its matches alone. This takes seconds, so it is done only to connect a camera
-        of which the map lacks most images. Single images can be found later, when all frames are registered.
+        of which the map lacks most images with another camera. Single images can be found later, when all
+        frames are registered.
         """
         for image_id in self._mapper.find_next_images(self._options, structure_less=False):
             if self._mapper.register_next_image(self._options, image_id):
@@ -288,12 +289,14 @@ class _MapperRun:
         return None
 
     def _missing_cameras(self) -> set[int]:
-        """Return the ids of the cameras most of whose images are not registered."""
+        """Return the ids of the cameras that another camera may connect: most of their images are missing."""
         images = self._model.images.values()
         every = Counter(image.camera_id for image in images)
         registered = Counter(image.camera_id for image in images if image.has_pose)
         return {
-            number for number, count in every.items() if registered[number] < _MIN_REGISTERED_RATIO * count
+            number
+            for number, count in every.items()
+            if registered[number] < _MIN_REGISTERED_RATIO * count and registered.keys() != {number}
         }
 
     def _restore_intrinsics(self) -> None:

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bodycap_batch.config import MapOptions
+from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.matching.database import DATABASE_NAME
+from bodycap_batch.mapping.validation.near_pairs import NO_TIMES, NearPairs
 from bodycap_batch.model.optical_flow import pixel_scale
 
 if TYPE_CHECKING:
@@ -58,16 +60,25 @@ class PairConsistency:
         return self.inlier_ratio < _MIN_INLIER_RATIO
 
 
-def evaluate_pairs(workspace: Path, model: pycolmap.Reconstruction) -> list[PairConsistency]:
+def evaluate_pairs(
+    workspace: Path, model: pycolmap.Reconstruction, times_ns: Mapping[str, IntArray] = NO_TIMES
+) -> list[PairConsistency]:
     """Compare the matches of verified pairs with the epipolar geometry that the model's poses define.
 
     Pairs are evaluated if both images are registered and the pair has at least `_MIN_PAIR_MATCHES` matches.
+    Of a pair that is near in time (`near_pairs`), only the matches that the poses explain count.
+
+    Args:
+        workspace: Folder of the database.
+        model: The model.
+        times_ns: Times (N,) of all frames of each camera, nanoseconds, by camera name.
 
     Source: the Sampson distance of Hartley, Zisserman, "Multiple view geometry", 2004, 11.4.
     """
     import pycolmap
 
     poses = {int(i): model.image(i).cam_from_world() for i in model.reg_image_ids()}
+    near = NearPairs(model, times_ns)
     rays, focal_px, max_error_px = {}, {}, {}
     out = []
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
@@ -88,8 +99,10 @@ def evaluate_pairs(workspace: Path, model: pycolmap.Reconstruction) -> list[Pair
                     rays[a][matches[:, 0]], rays[b][matches[:, 1]], essential
                 )
                 error_px = focal_px[a] * np.sqrt(squared)
-                ratio = float((error_px < max_error_px[a]).mean())
-                out.append(PairConsistency(a, b, len(matches), ratio))
+                explained = int((error_px < max_error_px[a]).sum())
+                count = explained if (a, b) in near else len(matches)
+                if count >= _MIN_PAIR_MATCHES:
+                    out.append(PairConsistency(a, b, count, explained / count))
     return out
 
 

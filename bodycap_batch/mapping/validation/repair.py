@@ -76,7 +76,7 @@ def repair_model(
         ids = read_image_ids(database)
     if keyframes is not None:
         ids = {ref: ids[ref] for ref in keyframes}
-    pairs = evaluate_pairs(context.workspace, model)
+    pairs = evaluate_pairs(context.workspace, model, context.times_ns)
     wrong = find_wrong_images(context, model, pairs)
     for _ in range(_ROUNDS if is_on(Mechanism.REPAIR) else 0):
         registered = registered_ids(model)
@@ -101,7 +101,7 @@ def repair_model(
             break
         # Most keyframes that are registered from their matches alone are removed again.
         other = re_register_images(model, wrong, context, len(ids), structure_less=False)
-        other_pairs = evaluate_pairs(context.workspace, other)
+        other_pairs = evaluate_pairs(context.workspace, other, context.times_ns)
         still_wrong = find_wrong_images(context, other, other_pairs)
         sound_before = len(registered - wrong)
         sound_after = len(registered_ids(other) - still_wrong)
@@ -127,12 +127,25 @@ def remove_without_adjustment(
 
     Returns:
         The model without misregistered keyframes; the image names of the removed keyframes; the fraction of
-        matches in inconsistent pairs before the removal.
+        matches in inconsistent pairs that is left.
     """
-    pairs = evaluate_pairs(context.workspace, model)
+    pairs = evaluate_pairs(context.workspace, model, context.times_ns)
     wrong = find_wrong_images(context, model, pairs)
     kept, removed = _remove_images(model, _without_confirmed(context, model, pairs, wrong))
-    return kept, removed, round(inconsistent_match_ratio(pairs), 4)
+    left = registered_ids(kept)
+    rest = [pair for pair in pairs if pair.first in left and pair.second in left]
+    return kept, removed, round(inconsistent_match_ratio(rest), 4)
+
+
+def left_contradicted(repair: Mapping[str, Any], ratio: float) -> float:
+    """Return the fraction of contradicting matches that decides whether a map is usable.
+
+    Args:
+        repair: The log entries of `repair_model`.
+        ratio: The fraction that is left after all removals. If one camera explains the contradictions, the
+            fraction before the removals decides: the map is then built without this camera.
+    """
+    return float(repair["contradicted_share"]) if "contradicting_camera" in repair else ratio
 
 
 def find_wrong_images(
@@ -148,7 +161,8 @@ def find_wrong_images(
         pairs: The verified pairs of the model (`evaluate_pairs`).
     """
     wrong = find_misregistered_images(pairs)
-    misplaced = find_misplaced_images(evaluate_agreement(context.workspace, model), image_sequences(model))
+    agreement = evaluate_agreement(context.workspace, model, context.times_ns)
+    misplaced = find_misplaced_images(agreement, image_sequences(model))
     if model.num_reg_images() - len(wrong | misplaced) < MIN_MODEL_KEYFRAMES:
         return wrong
     return wrong | misplaced

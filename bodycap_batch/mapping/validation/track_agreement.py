@@ -17,6 +17,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef
+from bodycap_batch.mapping.validation.near_pairs import NO_TIMES, NearPairs
 from bodycap_batch.mapping.validation.second_registration import observed_points
 
 if TYPE_CHECKING:
@@ -59,11 +60,22 @@ class PairAgreement:
         return self.agreeing >= max(1.0, _MIN_PAIR_AGREEMENT * self.judged)
 
 
-def evaluate_agreement(workspace: Path, model: pycolmap.Reconstruction) -> list[PairAgreement]:
-    """Compare the matches of all verified pairs of registered images with the points of a model."""
+def evaluate_agreement(
+    workspace: Path, model: pycolmap.Reconstruction, times_ns: Mapping[str, IntArray] = NO_TIMES
+) -> list[PairAgreement]:
+    """Compare the matches of all verified pairs of registered images with the points of a model.
+
+    Of a pair that is near in time (`near_pairs`), only the matches that agree are judged.
+
+    Args:
+        workspace: Folder of the database.
+        model: The model.
+        times_ns: Times (N,) of all frames of each camera, nanoseconds, by camera name.
+    """
     import pycolmap
 
     points = {int(number): observed_points(model, int(number)) for number in model.reg_image_ids()}
+    near = NearPairs(model, times_ns)
     out = []
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
@@ -71,8 +83,9 @@ def evaluate_agreement(workspace: Path, model: pycolmap.Reconstruction) -> list[
             if first in points and second in points:
                 matches = np.asarray(geometry.inlier_matches)
                 a, b = points[first][matches[:, 0]], points[second][matches[:, 1]]
-                judged = int(((a >= 0) | (b >= 0)).sum())
-                out.append(PairAgreement(first, second, judged, int(((a == b) & (a >= 0)).sum())))
+                agreeing = int(((a == b) & (a >= 0)).sum())
+                judged = agreeing if (first, second) in near else int(((a >= 0) | (b >= 0)).sum())
+                out.append(PairAgreement(first, second, judged, agreeing))
     return out
 
 

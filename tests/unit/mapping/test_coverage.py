@@ -14,7 +14,7 @@ from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     ImageRef,
     _write_camera,
-    count_with_features,
+    count_features,
     write_image,
 )
 from bodycap_batch.mapping.validation.epipolar_consistency import check_coverage
@@ -27,16 +27,14 @@ def _model(keyframes: int) -> SimpleNamespace:
     return SimpleNamespace(num_reg_images=lambda: keyframes)
 
 
-def test_keyframes_without_features_are_not_counted(tmp_path: Path) -> None:
+def test_the_features_of_each_keyframe_are_counted(tmp_path: Path) -> None:
     features = {0: 500, 1: 0, 2: 19, 3: 20}
     with pycolmap.Database.open(str(tmp_path / DATABASE_NAME)) as database:
         camera = _write_camera(database, LENS.to_pycolmap())
         for frame, count in features.items():
             image = write_image(database, ImageRef("torso", frame), camera)
             database.write_keypoints(image, np.ones((count, 2), np.float32))
-    refs = [ImageRef("torso", frame) for frame in features]
-    assert count_with_features(tmp_path, refs, 20) == 2
-    assert count_with_features(tmp_path, refs[1:3], 20) == 0
+    assert count_features(tmp_path) == {ImageRef("torso", frame): count for frame, count in features.items()}
 
 
 @pytest.mark.parametrize(

@@ -17,12 +17,11 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping import earlier_results
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
-    CameraKeyframes,
-    add_keyframes,
     read_detected_px,
     read_image_ids,
     read_keypoint_colours,
 )
+from bodycap_batch.mapping.matching.keyframe_features import CameraKeyframes, add_keyframes
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.rotation_path import RotationPath, TurningShutter

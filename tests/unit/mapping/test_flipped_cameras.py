@@ -20,8 +20,6 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
-    CameraKeyframes,
-    add_keyframes,
     read_image_ids,
     read_keypoint_colours,
 )
@@ -33,6 +31,7 @@ from bodycap_batch.mapping.matching.flipped_cameras import (
     label_cameras,
     mirror_descriptors,
 )
+from bodycap_batch.mapping.matching.keyframe_features import CameraKeyframes, add_keyframes
 from bodycap_batch.mapping.matching.retrieval import count_ratio_test_matches, largest_descriptors
 from bodycap_batch.model.map_diagnostics import CameraGroups, MapDiagnostics
 from bodycap_batch.model.scene import KeyframeSelection

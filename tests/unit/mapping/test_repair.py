@@ -12,12 +12,12 @@ import numpy as np
 import pycolmap
 import pytest
 
-from bodycap_batch.capture import Capture, CaptureCamera
+from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.core.errors import JobError
-from bodycap_batch.mapping import initial_models, results
+from bodycap_batch.core.errors import EstimationError, JobError
+from bodycap_batch.mapping import initial_models
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.initial_models import reconstruct_with_intrinsics
 from bodycap_batch.mapping.intrinsics import intrinsics_check
@@ -285,17 +285,43 @@ def test_without_points_no_image_is_confirmed(
 
 
 def test_a_further_model_without_points_is_dropped(
-    built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
+    built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
     model, poses, mapping, _ = built
     empty = copy.deepcopy(model)
     for point in list(empty.point3D_ids()):
         empty.delete_point3D(point)
-    monkeypatch.setattr(results, "frame_times_ns", lambda _: {"cam": np.arange(99) * 10**9})
+    mapping = replace(mapping, times_ns={"cam": np.arange(99) * 10**9})
     models = [copy.deepcopy(model), empty]
-    finalise_models(models, mapping, cast(Capture, None), [None, None])
+    finalise_models(models, mapping, [None, None])
     assert [item.num_reg_images() for item in models] == [_KEYFRAMES]
     assert _rms(models[0], poses) < 0.01
+
+
+@pytest.mark.parametrize(("sigma", "is_refined"), [(1e-6, False), (1.0, True)])
+def test_the_last_adjustment_changes_a_lens_by_what_its_uncertainty_allows(
+    sigma: float, built: tuple[Any, FloatArray, MappingContext, set[Any]], *, is_refined: bool
+) -> None:
+    model, poses, mapping, _ = built
+    mapping = replace(mapping, times_ns={"cam": np.arange(99) * 10**9}, lens_sigma={1: sigma})
+    models = [copy.deepcopy(model), copy.deepcopy(model)]
+    finalise_models(models, mapping, [None, None])
+    focal_px = [item.camera(1).params[0] for item in models]
+    assert bool(focal_px[0] != 420.0) is is_refined
+    assert focal_px[1] == focal_px[0], "a camera has one lens in all models"
+    assert _rms(models[0], poses) < 0.02
+
+
+def test_a_map_without_any_point_is_an_error_that_says_so(
+    built: tuple[Any, FloatArray, MappingContext, set[Any]],
+) -> None:
+    model, _, mapping, _ = built
+    empty = copy.deepcopy(model)
+    for point in list(empty.point3D_ids()):
+        empty.delete_point3D(point)
+    mapping = replace(mapping, times_ns={"cam": np.arange(99) * 10**9})
+    with pytest.raises(EstimationError, match="the map is empty"):
+        finalise_models([empty], mapping, [None])
 
 
 def test_conjugate_gradients_give_the_same_map_as_the_direct_solver(

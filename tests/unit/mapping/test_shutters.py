@@ -27,13 +27,12 @@ from bodycap_batch.mapping.intrinsics.shutters import (
 )
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
-    CameraKeyframes,
-    add_keyframes,
     read_detected_px,
     read_image_ids,
     read_keypoint_colours,
     rewrite_without_cameras,
 )
+from bodycap_batch.mapping.matching.keyframe_features import CameraKeyframes, add_keyframes
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.frame_matches import FrameMatcher, FrameMatches
 from bodycap_batch.model.geometry import so3_exp
@@ -103,7 +102,7 @@ def workspace(tmp_path: Path) -> Path:
     pans = [cast(CaptureCamera, _Pan(name)) for name in ("fixed", "rolling")]
     keyframes = [
         CameraKeyframes(pans[0], 1, np.array([0, 3])),
-        CameraKeyframes(pans[1], 2, np.array([0, 3]), _shutter()),
+        CameraKeyframes(pans[1], 2, np.array([0, 3]), shutter=_shutter()),
     ]
     add_keyframes(tmp_path, keyframes, MapOptions(), StageContext(work_dir=tmp_path, threads=1))
     return tmp_path

@@ -18,8 +18,12 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.optical_flow import GreyImage
 from bodycap_batch.model.point_tracks import PointTracks
-from bodycap_batch.tracks import PointTracker, find_fixed_regions, fixed_notes, fixed_regions_of
-from bodycap_batch.tracks.fixed_regions import in_regions
+from bodycap_batch.tasks.keyframes import regions_and_lens
+from bodycap_batch.tracks import (
+    PointTracker,
+    find_fixed_regions,
+    fixed_notes,
+)
 
 WIDTH, HEIGHT, FPS = 320, 240, 30
 
@@ -113,8 +117,10 @@ def test_a_hand_in_view_is_found_while_the_camera_turns() -> None:
     assert mask is not None
     assert not mask[HEIGHT - 30, 40]
     assert mask[20, 40]
-    both = np.array([[40.0, HEIGHT - 30.0], [40.0, 20.0]])
-    assert in_regions(both, regions, (WIDTH, HEIGHT)).tolist() == [True, False]
+    outside = tracks.outside(regions)
+    _, px = outside.at(0)
+    assert 0 < len(px) < len(tracks.at(0)[1])
+    assert not ((px[:, 0] < WIDTH // 4) & (px[:, 1] > 3 * HEIGHT // 4)).any()
 
 
 @pytest.mark.parametrize("directions", [1, 2])
@@ -146,7 +152,7 @@ def wrist_camera(count: int, read: list[int]) -> CaptureCamera:
             read.append(index)
             yield index, with_hand(picture(texture, shifts[index]))
 
-    lens = SimpleNamespace(width_px=WIDTH, height_px=HEIGHT)
+    lens = SimpleNamespace(width_px=WIDTH, height_px=HEIGHT, refine=False)
     camera = SimpleNamespace(
         name="palm", camera=lens, mask=None, times_ns=times(count), read_decodable=read_decodable
     )
@@ -156,7 +162,8 @@ def wrist_camera(count: int, read: list[int]) -> CaptureCamera:
 @pytest.mark.parametrize(("count", "most"), [(90, 90), (1500, 600)])
 def test_a_long_video_is_searched_in_even_parts(count: int, most: int, tmp_path: Path) -> None:
     read: list[int] = []
-    regions = fixed_regions_of(wrist_camera(count, read), StageContext(work_dir=tmp_path))
+    regions, lens = regions_and_lens(wrist_camera(count, read), StageContext(work_dir=tmp_path))
+    assert lens is None, "the lens is given"
     assert len(read) == most
     assert read[-1] == count - 1
     assert regions[regions.shape[0] // 2 + 3 : -1, 1 : regions.shape[1] // 2 - 6].mean() > 0.9
@@ -166,7 +173,9 @@ def test_nothing_is_read_if_the_mechanism_is_switched_off(tmp_path: Path) -> Non
     read: list[int] = []
     mechanisms.begin_task({mechanisms.KEY_OPTION: ["fixed_regions"]})
     try:
-        assert not fixed_regions_of(wrist_camera(90, read), StageContext(work_dir=tmp_path)).any()
+        regions, lens = regions_and_lens(wrist_camera(90, read), StageContext(work_dir=tmp_path))
+        assert not regions.any()
+        assert lens is None
     finally:
         mechanisms.begin_task({})
     assert read == []
