@@ -89,19 +89,37 @@ def calibrated_camera_ids(capture: Capture, ids: Mapping[str, int]) -> list[int]
 
 
 def with_estimated_lenses(capture: Capture, selections: Sequence[KeyframeSelection]) -> Capture:
-    """Return the capture with the lenses that the tracks determine, as if they were given.
+    """Return the capture with the lenses that the tracks show.
+
+    A lens that the tracks determine is used as if it were given. One that they determine less well is the
+    first estimate, which mapping refines.
 
     Args:
         capture: All cameras.
         selections: The keyframes of the cameras, with the lens that their tracks determine.
     """
-    lenses = {
-        item.camera: (item.lens.lens, item.lens.focal_sigma)
+    shown = {
+        item.camera: item.lens
         for item in selections
-        if item.lens is not None and item.lens.is_determined and capture.camera(item.camera).camera.refine
+        if item.lens is not None and capture.camera(item.camera).camera.refine
     }
-    record_act(Mechanism.LENS_FROM_TRACKS, len(lenses))
-    return _with_lenses(capture, lenses)
+    known = {name: (item.lens, item.focal_sigma) for name, item in shown.items() if item.is_determined}
+    starts = {
+        name: item.lens
+        for name, item in shown.items()
+        if item.is_better_than_typical and not item.is_determined
+    }
+    record_act(Mechanism.LENS_FROM_TRACKS, len(known) + len(starts))
+    capture = _with_lenses(capture, known)
+    if not starts:
+        return capture
+    cameras = tuple(
+        replace(item, camera=replace(starts[item.name], sideways=item.camera.sideways))
+        if item.name in starts
+        else item
+        for item in capture.cameras
+    )
+    return replace(capture, cameras=cameras)
 
 
 def with_map_lenses(capture: Capture, previous: MapResult) -> Capture:

@@ -48,6 +48,10 @@ _MAX_KEYFRAMES = 300
 """Maximum number of keyframes of a model whose velocities are adjusted. Origin: 160 MB for the reduced
 system, and some seconds for each step."""
 
+_MIN_POINT_SHARE = 0.5
+"""Share of its points that a model keeps if its lenses can be refined. A model that bends refines them to
+lenses that do not exist, which few points fit. Then the lenses stay. Evidence: docs/decisions/tracks.md."""
+
 
 def refine_map(
     capture: Capture,
@@ -92,6 +96,10 @@ def refine_map(
     shutil.copytree(previous.workspace, workspace)
     calibrated_ids = calibrated_camera_ids(capture, read_camera_ids(workspace))
     mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, skeletal_above)
+    every_id = sorted(read_camera_ids(workspace).values())
+    with_constant_lenses = make_mapping_context(
+        workspace, capture, options, every_id, context, skeletal_above
+    )
     cameras = {camera.name: camera for camera in capture.cameras}
     equal_cameras = groups_of_equal_cameras(capture.cameras)
     entries = previous.log.get("readouts_from_matches", {})
@@ -111,7 +119,10 @@ def refine_map(
         }
         rotations = _rotations(workspace, scene_map.cameras, paths)
         rolling = RollingShutterModel(model, paths, cameras, detected, rotations)
-        refined = _Refinement(model, rolling, scene_map, cameras, equal_cameras, from_matches, mapping).run()
+        refinement = _Refinement(model, rolling, scene_map, cameras, equal_cameras, from_matches, mapping)
+        refined = refinement.run()
+        if refined.model.num_points3D() < _MIN_POINT_SHARE * model.num_points3D():
+            refined = replace(refinement, mapping=with_constant_lenses).run()
         readouts, corrected_px = refined.readouts, refined.corrected_px
         readout_s = _seconds(readouts)
         distorted |= distorted_cameras(refined.rolling, readout_s, scene_map.readout_s.keys())

@@ -16,7 +16,7 @@ from bodycap_batch.model.static_span import MIN_STATIC_SPAN_NS
 if TYPE_CHECKING:
     import pycolmap
 
-_MIN_STATIC_POINTS = 20
+_MIN_STATIC_POINTS = 100
 """Minimum number of static points that determine the pose of a keyframe. If a keyframe has fewer static
 points, its transient points are kept. Evidence: docs/decisions/mapping.md."""
 
