@@ -100,7 +100,8 @@ class MapOptions(Options):
         512,
         ge=128,
         le=_MAX_FEATURES,
-        description="maximum number of SIFT features per keyframe; the strongest features are used",
+        description="maximum number of SIFT features of a keyframe with enough matches; the strongest ones "
+        "are used; a keyframe with few matches gets up to four times as many",
     )
     pairs: Literal["retrieval", "exhaustive"] = Field(
         "retrieval",

@@ -2,6 +2,7 @@
 
 from bodycap_batch.mapping.build import build_map, earlier_results
 from bodycap_batch.mapping.extend import extend_map
+from bodycap_batch.mapping.inputs import with_estimated_lenses
 from bodycap_batch.mapping.refine import refine_map
 
-__all__ = ["build_map", "earlier_results", "extend_map", "refine_map"]
+__all__ = ["build_map", "earlier_results", "extend_map", "refine_map", "with_estimated_lenses"]

@@ -89,43 +89,29 @@ def calibrated_camera_ids(capture: Capture, ids: Mapping[str, int]) -> list[int]
 
 
 def with_estimated_lenses(capture: Capture, selections: Sequence[KeyframeSelection]) -> Capture:
-    """Return the capture with the lenses that the tracks show.
-
-    A lens that the tracks determine is used as if it were given. One that they determine less well is the
-    first estimate, which mapping refines.
+    """Return the capture with the lenses that the tracks determine, as if they were given.
 
     Args:
         capture: All cameras.
         selections: The keyframes of the cameras, with the lens that their tracks determine.
     """
-    shown = {
-        item.camera: item.lens
+    lenses = {
+        item.camera: (item.lens.lens, item.lens.focal_sigma)
         for item in selections
-        if item.lens is not None and capture.camera(item.camera).camera.refine
+        if item.lens is not None and item.lens.is_determined and capture.camera(item.camera).camera.refine
     }
-    known = {name: (item.lens, item.focal_sigma) for name, item in shown.items() if item.is_determined}
-    starts = {
-        name: item.lens
-        for name, item in shown.items()
-        if item.is_better_than_typical and not item.is_determined
-    }
-    record_act(Mechanism.LENS_FROM_TRACKS, len(known) + len(starts))
-    capture = _with_lenses(capture, known)
-    if not starts:
-        return capture
-    cameras = tuple(
-        replace(item, camera=replace(starts[item.name], sideways=item.camera.sideways))
-        if item.name in starts
-        else item
-        for item in capture.cameras
-    )
-    return replace(capture, cameras=cameras)
+    record_act(Mechanism.LENS_FROM_TRACKS, len(lenses))
+    return _with_lenses(capture, lenses)
 
 
 def with_map_lenses(capture: Capture, previous: MapResult) -> Capture:
-    """Return the capture with the lenses of an earlier map, for the cameras whose lens is not given."""
+    """Return the capture with the lenses of an earlier map, for the cameras whose lens tracks determined.
+
+    A lens that nothing but the map determines is refined again with each extension: in a small map it may be
+    far off.
+    """
     mapped = {name: camera for item in reversed(previous.maps) for name, camera in item.cameras.items()}
-    unknown = {item.name for item in capture.cameras if item.camera.refine}
+    unknown = {item.name for item in capture.cameras if item.lens_sigma}
     return _with_lenses(capture, {name: (mapped[name], 0.0) for name in sorted(unknown & mapped.keys())})
 
 

@@ -6,12 +6,9 @@ from dataclasses import dataclass
 
 from bodycap_batch.model.camera import Camera
 
-_MAX_SIGMA = 0.1
-"""Maximum relative standard deviation of a focal length that is constant while the map is built. Evidence:
-docs/decisions/tracks.md."""
-_TYPICAL_SIGMA = 0.3
-"""Relative standard deviation of the focal length of a typical field of view, which is taken if nothing else
-is known."""
+_MAX_SIGMA = 0.2
+"""Maximum relative standard deviation of a focal length that is constant while the map is built. That of a
+typical field of view, which is taken otherwise, is 0.3. Evidence: docs/decisions/tracks.md."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,8 +31,3 @@ class LensEstimate:
     def is_determined(self) -> bool:
         """True if the tracks determine the focal length well enough for the map."""
         return self.focal_sigma < _MAX_SIGMA
-
-    @property
-    def is_better_than_typical(self) -> bool:
-        """True if the estimate is a better start than a typical field of view."""
-        return self.focal_sigma < _TYPICAL_SIGMA

@@ -90,11 +90,13 @@ def run_extend(task: ExtendTask, context: StageContext, files: Path) -> None:
     """Extend the map and store it."""
     import numpy as np
 
-    from bodycap_batch.mapping import extend_map
+    from bodycap_batch.mapping import extend_map, with_estimated_lenses
 
     extra = {name: np.asarray(frames, dtype=np.int64) for name, frames in task.extra.items()}
     previous = load_map(task.map.path)
+    selections = [load_keyframes(artefact.path) for artefact in task.keyframes.values()]
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
+    capture = with_estimated_lenses(capture, selections)
     _save_map(extend_map(capture, previous, extra, task.options, context), files)
 
 
