@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
+
+from bodycap_batch.capture import Capture
+from bodycap_batch.config import MapOptions
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.mapping import refine, refine_map
 from bodycap_batch.mapping.intrinsics.readout_time import Readout, judged_readout
 from bodycap_batch.mapping.refine import _readout_of, _Refinement
+from bodycap_batch.model.scene import MapResult
+from tests.scenes import small_map
 
 
 def refinement(
@@ -75,3 +84,49 @@ def test_an_unknown_error_of_a_logged_readout_time_is_infinite() -> None:
     readout = judged_readout(0.002, math.inf)
     assert _readout_of({**asdict(readout), "sigma_s": None}) == readout
     assert _readout_of(asdict(judged_readout(0.02, 0.001))) == judged_readout(0.02, 0.001)
+
+
+@pytest.mark.parametrize(("left", "runs"), [(90, 1), (10, 2)])
+def test_lenses_stay_if_their_refinement_would_lose_the_points(
+    left: int, runs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held: list[list[int]] = []
+
+    def model(points: int) -> Any:
+        return SimpleNamespace(num_points3D=lambda: points, reg_image_ids=list)
+
+    def run(self: _Refinement) -> Any:
+        held.append(list(self.mapping.calibrated_ids))
+        rolling = SimpleNamespace(motions=lambda *_: {}, displacement_px=lambda *_: 0.0)
+        return SimpleNamespace(
+            model=model(left if len(held) == 1 else 80),
+            readouts={},
+            corrected_px={},
+            rolling=rolling,
+            removed=0,
+            error_scales=None,
+        )
+
+    monkeypatch.setattr(_Refinement, "run", run)
+    monkeypatch.setattr(refine, "read_model", lambda *_: model(100))
+    monkeypatch.setattr(refine, "read_camera_ids", lambda _: {"head": 1, "palm": 2})
+    monkeypatch.setattr(refine, "calibrated_camera_ids", lambda *_: [2])
+    monkeypatch.setattr(
+        refine, "make_mapping_context", lambda *items: SimpleNamespace(calibrated_ids=items[3])
+    )
+    for name in ("RollingShutterModel", "_rotations", "write_models", "groups_of_equal_cameras"):
+        monkeypatch.setattr(refine, name, lambda *_: None)
+    monkeypatch.setattr(refine, "make_result", lambda models, *_: _result(models))
+    workspace = tmp_path / "before"
+    workspace.mkdir()
+    previous = MapResult(maps=(small_map(),), workspace=workspace, log={})
+    context = StageContext(work_dir=tmp_path / "now")
+    context.work_dir.mkdir()
+    result = refine_map(Capture(cameras=()), previous, (), MapOptions(), context)
+    assert held == [[2], [1, 2]][:runs]
+    assert result.log["points"] == [left if runs == 1 else 80]
+
+
+def _result(models: Any) -> MapResult:
+    points = [item.num_points3D() for item in models]
+    return MapResult(maps=(small_map(),), workspace=Path(), log={"points": points})
