@@ -22,9 +22,9 @@ from bodycap_batch.mapping.validation.transient_points import remove_transient_p
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.scene import MapResult
 
-_LENS_SIGMAS = 3.0
-"""Maximum change of a focal length by the last adjustment, in standard deviations of that of the tracks. The
-errors are 1.5 stated standard deviations, so this is 2 true ones. Evidence: docs/decisions/tracks.md."""
+_LENS_SIGMAS = 2.0
+"""Maximum change of a focal length by the last adjustment, in standard deviations of that of the tracks.
+Evidence: docs/decisions/tracks.md."""
 
 
 def finalise_models(models: list[Any], context: MappingContext, resected: Sequence[set[int] | None]) -> int:
