@@ -52,7 +52,6 @@ class Mechanism(StrEnum):
     FIXED_REGIONS = "fixed_regions"
     LENS_FROM_TRACKS = "lens_from_tracks"
     NEIGHBOUR_MATCHES = "neighbour_matches"
-    TRACK_MATCHES = "track_matches"
     GAP_FILLING = "gap_filling"
     SENSOR_PATH = "sensor_path"
     LYING = "lying"

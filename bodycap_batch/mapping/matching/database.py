@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import FloatArray
 
 if TYPE_CHECKING:
     import pycolmap
@@ -23,9 +23,6 @@ DATABASE_NAME = "database.db"
 """File name of the database in the workspace folder."""
 COLOURS_FOLDER = "colours"
 """Name of the folder with the colours of the keypoints, in the workspace folder. Each image has one file."""
-TRACKS_FOLDER = "tracks"
-"""Name of the folder with the track numbers of keypoints, in the workspace folder. Each image with keypoints
-that belong to tracks has one file."""
 DETECTED_FOLDER = "detected"
 """Name of the folder with the detected positions of the keypoints, in the workspace folder. Each image whose
 keypoints were moved to the instant of the middle row has one file."""
@@ -130,7 +127,7 @@ def rewrite_without_cameras(workspace: Path, cameras: Collection[str]) -> None:
     """
     import pycolmap
 
-    folders = [workspace / name for name in (COLOURS_FOLDER, DETECTED_FOLDER, TRACKS_FOLDER)]
+    folders = [workspace / name for name in (COLOURS_FOLDER, DETECTED_FOLDER)]
     before = (workspace / DATABASE_NAME).rename(workspace / f"whole_{DATABASE_NAME}")
     with (
         pycolmap.Database.open(str(before)) as source,
@@ -162,12 +159,6 @@ def rewrite_without_cameras(workspace: Path, cameras: Collection[str]) -> None:
 def read_keypoint_colours(workspace: Path, image_id: int) -> npt.NDArray[np.uint8]:
     """Return the RGB colours (N,3), 0 to 255, at the keypoints of an image."""
     return np.asarray(np.load(workspace / COLOURS_FOLDER / f"{image_id}.npy"), dtype=np.uint8)
-
-
-def read_tracks(workspace: Path, image_id: int) -> IntArray:
-    """Return the track numbers (T,) of the last T keypoints of an image."""
-    path = workspace / TRACKS_FOLDER / f"{image_id}.npy"
-    return np.asarray(np.load(path), dtype=np.int64) if path.exists() else np.zeros(0, dtype=np.int64)
 
 
 def write_image(database: pycolmap.Database, ref: ImageRef, camera_id: int) -> int:

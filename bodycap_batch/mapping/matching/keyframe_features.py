@@ -20,11 +20,9 @@ from bodycap_batch.mapping.matching.database import (
     COLOURS_FOLDER,
     DATABASE_NAME,
     DETECTED_FOLDER,
-    TRACKS_FOLDER,
     ImageRef,
     read_image_ids,
     read_keypoint_colours,
-    read_tracks,
     write_image,
 )
 from bodycap_batch.mapping.matching.neighbour_matches import features_for_neighbours
@@ -103,10 +101,6 @@ def add_keyframes(
                 descriptors = pycolmap.FeatureDescriptors(sift, features.descriptors)
                 database.write_descriptors(image_id, descriptors)
                 np.save(colours / f"{image_id}.npy", features.rgb)
-                if len(features.track):
-                    folder = workspace / TRACKS_FOLDER
-                    folder.mkdir(exist_ok=True)
-                    np.save(folder / f"{image_id}.npy", features.track)
                 done += 1
                 context.progress(min(done, total), total, "features")
     context.progress(0, 0, "choosing pairs")
@@ -174,7 +168,6 @@ def _read_features(workspace: Path, database: pycolmap.Database, image_id: int) 
         keypoints=keypoints,
         descriptors=np.asarray(database.read_descriptors(image_id).data, dtype=np.uint8),
         rgb=read_keypoint_colours(workspace, image_id),
-        track=read_tracks(workspace, image_id),
     )
 
 

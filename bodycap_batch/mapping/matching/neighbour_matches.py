@@ -24,7 +24,6 @@ from bodycap_batch.mapping.matching.pair_matching import (
     verify_pair,
 )
 from bodycap_batch.mapping.matching.sift import SiftFeatures, extract_features
-from bodycap_batch.tracks import PointTracker
 
 _MIN_MATCHES = 100
 """Number of verified matches with which neighbours are connected well. Evidence: docs/decisions/tracks.md."""
@@ -69,52 +68,7 @@ def features_for_neighbours(
             break
         found |= _extract(camera, added, MORE_FEATURES * count, context)
         record_act(Mechanism.NEIGHBOUR_MATCHES, len(added))
-    found = dict(sorted(found.items()))
-    if not is_on(Mechanism.TRACK_MATCHES):
-        return found
-    return _with_tracks(camera, found, matches.weak(found), context)
-
-
-def _with_tracks(
-    camera: CaptureCamera,
-    features: dict[int, SiftFeatures],
-    weak: Sequence[tuple[int, int]],
-    context: StageContext,
-) -> dict[int, SiftFeatures]:
-    """Return the features with points that optical flow follows between neighbours with few matches.
-
-    Args:
-        camera: Camera whose frames are read.
-        features: Features of each keyframe.
-        weak: Neighbours with few matches.
-        context: Cancellation.
-    """
-    lens, number = camera.camera, 0
-    out = dict(features)
-    runs = list[list[int]]()
-    for first, last in weak:
-        if runs and runs[-1][-1] == first:
-            runs[-1].append(last)
-        else:
-            runs.append([first, last])
-    for run in runs:
-        tracker = PointTracker(
-            camera=camera.name, width_px=lens.width_px, height_px=lens.height_px, mask=camera.mask
-        )
-        for index, grey in camera.read_decodable(np.arange(run[0], run[-1] + 1)):
-            context.check_cancelled()
-            tracker.add(index, grey)
-        tracks = tracker.tracks(run[-1] + 1)
-        every = np.concatenate([tracks.at(frame)[0] for frame in run])
-        seen, count = np.unique(every, return_counts=True)
-        kept = seen[count > 1]
-        for frame in run:
-            track, px = tracks.at(frame)
-            inside = np.isin(track, kept)
-            out[frame] = out[frame].with_tracks(px[inside], track[inside] + number)
-        number += int(every.max(initial=0)) + 1
-        record_act(Mechanism.TRACK_MATCHES, len(kept))
-    return out
+    return dict(sorted(found.items()))
 
 
 def _extract(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +15,7 @@ import numpy.typing as npt
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
-from bodycap_batch.mapping.matching.database import (
-    DATABASE_NAME,
-    ImageRef,
-    Pair,
-    read_image_ids,
-    read_tracks,
-)
+from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, read_image_ids
 from bodycap_batch.mapping.matching.descriptors import (
     DESCRIPTOR_NORM,
     MAX_MATCH_ANGLE_RAD,
@@ -77,14 +71,12 @@ class KeyframeFeatures:
             For an uncalibrated camera: detected positions, px (OpenCV's origin).
         error: Maximum epipolar error of an inlier, in the unit of `rays`.
         calibrated: True if the camera is calibrated; False if its intrinsics are only a first estimate.
-        track: (T,) number of the track of each of the last T features (`SiftFeatures.track`).
     """
 
     descriptors: ByteDescriptors
     rays: FloatArray
     error: float
     calibrated: bool
-    track: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @staticmethod
     def of(
@@ -136,9 +128,7 @@ def match_pairs(
     verified: dict[Pair, int] = {}
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         ids = read_image_ids(database)
-        features = _read_features(
-            workspace, database, ids, {ref for pair in pairs for ref in pair}, intrinsics
-        )
+        features = _read_features(database, ids, {ref for pair in pairs for ref in pair}, intrinsics)
         for done in range(0, len(pairs), _PAIRS_PER_TRANSACTION):
             context.progress(done, len(pairs), "pairs")
             block = pairs[done : done + _PAIRS_PER_TRANSACTION]
@@ -153,7 +143,6 @@ def match_pairs(
 
 
 def _read_features(
-    workspace: Path,
     database: pycolmap.Database,
     ids: Mapping[ImageRef, int],
     refs: set[ImageRef],
@@ -161,13 +150,10 @@ def _read_features(
 ) -> dict[ImageRef, KeyframeFeatures]:
     """Read the features of the keyframes `refs` from the database."""
     return {
-        ref: replace(
-            KeyframeFeatures.of(
-                np.asarray(database.read_keypoints(ids[ref]), dtype=np.float64)[:, :2],
-                np.asarray(database.read_descriptors(ids[ref]).data),
-                intrinsics[ref.camera],
-            ),
-            track=read_tracks(workspace, ids[ref]),
+        ref: KeyframeFeatures.of(
+            np.asarray(database.read_keypoints(ids[ref]), dtype=np.float64)[:, :2],
+            np.asarray(database.read_descriptors(ids[ref]).data),
+            intrinsics[ref.camera],
         )
         for ref in sorted(refs)
     }
@@ -190,8 +176,6 @@ def _match_block(
             if a != last:
                 last, first = a, features[a].descriptors.astype(np.float32)
             matches = find_mutual_matches(first, features[b].descriptors.astype(np.float32))
-            if a.camera == b.camera:
-                matches = np.concatenate([matches, common_tracks(features[a], features[b])])
             out.append(verify_pair(matches, features[a], features[b]))
         return out
 
@@ -226,13 +210,6 @@ def find_mutual_matches(first: FloatDescriptors, second: FloatDescriptors) -> In
     _, once = np.unique(nearest[near], return_index=True)
     near = near[np.sort(once)]
     return np.column_stack([near, nearest[near]])
-
-
-def common_tracks(first: KeyframeFeatures, second: KeyframeFeatures) -> IntArray:
-    """Return the matches (K,2) of features of the same tracks, as indices of features."""
-    _, one, other = np.intersect1d(first.track, second.track, assume_unique=True, return_indices=True)
-    start = [len(each.descriptors) - len(each.track) for each in (first, second)]
-    return np.column_stack([one + start[0], other + start[1]]).astype(np.int64)
 
 
 def _angle_rad(products: npt.NDArray[np.float32]) -> FloatArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Any
 
@@ -38,8 +38,6 @@ _POOR_RATIO = 0.5
 """Fraction of the maximum number of features below which a frame is poor in features. Features of such a
 frame are detected again in the full frame, with `_POOR_CONTRAST_THRESHOLD`. Evidence:
 docs/decisions/mapping.md."""
-_TRACK_SCALE_PX = 1.0
-"""Scale of a keypoint of a track. Retrieval compares the largest features, so it never takes one of these."""
 _POOR_CONTRAST_THRESHOLD = 0.01
 """Contrast threshold of the second detection. Evidence: docs/decisions/mapping.md."""
 
@@ -52,24 +50,11 @@ class SiftFeatures:
         keypoints: (N,4) x and y (px, COLMAP's origin), scale (px) and orientation (rad) of each keypoint.
         descriptors: (N,128) root-normalised descriptor of each keypoint.
         rgb: (N,3) colour of the image at each keypoint, 0 to 255.
-        track: (T,) number of the track of each of the last T keypoints. These come from optical flow and have
-            no descriptor (zeros). Keypoints of one camera with the same number show the same point.
     """
 
     keypoints: npt.NDArray[np.float32]
     descriptors: npt.NDArray[np.uint8]
     rgb: npt.NDArray[np.uint8]
-    track: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-
-    def with_tracks(self, px: npt.NDArray[np.float32], track: IntArray) -> SiftFeatures:
-        """Return the features with further keypoints (T,2) that belong to tracks (T,)."""
-        shape = np.tile(np.array([[_TRACK_SCALE_PX, 0.0]], np.float32), (len(px), 1))
-        return SiftFeatures(
-            np.concatenate([self.keypoints, np.column_stack([px, shape])]).astype(np.float32),
-            np.concatenate([self.descriptors, np.zeros((len(px), 128), np.uint8)]),
-            np.concatenate([self.rgb, np.full((len(px), 3), 128, np.uint8)]),
-            np.concatenate([self.track, track]),
-        )
 
 
 def extract_features(
