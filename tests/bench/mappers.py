@@ -39,14 +39,13 @@ from bodycap_batch.mapping.inputs import (
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
-    CameraKeyframes,
     ImageRef,
     Pair,
     add_camera,
-    add_keyframes,
     read_camera_ids,
     read_image_ids,
 )
+from bodycap_batch.mapping.matching.keyframe_features import CameraKeyframes, add_keyframes
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.results import finalise_models
@@ -316,7 +315,7 @@ def measure(folder: Path, features: int, work: Path) -> None:
         _write_line(f"{name}, {mapper}: {line_of(models[0], prepared)}, {seconds:.0f} CPU s")
         started = time.process_time()
         models[0], _ = repair_model(models[0], set(prepared.tried), prepared.context, prepared.refs)
-        finalise_models(models, prepared.context, prepared.capture, [None] * len(models))
+        finalise_models(models, prepared.context, [None] * len(models))
         last, _, _ = remove_without_adjustment(models[0], prepared.context)
         added = time.process_time() - started
         _write_line(f"{name}, {mapper}, repaired: {line_of(last, prepared)}, {added:.0f} more CPU s")
