@@ -53,11 +53,9 @@ def features_for_neighbours(
     if not is_on(Mechanism.NEIGHBOUR_MATCHES):
         return found
     matches = _Matches(camera, context)
+    # A picture with fewer features than half of the maximum has no more.
     poor = {
-        frame
-        for pair in matches.weak(found)
-        for frame in pair
-        if len(found[frame].keypoints) >= MORE_FEATURES * _MIN_SHARE * count / 2
+        frame for pair in matches.weak(found) for frame in pair if 2 * len(found[frame].keypoints) >= count
     }
     found |= _extract(camera, np.array(sorted(poor), dtype=np.int64), MORE_FEATURES * count, context)
     record_act(Mechanism.NEIGHBOUR_MATCHES, len(poor))
