@@ -32,7 +32,7 @@ def finalise_models(models: list[Any], context: MappingContext, resected: Sequen
 
     A model that is left without points is removed from the list: its keyframes saw nothing but transient
     points, or contradict each other. The last adjustment of the largest model refines the lenses that tracks
-    determined (`_adjust_with_lenses`). The other models keep these lenses.
+    determined (`_adjusted`). The other models keep these lenses.
 
     Args:
         models: Reconstructions, the largest first. The list and the reconstructions are changed in place.

@@ -73,7 +73,10 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
 
 
 def regions_and_lens(camera: CaptureCamera, context: StageContext) -> tuple[BoolArray, LensEstimate | None]:
-    """Return the regions that are fixed to the camera, and the lens of a camera that needs one."""
+    """Return the regions that are fixed to the camera, and the lens of a camera that needs one.
+
+    A video of fewer than two frames shows neither.
+    """
     import numpy as np
 
     from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
@@ -81,7 +84,7 @@ def regions_and_lens(camera: CaptureCamera, context: StageContext) -> tuple[Bool
 
     regions = np.zeros((1, 1), dtype=bool)
     wants_lens = camera.camera.refine and is_on(Mechanism.LENS_FROM_TRACKS)
-    if not wants_lens and not is_on(Mechanism.FIXED_REGIONS):
+    if len(camera.times_ns) < 2 or not (wants_lens or is_on(Mechanism.FIXED_REGIONS)):
         return regions, None
     tracks = track_video(camera, context)
     if is_on(Mechanism.FIXED_REGIONS):

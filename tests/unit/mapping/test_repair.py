@@ -284,13 +284,19 @@ def test_without_points_no_image_is_confirmed(
     assert confirm_images(mapping.workspace, model, sequences[0][:-1], sequences, 8.0) == set()
 
 
+def _without_points(model: Any) -> Any:
+    """Return a copy of a model that keeps its poses only."""
+    empty = copy.deepcopy(model)
+    for point in list(empty.point3D_ids()):
+        empty.delete_point3D(point)
+    return empty
+
+
 def test_a_further_model_without_points_is_dropped(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
     model, poses, mapping, _ = built
-    empty = copy.deepcopy(model)
-    for point in list(empty.point3D_ids()):
-        empty.delete_point3D(point)
+    empty = _without_points(model)
     mapping = replace(mapping, times_ns={"cam": np.arange(99) * 10**9})
     models = [copy.deepcopy(model), empty]
     finalise_models(models, mapping, [None, None])
@@ -316,9 +322,7 @@ def test_a_map_without_any_point_is_an_error_that_says_so(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
     model, _, mapping, _ = built
-    empty = copy.deepcopy(model)
-    for point in list(empty.point3D_ids()):
-        empty.delete_point3D(point)
+    empty = _without_points(model)
     mapping = replace(mapping, times_ns={"cam": np.arange(99) * 10**9})
     with pytest.raises(EstimationError, match="the map is empty"):
         finalise_models([empty], mapping, [None])

@@ -169,6 +169,17 @@ def test_a_long_video_is_searched_in_even_parts(count: int, most: int, tmp_path:
     assert regions[regions.shape[0] // 2 + 3 : -1, 1 : regions.shape[1] // 2 - 6].mean() > 0.9
 
 
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_video_of_fewer_than_two_frames_shows_neither_regions_nor_a_lens(
+    count: int, tmp_path: Path
+) -> None:
+    camera = wrist_camera(count, [])
+    camera.camera.refine = True  # type: ignore[misc]
+    regions, lens = regions_and_lens(camera, StageContext(work_dir=tmp_path))
+    assert not regions.any()
+    assert lens is None
+
+
 def test_nothing_is_read_if_the_mechanism_is_switched_off(tmp_path: Path) -> None:
     read: list[int] = []
     mechanisms.begin_task({mechanisms.KEY_OPTION: ["fixed_regions"]})
