@@ -223,9 +223,9 @@ class Flow:
         """Add keyframes at times of lost frames and register again, until no further frame is localised.
 
         Returns:
-            The artefact of the extended map, and the registrations against this map. A round that loses
-            frames is not used. Frames whose pose a round withdraws, because they contradict the map, were
-            wrong before and do not count as lost.
+            The artefact of the extended map, and the registrations against this map. A round that fails, or
+            that loses frames, is not used. Frames whose pose a round withdraws, because they contradict the
+            map, were wrong before and do not count as lost.
         """
         rounds = self._job.registration.rounds if is_on(Mechanism.EXTENSION) else 0
         for _ in range(rounds):
@@ -233,7 +233,12 @@ class Flow:
             wanted = {name: summary["wanted"] for name, summary in summaries.items() if summary["wanted"]}
             if not wanted:
                 break
-            extended = self._extend(scene_map, wanted, keyframes)
+            try:
+                extended = self._extend(scene_map, wanted, keyframes)
+            except EstimationError as error:
+                cause = "the map could not be extended to localise lost frames"
+                self.runner.note(f"{cause}, so the earlier map is kept: {error.message}", "extend")
+                break
             again = self.register(extended, keyframes, registrations)
             gained = _posed_frames(again) - _posed_frames(registrations)
             if gained < 0:

@@ -330,6 +330,15 @@ def test_the_map_is_not_extended_further_if_no_frame_is_gained(
     assert passes == rounds_used + 1
 
 
+def test_the_earlier_map_is_kept_if_its_extension_fails(bench: Bench) -> None:
+    bench.order(wanted=[[5]], localised=[5], fail="extend")
+    executed = bench.executed()
+    assert executed.count("registration torso") == 1
+    notes = [event.what for event in bench.events if event.kind == "note"]
+    assert sum("could not be extended" in note and "extend does not work out" in note for note in notes) == 1
+    assert (bench.out / "result.ply").exists()
+
+
 @pytest.mark.parametrize(("contradicted", "extensions_used"), [(0, 0), (3, 1)])
 def test_a_round_that_withdraws_wrong_poses_loses_no_frames(
     bench: Bench, contradicted: int, extensions_used: int
