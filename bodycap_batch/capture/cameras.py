@@ -63,6 +63,8 @@ class CaptureCamera:
         videos: Video file of each chapter, with the list of its frames.
         mask: (H,W) mask at the work size, True where the room is visible; None if the room is visible
             everywhere.
+        moving_regions: (N,R,C) mask of cells that divide the picture of each frame evenly, True where
+            something moves by itself, for example a hand; None if nothing does.
         damaged: (D,) indices into `frame_numbers` of frames that are damaged in the video. They are not read.
             Empty if the video was not yet searched for damage.
         kept: Stored copies of frames at the work size. They are read instead of the video. None if there are
@@ -88,6 +90,7 @@ class CaptureCamera:
     notes: tuple[str, ...] = ()
     videos: tuple[VideoFile, ...] = field(default=(), repr=False)
     mask: BoolArray | None = field(default=None, repr=False)
+    moving_regions: BoolArray | None = field(default=None, repr=False)
     damaged: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64), repr=False)
     kept: KeptFrames | None = field(default=None, repr=False)
     threads: int = 0
@@ -117,17 +120,26 @@ class CaptureCamera:
             nominal_fps=1e9 / float(np.median(np.diff(pictures.times_ns))),
         )
 
-    def is_unmasked(self, px: npt.NDArray[Any]) -> BoolArray:
-        """Return a mask (N,) of the pixels at which the camera's mask is True, or absent.
+    @property
+    def shows_only_room(self) -> bool:
+        """True if no part of any picture is left out."""
+        return self.mask is None and self.moving_regions is None
+
+    def is_unmasked(self, px: npt.NDArray[Any], frame: int | None = None) -> BoolArray:
+        """Return a mask (K,) of the pixels at which the room is visible.
 
         Args:
-            px: (N,2) pixels at the work size, with COLMAP's origin.
+            px: (K,2) pixels at the work size, with COLMAP's origin.
+            frame: Index of the frame, to leave out what moves by itself in it. None: only what no frame shows
+                of the room is left out.
         """
-        if self.mask is None:
-            return np.ones(len(px), dtype=bool)
-        column = np.clip(px[:, 0].astype(int), 0, self.mask.shape[1] - 1)
-        row = np.clip(px[:, 1].astype(int), 0, self.mask.shape[0] - 1)
-        return np.asarray(self.mask[row, column])
+        out = np.ones(len(px), dtype=bool)
+        size = self.camera.width_px, self.camera.height_px
+        if self.mask is not None:
+            out &= _at(self.mask, px, size)
+        if self.moving_regions is not None and frame is not None:
+            out &= ~_at(self.moving_regions[frame], px, size)
+        return out
 
     def key_indices(self) -> IntArray:
         """Return the indices into `frame_numbers` of the codec's key frames.
@@ -309,3 +321,11 @@ def _identity(planes: tuple[Planes, Colours]) -> tuple[Planes, Colours]:
     This function is used for `FrameCandidate.planes` if the planes have already been computed.
     """
     return planes
+
+
+def _at(cells: BoolArray, px: npt.NDArray[Any], size: tuple[int, int]) -> BoolArray:
+    """Return the values (K,) at pixels (K,2) of a mask (R,C) that divides a picture of some size evenly."""
+    rows, columns = cells.shape
+    column = np.clip((px[:, 0] * columns / size[0]).astype(int), 0, columns - 1)
+    row = np.clip((px[:, 1] * rows / size[1]).astype(int), 0, rows - 1)
+    return np.asarray(cells[row, column])

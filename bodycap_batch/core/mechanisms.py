@@ -50,6 +50,7 @@ class Mechanism(StrEnum):
     PATH_SMOOTHING = "path_smoothing"
     STATIC_POINTS = "static_points"
     FIXED_REGIONS = "fixed_regions"
+    MOVING_REGIONS = "moving_regions"
     LENS_FROM_TRACKS = "lens_from_tracks"
     NEIGHBOUR_MATCHES = "neighbour_matches"
     GAP_FILLING = "gap_filling"

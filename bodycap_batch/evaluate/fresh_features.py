@@ -5,12 +5,13 @@ The features are ORB. The map uses SIFT, and the tracks follow corners by optica
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX, Camera
 
 _LONG_SIDE_PX = 800
@@ -52,8 +53,16 @@ class FrameFeatures:
     row: FloatArray
 
 
-def detect_features(image: npt.NDArray[np.uint8], camera: Camera) -> FrameFeatures:
-    """Detect ORB features that are spread over a grey image (H,W) of the size of `camera`."""
+def detect_features(
+    image: npt.NDArray[np.uint8], camera: Camera, shows_room: Callable[[FloatArray], BoolArray]
+) -> FrameFeatures:
+    """Detect ORB features that are spread over the room in a grey image.
+
+    Args:
+        image: (H,W) image of the size of `camera`.
+        camera: Intrinsics.
+        shows_room: Returns which pixels (N,2) show the room (N,).
+    """
     import cv2
 
     height, width = image.shape
@@ -64,6 +73,8 @@ def detect_features(image: npt.NDArray[np.uint8], camera: Camera) -> FrameFeatur
     orb = cv2.ORB.create(_CANDIDATES, fastThreshold=_CORNER_CONTRAST)
     corners = orb.detect(image, None)
     px = np.array([corner.pt for corner in corners], dtype=np.float64).reshape(-1, 2)
+    inside = shows_room((px + CV2_PIXEL_OFFSET_PX) / factor)
+    corners, px = [corners[index] for index in np.flatnonzero(inside).tolist()], px[inside]
     cells = _cells_of(px, (image.shape[1], image.shape[0]))
     response = np.array([corner.response for corner in corners])
     kept = [corners[index] for index in _best_per_cell(cells, response, _FEATURES_PER_CELL)]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.capture.masks import without_regions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.evaluate.fresh_features import FrameFeatures, detect_features
@@ -25,6 +26,7 @@ from bodycap_batch.evaluate.right_frames import (
 from bodycap_batch.evaluate.two_view import Outcome
 from bodycap_batch.formats.tum import TimedPoses, read_tum
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.tracks import find_fixed_regions, find_moving_regions, find_moving_tracks, track_video
 
 _TIME_TOLERANCE = 0.25
 """Maximum difference between the times of a pose and its frame, as a fraction of the frame interval."""
@@ -134,16 +136,44 @@ def _check_camera(
 ) -> RightFrames:
     poses = poses_of_frames(delivered.poses, camera)
     count = len(poses)
-    features: list[FrameFeatures | None] = [None] * count
-    for index, image in camera.read_decodable(np.arange(count)):
-        features[index] = detect_features(image, delivered.lens.scaled(image.shape[1], image.shape[0]))
-        progress(index // 2, count)
     evidence = measure_pictures(
-        Pictures(features, np.asarray(camera.times_ns * 1e-9), delivered.readout_s),
+        read_pictures(camera, delivered.lens, delivered.readout_s, lambda done: progress(done // 2, count)),
         has_pose(poses),
         lambda done, total: progress((total + done) // 2, total),
     )
     return find_right_frames(evidence, poses)
+
+
+def read_pictures(
+    camera: CaptureCamera, lens: Camera, readout_s: float, progress: Callable[[int], None]
+) -> Pictures:
+    """Return the features of all frames of a camera that lie in the room.
+
+    A hand that moves, or that is fixed to the camera, follows other motions than the room. The tracks that
+    find it here use the lens, but no pose and no map.
+
+    Args:
+        camera: The camera with its video.
+        lens: Intrinsics of the camera.
+        readout_s: Time from the exposure of the first row to that of the last row; 0 for a global shutter.
+        progress: Receives the number of finished frames.
+    """
+    size, count = (camera.camera.width_px, camera.camera.height_px), len(camera.times_ns)
+    tracks = track_video(camera, lambda done, _: progress(done // 2))
+    fixed = find_fixed_regions(tracks, camera.times_ns)
+    tracks = tracks.outside(fixed)
+    moving = find_moving_tracks(tracks, lens.scaled(*size), camera.times_ns)
+    camera = replace(
+        camera,
+        mask=without_regions(camera.mask, fixed, size),
+        moving_regions=find_moving_regions(tracks, moving),
+    )
+    features: list[FrameFeatures | None] = [None] * count
+    for index, image in camera.read_decodable(np.arange(count)):
+        in_picture = lens.scaled(image.shape[1], image.shape[0])
+        features[index] = detect_features(image, in_picture, partial(camera.is_unmasked, frame=index))
+        progress((count + index) // 2)
+    return Pictures(features, np.asarray(camera.times_ns * 1e-9), readout_s)
 
 
 def poses_of_frames(poses: TimedPoses, camera: CaptureCamera) -> FloatArray:

@@ -19,16 +19,9 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.evaluate.breaks import contradicted_times, scale_jumps
 from bodycap_batch.evaluate.fresh_features import FrameFeatures, match_features
 from bodycap_batch.evaluate.three_view import CommonRays, Legs, judge_legs, measure_legs
-from bodycap_batch.evaluate.two_view import (
-    WRONG_DEG,
-    Motion,
-    Outcome,
-    RayMatches,
-    differs,
-    judge_rotation,
-    measure_rotation,
-)
+from bodycap_batch.evaluate.two_view import WRONG_DEG, Outcome, differs, judge_rotation
 from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp, so3_log
+from bodycap_batch.tracks.relative_motion import Motion, RayMatches, measure_rotation
 
 GAPS = {1: 1, 5: 1, 15: 3, 45: 3}
 """Distances in frames of the linked frames, and every how many frames a link starts."""

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.evaluate.two_view import INLIER_PX, Motion, Outcome, cross
+from bodycap_batch.evaluate.two_view import Outcome
 from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.tracks.relative_motion import INLIER_PX, Motion, cross
 
 _MIN_POINTS = 10
 """Minimum number of points that are seen in all three frames. Evidence: none."""

@@ -50,22 +50,28 @@ class PointTracks:
         own = slice(int(self.first[frame]), int(self.first[frame + 1]))
         return self.track[own], self.px[own]
 
-    def between(self, one: int, other: int) -> tuple[Pixels, Pixels]:
-        """Return the positions (K,2) in two frames of the tracks that both frames have."""
+    def between(self, one: int, other: int) -> tuple[IntArray, Pixels, Pixels]:
+        """Return the numbers (K,) of the tracks that two frames have, and their positions (K,2) in both."""
         tracks, px = self.at(one)
         other_tracks, other_px = self.at(other)
-        _, rows, other_rows = np.intersect1d(tracks, other_tracks, assume_unique=True, return_indices=True)
-        return px[rows], other_px[other_rows]
+        common, rows, other_rows = np.intersect1d(
+            tracks, other_tracks, assume_unique=True, return_indices=True
+        )
+        return common, px[rows], other_px[other_rows]
 
     def outside(self, regions: BoolArray) -> PointTracks:
         """Return the tracks without the observations in some regions.
 
         Args:
-            regions: (R,C) mask of cells that divide the picture evenly, True for each cell to leave out.
+            regions: (R,C) or (N,R,C) mask of cells that divide every picture, or the picture of each frame,
+                evenly, True for each cell to leave out.
         """
-        shape = np.array([regions.shape[1], regions.shape[0]])
+        shape = np.array([regions.shape[-1], regions.shape[-2]])
         cell = (self.px / np.array([self.width_px, self.height_px]) * shape).astype(np.int64)
         cell = np.clip(cell, 0, shape - 1)
-        keep = ~regions[cell[:, 1], cell[:, 0]]
+        frame = np.repeat(np.arange(self.frame_count), np.diff(self.first))
+        keep = ~np.broadcast_to(regions, (self.frame_count, *regions.shape[-2:]))[
+            frame, cell[:, 1], cell[:, 0]
+        ]
         before = np.concatenate([[0], np.cumsum(keep)])
         return replace(self, first=before[self.first], track=self.track[keep], px=self.px[keep])

@@ -94,6 +94,8 @@ class KeyframeSelection:
             indices in this selection count these frames only.
         fixed_regions: (R,C) mask of cells that divide the picture evenly, True where the picture is fixed to
             the camera, for example by the own hand. An empty array means that nothing is fixed.
+        moving_regions: (N,R,C) mask of such cells in each frame, True where something moves by itself, for
+            example a hand. An empty array means that nothing does.
         lens: The lens as the tracks of the video determine it; None for a given lens, or with too little
             motion.
     """
@@ -110,10 +112,12 @@ class KeyframeSelection:
     gyro: GyroRates | None = None
     pictures: Pictures | None = None
     fixed_regions: BoolArray = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    moving_regions: BoolArray = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=bool))
     lens: LensEstimate | None = None
 
     def __post_init__(self) -> None:
         set_array(self, "fixed_regions", (None, None), np.bool_)
+        set_array(self, "moving_regions", (None, None, None), np.bool_)
         set_array(self, "frames", (None,), np.int64)
         set_array(self, "damaged", (None,), np.int64)
         set_array(self, "sharpness", (self.frame_count,))
@@ -148,6 +152,7 @@ class KeyframeSelection:
             sharpness=self.sharpness[kept],
             damaged=index[self.damaged[kept[self.damaged]]],
             frozen=self.frozen[kept],
+            moving_regions=self.moving_regions[kept] if len(self.moving_regions) else self.moving_regions,
             matches=matches,
             pictures=pictures,
         )

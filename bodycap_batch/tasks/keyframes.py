@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from bodycap_batch.telemetry.streams import CameraTelemetry
 
 
+_PROGRESS_FRAMES = 30
+"""Number of frames between two reports of progress: a third of a second of work."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeyframesTask:
     """Select the keyframes of one camera.
@@ -52,12 +56,15 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     camera = load_capture(task.capture, threads=context.threads).cameras[0]
     size = camera.camera
     telemetry, telemetry_notes = _telemetry(camera, task)
-    regions, lens = regions_and_lens(camera, context)
+    regions, moving, lens = regions_and_lens(camera, context)
     in_room = without_regions(camera.mask, regions, (size.width_px, size.height_px))
     camera = replace(camera, mask=in_room)
     with FrameKeeper(files, size.width_px, size.height_px, camera.should_keep_all) as keeper:
         selection = select_keyframes(camera, task.options, context, keeper, with_matches=task.with_gyro)
-    selection = replace(selection, fixed_regions=regions, lens=lens)
+    selection = replace(selection, fixed_regions=regions, moving_regions=moving, lens=lens)
+    if selection.pictures is not None and len(moving):
+        # The tracks are of all frames; the selection counts only those that are no copies.
+        selection = replace(selection, moving_regions=moving[selection.pictures.frames])
     copies = copied_notes(camera.times_ns, selection.pictures)
     camera = camera.only(selection.pictures)
     if telemetry is not None:
@@ -72,28 +79,55 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     write_summary(files, frames=selection.frame_count, keyframes=len(selection.frames), notes=notes)
 
 
-def regions_and_lens(camera: CaptureCamera, context: StageContext) -> tuple[BoolArray, LensEstimate | None]:
-    """Return the regions that are fixed to the camera, and the lens of a camera that needs one.
+def regions_and_lens(
+    camera: CaptureCamera, context: StageContext
+) -> tuple[BoolArray, BoolArray, LensEstimate | None]:
+    """Return what the tracks of a video show: what is not the room, and the lens of a camera that needs one.
 
-    A video of fewer than two frames shows neither.
+    A video of fewer than two frames shows nothing.
+
+    Returns:
+        (R,C) mask of the regions that are fixed to the camera; (N,R,C) mask of those that move by themselves
+            in each frame, empty if nothing does; the lens.
     """
     import numpy as np
 
     from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
-    from bodycap_batch.tracks import estimate_lens, find_fixed_regions, track_video
+    from bodycap_batch.tracks import (
+        estimate_lens,
+        find_fixed_regions,
+        find_moving_regions,
+        find_moving_tracks,
+        track_video,
+    )
 
-    regions = np.zeros((1, 1), dtype=bool)
+    regions, moving, lens = np.zeros((1, 1), dtype=bool), np.zeros((0, 0, 0), dtype=bool), None
     wants_lens = camera.camera.refine and is_on(Mechanism.LENS_FROM_TRACKS)
-    if len(camera.times_ns) < 2 or not (wants_lens or is_on(Mechanism.FIXED_REGIONS)):
-        return regions, None
-    tracks = track_video(camera, context)
+    used = (Mechanism.FIXED_REGIONS, Mechanism.MOVING_REGIONS)
+    if len(camera.times_ns) < 2 or not (wants_lens or any(map(is_on, used))):
+        return regions, moving, None
+
+    def show(done: int, total: int) -> None:
+        context.check_cancelled()
+        if done % _PROGRESS_FRAMES == 0:
+            context.progress(done, total, "frames searched for hands")
+
+    tracks = track_video(camera, show)
     if is_on(Mechanism.FIXED_REGIONS):
         regions = find_fixed_regions(tracks, camera.times_ns)
         record_act(Mechanism.FIXED_REGIONS, int(regions.any()))
-    if not wants_lens:
-        return regions, None
-    context.progress(0, 0, "estimating the lens")
-    return regions, estimate_lens(tracks.outside(regions), camera.times_ns)
+    tracks = tracks.outside(regions)
+    context.progress(0, 0, "searching what moves by itself")
+    if wants_lens:
+        lens = estimate_lens(tracks, camera.times_ns)
+    if is_on(Mechanism.MOVING_REGIONS) and (lens is not None or not camera.camera.refine):
+        alone = find_moving_tracks(tracks, camera.camera if lens is None else lens.lens, camera.times_ns)
+        found = find_moving_regions(tracks, alone)
+        record_act(Mechanism.MOVING_REGIONS, int(found.any()))
+        moving = found if found.any() else moving
+        if lens is not None:
+            lens = estimate_lens(tracks.outside(found), camera.times_ns)
+    return regions, moving, lens
 
 
 def _telemetry(camera: CaptureCamera, task: KeyframesTask) -> tuple[CameraTelemetry | None, list[str]]:

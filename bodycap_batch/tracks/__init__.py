@@ -2,7 +2,16 @@
 
 from bodycap_batch.tracks.fixed_regions import find_fixed_regions, fixed_notes
 from bodycap_batch.tracks.lens import estimate_lens
+from bodycap_batch.tracks.moving_regions import find_moving_regions, find_moving_tracks
 from bodycap_batch.tracks.tracker import PointTracker
 from bodycap_batch.tracks.video import track_video
 
-__all__ = ["PointTracker", "estimate_lens", "find_fixed_regions", "fixed_notes", "track_video"]
+__all__ = [
+    "PointTracker",
+    "estimate_lens",
+    "find_fixed_regions",
+    "find_moving_regions",
+    "find_moving_tracks",
+    "fixed_notes",
+    "track_video",
+]

@@ -72,7 +72,7 @@ def find_fixed_regions(tracks: PointTracks, times_ns: IntArray) -> BoolArray:
     votes, total = (np.zeros((_DIRECTIONS, *shape)) for _ in range(2))
     size = np.array([tracks.width_px, tracks.height_px])
     for one, other in _pairs(times_ns):
-        start, end = tracks.between(one, other)
+        _, start, end = tracks.between(one, other)
         turn = _turn(start, end, tracks)
         if turn is None:
             continue

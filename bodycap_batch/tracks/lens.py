@@ -27,8 +27,8 @@ _MIN_POINTS = 40
 _SHIFT_PX = (25.0, 120.0)
 """Minimum and maximum median displacement between the frames of a pair, px of an image with a long side of
 640 px. A smaller one does not determine a pose; after a larger one, few tracks are left."""
-_MAX_SPAN_S = 1.5
-"""Maximum time between the frames of a pair, seconds. Tracks drift."""
+_MAX_SPAN_S = 1.0
+"""Maximum time between the frames of a pair, seconds. Tracks drift. Evidence: docs/decisions/tracks.md."""
 _ERROR_PX = 0.5
 """Scale of the robust loss, px of an image with a long side of 640 px: the error of a track after a second.
 Evidence: docs/decisions/tracks.md."""
@@ -53,6 +53,9 @@ _BEST_FOCAL = 3
 """Number of focal lengths for which they are tried: those with the least cost without distortion."""
 _FINE_FOCAL = np.geomspace(0.88, 1.14, 7)
 """Factors of the best focal length that are tried next."""
+_LEAST_SIGMA = float(np.log(_FINE_FOCAL[1] / _FINE_FOCAL[0])) / 12**0.5
+"""Least standard deviation of the logarithm of a focal length: that of even errors within a step. At the end
+of its range, a distortion holds the focal length of all samples at the same value."""
 _FINE_DISTORTION = np.array([-0.06, -0.03, 0.0])
 """Differences from the best distortion that are tried next. None is positive: a longer focal length with
 pincushion distortion fits turns of a few degrees as well, but lenses of cameras have barrel distortion."""
@@ -131,7 +134,7 @@ def estimate_lens(tracks: PointTracks, times_ns: IntArray) -> LensEstimate | Non
     _, poses = problem.cost(lens, [poses])
     return LensEstimate(
         lens=lens,
-        focal_sigma=_SIGMA_FACTOR * float(np.std(drawn)),
+        focal_sigma=max(_SIGMA_FACTOR * float(np.std(drawn)), _LEAST_SIGMA),
         pairs=len(pairs),
         error_px=float(np.median(np.abs(problem.residuals_px(lens, poses)[problem.valid]))),
     )
@@ -174,7 +177,7 @@ def _choose_pairs(tracks: PointTracks, times_ns: IntArray) -> list[tuple[int, in
         for gap in gaps[::-1].tolist():
             if start + gap >= tracks.frame_count:
                 continue
-            one, other = tracks.between(start, start + gap)
+            _, one, other = tracks.between(start, start + gap)
             if len(one) < _MIN_POINTS:
                 continue
             if low <= float(np.median(np.linalg.norm(other - one, axis=1))) <= high:
@@ -206,7 +209,7 @@ class _Problem:
         first, second = np.zeros((*shape, 2)), np.zeros((*shape, 2))
         valid = np.zeros(shape, dtype=bool)
         for number, pair in enumerate(pairs):
-            one, other = tracks.between(*pair)
+            _, one, other = tracks.between(*pair)
             rows = np.unique(np.linspace(0, len(one) - 1, min(len(one), _POINTS)).astype(int))
             first[number, : len(rows)], second[number, : len(rows)] = one[rows], other[rows]
             valid[number, : len(rows)] = True

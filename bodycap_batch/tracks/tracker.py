@@ -103,11 +103,6 @@ class PointTracker:
         """Return the positions (K,2) of the tracks in the newest frame, px of the frame (COLMAP's origin)."""
         return (self.px + np.float32(CV2_PIXEL_OFFSET_PX)) * np.float32(self._scale())
 
-    def restart(self) -> None:
-        """End all tracks: the next frame does not follow the newest one."""
-        self.image = None
-        self.px, self.track = self.px[:0], self.track[:0]
-
     def tracks(self, frame_count: int) -> PointTracks:
         """Return the tracks of all frames.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.lens_estimate import LensEstimate
-from bodycap_batch.tracks import estimate_lens, find_fixed_regions, track_video
+from bodycap_batch.tasks.keyframes import regions_and_lens
 from tests.bench.rows import DATA
 
 
@@ -31,10 +32,9 @@ def main(arguments: Sequence[str]) -> int:
     folders = options.folders or [DATA / name for name in ("walk12", "room12", "tum_fr1_xyz")]
     for folder in folders:
         for camera in open_capture(load_job(folder.resolve()).capture).cameras:
-            tracks = track_video(camera, StageContext(work_dir=Path()))
-            regions = find_fixed_regions(tracks, camera.times_ns)
-            found = estimate_lens(tracks.outside(regions), camera.times_ns)
-            share = f"fixed {regions.mean():4.0%}"
+            unknown = replace(camera, camera=replace(camera.camera, refine=True))
+            regions, moving, found = regions_and_lens(unknown, StageContext(work_dir=Path()))
+            share = f"fixed {regions.mean():4.0%}, moving {moving.mean() if moving.size else 0:4.0%}"
             sys.stdout.write(f"{folder.name:16} {camera.name:16} {share} {_line(camera.camera, found)}\n")
             sys.stdout.flush()
     return 0

@@ -18,7 +18,7 @@ import time
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ import numpy as np
 from bodycap_batch.capture import CaptureCamera, open_capture
 from bodycap_batch.config.job import load_job
 from bodycap_batch.core.arrays import BoolArray, FloatArray
-from bodycap_batch.evaluate.fresh_features import detect_features
+from bodycap_batch.evaluate.picture_check import read_pictures
 from bodycap_batch.evaluate.right_frames import Pictures, RightFrames, find_right_frames, measure_pictures
 from bodycap_batch.evaluate.two_view import Outcome
 from bodycap_batch.formats.tum import read_tum
@@ -189,14 +189,6 @@ def true_poses(truth: Path, camera: CaptureCamera) -> FloatArray:
     return found
 
 
-def read_pictures(camera: CaptureCamera, count: int, readout_s: float) -> Pictures:
-    """Return the features of the first frames of a camera with a known readout time."""
-    features = [None] * count
-    for index, image in camera.read_decodable(np.arange(count)):
-        features[index] = detect_features(image, camera.camera)  # type: ignore[call-overload]
-    return Pictures(features, np.asarray(camera.times_ns[:count] * 1e-9), readout_s)
-
-
 def true_readout_s(folder: Path) -> float:
     """Return the true readout time of a capture's cameras; 0 if the truth names none."""
     clocks = folder / "gt" / "clocks.json"
@@ -308,7 +300,12 @@ def main(arguments: Sequence[str]) -> int:
             single = folder / "groundtruth.txt"
             truth = single if single.exists() else folder / "gt" / f"{camera.name}.tum"
             path = true_poses(truth, camera)[: options.frames]
-            pictures = read_pictures(camera, len(path), true_readout_s(folder))
+            first = replace(
+                camera,
+                frame_numbers=camera.frame_numbers[: len(path)],
+                times_ns=camera.times_ns[: len(path)],
+            )
+            pictures = read_pictures(first, camera.camera, true_readout_s(folder), lambda _: None)
             row = run_camera(f"{folder.name}/{camera.name}", pictures, path, options.cases)
             rows.append(row)
             print(json.dumps(row), flush=True)

@@ -90,7 +90,7 @@ class _Video:
     def times_ns(self) -> np.ndarray:
         return np.arange(COUNT, dtype=np.int64) * 33_333_333
 
-    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
+    def is_unmasked(self, px: np.ndarray, frame: int | None = None) -> np.ndarray:
         column, row = np.clip(px.astype(int), 0, (319, 239)).T
         return np.ones(len(px), dtype=bool) if self.mask is None else self.mask[row, column]
 

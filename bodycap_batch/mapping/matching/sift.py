@@ -72,7 +72,7 @@ def extract_features(
 
     detectors = [
         cv2.SIFT.create(
-            count * (1 if camera.mask is None else _MASK_SURPLUS),
+            count * (1 if camera.shows_only_room else _MASK_SURPLUS),
             contrastThreshold=_CONTRAST_THRESHOLD,
             enable_precise_upscale=True,
         )
@@ -81,16 +81,16 @@ def extract_features(
     if context.threads == 1:
         for index, rgb in camera.read(frames, colour=True):
             context.check_cancelled()
-            yield index, _detect_features(detectors[0], camera, rgb, count)
+            yield index, _detect_features(detectors[0], camera, (index, rgb), count)
         return
     free: SimpleQueue[Any] = SimpleQueue()
     for detector in detectors:
         free.put(detector)
 
-    def work(rgb: npt.NDArray[np.uint8]) -> SiftFeatures:
+    def work(frame: tuple[int, npt.NDArray[np.uint8]]) -> SiftFeatures:
         detector = free.get()
         try:
-            return _detect_features(detector, camera, rgb, count)
+            return _detect_features(detector, camera, frame, count)
         finally:
             free.put(detector)
 
@@ -98,7 +98,7 @@ def extract_features(
         waiting: deque[tuple[int, Future[SiftFeatures]]] = deque()
         for index, rgb in camera.read(frames, colour=True):
             context.check_cancelled()
-            waiting.append((index, pool.submit(work, rgb)))
+            waiting.append((index, pool.submit(work, (index, rgb))))
             if len(waiting) > 2 * context.threads:
                 frame, job = waiting.popleft()
                 yield frame, job.result()
@@ -107,15 +107,16 @@ def extract_features(
 
 
 def _detect_features(
-    detector: Any, camera: CaptureCamera, rgb: npt.NDArray[np.uint8], requested: int
+    detector: Any, camera: CaptureCamera, frame: tuple[int, npt.NDArray[np.uint8]], requested: int
 ) -> SiftFeatures:
-    """Return the features of one RGB image (H,W,3) that lie where the room is visible.
+    """Return the features of one frame, index and RGB image (H,W,3), that lie where the room is visible.
 
     Features are detected in a reduced image. If there are few, for example on a bare ceiling, they are
     detected in the full frame. At most `requested` features are returned, the strongest ones.
     """
     import cv2
 
+    index, rgb = frame
     height, width = rgb.shape[:2]
     shrink = min(1.0, max(_DETECTION_SCALE, _MIN_LONG_SIDE_PX / max(height, width)))
     size = (round(width * shrink), round(height * shrink))
@@ -137,7 +138,7 @@ def _detect_features(
     pixels = (np.array([keypoint.pt for keypoint in found]) + CV2_PIXEL_OFFSET_PX) * scale
     shape = np.array([(keypoint.size * scale[0] / 2.0, np.radians(keypoint.angle)) for keypoint in found])
     keypoints = np.column_stack([pixels, shape]).astype(np.float32)
-    keep = camera.is_unmasked(keypoints[:, :2])
+    keep = camera.is_unmasked(keypoints[:, :2], index)
     if keep.sum() > requested:
         response = np.where(keep, [keypoint.response for keypoint in found], -np.inf)
         keep[np.argsort(-response, kind="stable")[requested:]] = False

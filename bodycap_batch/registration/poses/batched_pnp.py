@@ -290,7 +290,9 @@ def _information_of_rates(
                 own[:, i, j] = np.add.reduceat(entry * lag, starts)
     variance = np.maximum.reduceat(rates.sigma[rows], starts) ** 2
     prior = np.maximum(noise_px2, _SMALLEST_NOISE_PX2) / np.maximum(variance, _SMALLEST_VARIANCE)
-    own += prior[:, None, None] * np.eye(3)
+    # Rates on which no observation of a frame depends take nothing away, however little is known of them.
+    known = np.maximum(prior, np.finfo(np.float64).eps * np.maximum(np.trace(own, axis1=1, axis2=2), 1.0))
+    own += known[:, None, None] * np.eye(3)
     return np.asarray(cross @ np.linalg.solve(own, np.swapaxes(cross, 1, 2)))
 
 

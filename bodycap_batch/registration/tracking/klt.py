@@ -252,7 +252,7 @@ class _ActiveTracks:
         # track is rejected later, when the pose is estimated.
         with_check = motion is None or not motion.is_reliable
         tracked = track_points(first.grey, second.grey, self.px, motion, with_check=with_check)
-        keep = tracked.ok & second.camera.is_unmasked(tracked.px)
+        keep = tracked.ok & second.camera.is_unmasked(tracked.px, second.index)
         self.rows, self.px = self.rows[keep], tracked.px[keep]
         return len(self.rows) >= _MIN_TRACKS
 

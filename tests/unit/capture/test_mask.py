@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -86,3 +87,20 @@ def test_a_repainted_mask_is_another_input(tmp_path: Path) -> None:
     assert digest("job.yaml") != first
     capture = open_capture(load_job(tmp_path / "job.yaml").capture)
     assert capture.cameras[0].is_unmasked(np.array([[10.0, 10.0], [63.9, 47.9]])).tolist() == [False, True]
+
+
+def test_what_moves_by_itself_is_left_out_of_its_own_frame(tmp_path: Path) -> None:
+    write_video(tmp_path / "torso.mp4", [textured_frame(index) for index in range(4)])
+    (tmp_path / "job.yaml").write_text(
+        "capture: {cameras: [{name: torso, video: torso.mp4}]}\nskeleton: none\n"
+    )
+    camera = open_capture(load_job(tmp_path / "job.yaml").capture).cameras[0]
+    assert camera.shows_only_room
+    moving = np.zeros((4, 3, 4), dtype=bool)
+    moving[2, 0, 3] = True  # the cell at the upper right of the third frame
+    camera = replace(camera, moving_regions=moving)
+    px = np.array([[63.0, 1.0], [63.0, 47.0], [1.0, 1.0]])
+    assert not camera.shows_only_room
+    assert camera.is_unmasked(px, 2).tolist() == [False, True, True]
+    assert camera.is_unmasked(px, 1).all()
+    assert camera.is_unmasked(px).all()

@@ -18,7 +18,7 @@ from bodycap_batch.evaluate.right_frames import (
     find_right_frames,
     measure_pictures,
 )
-from bodycap_batch.evaluate.two_view import Outcome, RayMatches, _refined
+from bodycap_batch.evaluate.two_view import Outcome
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import (
     interpolate_pose,
@@ -28,6 +28,7 @@ from bodycap_batch.model.geometry import (
     so3_exp,
     transform_points,
 )
+from bodycap_batch.tracks.relative_motion import RayMatches, refine_motion
 
 FRAMES = 100
 PIXEL_RAD = 1 / 500
@@ -200,16 +201,20 @@ def test_without_matches_nothing_is_claimed(path: FloatArray) -> None:
     assert found.count(Outcome.UNMEASURABLE) == FRAMES
 
 
+def everywhere(px: np.ndarray) -> np.ndarray:
+    return np.ones(len(px), dtype=bool)
+
+
 def test_features_of_a_picture_are_spread_and_found_again() -> None:
     rng = np.random.default_rng(0)
     import cv2
 
     image = cv2.GaussianBlur(rng.integers(0, 256, (480, 640)).astype(np.uint8), (0, 0), 2.0)
     camera = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([500.0, 500, 320, 240]))
-    first = detect_features(image, camera)
+    first = detect_features(image, camera, everywhere)
     assert len(np.unique(first.cells)) == CELLS[0] * CELLS[1]
     moved = np.roll(image, 12, axis=1)
-    second = detect_features(moved, camera)
+    second = detect_features(moved, camera, everywhere)
     rows = match_features(first, second)
     assert len(rows) > 300
     shift = (
@@ -243,6 +248,6 @@ def test_what_matches_do_not_determine_is_uncertain_and_no_error() -> None:
     rays = np.column_stack([x, np.zeros(80), np.ones(80)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     matches = RayMatches(first=rays, second=rays, cells=np.arange(80), noise_rad=np.full(80, 1e-9))
-    measured = _refined(matches, np.eye(3), turn=False)
+    measured = refine_motion(matches, np.eye(3), turn=False)
     assert np.isfinite(measured.covariance).all()
     assert measured.covariance.diagonal().max() > 1e6

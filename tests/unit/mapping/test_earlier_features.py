@@ -38,7 +38,7 @@ class _Blots:
     def __init__(self) -> None:
         self.read_frames: list[int] = []
 
-    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
+    def is_unmasked(self, px: np.ndarray, frame: int | None = None) -> np.ndarray:
         return np.ones(len(px), dtype=bool)
 
     def read(self, frames: np.ndarray, *, colour: bool) -> Any:

@@ -66,7 +66,7 @@ class _Pan:
         self.frames = np.arange(count)
         self.name, self._start, self._mirrored, self._turned = name, start, mirrored, upside_down
 
-    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
+    def is_unmasked(self, px: np.ndarray, frame: int | None = None) -> np.ndarray:
         return np.ones(len(px), dtype=bool)
 
     def read(self, frames: np.ndarray, *, colour: bool) -> Iterator[tuple[int, np.ndarray]]:

@@ -35,7 +35,7 @@ class Pan:
         if plain:
             self.wall[:] = 128.0
 
-    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
+    def is_unmasked(self, px: np.ndarray, frame: int | None = None) -> np.ndarray:
         return np.ones(len(px), dtype=bool)
 
     def read(self, frames: np.ndarray, *, colour: bool) -> Any:

@@ -73,7 +73,7 @@ class _Pan:
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
+    def is_unmasked(self, px: np.ndarray, frame: int | None = None) -> np.ndarray:
         return np.ones(len(px), dtype=bool)
 
     def read(self, frames: np.ndarray, *, colour: bool) -> Any:

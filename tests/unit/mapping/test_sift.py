@@ -25,7 +25,7 @@ class _Blobs:
         self._hidden = hidden_left_px
         self.mask = None if not hidden_left_px else np.arange(640) >= np.full((480, 1), hidden_left_px)
 
-    def is_unmasked(self, px: np.ndarray) -> np.ndarray:
+    def is_unmasked(self, px: np.ndarray, frame: int | None = None) -> np.ndarray:
         return px[:, 0] >= self._hidden
 
     def read(self, frames: np.ndarray, *, colour: bool) -> Iterator[tuple[int, np.ndarray]]:

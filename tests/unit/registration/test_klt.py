@@ -37,7 +37,7 @@ def _video(visible_to_px: float = 640.0) -> CaptureCamera:
         for index in range(*slice(start, stop).indices(COUNT)):
             yield index, images[index].astype(np.uint8)
 
-    def is_unmasked(px: np.ndarray) -> np.ndarray:
+    def is_unmasked(px: np.ndarray, frame: int | None = None) -> np.ndarray:
         return px[:, 0] < visible_to_px
 
     video = SimpleNamespace(times_ns=np.arange(COUNT), grey_frames=grey_frames, is_unmasked=is_unmasked)
