@@ -10,9 +10,9 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, IntArray
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.optical_flow import Pixels, fit_rotation, pixel_scale, unit_directions
+from bodycap_batch.model.optical_flow import Pixels, pixel_scale, unit_directions
 from bodycap_batch.model.point_tracks import PointTracks
-from bodycap_batch.tracks.relative_motion import INLIER_PX, RayMatches, measure_rotation, residuals
+from bodycap_batch.tracks.relative_motion import RayMatches, measure_rotation, residuals
 
 _SPANS_S = (0.2, 0.4)
 """Times, seconds, over which the motion of points is compared with that of the camera. Evidence:
@@ -25,9 +25,6 @@ limit of the check of tracks, forward and back."""
 _MIN_SUPPORT = 0.6
 """Share of the cells with a track that must support the motion of the camera. With less, for example with a
 shadow that moves over a table, it is not known what is the room. Evidence: docs/decisions/tracks.md."""
-_TURN_SUPPORT = 0.9
-"""Share of the support of the best motion with which a mere turn is taken instead. A camera that stands still
-has epipolar lines of any direction, also along the motion of a hand. Evidence: none."""
 _OFF_ERRORS = 4.0
 """Distance, in standard deviations, of a track from the motion of the camera with which it does not follow
 it. Evidence: docs/decisions/tracks.md."""
@@ -78,11 +75,6 @@ def _off_camera_motion(matches: RayMatches) -> BoolArray | None:
     motion = measure_rotation(matches)
     if motion is None or motion.support < _MIN_SUPPORT * len(np.unique(matches.cells)):
         return None
-    turn = fit_rotation(matches.first, matches.second)
-    distance_px = np.linalg.norm(matches.second - matches.first @ turn.T, axis=1) / matches.noise_rad
-    turned = len(np.unique(matches.cells[distance_px < INLIER_PX]))
-    if turned >= _TURN_SUPPORT * motion.support:
-        return np.asarray(distance_px > _OFF_ERRORS)
     residual, in_front = residuals(matches, motion)
     return np.asarray((np.abs(residual) > _OFF_ERRORS) | ~in_front)
 

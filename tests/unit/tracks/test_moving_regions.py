@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.model.camera import Camera
@@ -61,9 +60,8 @@ def seen_often(tracks: PointTracks) -> BoolArray:
     return np.bincount(tracks.track) > FPS
 
 
-@pytest.mark.parametrize("motion", [1.0, 0.0])
-def test_a_hand_is_found_before_a_camera_that_moves_or_stands_still(motion: float) -> None:
-    tracks = tracks_with_hand(0.08, motion)
+def test_a_hand_is_found_before_a_camera_that_moves() -> None:
+    tracks = tracks_with_hand(0.08)
     moving = find_moving_tracks(tracks, LENS, TIMES_NS)
     judged = seen_often(tracks)
     assert moving[:HAND][judged[:HAND]].mean() > 0.9
