@@ -33,7 +33,7 @@ FRAMES = np.array([0, 2, 3, 5])
 class _Blots:
     """A camera whose pictures are irregular blots; it records which frames are read."""
 
-    name, mask = "torso", None
+    name, shows_only_room = "torso", True
 
     def __init__(self) -> None:
         self.read_frames: list[int] = []

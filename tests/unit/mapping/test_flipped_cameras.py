@@ -58,7 +58,7 @@ LEFT_OR_TORSO = MapDiagnostics(undecided_groups=((("left",), ("torso",)),))
 class _Pan:
     """A camera that pans along the wall from `start`; its picture may be mirrored or upside down."""
 
-    mask = None
+    shows_only_room = True
 
     def __init__(
         self, name: str, start: int, *, mirrored: bool = False, upside_down: bool = False, count: int = 6

@@ -25,7 +25,7 @@ LENS = Camera(
 class Pan:
     """A camera that moves along a textured wall by a constant number of pixels a frame."""
 
-    name, mask, camera, calibrated = "torso", None, LENS, True
+    name, shows_only_room, camera, calibrated = "torso", True, LENS, True
 
     def __init__(self, step_px: float, *, plain: bool = False) -> None:
         self.step_px = step_px

@@ -68,7 +68,7 @@ def _picture(frame: int, step_px: int = 60) -> np.ndarray:
 class _Pan:
     """A camera that pans along the wall."""
 
-    mask = None
+    shows_only_room = True
 
     def __init__(self, name: str) -> None:
         self.name = name

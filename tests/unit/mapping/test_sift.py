@@ -24,6 +24,7 @@ class _Blobs:
     def __init__(self, hidden_left_px: float = 0.0) -> None:
         self._hidden = hidden_left_px
         self.mask = None if not hidden_left_px else np.arange(640) >= np.full((480, 1), hidden_left_px)
+        self.shows_only_room = self.mask is None
 
     def is_unmasked(self, px: np.ndarray, frame: int | None = None) -> np.ndarray:
         return px[:, 0] >= self._hidden
