@@ -130,8 +130,7 @@ class CaptureCamera:
 
         Args:
             px: (K,2) pixels at the work size, with COLMAP's origin.
-            frame: Index of the frame, to leave out what moves by itself in it. None: only what no frame shows
-                of the room is left out.
+            frame: Index of the frame, to leave out what moves by itself in it. None: only the mask counts.
         """
         out = np.ones(len(px), dtype=bool)
         size = self.camera.width_px, self.camera.height_px

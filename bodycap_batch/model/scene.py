@@ -124,6 +124,8 @@ class KeyframeSelection:
         if len(self.frozen) == 0:
             object.__setattr__(self, "frozen", np.zeros(self.frame_count, dtype=bool))
         set_array(self, "frozen", (self.frame_count,), np.bool_)
+        if len(self.moving_regions) not in (0, self.frame_count):
+            raise ValueError("moving_regions: there must be a mask for each frame, or none")
         if len(self.frames) and (
             self.frames[0] < 0 or self.frames[-1] >= self.frame_count or (np.diff(self.frames) <= 0).any()
         ):
@@ -131,6 +133,8 @@ class KeyframeSelection:
 
     def only(self, pictures: Pictures | None) -> KeyframeSelection:
         """Return the selection from the video without its copies; unchanged for None.
+
+        The selection must not have moving regions yet.
 
         Args:
             pictures: The frames that are no copies, by their indices in this selection.
@@ -152,7 +156,6 @@ class KeyframeSelection:
             sharpness=self.sharpness[kept],
             damaged=index[self.damaged[kept[self.damaged]]],
             frozen=self.frozen[kept],
-            moving_regions=self.moving_regions[kept] if len(self.moving_regions) else self.moving_regions,
             matches=matches,
             pictures=pictures,
         )

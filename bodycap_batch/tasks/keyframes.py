@@ -23,7 +23,7 @@ _PROGRESS_FRAMES = 30
 """Number of frames between two reports of progress: a third of a second of work."""
 _MIN_MOVING_SHARE = 0.02
 """Share of the pictures that moves by itself, below which nothing is left out: the edges of near things and
-reflections have up to 1.4 % in rooms in which nothing moves. Evidence: docs/decisions/tracks.md."""
+reflections have up to 1.6 % in rooms in which nothing moves. Evidence: docs/decisions/tracks.md."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,10 +64,10 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     camera = replace(camera, mask=in_room)
     with FrameKeeper(files, size.width_px, size.height_px, camera.should_keep_all) as keeper:
         selection = select_keyframes(camera, task.options, context, keeper, with_matches=task.with_gyro)
-    selection = replace(selection, fixed_regions=regions, moving_regions=moving, lens=lens)
     if selection.pictures is not None and len(moving):
         # The tracks are of all frames; the selection counts only those that are no copies.
-        selection = replace(selection, moving_regions=moving[selection.pictures.frames])
+        moving = moving[selection.pictures.frames]
+    selection = replace(selection, fixed_regions=regions, moving_regions=moving, lens=lens)
     copies = copied_notes(camera.times_ns, selection.pictures)
     camera = camera.only(selection.pictures)
     if telemetry is not None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.evaluate.breaks import contradicted_times
+from bodycap_batch.evaluate.breaks import contradicted_times, scale_jumps
 from bodycap_batch.evaluate.fresh_features import CELLS, FrameFeatures, detect_features, match_features
 from bodycap_batch.evaluate.right_frames import (
     PictureEvidence,
@@ -251,3 +253,16 @@ def test_what_matches_do_not_determine_is_uncertain_and_no_error() -> None:
     measured = refine_motion(matches, np.eye(3), turn=False)
     assert np.isfinite(measured.covariance).all()
     assert measured.covariance.diagonal().max() > 1e6
+
+
+def test_ratios_that_show_a_small_part_of_a_jump_do_not_measure_it() -> None:
+    # Even steps. Four ratios begin at the first frame: a jump after it would change them by 50, 10, 2.5 and
+    # 0.7 %. Their errors are ten times as large as that. Further on, five ratios of each length are right.
+    def leg(error: float) -> Any:
+        return SimpleNamespace(log_ratio=(-error, 0.02), parallax=1.0, translations=np.eye(2, 3))
+
+    gaps = (2, 10, 40, 150)
+    legs = [((0, gap, 2 * gap), leg(10.0 / gap)) for gap in gaps]
+    legs += [((at, at + gap, at + 2 * gap), leg(0.0)) for gap in gaps for at in range(400, 2000, 320)]
+    centres = np.column_stack([np.arange(2400.0), np.zeros((2400, 2))])
+    assert scale_jumps(legs, centres, []) == []

@@ -238,6 +238,16 @@ def test_the_covariance_contains_the_angular_velocity_of_a_rolling_shutter() -> 
     assert np.mean(squared[True]) > 1.5
 
 
+def test_a_rate_of_which_nothing_is_known_is_no_error_if_no_observation_depends_on_it() -> None:
+    nothing = RateErrors(np.zeros(4), np.full(4, np.inf))
+    jacobian = np.random.default_rng(0).normal(size=(2, 6, 4))
+    taken = batched_pnp._information_of_rates(
+        nothing, np.arange(4), jacobian, np.ones(4), np.array([0]), np.array([0.25])
+    )
+    assert taken.shape == (1, 6, 6)
+    assert not taken.any()
+
+
 def _with_fitted_rate(
     points: np.ndarray, px: np.ndarray, truth: np.ndarray, rates: RateErrors
 ) -> batched_pnp.Observations:

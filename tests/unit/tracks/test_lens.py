@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.point_tracks import PointTracks
 from bodycap_batch.tracks import estimate_lens
+from tests.unit.tracks.simulated import project, tracks_of_views
 
 WIDTH, HEIGHT, FRAMES, FPS = 640, 480, 60, 30
 
@@ -24,27 +24,14 @@ def tracks_of(lens: Camera, motion: float = 1.0) -> PointTracks:
     rng = np.random.default_rng(5)
     points = rng.uniform((-4, -3, -4), (4, 3, 4), (3000, 3))
     points = points[np.linalg.norm(points, axis=1) > 1.5]
-    first, track, px = [0], [], []
+    views = []
     for time in np.arange(FRAMES) / FPS:
         turn = so3_exp(
             motion * np.array([0.5 * np.sin(3 * time), 0.9 * np.sin(2 * time), 0.2 * np.sin(4 * time)])
         )
         centre = motion * np.array([0.3 * np.sin(2.5 * time), 0.1 * np.sin(4 * time), 0.2 * time])
-        seen: FloatArray = (points - centre) @ turn
-        found = lens.project(seen)
-        inside = (seen[:, 2] > 0.3) & ((found > 5) & (found < (WIDTH - 5, HEIGHT - 5))).all(axis=1)
-        rows = np.flatnonzero(inside)
-        track.append(rows)
-        px.append(found[rows] + rng.normal(0, 0.2, (len(rows), 2)))
-        first.append(first[-1] + len(rows))
-    return PointTracks(
-        camera="head",
-        width_px=WIDTH,
-        height_px=HEIGHT,
-        first=np.array(first),
-        track=np.concatenate(track),
-        px=np.concatenate(px).astype(np.float32),
-    )
+        views.append(project(lens, (points - centre) @ turn))
+    return tracks_of_views(lens, views, rng)
 
 
 TIMES_NS = (np.arange(FRAMES) * 1e9 / FPS).astype(np.int64)

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
+import pytest
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray
+import bodycap_batch.tracks
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.core.arrays import BoolArray
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.point_tracks import PointTracks
+from bodycap_batch.tasks.keyframes import regions_and_lens
 from bodycap_batch.tracks import estimate_lens, find_moving_regions, find_moving_tracks
+from tests.unit.tracks.simulated import project, tracks_of_views
 
 WIDTH, HEIGHT, FRAMES, FPS = 640, 480, 60, 30
 LENS = Camera(
@@ -21,38 +30,27 @@ HAND = 100
 """Number of points on the hand, half a metre ahead of the camera: they are the first tracks."""
 
 
-def tracks_with_hand(hand_m: float, motion: float = 1.0) -> PointTracks:
+def tracks_with_hand(hand_m: float, motion: float = 1.0, half_side_m: float = 0.1) -> PointTracks:
     """Return tracks of a room, and of a square hand before the camera that moves to and fro by itself.
 
     Args:
         hand_m: How far the hand moves, metres.
         motion: How far the camera moves and turns, relative to a quick walk.
+        half_side_m: Half of the side of the hand.
     """
     rng = np.random.default_rng(2)
     room = rng.uniform((-4, -3, 1.5), (4, 3, 5), (1200, 3))
-    hand = rng.uniform((-0.1, -0.1, 0.45), (0.1, 0.1, 0.55), (HAND, 3))
-    first, track, px = [0], [], []
+    hand = rng.uniform((-half_side_m, -half_side_m, 0.45), (half_side_m, half_side_m, 0.55), (HAND, 3))
+    views = []
     for time in np.arange(FRAMES) / FPS:
         turn = so3_exp(motion * np.array([0.1 * np.sin(3 * time), 0.2 * np.sin(2 * time), 0.0]))
         centre = motion * np.array([0.3 * np.sin(2.5 * time), 0.1 * np.sin(4 * time), 0.3 * time])
         moved = hand + hand_m * np.array([np.sin(5 * time), np.cos(4 * time), 0.5 * np.sin(3 * time)])
-        seen: FloatArray = np.concatenate([moved, (room - centre) @ turn])
-        found = LENS.project(seen)
-        inside = (seen[:, 2] > 0.3) & ((found > 5) & (found < (WIDTH - 5, HEIGHT - 5))).all(axis=1)
-        low, high = found[:HAND].min(axis=0), found[:HAND].max(axis=0)
-        inside[HAND:] &= ~((found[HAND:] > low) & (found[HAND:] < high)).all(axis=1)
-        rows = np.flatnonzero(inside)
-        track.append(rows)
-        px.append(found[rows] + rng.normal(0, 0.2, (len(rows), 2)))
-        first.append(first[-1] + len(rows))
-    return PointTracks(
-        camera="head",
-        width_px=WIDTH,
-        height_px=HEIGHT,
-        first=np.array(first),
-        track=np.concatenate(track),
-        px=np.concatenate(px).astype(np.float32),
-    )
+        px, seen = project(LENS, np.concatenate([moved, (room - centre) @ turn]))
+        low, high = px[:HAND].min(axis=0), px[:HAND].max(axis=0)
+        seen[HAND:] &= ~((px[HAND:] > low) & (px[HAND:] < high)).all(axis=1)
+        views.append((px, seen))
+    return tracks_of_views(LENS, views, rng)
 
 
 def seen_often(tracks: PointTracks) -> BoolArray:
@@ -84,9 +82,10 @@ def test_the_regions_follow_the_hand_and_leave_the_room() -> None:
     assert np.mean(in_room) < 0.1
 
 
-def test_nothing_moves_by_itself_in_a_still_room() -> None:
-    tracks = tracks_with_hand(0.0, 0.0)
-    assert not find_moving_tracks(tracks, LENS, TIMES_NS).any()
+def test_a_room_before_a_camera_that_moves_does_not_move_by_itself() -> None:
+    # The hand is fixed to the camera here.
+    moving = find_moving_tracks(tracks_with_hand(0.0), LENS, TIMES_NS)
+    assert moving[HAND:].mean() < 0.02
 
 
 def test_nothing_is_left_out_if_no_motion_has_most_of_the_picture() -> None:
@@ -104,3 +103,17 @@ def test_the_lens_is_found_without_the_hand() -> None:
     found = estimate_lens(tracks.outside(regions), TIMES_NS)
     assert found is not None
     assert abs(np.log(found.lens.focal_px / LENS.focal_px)) < 0.05
+
+
+@pytest.mark.parametrize(("half_side_m", "is_left_out"), [(0.1, True), (0.02, False)])
+def test_only_a_thing_of_some_size_is_left_out(
+    half_side_m: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_left_out: bool
+) -> None:
+    # The tracks come from a simulation, since a flat picture does not show what moves by itself.
+    found = tracks_with_hand(0.08, half_side_m=half_side_m)
+    monkeypatch.setattr(bodycap_batch.tracks, "track_video", lambda camera, progress: found)
+    camera = cast(CaptureCamera, SimpleNamespace(camera=LENS, times_ns=TIMES_NS))
+    fixed, moving, lens = regions_and_lens(camera, StageContext(work_dir=tmp_path))
+    assert not fixed.any()
+    assert lens is None, "the lens is given"
+    assert (moving.mean() > 0.02) if is_left_out else (moving.size == 0)
