@@ -106,7 +106,8 @@ def bundle_adjust(
 ) -> None:
     """Adjust a model once.
 
-    By default, all poses are adjusted and the model gets a new gauge. If `only` is given, all intrinsics are
+    By default, all poses are adjusted and the model gets a new gauge. If an adjustment leads to an impossible
+    lens, it is made again with the lens that the camera had. If `only` is given, all intrinsics are
     constant, and only two things are adjusted: the poses of the images in `only`, and the points that only
     these images observe.
 
@@ -151,9 +152,33 @@ def bundle_adjust(
         # For conjugate gradients, the gauge stays free: a fixed gauge makes the matrix blocks unequal in
         # size, and with unequal blocks conjugate gradients are slow.
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    free = set(model.cameras) - set(calibrated_ids) if only is None else set()
+    before = copy.deepcopy(model) if free else None
     summary = pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
+    limits = settings.mapper
+    impossible = {
+        camera_id
+        for camera_id in free
+        if model.camera(camera_id).has_bogus_params(
+            limits.min_focal_length_ratio, limits.max_focal_length_ratio, limits.max_extra_param
+        )
+    }
+    if impossible:
+        _restore(model, before)
+        bundle_adjust(model, settings, {*calibrated_ids, *impossible}, iterations, loss_px, only)
+        return
     if not summary.is_solution_usable():
         raise EstimationError(
             f"the map of {model.num_reg_images()} keyframes could not be refined: {summary.brief_report()}",
             hint="set `registration: {rounds: 0}` to use the map as it was first built",
         )
+
+
+def _restore(model: Any, before: Any) -> None:
+    """Give a model the poses, points and lenses of an earlier copy of it, in place."""
+    for frame_id in before.reg_frame_ids():
+        model.frame(frame_id).rig_from_world = before.frame(frame_id).rig_from_world
+    for point_id, point in before.points3D.items():
+        model.point3D(point_id).xyz = point.xyz
+    for camera_id, camera in before.cameras.items():
+        model.camera(camera_id).params = camera.params
