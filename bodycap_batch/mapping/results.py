@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError
@@ -22,17 +19,13 @@ from bodycap_batch.mapping.validation.transient_points import remove_transient_p
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.scene import MapResult
 
-_LENS_SIGMAS = 2.0
-"""Maximum change of a focal length by the last adjustment, in standard deviations of that of the tracks.
-Evidence: docs/decisions/tracks.md."""
-
 
 def finalise_models(models: list[Any], context: MappingContext, resected: Sequence[set[int] | None]) -> int:
     """Remove transient points, points on the wearer and dominant points, and adjust robustly, in place.
 
     A model that is left without points is removed from the list: its keyframes saw nothing but transient
     points, or contradict each other. The last adjustment of the largest model refines the lenses that tracks
-    determined (`_adjusted`). The other models keep these lenses.
+    determined (`_adjust`). The other models keep these lenses.
 
     Args:
         models: Reconstructions, the largest first. The list and the reconstructions are changed in place.
@@ -55,9 +48,8 @@ def finalise_models(models: list[Any], context: MappingContext, resected: Sequen
             continue
         only = None if image_ids is None else image_ids & registered_ids(model)
         if only is None or only:
-            kept.append(_adjusted(model, context, lenses, only))
-        else:
-            kept.append(model)
+            _adjust(model, context, lenses, only)
+        kept.append(model)
         lenses |= {
             number: kept[-1].camera(number).params for number in kept[-1].cameras if number not in lenses
         }
@@ -70,37 +62,22 @@ def finalise_models(models: list[Any], context: MappingContext, resected: Sequen
     return total
 
 
-def _adjusted(
+def _adjust(
     model: Any, context: MappingContext, known: Mapping[int, Any], only: Collection[int] | None
-) -> Any:
-    """Return a model after its last robust adjustment.
-
-    The focal length that tracks determine has a standard deviation. A map that is small, or that bends, may
-    determine another one with ease. If the two are too far apart, the lens of the tracks stays.
+) -> None:
+    """Adjust a model robustly for the last time, in place.
 
     Args:
-        model: A reconstruction. It may be changed in place.
+        model: A reconstruction. It is changed in place.
         context: Mapper options, and the cameras whose lens tracks determined.
         known: Parameters of the lenses that a larger model determined, by camera id.
         only: Ids of the images to adjust; None: all images.
     """
-    settings, held = context.mapper_options(), set(context.calibrated_ids)
-    for number in context.lens_sigma.keys() & known.keys() & set(model.cameras):
+    estimated = context.lens_sigma.keys() & set(model.cameras)
+    for number in estimated & known.keys():
         model.camera(number).params = known[number]
-    free = context.lens_sigma.keys() & set(model.cameras) - known.keys()
-    before = {number: model.camera(number).mean_focal_length() for number in free}
-    with_free = copy.deepcopy(model) if free else model
-    adjust_robustly(with_free, settings, sorted(held - free), only)
-    contradicted = {
-        number
-        for number in free
-        if abs(np.log(with_free.camera(number).mean_focal_length() / before[number]))
-        > _LENS_SIGMAS * context.lens_sigma[number]
-    }
-    if not contradicted:
-        return with_free
-    adjust_robustly(model, settings, sorted(held - free | contradicted), only)
-    return model
+    held = set(context.calibrated_ids) - (estimated - known.keys())
+    adjust_robustly(model, context.mapper_options(), sorted(held), only)
 
 
 def misplaced_frames(names: Collection[str], models: Sequence[Any]) -> dict[str, tuple[int, ...]]:
