@@ -81,6 +81,8 @@ def page_content(
         "scene": scene,
         "places": {name: place.replace("_", " ") for name, place in inputs.places_from_motion.items()},
         "has_viewer": scene.has_content,
+        "has_shade": inputs.capture is not None
+        and not all(camera.shows_only_room for camera in inputs.capture.cameras),
         "has_body": inputs.merge is not None,
         "cameras": _cameras(inputs, losses, colours, budget),
         "causes": {cause.value: criterion for cause, criterion in _CAUSE_CRITERIA.items()},

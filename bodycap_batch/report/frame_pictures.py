@@ -35,6 +35,9 @@ _JPEG_QUALITY = 60
 """JPEG quality on the scale from 0 to 100. Evidence: none."""
 _PROBED_FRAMES = 6
 """Number of frames that are encoded to estimate the size of a picture. Evidence: none."""
+_SHADE_BGR, _SHADE_DIVISOR = np.array([90, 20, 90], np.uint8), 3
+"""Colour that is added to what is left out of a picture, after its brightness is divided: a dark violet,
+which rooms hardly show."""
 _MAX_PICTURES_PER_S = 5.0
 """Maximum number of pictures per second of video.
 
@@ -152,7 +155,7 @@ def measure_appearance(
         half_size = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         found = cv2.goodFeaturesToTrack(half_size, MAX_CORNERS, _CORNER_QUALITY, 5.0)
         corners = 0 if found is None else len(_corners_above_noise(half_size, found.reshape(-1, 2)))
-        picture = _encode_picture(index, image, _LOST_SIDE_PX)
+        picture = _encode_picture(camera, index, image, _LOST_SIDE_PX)
         measured[index] = FrameAppearance(picture=picture, brightness=float(grey.mean()), corners=corners)
     return measured
 
@@ -208,7 +211,7 @@ def _thin_to_budget(pictures: list[FramePicture], budget: int) -> list[FramePict
 
 def _read_pictures(camera: CaptureCamera, indices: IntArray, context: StageContext) -> list[FramePicture]:
     return [
-        _encode_picture(index, image, _SERIES_SIDE_PX)
+        _encode_picture(camera, index, image, _SERIES_SIDE_PX)
         for index, image in _decode_frames(camera, indices, context)
     ]
 
@@ -229,12 +232,18 @@ def _decode_frames(camera: CaptureCamera, indices: IntArray, context: StageConte
     return frames
 
 
-def _encode_picture(index: int, image: Any, side_px: int) -> FramePicture:
+def _encode_picture(camera: CaptureCamera, index: int, image: Any, side_px: int) -> FramePicture:
+    """Return a small JPEG of a frame. What is masked or is not the room is shaded."""
     import cv2
 
     factor = min(1.0, side_px / max(image.shape[:2]))
     size = (max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor)))
     small = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
+    lens = camera.camera
+    x, y = np.meshgrid(*((np.arange(n) + 0.5) / n for n in size))
+    px = np.column_stack([x.ravel() * lens.width_px, y.ravel() * lens.height_px])
+    left_out = ~camera.is_unmasked(px, index).reshape(small.shape[:2])
+    small[left_out] = _SHADE_BGR + small[left_out] // _SHADE_DIVISOR
     _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     text = base64.b64encode(encoded.tobytes()).decode("ascii")
     return FramePicture(index=index, jpeg=text, width=size[0], height=size[1])

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from bodycap_batch.capture import KeptFrames
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.camera import Camera
 from bodycap_batch.report.frame_pictures import MAX_JPEG_CHARACTERS, picture_series
 
 
@@ -23,6 +26,12 @@ class NoiseVideo:
         self.damaged = np.zeros(0, np.int64)
         self.nominal_fps = 30.0
         self.passes = 0
+        params = np.array([300.0, 300.0, 160.0, 120.0])
+        self.camera = Camera(model="PINHOLE", width_px=320, height_px=240, params=params)
+
+    def is_unmasked(self, px: np.ndarray, frame: int) -> np.ndarray:
+        """Return True but for the right half of frame 0."""
+        return np.asarray((px[:, 0] < 160) | (frame > 0))
 
     def key_indices(self) -> np.ndarray:
         return np.array([0])
@@ -70,3 +79,17 @@ def test_the_video_is_read_where_no_frames_are_kept(tmp_path: Path) -> None:
     assert {3, 15, 27} < {picture.index for picture in found}
     assert sum(picture.index > 57 for picture in found) == 5
     assert found[-1].index == 89
+
+
+def test_what_is_left_out_is_shaded(tmp_path: Path) -> None:
+    video: Any = NoiseVideo(levels=256)
+    found = picture_series(video, np.arange(90) / 30.0, 15 * 60_000, StageContext(work_dir=tmp_path))
+    first, later = (
+        np.asarray(cv2.imdecode(np.frombuffer(base64.b64decode(each.jpeg), np.uint8), cv2.IMREAD_COLOR))
+        for each in (found[0], found[1])
+    )
+    shade = first[:, 170:].reshape(-1, 3).mean(axis=0)
+    assert shade[1] < 0.7 * min(shade[0], shade[2])
+    for room in (first[:, :150], later):
+        mean = room.reshape(-1, 3).mean(axis=0)
+        assert np.ptp(mean) < 0.1 * mean.mean()
