@@ -341,12 +341,20 @@ def _misplaced_criteria(
         subject="cameras",
         name="Parts that contradict the map",
         grade=grade_value(worst, _GOOD_MISPLACED_SHARE, _FAIR_MISPLACED_SHARE),
-        finding=f"{name}: {len(misplaced[name])} keyframes ({format_percent(worst, 1)}) contradict the rest "
-        f"of the map and were left out (frames {min(misplaced[name])} to {max(misplaced[name])})",
+        finding=f"{name}: {_keyframes_that_contradict(misplaced[name], format_percent(worst, 1))}",
         rationale="The matches of these keyframes do not belong to common points: the part has another scale "
         "or another place. The poses of the frames near these keyframes can be wrong by decimetres, although "
         "their error in pixels is small.",
         value=worst,
+    )
+
+
+def _keyframes_that_contradict(frames: Collection[int], share: str) -> str:
+    if len(frames) == 1:
+        return f"one keyframe ({share}) contradicts the rest of the map and was left out (frame {min(frames)})"
+    return (
+        f"{len(frames)} keyframes ({share}) contradict the rest of the map and were left out "
+        f"(frames {min(frames)} to {max(frames)})"
     )
 
 

@@ -34,7 +34,8 @@ def test_the_grade_follows_the_share_of_misplaced_keyframes(frames: list[int], g
     assert verdict.cameras is grade
     found = [item for item in verdict.criteria if item.name == "Parts that contradict the map"]
     assert len(found) == bool(frames)
-    assert all(item.finding.startswith(f"left_palm: {len(frames)} keyframes") for item in found)
+    count = "one keyframe" if len(frames) == 1 else f"{len(frames)} keyframes"
+    assert all(item.finding.startswith(f"left_palm: {count} (") for item in found)
 
 
 def test_a_map_without_the_check_has_no_such_criterion() -> None:
