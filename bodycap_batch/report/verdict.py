@@ -351,7 +351,8 @@ def _misplaced_criteria(
 
 def _keyframes_that_contradict(frames: Collection[int], share: str) -> str:
     if len(frames) == 1:
-        return f"one keyframe ({share}) contradicts the rest of the map and was left out (frame {min(frames)})"
+        frame = min(frames)
+        return f"one keyframe ({share}) contradicts the rest of the map and was left out (frame {frame})"
     return (
         f"{len(frames)} keyframes ({share}) contradict the rest of the map and were left out "
         f"(frames {min(frames)} to {max(frames)})"
