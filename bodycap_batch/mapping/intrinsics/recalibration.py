@@ -20,6 +20,11 @@ _MIN_KEYFRAME_RATIO = 0.95
 map with a smaller ratio is not better. The ratio is computed for all cameras together and for each camera.
 Evidence: none."""
 
+_MAX_FOCAL_FACTOR = 3.0
+"""Maximum factor between a given focal length and the one that a map determines. Origin: the fields of view
+of one camera differ by less (narrow and wide: 2.2). A larger factor is a lens that the map does not
+determine. Evidence: docs/decisions/mapping.md."""
+
 
 def recalibrate_if_misfit(
     result: MapResult,
@@ -63,7 +68,7 @@ def _recalibrate(
         build: Function that builds a map of a capture with changed intrinsics.
         usable: Whether the given map is usable. A better map always contains all cameras whose given
             intrinsics contradict the given map. If the given map is usable, a better map also passes
-            `_is_better_map`.
+            `_is_better_map`. Its lenses must be possible ones (`_is_possible`).
     """
     misfits = result.diagnostics.misfit_factors or {}
     if not misfits or not is_on(Mechanism.RECALIBRATION):
@@ -75,7 +80,10 @@ def _recalibrate(
     except EstimationError as error:
         return replace(result, log={**result.log, "freeing_failed": error.message})
     other = again.maps[0]
-    if not (misfits.keys() <= other.cameras.keys() and (not usable or _is_better_map(other, result.maps[0]))):
+    is_better = misfits.keys() <= other.cameras.keys() and (
+        not usable or _is_better_map(other, result.maps[0])
+    )
+    if not is_better or not all(_is_possible(other.cameras[name], given[name]) for name in misfits):
         comparison = {"keyframes": _count_keyframes(other), "mean_error_px": round(other.mean_error_px(), 4)}
         return replace(result, log={**result.log, "freeing_refused": comparison})
     cameras = {name: other.cameras[name] for name in sorted(misfits)}
@@ -156,6 +164,12 @@ def _initial_guess(camera: Camera, factor: float) -> Camera:
         params=params,
         refine=True,
     )
+
+
+def _is_possible(refined: Camera, given: Camera) -> bool:
+    """Return whether a camera with a given lens may have the refined one in another mode."""
+    factor = refined.focal_px / given.focal_px
+    return 1.0 / _MAX_FOCAL_FACTOR < factor < _MAX_FOCAL_FACTOR
 
 
 def _is_better_map(other: Map, one: Map) -> bool:

@@ -57,6 +57,15 @@ def test_new_intrinsics_keep_the_direction_of_the_sensor() -> None:
     assert {each.name: each.camera.sideways for each in later.cameras} == {"left_palm": True, "torso": False}
 
 
+@pytest.mark.parametrize("zoom", [0.3, 9.5])
+def test_an_absurd_lens_is_no_evidence_against_the_given_one(zoom: float) -> None:
+    """A map of a table from one side fitted a focal length of 9.5 times the right one."""
+    first = _mapped(0.9, {"left_palm": 1.07})
+    found = recalibrate_if_misfit(first, CAPTURE, lambda _: _mapped(0.5, {}, zoom=zoom))
+    assert found.maps == first.maps
+    assert found.diagnostics.recalibrated == ()
+
+
 def test_misfit_intrinsics_start_from_the_focal_length_that_fits() -> None:
     seen = []
 
