@@ -350,6 +350,7 @@ def _misplaced_criteria(
 
 
 def _keyframes_that_contradict(frames: Collection[int], share: str) -> str:
+    """Return the sentence about the keyframes that were left out, by their frame indices."""
     if len(frames) == 1:
         frame = min(frames)
         return f"one keyframe ({share}) contradicts the rest of the map and was left out (frame {frame})"

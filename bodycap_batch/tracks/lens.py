@@ -17,6 +17,7 @@ from bodycap_batch.model.geometry import skew, so3_exp
 from bodycap_batch.model.lens_estimate import LensEstimate
 from bodycap_batch.model.optical_flow import pixel_scale, unit_directions
 from bodycap_batch.model.point_tracks import PointTracks
+from bodycap_batch.tracks.relative_motion import cross
 
 _PAIRS = 36
 """Number of pairs of frames. Evidence: docs/decisions/tracks.md."""
@@ -52,22 +53,27 @@ _DISTORTIONS = {"SIMPLE_RADIAL": (-0.25, -0.1), "SIMPLE_RADIAL_FISHEYE": (-0.1, 
 _BEST_FOCAL = 3
 """Number of focal lengths for which they are tried: those with the least cost without distortion."""
 _CANDIDATES = 4
-"""Number of lenses from which lens, readout times and poses are fitted together."""
+"""Number of lenses from which lens, readout times and poses are fitted together. Evidence:
+docs/decisions/tracks.md."""
 _ROUNDS, _JOINT_STEPS = 2, 8
-"""Number of rounds, each after a search of poses by RANSAC, and of Gauss–Newton steps of a round."""
+"""Number of rounds, each after a search of poses by RANSAC, and of steps of a round. Evidence:
+docs/decisions/tracks.md."""
 _JOINT_DAMPING = 1e-5
-"""Damping of the poses in these steps. With more, the poses hold the readout time where it began."""
+"""Damping of the poses in the first of these steps. With more, the poses hold the readout time where it
+began. Evidence: docs/decisions/tracks.md."""
 _DIFFERENCES = np.array([1e-3, 1e-3, 5e-4, 5e-4])
 """Differences of log focal length, distortion and readout times (seconds) for derivatives."""
 _MAX_CHANGE = np.array([0.1, 0.05, 0.01, 0.01])
 """Maximum changes of these in one step."""
 _DISTORTION_SIGMA, _READOUT_SIGMA_S = 0.05, 0.015
-"""Standard deviations of distortion, from the nearest one that is tried, and of readout times (seconds)."""
+"""Usual deviations of the distortion from the start of a fit, and of the readout times from 0 (seconds).
+Evidence: none."""
 _MAX_PINCUSHION = 0.03
-"""Maximum distortion above the nearest one that is tried. A longer focal length with pincushion distortion
-fits turns of a few degrees as well, but lenses of cameras have barrel distortion."""
+"""Maximum growth of the distortion in a fit. A longer focal length with pincushion distortion fits turns of a
+few degrees as well, but lenses of cameras have barrel distortion. Evidence: docs/decisions/tracks.md."""
 _PRIOR = np.diag([0.0, 1.0 / _DISTORTION_SIGMA**2, *[1.0 / _READOUT_SIGMA_S**2] * 2])
-"""The prior information about them."""
+"""Information matrix of these deviations. It shortens steps where the pairs tell little. Whether a step is
+taken depends on the pairs alone."""
 _LEAST_SIGMA = 0.01
 """Least standard deviation of the logarithm of a focal length. Evidence: docs/decisions/tracks.md."""
 _DAMPING = 1e-3
@@ -169,9 +175,10 @@ class _Shared:
 
     Attributes:
         lens: The lens.
-        usual_distortion: The distortion from which it deviates little.
-        readout_s: (2,) time from the first to the last column and row, seconds. One of them is 0 or nearly
-            so; which one, is known only if it is known how the camera was held.
+        usual_distortion: The distortion at the start of the fit.
+        readout_s: (2,) time from the first to the last column, and from the first to the last row, seconds.
+            A sensor reads rows or columns, so one of the two should be 0. Which one depends on how the camera
+            was held, which is often unknown.
     """
 
     lens: Camera
@@ -331,7 +338,7 @@ class _Problem:
     Attributes:
         first_px: (P,K,2) points in the first frame of each pair, px.
         second_px: (P,K,2) points in the second frame, px.
-        first_px_s: (P,K,2) speeds of the points in the first frame, px of one frame to the next, per second.
+        first_px_s: (P,K,2) speeds of the points in the first frame, px/s, if all rows had one time.
         second_px_s: (P,K,2) the same in the second frame.
         valid: (P,K) False where a pair has fewer than K points.
         error_px: Scale of the robust loss, px.
@@ -509,12 +516,6 @@ def _translations(rotation: FloatArray, rays: _Rays) -> FloatArray:
     return np.asarray(np.linalg.eigh(np.einsum("pk,pki,pkj->pij", weight, normal, normal))[1][:, :, 0])
 
 
-def _cross(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the cross products (P,K,3). NumPy's function takes three times as long for small arrays."""
-    (ax, ay, az), (bx, by, bz) = (np.moveaxis(item, 2, 0) for item in (one, other))
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=2)
-
-
 def _residuals_px(poses: _Poses, rays: _Rays) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the distances (P,K) of the points from their epipolar lines, px (Sampson's approximation).
 
@@ -559,9 +560,9 @@ class _System:
         residual, turned, size = _residuals_px(poses, rays)
         weight = rays.valid / (1.0 + (residual / error_px) ** 2)
         # t · ((ω × a) × b) = ω · (a × (b × t))
-        by_rotation = _cross(turned, rays.second @ skew(translation))
+        by_rotation = cross(turned, rays.second @ skew(translation))
         tangent = np.linalg.svd(translation[:, :, None])[0][:, :, 1:]
-        by_translation = _cross(turned, rays.second) @ tangent
+        by_translation = cross(turned, rays.second) @ tangent
         jacobian = np.concatenate([by_rotation, by_translation], axis=2) / size[:, :, None]
         weighted = (weight[:, :, None] * jacobian).swapaxes(1, 2)
         hessian = weighted @ jacobian

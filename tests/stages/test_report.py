@@ -356,6 +356,36 @@ def test_a_camera_without_poses_uses_the_clock_of_the_capture(inputs: ReportInpu
     assert times[0] == pytest.approx(2.5)
 
 
+@pytest.mark.parametrize("is_masked", [True, False])
+def test_the_legend_explains_shaded_pictures_only_if_there_are_some(
+    inputs: ReportInputs, tmp_path: Path, *, is_masked: bool
+) -> None:
+    write_video(tmp_path / "torso.mp4", [textured_frame(index % 12) for index in range(60)])
+    lens = {"model": "PINHOLE", "params": [60.0, 60.0, 32.0, 24.0], "width": 64, "height": 48}
+    camera = {"name": "torso", "video": [str(tmp_path / "torso.mp4")], "calibration": lens}
+    (opened,) = open_capture(CaptureConfig.model_validate({"cameras": [camera]})).cameras
+    mask = np.arange(64)[None, :] < np.full((48, 1), 32) if is_masked else None
+    kept = {name: getattr(inputs, name) for name in ("maps", "registrations", "clocks")}
+    capture = Capture(cameras=tuple(replace(opened, name=name, mask=mask) for name in inputs.cameras))
+    text = written(ReportInputs(name="x", cameras=inputs.cameras, capture=capture, **kept), tmp_path)
+    assert ("moving by itself" in text) is is_masked
+
+
+def test_a_doubt_without_advice_is_not_called_good(inputs: ReportInputs, tmp_path: Path) -> None:
+    camera = {"coverage": 1.0, "frames": 300, "frames_registered": 300, "frame": "map-0", "keyframes": 90}
+    metrics = {
+        "frame": "map-0",
+        "total": {**camera, "mean_reprojection_error_px": 0.4},
+        "cameras": {name: dict(camera) for name in inputs.cameras},
+        "mapping": {"misplaced_keyframes": {"torso": list(range(30, 36))}},
+        "models": [],
+    }
+    text = written(ReportInputs(name="x", cameras=inputs.cameras, metrics=metrics), tmp_path)
+    assert "6 keyframes" in text
+    assert "No advice is known" in text
+    assert "every measured criterion is good" not in text
+
+
 def test_every_link_of_the_page_has_a_target(inputs: ReportInputs, tmp_path: Path) -> None:
     kept = {name: getattr(inputs, name) for name in ("cameras", "maps", "registrations", "clocks")}
     failure = {"stage": "merge", "type": "EstimationError", "message": "stopped", "hint": ""}
