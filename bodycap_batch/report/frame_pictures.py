@@ -36,8 +36,8 @@ _JPEG_QUALITY = 60
 _PROBED_FRAMES = 6
 """Number of frames that are encoded to estimate the size of a picture. Evidence: none."""
 _SHADE_BGR, _SHADE_DIVISOR = np.array([90, 20, 90], np.uint8), 3
-"""Colour that is added to what is left out of a picture, after its brightness is divided: a dark violet,
-which rooms hardly show."""
+"""Colour that is added to what is left out of a picture, after its brightness is divided: a dark violet.
+Evidence: none."""
 _MAX_PICTURES_PER_S = 5.0
 """Maximum number of pictures per second of video.
 
