@@ -41,9 +41,9 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
         {"validation", "initial_models"},
         {"inputs", "model_joining"},
         {"results"},
-        {"build", "extend", "refine"},
+        {"build", "extend", "further_maps", "refine"},
     ),
-    "registration": ({"tracking"}, {"poses"}, {"recovery"}, {"stage"}),
+    "registration": ({"tracking"}, {"poses"}, {"recovery"}, {"stage"}, {"further_maps"}),
     "fill": (
         {"leg_geometry", "trunk_signals"},
         {"contacts", "head"},

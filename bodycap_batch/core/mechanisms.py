@@ -55,6 +55,7 @@ class Mechanism(StrEnum):
     NEIGHBOUR_MATCHES = "neighbour_matches"
     GAP_FILLING = "gap_filling"
     SENSOR_PATH = "sensor_path"
+    FURTHER_MAPS = "further_maps"
     LYING = "lying"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,6 +22,7 @@ from bodycap_batch.evaluate.right_frames import (
     RightFrames,
     find_right_frames,
     has_pose,
+    join_paths,
     measure_pictures,
 )
 from bodycap_batch.evaluate.two_view import Outcome
@@ -37,12 +39,13 @@ class DeliveredCamera:
     """What a results folder delivers of one camera.
 
     Attributes:
-        poses: The delivered poses world_from_camera.
+        paths: The delivered poses map_from_camera, one path for each map. The scales, axes and origins of the
+            maps differ.
         lens: The delivered intrinsics.
         readout_s: Time from the exposure of the first row to that of the last row; 0 for a global shutter.
     """
 
-    poses: TimedPoses
+    paths: tuple[TimedPoses, ...]
     lens: Camera
     readout_s: float = 0.0
 
@@ -51,28 +54,31 @@ def read_delivered(results: Path) -> dict[str, DeliveredCamera]:
     """Read the paths and the intrinsics of a results folder, by camera name.
 
     The folder must hold ``trajectories/<camera>.tum`` and a COLMAP model in ``colmap/<n>/`` for each camera.
-    Cameras without a pose are left out.
+    Paths in other maps are in folders of ``trajectories/``. Cameras without a pose are left out.
 
     Raises:
         JobError: The folder holds no paths, or a file is malformed.
     """
-    paths = sorted((results / "trajectories").glob("*.tum"))
-    if not paths:
+    files = sorted((results / "trajectories").rglob("*.tum"))
+    if not files:
         raise JobError(
             f"{results} holds no camera paths",
             hint="give the folder of a finished job, with trajectories/<camera>.tum in it",
         )
     lenses = _lenses(results / "colmap")
-    poses = {path.stem: read_tum(path) for path in paths}
+    paths = defaultdict[str, list[TimedPoses]](list)
+    for file in files:
+        if len((path := read_tum(file)).times_ns):
+            paths[file.stem].append(path)
     readouts = _readouts(results / "metrics.json")
     return {
         name: DeliveredCamera(
-            poses=found,
+            paths=tuple(found),
             lens=replace(lenses[name], sideways=bool(readouts.get(name, {}).get("sideways", False))),
             readout_s=float(readouts.get(name, {}).get("seconds") or 0.0),
         )
-        for name, found in poses.items()
-        if name in lenses and len(found.times_ns)
+        for name, found in paths.items()
+        if name in lenses
     }
 
 
@@ -134,14 +140,21 @@ def check_with_pictures(
 def _check_camera(
     delivered: DeliveredCamera, camera: CaptureCamera, progress: Callable[[int, int], None]
 ) -> RightFrames:
-    poses = poses_of_frames(delivered.poses, camera)
-    count = len(poses)
-    evidence = measure_pictures(
-        read_pictures(camera, delivered.lens, delivered.readout_s, lambda done: progress(done // 2, count)),
-        has_pose(poses),
-        lambda done, total: progress((total + done) // 2, total),
+    count, paths = len(camera.times_ns), len(delivered.paths)
+    pictures = read_pictures(
+        camera, delivered.lens, delivered.readout_s, lambda done: progress(done // 2, count)
     )
-    return find_right_frames(evidence, poses)
+    found = []
+    for number, path in enumerate(delivered.paths):
+        poses = poses_of_frames(path, camera)
+        show = partial(_show_part, progress, number, paths)
+        found.append(find_right_frames(measure_pictures(pictures, has_pose(poses), show), poses))
+    return join_paths(found)
+
+
+def _show_part(progress: Callable[[int, int], None], number: int, parts: int, done: int, total: int) -> None:
+    """Show the progress of one of several paths, in the second half of the whole."""
+    progress((total + (number * total + done) // parts) // 2, total)
 
 
 def read_pictures(

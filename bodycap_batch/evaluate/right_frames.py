@@ -210,6 +210,20 @@ class RightFrames:
         return sum(each is outcome for each in self.outcome)
 
 
+def join_paths(paths: Sequence[RightFrames]) -> RightFrames:
+    """Return the outcome for one camera whose frames are in several paths, each in a map of its own.
+
+    Args:
+        paths: The outcome of each path. No frame is in two paths.
+    """
+    outcomes = zip(*(path.outcome for path in paths), strict=True)
+    return RightFrames(
+        outcome=tuple(next((each for each in frame if each is not None), None) for frame in outcomes),
+        links=sum((Counter(path.links) for path in paths), Counter[Outcome]()),
+        legs={frames: outcome for path in paths for frames, outcome in path.legs.items()},
+    )
+
+
 def measure_pictures(
     pictures: Pictures, posed: BoolArray, progress: Callable[[int, int], None] | None = None
 ) -> PictureEvidence:

@@ -23,6 +23,7 @@ class ExportInputs:
         out_dir: Folder for the result files. The folder is created if it does not exist.
         maps: The maps, largest first, each in its own gauge.
         trajectories: One trajectory for each camera, in the gauge of the camera's map.
+        other_paths: Trajectories of lost frames in other maps than the map of the camera's trajectory.
         clocks: The clock of each camera, by camera name.
         reference_camera: Name of the camera to which clock offsets are relative; "" if they are relative to
             the common clock.
@@ -52,6 +53,7 @@ class ExportInputs:
     row_fraction: Mapping[str, FloatArray] = field(default_factory=dict)
     relative_poses: tuple[RelativePose, ...] = ()
     inertial: Mapping[str, InertialCamera] = field(default_factory=dict)
+    other_paths: tuple[Trajectory, ...] = ()
     log: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from bodycap_batch.export.export_inputs import ExportInputs
-from bodycap_batch.export.target_frames import trajectories_in_target_frames
+from bodycap_batch.export.target_frames import target_numbers, trajectories_in_target_frames
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.tum import seconds_text
-from bodycap_batch.model.scene import FrameStatus
+from bodycap_batch.model.scene import FrameStatus, Trajectory
 
-COLUMNS = ("camera", "frame", "time", "common_time", "status", "reason", "inliers", "error")
+COLUMNS = ("camera", "frame", "time", "common_time", "status", "reason", "inliers", "error", "map")
 LOST = "LOST"
 
 
@@ -23,8 +24,11 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
 
     Times are in seconds. Errors are in pixels at the work size (the image size that all stages work at). The
     column `status` is KEYFRAME, REGISTERED, INERTIAL or LOST. INERTIAL means that the pose was derived
-    from the inertial sensor. For a lost frame, the
-    column `reason` holds the value of `FrameStatus`.
+    from the inertial sensor. For a lost frame, the column `reason` holds the value of `FrameStatus`.
+
+    The column `map` is the number of the map to which the pose refers, as in the names ``map_<n>.ply``; 0 is
+    ``map.ply``. A lost frame with a pose in another map than that of the camera's path has the reason
+    OTHER_MAP and the number of this map.
 
     Args:
         path: Path of the file to write.
@@ -36,7 +40,9 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
+    numbers = target_numbers(inputs)
     for trajectory in trajectories_in_target_frames(inputs):
+        map_numbers = _map_numbers(trajectory, inputs.other_paths, numbers)
         common = inputs.clocks[trajectory.camera].common_times_ns(trajectory.times_ns)
         for index, status in enumerate(trajectory.status):
             error = trajectory.error_px[index]
@@ -49,10 +55,24 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
                     *_status_and_reason(status),
                     int(trajectory.inliers[index]),
                     f"{error:.3f}" if np.isfinite(error) else "",
+                    map_numbers.get(int(trajectory.frame_numbers[index]), ""),
                 )
             )
     write_text(path, text.getvalue())
     return path
+
+
+def _map_numbers(
+    path: Trajectory, other_paths: Sequence[Trajectory], numbers: Mapping[str, int]
+) -> dict[int, int]:
+    """Return the number of the map to which the pose of each frame of a camera refers, by frame number."""
+    parts = (path, *(other for other in other_paths if other.camera == path.camera))
+    return {
+        int(frame): numbers[part.gauge]
+        for part in parts
+        for frame in part.frame_numbers[part.localised]
+        if part.gauge in numbers
+    }
 
 
 def _status_and_reason(status: FrameStatus) -> tuple[str, str]:

@@ -24,7 +24,7 @@ from bodycap_batch.export.target_frames import (
 from bodycap_batch.model.geometry import invert, rotation_angle_rad, transform_points
 from bodycap_batch.model.relative_pose import RelativePose
 from bodycap_batch.model.rotation_path import PosePath
-from bodycap_batch.model.scene import Map, Trajectory
+from bodycap_batch.model.scene import FrameStatus, Map, Trajectory
 from bodycap_batch.model.skeleton import Motion
 
 
@@ -36,7 +36,8 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
         motion: The exported motion; None without a body.
         gap: Difference of the exported motion from the motion graph and from the cameras (`Projection.gap`).
     """
-    errors = [observation_errors(scene, inputs.trajectories) for scene in inputs.maps]
+    paths = (*inputs.trajectories, *inputs.other_paths)
+    errors = [observation_errors(scene, paths) for scene in inputs.maps]
     trajectories = trajectories_in_target_frames(inputs)
     cameras = {path.camera: _camera_metrics(inputs, path, errors) for path in trajectories}
     out: dict[str, Any] = {
@@ -167,6 +168,7 @@ def _camera_metrics(
         "frame": trajectory.gauge,
         "frames": len(registered),
         "frames_registered": int(registered.sum()),
+        "frames_in_other_maps": trajectory.status.count(FrameStatus.OTHER_MAP),
         "coverage": float(registered.mean()) if len(registered) else 0.0,
         "status": dict(sorted(Counter(status.value for status in trajectory.status).items())),
         "keyframes_selected": sum(selected) if selected else None,
@@ -229,6 +231,7 @@ def _total_metrics(
         "cameras_registered": sum(camera["frames_registered"] > 0 for camera in cameras.values()),
         "frames": frames,
         "frames_registered": registered,
+        "frames_in_other_maps": total("frames_in_other_maps"),
         "coverage": registered / frames if frames else 0.0,
         "keyframes_selected": total("keyframes_selected"),
         "keyframes": total("keyframes"),

@@ -13,6 +13,7 @@ from bodycap_batch.export.target_frames import (
     ExportedMap,
     main_target_name,
     maps_in_target_frames,
+    target_numbers,
     trajectories_in_target_frames,
 )
 from bodycap_batch.formats.colmap import write_colmap_model
@@ -50,24 +51,24 @@ def write_maps(inputs: ExportInputs, left_out: list[str]) -> list[Path]:
     Raises:
         StoreError: A file cannot be written.
     """
-    main_target = main_target_name(inputs)
     written = []
     colours = camera_colours(item.camera for item in inputs.trajectories)
     groups: dict[str, list[ExportedMap]] = {}
     for exported in maps_in_target_frames(inputs):
         groups.setdefault(exported.target, []).append(exported)
-    for number, (name, members) in enumerate(groups.items()):
+    for name, number in target_numbers(inputs).items():
+        members = groups[name]
         points = [_points_in_target(member) for member in members]
         cloud = PointCloud(
             points=np.concatenate(points), colors=np.concatenate([member.scene.colors for member in members])
         )
         paths = {
             item.camera: _camera_centres(item)
-            for item in trajectories_in_target_frames(inputs)
+            for item in (*trajectories_in_target_frames(inputs), *inputs.other_paths)
             if item.gauge == name
         }
         spacing = PATH_SPACING_M if name == WORLD else _PATH_SPACING_RATIO * _extent(cloud.points)
-        file = inputs.out_dir / ("map.ply" if name == main_target else f"map_{number}.ply")
+        file = inputs.out_dir / (f"map_{number}.ply" if number else "map.ply")
         drawn = add_camera_paths(cloud, paths, spacing, colours) if paths else cloud
         if not len(cloud.points):
             rest = "shows camera paths only" if len(drawn.points) else "is not written"
@@ -82,7 +83,8 @@ def write_trajectories(inputs: ExportInputs, left_out: list[str]) -> list[Path]:
     """Write one TUM file for each camera, with the camera's localised frames and own timestamps.
 
     The files are in ``trajectories/``. If the poses of a camera are not in the main target frame, the file is
-    in ``trajectories/unplaced/``. A camera without localised frames has a file without poses, because an
+    in ``trajectories/unplaced/``. Poses of lost frames in the further map number n are in
+    ``trajectories/map_<n>/``. A camera without localised frames has a file without poses, because an
     evaluation counts this camera, too.
 
     Args:
@@ -95,21 +97,29 @@ def write_trajectories(inputs: ExportInputs, left_out: list[str]) -> list[Path]:
     Raises:
         StoreError: A file cannot be written.
     """
-    main_target = main_target_name(inputs)
+    main_target, top = main_target_name(inputs), inputs.out_dir / "trajectories"
+    numbers = target_numbers(inputs)
     written = []
+    for trajectory in inputs.other_paths:
+        written.append(_write_path(top / f"map_{numbers[trajectory.gauge]}", trajectory))
     for trajectory in trajectories_in_target_frames(inputs):
         localised = trajectory.localised
-        folder = inputs.out_dir / "trajectories"
-        folder = folder if trajectory.gauge == main_target or not localised.any() else folder / "unplaced"
-        file = folder / f"{trajectory.camera}.tum"
-        poses = TimedPoses(
-            times_ns=trajectory.times_ns[localised], world_from_cam=trajectory.gauge_from_cam[localised]
-        )
-        write_tum(file, poses, _header_comments(trajectory))
-        written.append(file)
+        folder = top if trajectory.gauge == main_target or not localised.any() else top / "unplaced"
+        written.append(file := _write_path(folder, trajectory))
         if not localised.any():
             left_out.append(f"trajectories/{file.name} has no poses: no frame of this camera was localised")
     return written
+
+
+def _write_path(folder: Path, trajectory: Trajectory) -> Path:
+    """Write the localised frames of a trajectory to a TUM file in a folder, and return its path."""
+    localised = trajectory.localised
+    poses = TimedPoses(
+        times_ns=trajectory.times_ns[localised], world_from_cam=trajectory.gauge_from_cam[localised]
+    )
+    file = folder / f"{trajectory.camera}.tum"
+    write_tum(file, poses, _header_comments(trajectory))
+    return file
 
 
 def _header_comments(trajectory: Trajectory) -> list[str]:

@@ -66,3 +66,9 @@ def main_target_name(inputs: ExportInputs) -> str:
     """
     exported = maps_in_target_frames(inputs)
     return exported[0].target if exported else WORLD
+
+
+def target_numbers(inputs: ExportInputs) -> dict[str, int]:
+    """Return the number of each target frame, by its name. The main target frame has the number 0."""
+    names = (item.target for item in maps_in_target_frames(inputs))
+    return {name: number for number, name in enumerate(dict.fromkeys(names))}

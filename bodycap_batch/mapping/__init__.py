@@ -2,7 +2,15 @@
 
 from bodycap_batch.mapping.build import build_map, earlier_results
 from bodycap_batch.mapping.extend import extend_map
+from bodycap_batch.mapping.further_maps import map_lost_keyframes
 from bodycap_batch.mapping.inputs import with_estimated_lenses
 from bodycap_batch.mapping.refine import refine_map
 
-__all__ = ["build_map", "earlier_results", "extend_map", "refine_map", "with_estimated_lenses"]
+__all__ = [
+    "build_map",
+    "earlier_results",
+    "extend_map",
+    "map_lost_keyframes",
+    "refine_map",
+    "with_estimated_lenses",
+]

@@ -115,6 +115,15 @@ def with_map_lenses(capture: Capture, previous: MapResult) -> Capture:
     return _with_lenses(capture, {name: (mapped[name], 0.0) for name in sorted(unknown & mapped.keys())})
 
 
+def with_lenses_of_maps(capture: Capture, previous: MapResult) -> Capture:
+    """Return the capture with the lenses of an earlier map, as if they were given.
+
+    A camera has one lens. The largest map with the camera determines it.
+    """
+    mapped = {name: camera for item in reversed(previous.maps) for name, camera in item.cameras.items()}
+    return _with_lenses(capture, {name: (camera, 0.0) for name, camera in sorted(mapped.items())})
+
+
 def _with_lenses(capture: Capture, lenses: Mapping[str, tuple[Camera, float]]) -> Capture:
     """Return the capture with lenses that were not given.
 

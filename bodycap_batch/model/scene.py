@@ -43,6 +43,7 @@ class FrameStatus(StrEnum):
     UNCONFIRMED: Lost; few observations support the estimated pose, and no neighbouring frame confirms it.
     CONTRADICTED: Lost; the pose was withdrawn, because the keyframes around the frame contradict the map.
     NO_MAP: Lost; no map contains this camera.
+    OTHER_MAP: Lost in the camera's map; localised in another map, whose place in the camera's map is unknown.
     DAMAGED: Lost; the frame cannot be decoded, or the decoder reports that its data are damaged.
     FROZEN: Lost; the recording repeats an earlier picture although the camera moves.
     """
@@ -58,6 +59,7 @@ class FrameStatus(StrEnum):
     UNCONFIRMED = "UNCONFIRMED"
     CONTRADICTED = "CONTRADICTED"
     NO_MAP = "NO_MAP"
+    OTHER_MAP = "OTHER_MAP"
     DAMAGED = "DAMAGED"
     FROZEN = "FROZEN"
 
@@ -299,6 +301,21 @@ class Trajectory:
         if (posed != self.localised).any():
             raise ValueError("status and poses disagree on which frames are localised")
 
+    def without(self, frames: BoolArray, status: FrameStatus) -> Trajectory:
+        """Return the trajectory without the poses of some frames.
+
+        Args:
+            frames: (N,) True for the frames that lose their pose.
+            status: The status of those of them that had one.
+        """
+        new = np.where(frames & self.localised, status, self.status)
+        return replace(
+            self,
+            gauge_from_cam=np.where(frames[:, None, None], np.nan, self.gauge_from_cam),
+            covariance=np.where(frames[:, None, None], np.nan, self.covariance),
+            status=tuple(map(FrameStatus, new)),
+        )
+
     @property
     def localised(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """Mask (N,) that is True for the frames with a measured pose."""
@@ -315,6 +332,18 @@ class Trajectory:
     def seconds(self) -> FloatArray:
         """Time (N,) of each frame on the clock of the camera, seconds."""
         return np.asarray(self.times_ns * 1e-9, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OtherPaths:
+    """The poses of frames of one camera in other maps than the map of its path.
+
+    Attributes:
+        trajectories: One trajectory for each of these maps. No frame has a pose in two of them, or in one of
+            them and in the camera's path.
+    """
+
+    trajectories: tuple[Trajectory, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,7 +10,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_POSED
+from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_MAPPED, LEAST_POSED
 from bodycap_batch.config.models import CameraConfig, Job
 from bodycap_batch.config.mounts import MOTION_PLACES, mount_of
 from bodycap_batch.core.errors import BodycapError, CaptureError, EstimationError, JobError
@@ -43,6 +43,7 @@ from bodycap_batch.tasks.clocks import (
 )
 from bodycap_batch.tasks.export import EXPORT, ExportTask
 from bodycap_batch.tasks.fill import FILL, FillTask
+from bodycap_batch.tasks.further import FURTHER_MAPS, FURTHER_POSES, FurtherMapsTask, FurtherPosesTask
 from bodycap_batch.tasks.inertial import INERTIAL, InertialTask
 from bodycap_batch.tasks.inputs import BodyInput, CaptureRef, FileRef, stated_clocks
 from bodycap_batch.tasks.keyframes import KEYFRAMES, KeyframesTask
@@ -377,6 +378,46 @@ class Flow:
         for artefact in used.values():
             self.runner.report_notes(artefact, "registration")
         return {**registrations, **used}
+
+    def map_lost_parts(
+        self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
+    ) -> tuple[Artefact, ByCamera]:
+        """Map the parts of the videos that no path contains, and localise their frames in these maps.
+
+        Returns:
+            The artefact of all maps, and the registrations, which name these frames and hold their poses.
+            Both are unchanged if there are no further maps.
+        """
+        summaries = [read_summary(artefact.path) for artefact in registrations.values()]
+        lost = [summary["frames"] - summary["localised"] for summary in summaries]
+        if sum(lost) < LEAST_MAPPED or not is_on(Mechanism.FURTHER_MAPS):
+            return scene_map, registrations
+        task = FurtherMapsTask(
+            options=self._job.map,
+            capture=self._footage(),
+            keyframes=refs_by_camera(keyframes),
+            map=artefact_ref(scene_map),
+            registrations=refs_by_camera(registrations),
+        )
+        further = self.runner.run(make_task(FURTHER_MAPS, task, threads=self._threads))
+        if not read_summary(further.path)["further"]:
+            return scene_map, registrations
+        found = self.runner.run_all(
+            make_task(
+                FURTHER_POSES,
+                FurtherPosesTask(
+                    options=self._job.registration,
+                    capture=self._footage([camera]),
+                    keyframes=refs_by_camera({camera.name: keyframes[camera.name]}),
+                    map=artefact_ref(further),
+                    registration=artefact_ref(registrations[camera.name]),
+                ),
+                camera=camera.name,
+                threads=threads,
+            )
+            for camera, threads in zip(self._capture.cameras, self.runner.threads_per_camera(), strict=True)
+        )
+        return further, found
 
     def merge(
         self, scene_map: Artefact, registrations: ByCamera, clocks: Artefact, keyframes: ByCamera

@@ -118,7 +118,8 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     results.registrations = flow.recover(results.map, found, keyframes)
     results.job = job = flow.find_places(results.map, results.registrations)
     results.clocks = flow.clocks(results.map, results.registrations)
-    results.registrations = flow.use_sensors(results.registrations)
+    found = flow.use_sensors(results.registrations)
+    results.map, results.registrations = flow.map_lost_parts(results.map, found, keyframes)
     yield "registration"
     results.stage = "merge"
     results.merged, results.failure = _merge(job, flow, results)

@@ -33,6 +33,7 @@ _LOSS_REASONS = {
     FrameStatus.UNCONFIRMED: "no neighbouring frame confirms the pose",
     FrameStatus.CONTRADICTED: "this part contradicts the map",
     FrameStatus.NO_MAP: "camera not in the map",
+    FrameStatus.OTHER_MAP: "in another map",
     FrameStatus.DAMAGED: "damaged in the video",
     FrameStatus.FROZEN: "the recording is frozen",
 }

@@ -147,6 +147,7 @@ _CAUSE_CRITERIA = {
     LossCause.UNKNOWN_PLACE: "the frame is sharp and textured, but it does not match the map",
     LossCause.CONTRADICTED: "two or more successive keyframes near the frame contradict the rest of the map",
     LossCause.NO_MAP: "there is no map for this camera",
+    LossCause.OTHER_MAP: "the frame has a pose in another map, whose place in the room is not known",
     LossCause.DAMAGED: "the decoder reports damaged data, or gives no picture for the frame",
     LossCause.FROZEN: "the video repeats one picture, although the camera moves before or after it",
 }

@@ -45,6 +45,7 @@ class LossCause(StrEnum):
     UNKNOWN_PLACE = "place not in the map"
     CONTRADICTED = "part that contradicts the map"
     NO_MAP = "no map for this camera"
+    OTHER_MAP = "part in another map"
     DAMAGED = "damaged video"
     FROZEN = "frozen recording"
 
@@ -98,6 +99,7 @@ def find_frame_losses(inputs: ReportInputs) -> list[FrameLoss]:
 _CAUSES_OF_REASONS = {
     FrameStatus.CONTRADICTED: LossCause.CONTRADICTED,
     FrameStatus.NO_MAP: LossCause.NO_MAP,
+    FrameStatus.OTHER_MAP: LossCause.OTHER_MAP,
     FrameStatus.DAMAGED: LossCause.DAMAGED,
     FrameStatus.FROZEN: LossCause.FROZEN,
 }

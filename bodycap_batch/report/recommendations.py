@@ -75,6 +75,8 @@ _ACTIONS = {
     LossCause.DAMAGED: "Copy the video again from the camera's card. If it is damaged there, too, use "
     "another card.",
     LossCause.NO_MAP: "Let all cameras see the same places: walk in a loop and look around in each place.",
+    LossCause.OTHER_MAP: "Turn more slowly between the parts of the video, and let the camera see the same "
+    "things before and after.",
     LossCause.FROZEN: "Use a fast memory card and a fully charged battery, close other apps, and play "
     "the videos before the cameras are taken off.",
 }
@@ -90,6 +92,7 @@ _OBSERVATIONS = {
     LossCause.UNKNOWN_PLACE: "the picture was sharp and textured, but its content is not in the map",
     LossCause.CONTRADICTED: "the poses of this part contradict the rest of the map, so they were left out",
     LossCause.NO_MAP: "no map contains the camera",
+    LossCause.OTHER_MAP: "this part is in another map, whose place in the room is not known",
     LossCause.DAMAGED: "the video file is damaged there",
     LossCause.FROZEN: "the recording repeated one picture instead of new ones",
 }

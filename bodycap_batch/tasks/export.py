@@ -64,6 +64,7 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
         partial_reason=task.failure,
         row_fraction=found.row_fraction,
         inertial=found.inertial,
+        other_paths=found.other_paths,
         relative_poses=found.relative_poses(task.segments),
         log={**scene.log, "reach": read_summary(task.clocks.path)["distances"]},
     )

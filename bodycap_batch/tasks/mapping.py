@@ -83,7 +83,7 @@ def run_map(task: MapTask, context: StageContext, files: Path) -> None:
     refined = None if task.refined is None else load_map(task.refined.path)
     earlier = earlier_results(capture, refined)
     result = build_map(capture, selections, task.options, context, earlier=earlier)
-    _save_map(result, files)
+    save_map(result, files)
 
 
 def run_extend(task: ExtendTask, context: StageContext, files: Path) -> None:
@@ -97,7 +97,7 @@ def run_extend(task: ExtendTask, context: StageContext, files: Path) -> None:
     selections = [load_keyframes(artefact.path) for artefact in task.keyframes.values()]
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
     capture = with_estimated_lenses(capture, selections)
-    _save_map(extend_map(capture, previous, extra, task.options, context), files)
+    save_map(extend_map(capture, previous, extra, task.options, context), files)
 
 
 def run_refine(task: RefineTask, context: StageContext, files: Path) -> None:
@@ -109,7 +109,7 @@ def run_refine(task: RefineTask, context: StageContext, files: Path) -> None:
     capture = load_capture(task.capture, threads=context.threads)
     result = refine_map(capture, previous, paths, task.options, context)
     rolling, before = _rolling_cameras(result), _rolling_cameras(previous)
-    _save_map(
+    save_map(
         result,
         files,
         late=sorted(rolling - before),
@@ -124,7 +124,7 @@ def _rolling_cameras(result: MapResult) -> set[str]:
     return {name for scene_map in result.maps for name in scene_map.readout_s}
 
 
-def _save_map(
+def save_map(
     result: MapResult,
     files: Path,
     *,
@@ -161,6 +161,7 @@ def _save_map(
         corrected=list(corrected),
         corrected_before=list(corrected_before),
         distorted=list(distorted),
+        further=len(result.log.get("further_maps", ())),
         notes=[
             *flip_notes(diagnostics),
             *map(contradicting_camera_note, diagnostics.contradicting_cameras),
@@ -174,7 +175,7 @@ def _save_map(
 
 _LIBRARIES = (*VISION_LIBRARIES, "pycolmap")
 _MODULES = (*VISION_MODULES, "pycolmap", "bodycap_batch.mapping")
-_MEMORY_MB = 1500
+MAP_MEMORY_MB = 1500
 """Memory to reserve (MB) for a task that builds, extends or refines a map.
 Evidence: docs/decisions/pipeline.md."""
 MAP = Stage(
@@ -183,7 +184,7 @@ MAP = Stage(
     function=run_map,
     libraries=_LIBRARIES,
     modules=_MODULES,
-    memory_mb=_MEMORY_MB,
+    memory_mb=MAP_MEMORY_MB,
 )
 EXTEND = Stage(
     name="extend",
@@ -191,7 +192,7 @@ EXTEND = Stage(
     function=run_extend,
     libraries=_LIBRARIES,
     modules=_MODULES,
-    memory_mb=_MEMORY_MB,
+    memory_mb=MAP_MEMORY_MB,
 )
 REFINE = Stage(
     name="refine",
@@ -199,5 +200,5 @@ REFINE = Stage(
     function=run_refine,
     libraries=_LIBRARIES,
     modules=_MODULES,
-    memory_mb=_MEMORY_MB,
+    memory_mb=MAP_MEMORY_MB,
 )

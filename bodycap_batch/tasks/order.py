@@ -11,9 +11,12 @@ STAGE_ORDER: tuple[StageName, ...] = get_args(StageName)
 """The stages of a job in the order in which they run."""
 BESIDE_KEYFRAMES = frozenset({"sound"})
 """Further stages that run at the same time as the keyframes."""
-_DURING_REGISTRATION = frozenset({"extend", "refine", "recover", "clocks", "places", "inertial"})
+_DURING_REGISTRATION = frozenset(
+    {"extend", "refine", "recover", "clocks", "places", "inertial", "further_maps", "further_poses"}
+)
 """Further stages that may run up to the merge. They extend and refine the map, recover lost frames, determine
-the clocks, find the places of cameras from the motion, and use the inertial sensors."""
+the clocks, find the places of cameras from the motion, use the inertial sensors, and map what is still
+lost."""
 
 
 def stages_from(stage: StageName) -> frozenset[str]:

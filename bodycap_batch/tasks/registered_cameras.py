@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 INERTIAL_CAMERA = "inertial"
 """Name of the file, without suffix, that holds what the inertial sensor of a camera gives."""
+OTHER_PATHS = "other_paths"
+"""Name of the file, without suffix, that holds the poses of a camera in other maps than that of its path."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,12 +35,14 @@ class RegisteredCameras:
             for the rolling shutter.
         inertial: By camera name, what the inertial sensor of the camera gives. Only cameras with telemetry
             have an entry.
+        other_paths: The trajectories of lost frames in other maps than that of the camera's path.
     """
 
     trajectories: tuple[Trajectory, ...]
     clocks: Mapping[str, CameraClock]
     row_fraction: Mapping[str, FloatArray]
     inertial: Mapping[str, InertialCamera]
+    other_paths: tuple[Trajectory, ...] = ()
 
     @staticmethod
     def load(paths: Sequence[Path], maps: Sequence[Map], clocks: CaptureClocks) -> RegisteredCameras:
@@ -54,12 +58,14 @@ class RegisteredCameras:
         from bodycap_batch.model.camera_clock import FrameTiming
         from bodycap_batch.model.inertial_camera import InertialCamera
         from bodycap_batch.model.rolling_shutter import mean_row_fraction
+        from bodycap_batch.model.scene import OtherPaths
 
         corrected = {name for each in maps for name in each.readout_s}
         trajectories: list[Trajectory] = []
         timings: dict[str, FrameTiming] = {}
         rows: dict[str, FloatArray] = {}
         inertial: dict[str, InertialCamera] = {}
+        other_paths: list[Trajectory] = []
         for path in paths:
             # Only one registration is in memory at a time: the tracks of a long video need much memory.
             found = load_registration(path)
@@ -70,11 +76,14 @@ class RegisteredCameras:
                 rows[name] = mean_row_fraction(found, read_dataclass(Camera, path, "camera"))
             if (path / f"{INERTIAL_CAMERA}.json").exists():
                 inertial[name] = read_dataclass(InertialCamera, path, INERTIAL_CAMERA)
+            if (path / f"{OTHER_PATHS}.json").exists():
+                other_paths += read_dataclass(OtherPaths, path, OTHER_PATHS).trajectories
         return RegisteredCameras(
             trajectories=tuple(trajectories),
             clocks=clocks.with_timing(timings),
             row_fraction=rows,
             inertial=inertial,
+            other_paths=tuple(other_paths),
         )
 
     def relative_poses(self, segments: Sequence[Sequence[str]]) -> tuple[RelativePose, ...]:

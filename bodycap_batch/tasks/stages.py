@@ -9,6 +9,7 @@ from bodycap_batch.tasks.check import CHECK
 from bodycap_batch.tasks.clocks import CLOCKS
 from bodycap_batch.tasks.export import EXPORT
 from bodycap_batch.tasks.fill import FILL
+from bodycap_batch.tasks.further import FURTHER_MAPS, FURTHER_POSES
 from bodycap_batch.tasks.inertial import INERTIAL
 from bodycap_batch.tasks.keyframes import KEYFRAMES
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE
@@ -37,6 +38,8 @@ STAGES: Mapping[str, Stage[Any]] = {
         CLOCKS,
         PLACES,
         INERTIAL,
+        FURTHER_MAPS,
+        FURTHER_POSES,
         MERGE,
         FILL,
         EXPORT,

@@ -96,6 +96,16 @@ def add_camera(database: pycolmap.Database, camera: CaptureCamera) -> int:
     return _write_camera(database, model)
 
 
+def update_camera(workspace: Path, camera_id: int, camera: CaptureCamera) -> None:
+    """Replace the intrinsics of a camera in the database of a workspace."""
+    import pycolmap
+
+    model = camera.camera.to_pycolmap()
+    model.camera_id, model.has_prior_focal_length = camera_id, True
+    with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
+        database.update_camera(model)
+
+
 def _write_camera(database: pycolmap.Database, model: pycolmap.Camera) -> int:
     """Write one camera and a separate rig for it, and return the camera's id."""
     import pycolmap

@@ -180,6 +180,10 @@ HASHED = {
     "keyframes": CAMERAS | {"keyframes", "telemetry", "tracks"},
     **dict.fromkeys(("map", "extend", "refine"), CAMERAS | {"mapping", "inertial", "telemetry"}),
     **dict.fromkeys(("registration", "rig", "recover"), CAMERAS | {"registration", "inertial", "telemetry"}),
+    **dict.fromkeys(
+        ("further_maps", "further_poses"),
+        CAMERAS | {"mapping", "registration", "inertial", "telemetry"},
+    ),
     # Merging reads marker boards from the images, and explains a failure by mirrored cameras.
     "merge": BODY | {"merging", "calibration", "mapping"},
     "fill": BODY | {"fill"},
@@ -213,8 +217,12 @@ def test_all_files_of_an_estimator_count(copied: Path, stage: str, package: str)
     assert set((copied / package).rglob("*.py")) <= found
 
 
+MAPPING = {"map", "extend", "refine", "further_maps", "further_poses"}
+"""The stages that use the code of mapping."""
+
+
 def test_a_stage_is_changed_by_its_own_code_and_no_other_stage_is(copied: Path) -> None:
-    assert changed_by(copied / "mapping" / "build.py") == {"map", "extend", "refine"}
+    assert changed_by(copied / "mapping" / "build.py") == MAPPING
     assert changed_by(copied / "keyframes.py") == {"keyframes"}
 
 
@@ -224,7 +232,7 @@ def test_shared_geometry_changes_what_computes_with_it(copied: Path) -> None:
 
 def test_the_code_of_a_task_counts_for_its_stages(copied: Path) -> None:
     assert changed_by(copied / "tasks" / "export.py") == {"export"}
-    assert changed_by(copied / "tasks" / "mapping.py") == {"map", "extend", "refine"}
+    assert changed_by(copied / "tasks" / "mapping.py") == MAPPING
     assert changed_by(copied / "tasks" / "stage.py") == set(STAGES)
 
 
@@ -333,7 +341,8 @@ def test_code_for_output_does_not_count(copied: Path) -> None:
 
 
 def test_the_conditions_of_recovery_count(copied: Path) -> None:
-    stages = {"registration", "recover", "inertial"}  # all that store a registration
+    # All that store a registration, and the maps of lost frames.
+    stages = {"registration", "recover", "inertial", *MAPPING}
     assert changed_by(copied / "config" / "lost_frames.py") == stages
 
 

@@ -26,6 +26,7 @@ from bodycap_batch.tasks.check import CheckTask
 from bodycap_batch.tasks.clocks import CameraDistance, ClocksTask
 from bodycap_batch.tasks.export import ExportTask
 from bodycap_batch.tasks.fill import FillTask
+from bodycap_batch.tasks.further import FurtherMapsTask, FurtherPosesTask
 from bodycap_batch.tasks.inertial import InertialTask
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, FileRef, MountInput, StatedClock
 from bodycap_batch.tasks.keyframes import KeyframesTask
@@ -112,6 +113,14 @@ def tasks(folder: Path) -> dict[str, Any]:
             capture=capture,
             registrations=stored,
             samples={"torso": FileRef(path=folder / "torso.imu.csv", digest="of the samples")},
+        ),
+        "further_maps": FurtherMapsTask(**together, options=MapOptions()),
+        "further_poses": FurtherPosesTask(
+            options=RegistrationOptions(rounds=2),
+            capture=capture,
+            keyframes=stored,
+            map=scene_map,
+            registration=scene_map,
         ),
         "sound": SoundTask(
             capture=capture,
