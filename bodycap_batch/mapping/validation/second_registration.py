@@ -26,7 +26,7 @@ _MAX_SHIFT = 0.02
 its points. Evidence: docs/decisions/mapping.md."""
 _MIN_INLIERS = 15
 """Minimum number of matches that agree with the second pose. Origin: the mapper's minimum number for the
-registration of a keyframe in a hard capture. Evidence: docs/decisions/mapping.md."""
+registration of a keyframe in a hard capture. Evidence: none."""
 _MIN_INLIER_RATIO = 0.5
 """Minimum fraction of the matches that agree with the second pose. Evidence: none."""
 _MIN_OBSERVATIONS = 2
