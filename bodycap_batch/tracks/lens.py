@@ -72,8 +72,8 @@ _MAX_PINCUSHION = 0.03
 """Maximum growth of the distortion in a fit. A longer focal length with pincushion distortion fits turns of a
 few degrees as well, but lenses of cameras have barrel distortion. Evidence: docs/decisions/tracks.md."""
 _PRIOR = np.diag([0.0, 1.0 / _DISTORTION_SIGMA**2, *[1.0 / _READOUT_SIGMA_S**2] * 2])
-"""Information matrix of these deviations. It shortens steps where the pairs tell little. Whether a step is
-taken depends on the pairs alone."""
+"""Information matrix of these deviations. It shortens steps where the pairs determine little. Whether a step
+is taken depends on the pairs alone."""
 _LEAST_SIGMA = 0.01
 """Least standard deviation of the logarithm of a focal length. Evidence: none."""
 _DAMPING = 1e-3
