@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import shlex
+from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -122,3 +125,26 @@ def test_every_page_is_in_the_table_of_contents() -> None:
         page.relative_to(DOCS).with_suffix("").as_posix() for page in PAGES[1:] if page.name != "index.md"
     ]
     assert not [page for page in pages if f"\n{page}\n" not in index]
+
+
+def constants_with_evidence() -> Iterator[tuple[set[str], str]]:
+    """Names of constants (one, or those of one assignment), and the page of decisions to which they point."""
+    for path in sorted((REPOSITORY / "bodycap_batch").rglob("*.py")):
+        for first, second in pairwise(ast.parse(path.read_text(encoding="utf-8")).body):
+            is_text = isinstance(second, ast.Expr) and isinstance(second.value, ast.Constant)
+            if is_text and isinstance(first, ast.Assign | ast.AnnAssign):
+                names = {
+                    node.id
+                    for node in ast.walk(first)
+                    if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+                }
+                for page in re.findall(r"docs/decisions/\w+\.md", ast.unparse(second)):
+                    yield names, page
+
+
+def test_constants_that_point_to_decisions_are_named_there() -> None:
+    constants = list(constants_with_evidence())
+    assert constants
+    texts = {page: (REPOSITORY / page).read_text(encoding="utf-8") for _, page in constants}
+    on_page = {page: set(re.findall(r"\w+", text)) for page, text in texts.items()}
+    assert not [(names, page) for names, page in constants if not names & on_page[page]]

@@ -23,7 +23,7 @@ demuxer adds 2^33 to a time that starts again at a smaller number, because it tr
 
 _UNKNOWN_WAIT = 4
 """Maximum number of frame intervals that the first frame of a codec that reorders frames waits, if the
-container does not tell. Origin: usual encoders of H.264 and H.265 reorder up to four frames."""
+container does not state it. Origin: usual encoders of H.264 and H.265 reorder up to four frames."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -134,7 +134,7 @@ def _restart_notes(videos: tuple[VideoFile, ...]) -> list[str]:
         first += len(video.pts)
     return [
         f"the times in {path.name} start again at frame {', '.join(map(str, at))}, as in a file of "
-        f"{len(at) + 1} recordings that were joined. Unless the file tells the time between them, each is "
+        f"{len(at) + 1} recordings that were joined. Unless the file states the time between them, each is "
         "taken to follow directly the one before. If time passed, give the recordings as separate files, or "
         "write a file of timestamps"
         for path, at in restarts.items()

@@ -40,7 +40,7 @@ def find_job(path: Path) -> JobPlace:
 
     A folder of results holds ``run.json`` and ``job.yaml``, itself or in its subfolder ``partial``. The
     folder of a job in a watched folder (``done/NAME``) means its results. A path that cannot be read is taken
-    for a job; loading it tells why it cannot be read.
+    for a job; loading it reports why it cannot be read.
     """
     try:
         return _place_of(path)

@@ -1,7 +1,7 @@
 """Read when a recording started from its file: the creation time, the timecode and the time of GPS.
 
 The clocks of cameras are set by hand, and GPS time is written to some tenths of a second, so these times only
-tell where to search first, and whether two recordings can belong together.
+show where to search first, and whether two recordings can belong together.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ _MIN_LOG_ODDS = 10.0
 """Least logarithm of the likelihood of the peak over that of all other offsets. Evidence:
 docs/decisions/clocks.md."""
 _MIN_SCORE = 10.0
-"""Least score of an accepted offset. Evidence: docs/decisions/clocks.md."""
+"""Least score of an accepted offset. Evidence: none."""
 _MAX_SIGMA_S = 0.040
 """Maximum standard deviation of an accepted offset, seconds. Evidence: docs/decisions/clocks.md."""
 _MIN_EDGE_S = 0.1

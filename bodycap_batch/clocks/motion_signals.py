@@ -16,10 +16,10 @@ _FINE_STEPS = 4
 """Number of interpolated samples in each step, on which the smoothing works."""
 _SMOOTHING_S = 0.05
 """Standard deviation of the smoothing of positions and rotations, seconds. Origin: it reduces the noise of
-poses, and the movements of a limb are slower. Evidence: docs/decisions/clocks.md."""
+poses, and the movements of a limb are slower. Evidence: none."""
 BAND_EDGES_S = (0.2, 0.6)
 """Standard deviations of the smoothing, seconds, that divides velocity and turn rate into three bands: shocks
-of steps, swings, slow movements. Evidence: docs/decisions/clocks.md."""
+of steps, swings, slow movements. Evidence: none."""
 _MAX_GAP_S = 0.21
 """Maximum time between two frames for an interpolation, seconds. Origin: three frames at 15 fps."""
 _GAP_MARGIN_S = 0.06

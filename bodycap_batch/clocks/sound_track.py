@@ -244,7 +244,7 @@ def _without_slow_sound(track: SoundTrack, clock: ChapterClock) -> SoundTrack:
     if not track.pieces or abs(clock.rate - 1.0) <= _MAX_RATE_ERROR:
         return track
     slower = f"the file plays its pictures {1.0 / clock.rate:.3g} times slower than they were taken"
-    problem = f"{slower}, so nothing tells the times of its sound"
+    problem = f"{slower}, so the times of its sound are unknown"
     return replace(track, pieces=(), recorder=None, problem=problem, notes=())
 
 

@@ -39,7 +39,7 @@ hand beside a wrist camera gave wrong legs in 25 of 38 triples of a path whose r
 pairs."""
 _STEPS = (5, 3, 2, 1)
 """Distances in frames that one step of a chain may have, in the order in which they are tried. Between near
-frames the pictures hardly tell a turn from a step to the side, and all errors have the same sign."""
+frames the pictures hardly distinguish a turn from a step to the side, and all errors have the same sign."""
 
 
 _MIN_WRONG_LINKS = 2

@@ -148,7 +148,7 @@ def _split_long_stances(
     """Insert steps into periods of standing in which the hips move away from the feet or turn.
 
     A person who sits down moves the hips backward, and one who stands up moves them forward, over feet that
-    stay. `sunk_m` (T,) tells how far the hips are below those of a standing person.
+    stay. `sunk_m` (T,) states how far the hips are below those of a standing person.
     """
     out: list[_Stance] = []
     hips, heading = signals.slow_hips_m[:, :2], signals.heading_rad

@@ -35,7 +35,7 @@ the first byte of a plain packet."""
 _OTHER_STARTS = (b"\x00\x00\x01\xba", b"\x00\x00\x01\xb3", b"\x00\x00\x00\x01", b"\x30\x26\xb2\x75", b"FLV")
 """First bytes of further kinds of video: MPEG-PS; MPEG-2, H.264 and H.265 without a container; WMV, FLV."""
 _MAX_HEAD_BYTES = 4 * max(_PACKET_BYTES)
-"""Number of bytes from the start of a file that tell its kind. The first packet of MPEG-TS may be cut, and
+"""Number of bytes from the start of a file that show its kind. The first packet of MPEG-TS may be cut, and
 two more must follow it."""
 _MAX_PARTS = 100_000
 """Maximum number of boxes, elements or chunks that are read. A recording in fragments of half a second
@@ -113,7 +113,7 @@ def missing_part(path: Path, video_suffixes: frozenset[str] | None = None) -> Mi
             suffix is.
 
     Returns:
-        The missing part; None if nothing is missing, or if the file does not tell.
+        The missing part; None if nothing is missing, or if the file does not show it.
     """
     suffix = path.suffix.lower()
     is_named = video_suffixes is None or suffix in video_suffixes

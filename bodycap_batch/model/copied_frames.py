@@ -20,7 +20,7 @@ _MAX_ENCODED_RATIO = 0.5
 """The same for the change of a copy that the encoder encoded again, which does not displace its corners.
 Evidence: docs/decisions/keyframes.md."""
 _MIN_COPIES = 8
-"""Minimum number of copies, and of pairs of steps, that tell whether a video is a regular conversion.
+"""Minimum number of copies, and of pairs of steps, that show whether a video is a regular conversion.
 Evidence: none."""
 _MIN_REGULAR = 0.95
 """Minimum share of the copies that a regular conversion explains, and minimum share of the copies it predicts

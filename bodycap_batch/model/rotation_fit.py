@@ -210,7 +210,7 @@ def fit_to_rays(
 def _with_rates(path: RotationPath, rays: MatchedRays, readout_s: float) -> RotationPath:
     """Return the path with angular velocities that fit the matches, besides the rotations between frames.
 
-    The rows of a frame are exposed one after another, so the matches of a frame tell its angular velocity.
+    The rows of a frame are exposed one after another, so matches of a frame determine its angular velocity.
     This matters where the velocity changes much from one frame to the next, and at the ends of segments. The
     velocity of the spline is used as a prior.
     """

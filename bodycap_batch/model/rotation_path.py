@@ -178,7 +178,7 @@ class RotationPath:
         rotation = map_from_cam[:, :3, :3]
         step[both] = np.swapaxes(rotation[1:], 1, 2)[both] @ rotation[:-1][both]
         posed = RotationPath.from_steps(self.times_ns, step, known | both, shrunk=shrunk)
-        # Without a neighbour with a pose on each side, poses do not tell the rate better than the matches.
+        # Without a neighbour with a pose on each side, poses determine the rate no better than matches.
         beside = np.concatenate([[False], both]) & np.concatenate([both, [False]]) & ~self.measured()
         rate = np.where(beside[:, None], posed.rate, self._rate_or(posed.rate))
         # Without matches, the rate at an end is that between its neighbours. The pose of the frame itself
@@ -585,8 +585,8 @@ class PosePath:
     ) -> PosePath:
         """Return the path with angular velocities and accelerations that fit the observations of each frame.
 
-        A hand shakes faster than its video can tell from frame to frame. But the rows of a frame are exposed
-        one after another, so the observations of a frame tell its angular velocity, and how this changes
+        A hand shakes faster than its video can show from frame to frame. But the rows of a frame are exposed
+        one after another, so the observations of a frame determine its angular velocity, and how this changes
         during the readout. A correction of both is fitted together with a correction of the pose, which is
         not used. The prior of a velocity is the usual size of the corrections of a camera, or a part of the
         deviation of the velocity from its neighbours if this is more. The prior of an acceleration is a part

@@ -95,7 +95,7 @@ def _posture_criteria(sigmas: Mapping[str, float], means: Mapping[str, float]) -
         rationale="People who walk and reach out keep below 0.33, people who throw their arms about reach "
         "0.76 (0.5 in the mean over the capture). A wrong clock, a video with a cut, exchanged cameras, or a "
         "camera in another place than the job says needs rare postures: 0.35 to 1. The motion then looks "
-        "possible, but it is wrong. This figure alone cannot tell thrown arms from a wrong clock.",
+        "possible, but it is wrong. This figure alone cannot distinguish thrown arms from a wrong clock.",
         value=overall,
     )
 

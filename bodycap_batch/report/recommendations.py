@@ -27,7 +27,7 @@ from bodycap_batch.report.verdict import (
 )
 
 MAX_RECOMMENDATIONS = 3
-"""Maximum number of recommendations. Nobody changes more at once, and the next capture tells what remains.
+"""Maximum number of recommendations. Nobody changes more at once, and the next capture shows what remains.
 Evidence: none."""
 _MIN_LOST_SHARE = 0.02
 """Minimum fraction of all frames that a cause of losses must affect to give a recommendation.

@@ -129,7 +129,7 @@ def _headline(
         return "The job stopped before there was a result."
     camera_phrases = (
         "are tracked well",
-        "are tracked, with gaps or doubts",
+        "are tracked, with gaps or uncertain parts",
         "are tracked poorly",
         "are not tracked",
     )

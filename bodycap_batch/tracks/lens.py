@@ -20,9 +20,9 @@ from bodycap_batch.model.point_tracks import PointTracks
 from bodycap_batch.tracks.relative_motion import cross
 
 _PAIRS = 36
-"""Number of pairs of frames. Evidence: docs/decisions/tracks.md."""
+"""Number of pairs of frames. Evidence: none."""
 _POINTS = 100
-"""Maximum number of points of a pair. Evidence: docs/decisions/tracks.md."""
+"""Maximum number of points of a pair. Evidence: none."""
 _MIN_POINTS = 40
 """Minimum number of points of a pair. Origin: eight for each of its five unknowns."""
 _SHIFT_PX = (25.0, 120.0)
@@ -32,7 +32,7 @@ _MAX_SPAN_S = 1.0
 """Maximum time between the frames of a pair, seconds. Tracks drift. Evidence: docs/decisions/tracks.md."""
 _ERROR_PX = 0.5
 """Scale of the robust loss, px of an image with a long side of 640 px: the error of a track after a second.
-Evidence: docs/decisions/tracks.md."""
+Evidence: none."""
 _ANCHORS = (0.4, 0.7, 1.2)
 """Focal lengths, as a share of the long side, at which RANSAC searches the poses to start from. A start that
 suits a lens which is a third longer or shorter is improved by the steps."""
@@ -41,7 +41,7 @@ _TRIALS = 60
 _MIN_PAIRS = 6
 """Minimum number of pairs. Evidence: none."""
 _STEPS = 6
-"""Number of Gauss–Newton steps for each lens. Evidence: docs/decisions/tracks.md."""
+"""Number of Gauss–Newton steps for each lens. Evidence: none."""
 _MIN_AHEAD = 0.2
 """Minimum cosine between a line of sight and the axis of the lens for the five-point algorithm: it knows no
 points beside the camera."""
@@ -72,10 +72,10 @@ _MAX_PINCUSHION = 0.03
 """Maximum growth of the distortion in a fit. A longer focal length with pincushion distortion fits turns of a
 few degrees as well, but lenses of cameras have barrel distortion. Evidence: docs/decisions/tracks.md."""
 _PRIOR = np.diag([0.0, 1.0 / _DISTORTION_SIGMA**2, *[1.0 / _READOUT_SIGMA_S**2] * 2])
-"""Information matrix of these deviations. It shortens steps where the pairs tell little. Whether a step is
-taken depends on the pairs alone."""
+"""Information matrix of these deviations. It shortens steps where the pairs determine little. Whether a step
+is taken depends on the pairs alone."""
 _LEAST_SIGMA = 0.01
-"""Least standard deviation of the logarithm of a focal length. Evidence: docs/decisions/tracks.md."""
+"""Least standard deviation of the logarithm of a focal length. Evidence: none."""
 _DAMPING = 1e-3
 """Damping of the Gauss–Newton steps, as a share of the mean of the diagonal."""
 _WRONG = 10.0

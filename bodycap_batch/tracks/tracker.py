@@ -21,21 +21,21 @@ from bodycap_batch.model.point_tracks import PointTracks
 
 _CELLS = 300
 """Number of cells of the picture. Each cell holds one point at least, if it has texture. Evidence:
-docs/decisions/tracks.md."""
+none."""
 _WINDOW_PX = 11
-"""Side length of the window around a point, px of the tracked image. Evidence: docs/decisions/tracks.md."""
+"""Side length of the window around a point, px of the tracked image. Evidence: none."""
 _LEVELS = 3
 """Number of pyramid levels above the tracked image. The smallest level has a width of 80 px, so that a point
 can move by about 50 px from frame to frame."""
 _MAX_ROUND_TRIP_PX = 0.7
 """Maximum distance, px of the tracked image, between a point and its position after tracking forward and
-back. Evidence: docs/decisions/tracks.md."""
+back. Evidence: none."""
 _MIN_SURVIVAL = 0.5
 """Share of the tracks of the last frame below which the motion of the whole picture is searched, and the
 tracks start from it. Origin: a hand turns by up to 35 degrees between two frames."""
 _NOISE_FACTOR = 4.0
 """Minimum eigenvalue of a corner, as a multiple of the eigenvalue at the noisy, plain parts of the picture.
-Evidence: docs/decisions/tracks.md."""
+Evidence: none."""
 _PLAIN_PERCENTILE = 10.0
 """Percentile of the eigenvalues of a picture that stands for its plain parts."""
 _MIN_EIGENVALUE = 1e-5

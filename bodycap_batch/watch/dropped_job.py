@@ -255,7 +255,7 @@ def _require_readable_videos(loaded: LoadedJob) -> None:
     """
     found = dict(loaded.unreadable)
     for path in (path for camera in loaded.job.capture.cameras for path in camera.video):
-        # FFmpeg knows more kinds of video than the structure of a file tells.
+        # FFmpeg knows more kinds of video than the structure of a file shows.
         found.update({video: why for video, why in unreadable_videos(path).items() if why != NO_VIDEO})
     for path, reason in found.items():
         raise CaptureError(

@@ -113,7 +113,7 @@ def _is_abandoned(path: Path) -> bool:
 def _read_watcher_status(path: Path) -> WatcherStatus | None:
     """Return the content of a watcher's file.
 
-    If the file is damaged, return what the file's name tells. Return None if the file cannot be read, or if
+    If the file is damaged, return what the file's name states. Return None if the file cannot be read, or if
     its name is not that of a watcher's file.
     """
     here = is_from_this_machine(path.name.removeprefix(_PREFIX))

@@ -620,12 +620,12 @@ def _map_of_two_cameras(pictures: list[np.ndarray]) -> Map:
     )
 
 
-@pytest.mark.parametrize(("doubtful", "step"), [([], 3), ([2], 3), ([20], 6)])
+@pytest.mark.parametrize(("contradicted", "step"), [([], 3), ([2], 3), ([20], 6)])
 def test_only_points_of_other_cameras_find_frames_among_misplaced_keyframes(
     monkeypatch: pytest.MonkeyPatch,
     pictures: list[np.ndarray],
     context: StageContext,
-    doubtful: list[int],
+    contradicted: list[int],
     step: int,
 ) -> None:
     used = []
@@ -638,8 +638,8 @@ def test_only_points_of_other_cameras_find_frames_among_misplaced_keyframes(
     monkeypatch.setattr(recover, "estimate_exposure", lambda *_: 0.0)
     scene = _map_of_two_cameras(pictures)
     capture = cast(Capture, _Capture(_Video(pictures)))
-    mask = np.isin(np.arange(COUNT), doubtful)
-    known = recover.KnownFrames(doubtful=mask)
+    mask = np.isin(np.arange(COUNT), contradicted)
+    known = recover.KnownFrames(contradicted=mask)
     find_lost_poses(_tracked(), scene, capture, RegistrationOptions(), context, known)
     points = np.unique(scene.obs_point)
     np.testing.assert_array_equal(np.intersect1d(np.flatnonzero(used[0]), points), points[points % step == 0])
@@ -654,8 +654,8 @@ def test_poses_from_tracking_among_misplaced_keyframes_are_withdrawn_before_the_
 
     def find(registration: Registration, *rest: object) -> Registration:
         known = cast(recover.KnownFrames, rest[-1])
-        assert known.doubtful is not None
-        searched.append((registration.trajectory.status[29], np.flatnonzero(known.doubtful)))
+        assert known.contradicted is not None
+        searched.append((registration.trajectory.status[29], np.flatnonzero(known.contradicted)))
         return registration
 
     monkeypatch.setattr(recover, "find_lost_poses", find)

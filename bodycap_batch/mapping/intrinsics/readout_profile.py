@@ -1,7 +1,7 @@
 """Estimate readout times before the map exists, from matches between adjacent frames.
 
 A wrong readout time leaves deviations between matches and rotation wherever the camera turns at different
-speeds in two adjacent frames. If the camera turns at a constant speed, nothing tells the readout time.
+speeds in two adjacent frames. If the camera turns at a constant speed, nothing shows the readout time.
 """
 
 from __future__ import annotations
@@ -231,7 +231,7 @@ def _estimate(profiles: Sequence[_Profile]) -> _Estimate:
         centre, step_s = nearest, _LAST_STEP_S
     sigma_s = _sigma_s(profiles, centre, best, step_s)
     if sigma_s > _MAX_SIGMA_S:
-        # The cost is rough where rotations of pairs are uncertain. Then a wider parabola tells more.
+        # The cost is rough where rotations of pairs are uncertain. Then a wider parabola determines more.
         wide = np.array([cost(centre + step * _STEP_S) for step in (-1, 0, 1)])
         wide_best = centre + _STEP_S * _parabola_minimum(wide)
         wide_sigma_s = _sigma_s(profiles, centre, wide_best, _STEP_S)

@@ -67,7 +67,7 @@ deviations. With a larger deviation, the cameras do not share the mean. Evidence
 STATED = "stated"
 """`Readout.source` of a readout time that is given in the job."""
 _NONE_FOUND = "none found"
-"""`Readout.source` of a camera without a rolling shutter, as far as an estimate can tell."""
+"""`Readout.source` of a camera without a rolling shutter, as far as an estimate can show it."""
 _UNDETERMINED = "not determined: "
 """First words of `Readout.source` of a camera whose readout time is unknown; the reason follows."""
 _BLOCKS = 8
@@ -149,7 +149,7 @@ class Readout:
 
     @property
     def determined(self) -> bool:
-        """True if the readout time is known, or known to be short; False if the data do not tell it."""
+        """True if the readout time is known, or known to be short; False if the data do not determine it."""
         return not self.source.startswith(_UNDETERMINED)
 
     @property
@@ -430,7 +430,7 @@ class RollingShutterModel:
             point=np.ravel(point),
             px=np.concatenate([np.zeros((0, 2)), *(item.px for item in items)]),
             equal_cameras=equal_cameras,
-            silent=self._silent_cameras(),
+            uninformative=self._uninformative_cameras(),
         )
         seconds = {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
         adjusted = adjustment.run(
@@ -471,8 +471,8 @@ class RollingShutterModel:
         sigma_s = {name: readout.sigma_s for name, readout in readouts.items()}
         return camera_motions(self._intrinsics, self._poses, self._rotations, seconds, sigma_s, error_scales)
 
-    def _silent_cameras(self) -> set[str]:
-        """Return the names of the cameras whose motion does not tell their readout times.
+    def _uninformative_cameras(self) -> set[str]:
+        """Return the names of the cameras whose motion does not determine their readout times.
 
         The motion of a camera without a trajectory is that of matches, which is too smooth.
         """

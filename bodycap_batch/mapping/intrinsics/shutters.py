@@ -135,8 +135,8 @@ def possible_readouts(
 
     If matches find no rolling shutter, the readout time is shorter than 2 ms. Where a camera turns fast, this
     still displaces keypoints far. Such a readout time is an unknown of the adjustment of the map, together
-    with those of equal cameras. It tells no direction of the rows, so cameras with an unknown direction are
-    left out.
+    with those of equal cameras. It does not determine the direction of the rows, so cameras with an unknown
+    direction are left out.
 
     Args:
         capture: All cameras.

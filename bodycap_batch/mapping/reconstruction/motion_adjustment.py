@@ -74,13 +74,13 @@ _COMMON_RATIO = 0.25
 """Part of the usual error of the velocities of a path that all velocities have in common, because a spline is
 too smooth. A readout time is wrong by this part. Evidence: docs/decisions/mapping.md."""
 _MIN_KEYFRAMES = 4
-"""Minimum number of keyframes that tell a readout time. With fewer, the scatter of single keyframes is
+"""Minimum number of keyframes that determine a readout time. With fewer, the scatter of single keyframes is
 unknown. Evidence: docs/decisions/mapping.md."""
 _SCALE_STEPS = 200
 """Number of steps in which the usual size of the errors is computed. It only bounds the computing time: a
 step takes microseconds, and in 8 maps at most 16 steps gave the size to 0.1 %."""
 _MIN_OBSERVATIONS = 12
-"""Minimum number of observations of a keyframe that tells how wrong velocities are. Evidence: none."""
+"""Minimum number of observations of a keyframe that show how wrong velocities are. Evidence: none."""
 _MIN_SCALE = 0.05
 """Smallest factor of the expected errors of velocities. It only prevents that an exact path leaves no
 freedom."""
@@ -92,7 +92,7 @@ class AdjustedReadout:
 
     Attributes:
         seconds: Readout time for which the map was adjusted, seconds; 0 if the adjustment shows that the
-            shutter is global, as far as it can tell.
+            shutter is global, as far as it can show it.
         best_s: Most likely readout time, seconds.
         sigma_s: Its standard deviation, seconds; None if the readout time was constant.
     """
@@ -146,7 +146,7 @@ class _Readouts:
         readout_s: Mapping[str, float],
         expected_s: Mapping[str, tuple[float, float]],
         groups: Sequence[Sequence[str]],
-        silent: Collection[str] = (),
+        uninformative: Collection[str] = (),
     ) -> _Readouts:
         """Return the readout times at the start; see `MotionAdjustment.run`.
 
@@ -154,15 +154,17 @@ class _Readouts:
             readout_s: Readout times by camera name, seconds.
             expected_s: Expected values and standard deviations by camera name, seconds.
             groups: Groups of names of equal cameras.
-            silent: Names of the cameras whose motion does not tell a readout time. They follow an equal
-                camera that starts from the same one.
+            uninformative: Names of the cameras whose motion does not determine a readout time. They
+                follow an equal camera that starts from the same one.
         """
         group_of = {name: number for number, group in enumerate(groups) for name in group}
         keys: dict[str, tuple[object, ...]] = {
             name: (group_of.get(name, name), readout_s[name], *expected_s[name]) for name in readout_s
         }
-        for name in keys.keys() & set(silent):
-            others = [keys[other] for other in sorted(keys.keys() - set(silent)) if expected_s[other][1]]
+        for name in keys.keys() & set(uninformative):
+            others = [
+                keys[other] for other in sorted(keys.keys() - set(uninformative)) if expected_s[other][1]
+            ]
             same = [key for key in others if key[:2] == keys[name][:2]]
             keys[name] = same[0] if same else (name, *keys[name])
         different = list(dict.fromkeys(keys.values()))
@@ -273,7 +275,7 @@ class MotionAdjustment:
         point: (M,) observed point.
         px: (M,2) detected pixel.
         equal_cameras: Groups of names of cameras that may be of one model.
-        silent: Names of the cameras whose motion is too smooth to tell a readout time.
+        uninformative: Names of the cameras whose motion is too smooth to determine a readout time.
     """
 
     lenses: Mapping[str, Camera]
@@ -285,7 +287,7 @@ class MotionAdjustment:
     point: IntArray
     px: FloatArray
     equal_cameras: Sequence[Sequence[str]] = ()
-    silent: Collection[str] = ()
+    uninformative: Collection[str] = ()
 
     def run(
         self,
@@ -307,7 +309,7 @@ class MotionAdjustment:
             expected_s: Their expected values and standard deviations before the adjustment, seconds. A
                 readout time with a standard deviation of 0 is constant.
         """
-        readouts = _Readouts.create(readout_s, expected_s, self.equal_cameras, self.silent)
+        readouts = _Readouts.create(readout_s, expected_s, self.equal_cameras, self.uninformative)
         scales: FloatArray = np.full((len(self.camera), 3), _FIRST_SCALE)
         found = RollingMap(
             cam_from_map=cam_from_map,
@@ -394,7 +396,7 @@ class MotionAdjustment:
             noise_px=noise_px,
             interval_s=interval_s,
             readout=np.array([readouts.number.get(name, 0) for name in self.camera], dtype=np.int64),
-            tells=np.array([name not in self.silent for name in self.camera], dtype=bool),
+            informative=np.array([name not in self.uninformative for name in self.camera], dtype=bool),
             common_points=common_points,
         )
         return seen, np.maximum(errors, _NO_MOTION_SIGMA)
@@ -404,9 +406,11 @@ class MotionAdjustment:
 
         They are large where the camera turns slowly, so that a readout time displaces pixels by little.
         """
-        k = seen.keyframe[seen.telling]
+        k = seen.keyframe[seen.informative_observations]
         focal = np.array([each.focal_px / pixel_scale(each.width_px, each.height_px) for each in seen.lenses])
-        squares = (focal[seen.lens[k]] * np.linalg.norm(seen.turn[seen.telling], axis=1)) ** 2
+        squares = (
+            focal[seen.lens[k]] * np.linalg.norm(seen.turn[seen.informative_observations], axis=1)
+        ) ** 2
         count, total = (
             np.bincount(seen.readout[k], each, len(readouts.seconds)) for each in (np.ones(len(k)), squares)
         )
@@ -415,9 +419,9 @@ class MotionAdjustment:
             return np.asarray(np.abs(readouts.scale_s) * _SYSTEMATIC_PX / px)
 
     def _uncertain(self, seen: RowObservations, readouts: _Readouts) -> BoolArray:
-        """Return a mask (R,) of the readout times that the adjustment tells less well than they are known."""
-        telling = np.unique(seen.keyframe[seen.telling])
-        keyframes = np.bincount(seen.readout[telling], minlength=len(readouts.seconds))
+        """Return a mask (R,) of the readout times that were known better than they are determined here."""
+        informative = np.unique(seen.keyframe[seen.informative_observations])
+        keyframes = np.bincount(seen.readout[informative], minlength=len(readouts.seconds))
         unsure = self._systematic_errors(seen, readouts) > readouts.expected_s[:, 1]
         return np.asarray(unsure | (keyframes < _MIN_KEYFRAMES))
 

@@ -67,7 +67,8 @@ class RowObservations:
         interval_s: (K,) frame interval of the camera of each keyframe, seconds.
         readout: (K,) number of the readout time of the camera of each keyframe, one of R. Turns and shifts
             are proportional to it. A camera without a rolling shutter has any number; its delays are 0.
-        tells: (K,) True if the expected motion of the keyframe is exact enough to tell the readout time.
+        informative: (K,) True if the expected motion of the keyframe is exact enough to determine the
+            readout time.
         common_points: The points that pairs of keyframes have in common.
     """
 
@@ -82,13 +83,13 @@ class RowObservations:
     noise_px: float
     interval_s: FloatArray
     readout: IntArray
-    tells: BoolArray
+    informative: BoolArray
     common_points: CommonPoints
 
     @property
-    def telling(self) -> BoolArray:
-        """Mask (M,) of the observations that tell a readout time."""
-        return np.asarray((self.delay_s != 0.0) & self.tells[self.keyframe])
+    def informative_observations(self) -> BoolArray:
+        """Mask (M,) of the observations that determine a readout time."""
+        return np.asarray((self.delay_s != 0.0) & self.informative[self.keyframe])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -259,7 +260,7 @@ def correction_ratios(seen: RowObservations, found: RollingMap) -> FloatArray:
     turned, corrected = np.linalg.norm(turn, axis=1), np.linalg.norm(correction, axis=1)
     out = np.zeros(len(found.readout_ratio))
     for number in range(len(out)):
-        own = (seen.readout[rows] == number) & seen.telling
+        own = (seen.readout[rows] == number) & seen.informative_observations
         usual = float(np.median(turned[own])) if own.any() else 0.0
         out[number] = float(np.median(corrected[own])) / usual if usual else 0.0
     return out
@@ -352,9 +353,9 @@ def _turns(seen: RowObservations, found: RollingMap) -> tuple[FloatArray, FloatA
 
 
 def _ratios(seen: RowObservations, found: RollingMap) -> FloatArray:
-    """Return the ratios (M,1) of the readout times, 1 for keyframes that do not tell their readout time."""
+    """Return the ratios (M,1) of the readout times, 1 for keyframes that do not determine it."""
     k = seen.keyframe
-    return np.asarray(np.where(seen.tells[k], found.readout_ratio[seen.readout[k]], 1.0)[:, None])
+    return np.asarray(np.where(seen.informative[k], found.readout_ratio[seen.readout[k]], 1.0)[:, None])
 
 
 def _project(seen: RowObservations, rays: FloatArray) -> FloatArray:
@@ -490,7 +491,7 @@ def _derivatives(seen: RowObservations, found: RollingMap, valid: BoolArray) -> 
     k = seen.keyframe
     delay = seen.delay_s[:, None, None]
     by_ratio = np.einsum("mdi,mi->md", by_turn, seen.turn) - np.einsum("mdi,mi->md", by_middle, seen.shift)
-    by_ratio *= seen.tells[k][:, None]
+    by_ratio *= seen.informative[k][:, None]
     by_keyframe = np.concatenate(
         [
             -by_middle @ skew(at_middle),

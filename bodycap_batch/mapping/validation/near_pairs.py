@@ -1,4 +1,4 @@
-"""Tell pairs of successive keyframes of one camera from pairs that see a place again.
+"""Distinguish pairs of successive keyframes of one camera from pairs that see a place again.
 
 Two pictures of one camera with little time between them show the same place. If their matches contradict a
 map, something moves by itself: a hand, or what it carries. Two pictures with much time between them, or of
@@ -25,7 +25,7 @@ NO_TIMES: Mapping[str, IntArray] = MappingProxyType({})
 
 
 class NearPairs:
-    """Tells which pairs of images of a model are near in time.
+    """States which pairs of images of a model are near in time.
 
     Args:
         model: The model.

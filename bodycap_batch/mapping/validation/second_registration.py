@@ -1,8 +1,8 @@
-"""Register doubtful keyframes a second time, from points that only other keyframes determine.
+"""Register inconsistent keyframes a second time, from points that only other keyframes determine.
 
 The matches of a keyframe may contradict the points of a map for two reasons: the keyframe is misplaced, or
 its picture is blurred or shows the wearer, so that many of its features are wrong. A second registration
-decides. It uses the points that the keyframes without doubt determine, and does not start from the first
+decides. It uses the points that the consistent keyframes determine, and does not start from the first
 pose. If both poses agree, the keyframe is in the right place.
 """
 
@@ -26,22 +26,22 @@ _MAX_SHIFT = 0.02
 its points. Evidence: docs/decisions/mapping.md."""
 _MIN_INLIERS = 15
 """Minimum number of matches that agree with the second pose. Origin: the mapper's minimum number for the
-registration of a keyframe in a hard capture. Evidence: docs/decisions/mapping.md."""
+registration of a keyframe in a hard capture. Evidence: none."""
 _MIN_INLIER_RATIO = 0.5
 """Minimum fraction of the matches that agree with the second pose. Evidence: none."""
 _MIN_OBSERVATIONS = 2
-"""Minimum number of keyframes without doubt that determine a point: two lines of sight."""
+"""Minimum number of consistent keyframes that determine a point: two lines of sight."""
 _MAX_POINT_SIGMA = 0.05
 """Maximum standard deviation of a point, for lines of sight with an error of one pixel, as a fraction of its
 distance from the keyframe. Evidence: none."""
 _NEIGHBOURS = 4
-"""Number of doubtful keyframes before and after a keyframe that decide with it. Evidence:
+"""Number of inconsistent keyframes before and after a keyframe that decide with it. Evidence:
 docs/decisions/mapping.md."""
 _MIN_CONFIRMED_RATIO = 0.5
 """Minimum fraction of these keyframes, with the keyframe itself, that a second registration finds in the same
 place. One keyframe in a misplaced block may agree by chance. Evidence: docs/decisions/mapping.md."""
 _MIN_CONFIRMED = 2
-"""Minimum number of these keyframes. A single doubtful keyframe is never confirmed. Evidence:
+"""Minimum number of these keyframes. A single inconsistent keyframe is never confirmed. Evidence:
 docs/decisions/mapping.md."""
 _SEED = 0
 """Seed of RANSAC."""
@@ -128,26 +128,26 @@ class _SightLines:
 def confirm_images(
     workspace: Path,
     model: pycolmap.Reconstruction,
-    doubtful: Collection[int],
+    inconsistent: Collection[int],
     sequences: Sequence[Sequence[int]],
     max_error_px: float,
 ) -> set[int]:
-    """Return the doubtful images whose pose a second registration confirms.
+    """Return the inconsistent images whose pose a second registration confirms.
 
     An image is confirmed if the second registration finds it in the same place, and also at least half of the
-    doubtful images next to it. A single doubtful image is not confirmed.
+    inconsistent images next to it. A single inconsistent image is not confirmed.
 
     Args:
         workspace: Folder of the database with verified matches.
         model: The model.
-        doubtful: Ids of registered images. The points are triangulated without them.
+        inconsistent: Ids of registered images. The points are triangulated without them.
         sequences: For each camera, the ids of its registered images in the order of time.
         max_error_px: Maximum reprojection error of a match that agrees with a pose, pixels.
     """
-    found = _images_found_again(workspace, model, doubtful, max_error_px)
+    found = _images_found_again(workspace, model, inconsistent, max_error_px)
     out = set()
     for sequence in sequences:
-        for start, stop in runs(np.isin(sequence, sorted(doubtful))):
+        for start, stop in runs(np.isin(sequence, sorted(inconsistent))):
             agrees = np.isin(sequence[start:stop], sorted(found))
             for place in np.flatnonzero(agrees).tolist():
                 near = agrees[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1]
@@ -157,17 +157,17 @@ def confirm_images(
 
 
 def _images_found_again(
-    workspace: Path, model: pycolmap.Reconstruction, doubtful: Collection[int], max_error_px: float
+    workspace: Path, model: pycolmap.Reconstruction, inconsistent: Collection[int], max_error_px: float
 ) -> set[int]:
-    """Return the doubtful images that a second registration finds in the same place."""
-    sound = {int(number) for number in model.reg_image_ids()} - set(doubtful)
-    if not doubtful or not sound or not model.num_points3D():
+    """Return the inconsistent images that a second registration finds in the same place."""
+    sound = {int(number) for number in model.reg_image_ids()} - set(inconsistent)
+    if not inconsistent or not sound or not model.num_points3D():
         return set()
     observed = {int(number): observed_points(model, int(number)) for number in model.reg_image_ids()}
     lines = _SightLines.create(model, observed)
     points, sigma = lines.triangulate(sound)
     out = set()
-    for number, (features, ids) in _matched_points(workspace, set(doubtful), sound, observed).items():
+    for number, (features, ids) in _matched_points(workspace, set(inconsistent), sound, observed).items():
         rows = np.array([lines.rows[int(point)] for point in ids], dtype=np.int64)
         if _is_confirmed(model.image(number), model, features, points[rows], sigma[rows], max_error_px):
             out.add(number)
@@ -184,9 +184,9 @@ def observed_points(model: pycolmap.Reconstruction, image_id: int) -> IntArray:
 
 
 def _matched_points(
-    workspace: Path, doubtful: set[int], sound: set[int], observed: Mapping[int, IntArray]
+    workspace: Path, inconsistent: set[int], sound: set[int], observed: Mapping[int, IntArray]
 ) -> dict[int, tuple[IntArray, IntArray]]:
-    """Return for each doubtful image its features (K,) and the points (K,) that their matches observe.
+    """Return for each inconsistent image its features (K,) and the points (K,) that their matches observe.
 
     Only matches with sound images count.
     """
@@ -198,7 +198,7 @@ def _matched_points(
             first, second = map(int, pycolmap.pair_id_to_image_pair(pair))
             matches = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
             for one, other, columns in ((first, second, (0, 1)), (second, first, (1, 0))):
-                if one in doubtful and other in sound:
+                if one in inconsistent and other in sound:
                     features, partners = matches[:, columns].T
                     ids = observed[other][partners]
                     found.setdefault(one, []).append(np.column_stack([features, ids])[ids >= 0])

@@ -62,12 +62,12 @@ class KnownFrames:
     Attributes:
         rotation: The rotation of a camera with a rolling shutter from matches between adjacent frames; None
             if it is unknown.
-        doubtful: (N,) True for frames in blocks of misplaced keyframes; None if there are none. Lost
+        contradicted: (N,) True for frames in blocks of misplaced keyframes; None if there are none. Lost
             intervals with such frames are searched with `independent_localiser`.
     """
 
     rotation: RotationPath | None = None
-    doubtful: BoolArray | None = None
+    contradicted: BoolArray | None = None
 
 
 _NOTHING_KNOWN = KnownFrames()
@@ -130,8 +130,8 @@ def recover_lost_frames(
         own, trajectories[1:], scene_map, inputs.selection, options, context.threads
     )
     registration = withdraw_contradicted_poses(registration, inputs.maps, inputs.misplaced)
-    doubtful = contradicted_frames(registration.trajectory, inputs.maps, inputs.misplaced)
-    known = KnownFrames(rotation=own.rotation, doubtful=doubtful)
+    contradicted = contradicted_frames(registration.trajectory, inputs.maps, inputs.misplaced)
+    known = KnownFrames(rotation=own.rotation, contradicted=contradicted)
     found = find_lost_poses(registration, scene_map, inputs.capture, options, context, known)
     return replace(found, trajectory=with_map_error(found.trajectory, inputs.maps))
 
@@ -180,7 +180,7 @@ def find_lost_poses(
         scene_map=scene_map,
         localiser=localiser,
         independent=independent_localiser(localiser, camera.name),
-        doubtful=np.zeros(len(lost), dtype=bool) if known.doubtful is None else known.doubtful,
+        contradicted=np.zeros(len(lost), dtype=bool) if known.contradicted is None else known.contradicted,
         times=times,
         statistics=statistics,
         seed_rows=_seed_keyframes(scene_map, camera.name, lost),
@@ -268,8 +268,8 @@ class _IntervalSearch:
         camera: The camera.
         scene_map: The map.
         localiser: Estimates the pose of a frame near an expected pose.
-        independent: The same for intervals with doubtful frames; see `independent_localiser`.
-        doubtful: (N,) True for frames in blocks of misplaced keyframes.
+        independent: The same for intervals with contradicted frames; see `independent_localiser`.
+        contradicted: (N,) True for frames in blocks of misplaced keyframes.
         times: (N,) times of the frames, in units of the frame interval.
         statistics: How smoothly the camera moves.
         seed_rows: Row indices in the map by frame, for the lost frames that are keyframes.
@@ -282,7 +282,7 @@ class _IntervalSearch:
     scene_map: Map
     localiser: GuidedLocaliser
     independent: GuidedLocaliser
-    doubtful: BoolArray
+    contradicted: BoolArray
     times: FloatArray
     statistics: MotionStatistics
     seed_rows: Mapping[int, int]
@@ -311,7 +311,7 @@ class _IntervalSearch:
             keyframe_rows=seed_rows,
             statistics=self.statistics,
         )
-        localiser = self.independent if self.doubtful[start:stop].any() else self.localiser
+        localiser = self.independent if self.contradicted[start:stop].any() else self.localiser
         return _accepted_poses(Propagation(localiser, interval, self.turns))
 
 

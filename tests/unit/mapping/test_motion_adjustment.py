@@ -225,7 +225,7 @@ def test_a_camera_whose_motion_is_too_smooth_does_not_change_the_readout_time() 
         point=np.tile(adjustment.point, 2),
         px=np.tile(adjustment.px, (2, 1)),
         equal_cameras=[["hand", "other"]],
-        silent={"other"},
+        uninformative={"other"},
     )
     start_s = 0.9 * READOUT_S
     found = slower.run(

@@ -278,9 +278,9 @@ def test_without_points_no_image_is_confirmed(
         empty.delete_point3D(point)
     sequences = image_sequences(empty)
     assert confirm_images(mapping.workspace, empty, sequences[0][:3], sequences, 8.0) == set()
-    # All images of the model are doubtful: no image is left that determines points.
+    # All images of the model are inconsistent: no image is left that determines points.
     assert confirm_images(mapping.workspace, model, sequences[0], sequences, 8.0) == set()
-    # The only images that are left see nothing in common with the doubtful ones.
+    # The only images that are left see nothing in common with the inconsistent ones.
     assert confirm_images(mapping.workspace, model, sequences[0][:-1], sequences, 8.0) == set()
 
 

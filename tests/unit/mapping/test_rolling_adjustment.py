@@ -92,7 +92,7 @@ def scene(*, shrunk: bool = False) -> tuple[RowObservations, RollingMap, MotionE
         noise_px=0.7,
         interval_s=np.full(len(KEYFRAMES), FRAME_S),
         readout=np.zeros(len(KEYFRAMES), np.int64),
-        tells=np.ones(len(KEYFRAMES), bool),
+        informative=np.ones(len(KEYFRAMES), bool),
         common_points=CommonPoints.of(k, np.concatenate(point)),
     )
     truth = RollingMap(
@@ -159,7 +159,7 @@ def rate_errors(found: RollingMap) -> FloatArray:
 def test_velocities_that_the_path_does_not_contain_are_found() -> None:
     seen, truth, errors = scene(shrunk=True)
     found = adjusted(seen, truth, errors)
-    # The shake turns by 1.4 rad/s at most. The rows of 150 points tell it to some 0.1 rad/s.
+    # The shake turns by 1.4 rad/s at most. The rows of 150 points determine it to some 0.1 rad/s.
     assert np.median(rate_errors(truth)) > 0.1
     assert np.median(rate_errors(found)) < 0.5 * np.median(rate_errors(truth))
     # Seen at one instant, the points lie where the true poses show them, but for the gauge.
@@ -240,7 +240,7 @@ def test_a_readout_time_that_is_known_otherwise_counts_as_an_observation() -> No
     assert readout_errors(seen, found, expected, width_px) == pytest.approx(EXACT, rel=0.01)
 
 
-def test_a_camera_that_does_not_move_tells_no_readout_time() -> None:
+def test_a_camera_that_does_not_move_determines_no_readout_time() -> None:
     seen, truth, errors = scene()
     still = with_readout_ratio(seen, 0.0)
     expected = replace(errors, readout=np.full(1, 0.3))
@@ -248,13 +248,13 @@ def test_a_camera_that_does_not_move_tells_no_readout_time() -> None:
     assert correction_ratios(still, truth) == [0.0]
 
 
-def test_a_keyframe_that_does_not_tell_the_readout_time_does_not_depend_on_it() -> None:
+def test_a_keyframe_that_does_not_determine_the_readout_time_does_not_depend_on_it() -> None:
     seen, truth, _ = scene()
-    part = replace(seen, tells=np.arange(len(KEYFRAMES)) % 2 == 0)
+    part = replace(seen, informative=np.arange(len(KEYFRAMES)) % 2 == 0)
     longer = replace(truth, readout_ratio=np.full(1, 1.1))
     changed = np.abs(_residuals(part, longer)[0] - _residuals(part, truth)[0]).max(axis=1) > 1e-9
-    assert (changed == part.telling).mean() > 0.99
-    assert not changed[~part.tells[part.keyframe]].any()
+    assert (changed == part.informative_observations).mean() > 0.99
+    assert not changed[~part.informative[part.keyframe]].any()
 
 
 def test_without_a_shutter_nothing_but_noise_is_adjusted() -> None:
