@@ -163,6 +163,10 @@ def recovered(options: Json, arguments: Json, files: Path) -> None:
     (files / "summary.json").write_bytes((before / "summary.json").read_bytes())
 
 
+def further_mapped(options: Json, arguments: Json, files: Path) -> None:
+    (files / "summary.json").write_text(json.dumps({"further": orders().get("further", 0)}))
+
+
 def merged(options: Json, arguments: Json, files: Path) -> None:
     (files / "summary.json").write_text(
         json.dumps({"notes": ["a note"], "unused_cameras": orders().get("unused", {})})
@@ -207,6 +211,7 @@ EXTRA = {
     "registration": registered,
     "refine": refined,
     "recover": recovered,
+    "further_maps": further_mapped,
     "merge": merged,
     "export": exported,
     "places": placed,
@@ -227,6 +232,8 @@ NAMES = (
     "clocks",
     "places",
     "inertial",
+    "further_maps",
+    "further_poses",
     "merge",
     "fill",
     "export",

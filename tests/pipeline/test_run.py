@@ -349,6 +349,26 @@ def test_a_round_that_withdraws_wrong_poses_loses_no_frames(
     assert (used[2]["previous"] is not None) == bool(extensions_used)
 
 
+@pytest.mark.parametrize("further", [0, 2])
+def test_lost_parts_get_maps_of_their_own(bench: Bench, further: int) -> None:
+    """With further maps, all later stages use them, and the registrations that name their frames."""
+    bench.order(lost={"torso": 12}, further=further)
+    executed = bench.executed()
+    assert "further_maps" in executed
+    poses = {"further_poses torso", "further_poses left_palm"}
+    assert poses & set(executed) == (poses if further else set())
+    used = json.loads((bench.out / "result.ply").read_text())
+    assert json.loads(used["map"])[0] == ("further_maps" if further else "map")
+    assert json.loads(used["registrations"]["left_palm"])[0] == (
+        "further_poses" if further else "registration"
+    )
+
+
+def test_few_lost_frames_need_no_further_map(bench: Bench) -> None:
+    bench.order(lost={"torso": 9})
+    assert not {name for name in bench.executed() if name.startswith("further")}
+
+
 @pytest.mark.parametrize("name", ["torso.imu.csv", "torso.gcsv"])
 def test_sensors_are_used_where_there_are_samples(bench: Bench, name: str) -> None:
     (bench.folder / name).write_text("samples")
