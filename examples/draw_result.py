@@ -18,8 +18,8 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 import open3d as o3d
 
+from bodycap_batch import Result
 from bodycap_batch.formats.bvh import read_bvh
-from bodycap_batch.formats.tum import read_tum
 
 BODY_TIMES = 6
 TONES = ("#d1495b", "#00798c", "#edae49", "#66a182", "#8d6a9f", "#2e4057")
@@ -44,10 +44,12 @@ def draw(results: Path, picture: Path) -> None:
     """Write the picture."""
     cloud = o3d.io.read_point_cloud(str(results / "map.ply"))
     points, colours = np.asarray(cloud.points), np.asarray(cloud.colors)
-    paths = {path.stem: read_tum(path) for path in sorted((results / "trajectories").glob("*.tum"))}
-    centres = np.concatenate(
-        [path.world_from_cam[:, :3, 3] for path in paths.values() if len(path.world_from_cam)]
-    )
+    frame = Result(results).metrics()["frame"]
+    trajectories = Result(results).trajectories().items()
+    paths = {
+        name: path.centres[path.localised] for name, path in trajectories if path.frame_of_reference == frame
+    }
+    centres = np.concatenate(list(paths.values()))
     low, high = np.percentile(points, [3, 97], axis=0)
     low, high = np.minimum(low, centres.min(axis=0)), np.maximum(high, centres.max(axis=0))
     inside = ((points > low) & (points < high)).all(axis=1)
@@ -56,7 +58,7 @@ def draw(results: Path, picture: Path) -> None:
     axes = figure.add_subplot(projection="3d", computed_zorder=False)
     axes.scatter(*points[inside].T, c=colours[inside], s=7, linewidths=0, alpha=0.85)
     for tone, (name, path) in zip(TONES, paths.items(), strict=False):
-        axes.plot(*path.world_from_cam[:, :3, 3].T, color=tone, linewidth=1.6, label=name.replace("_", " "))
+        axes.plot(*path.T, color=tone, linewidth=1.6, label=name.replace("_", " "))
     _, motion = read_bvh(results / "motion.bvh")
     if motion is not None:
         ticks = np.linspace(0, len(motion.root_in_world_m) - 1, BODY_TIMES).round().astype(int)

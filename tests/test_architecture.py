@@ -16,7 +16,7 @@ LAYERS = (
     {"core", "presets"},
     {"model", "store"},
     {"formats", "overlay", "runner"},
-    {"config"},
+    {"config", "results"},
     {"capture"},
     {"telemetry"},
     {"inertial", "tracks"},
@@ -26,7 +26,8 @@ LAYERS = (
     },
     {"tasks"},
     {"pipeline"},
-    {"watch"},
+    {"watch", "job_places"},
+    {"api"},
     {"cli"},
 )  # fmt: skip
 """A module or package directly below bodycap_batch imports only those of layers before its own."""
@@ -162,7 +163,7 @@ def catches_all(handler: ast.ExceptHandler) -> bool:
 @each_module
 def test_imports_lead_to_lower_layers(module: Module) -> None:
     if not module.name:
-        assert not list(own_imports(module))
+        assert {name for _, name in own_imports(module)} == {"api"}  # for type checkers alone
         return
     assert not upward(module, 0, LAYERS)
 

@@ -15,6 +15,7 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Literal
 
+from bodycap_batch.core.context import cores
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.fbx import require_blender
 
@@ -110,7 +111,7 @@ def _python_finding() -> MachineFinding:
 
 
 def _processor_finding() -> MachineFinding:
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = cores()
     if count > 1:
         return MachineFinding(what="processors", state="ok", found=f"{count}; no GPU is used")
     return MachineFinding(

@@ -15,21 +15,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.job_places import find_job, find_store
 from bodycap_batch.cli.progress_display import print_event, text_from_event
 from bodycap_batch.cli.shared_options import (
     BatchOutOption,
     HeightOption,
     MemoryOption,
     StoreOption,
-    cores,
     make_overrides,
 )
 from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line, print_message, print_messages
+from bodycap_batch.core.context import cores
 from bodycap_batch.core.errors import Cancelled, JobError
 from bodycap_batch.core.printable import printable
 from bodycap_batch.core.progress import Event
+from bodycap_batch.job_places import find_job, find_store
 
 if TYPE_CHECKING:
     from bodycap_batch.pipeline import BatchJob, Outcome, Settings

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.job_places import find_job
 from bodycap_batch.cli.shared_options import (
     ActivityOption,
     CamerasOption,
@@ -20,6 +19,7 @@ from bodycap_batch.cli.shared_options import (
     make_overrides,
 )
 from bodycap_batch.cli.terminal import print_json, print_line
+from bodycap_batch.job_places import find_job
 
 
 @app.command()

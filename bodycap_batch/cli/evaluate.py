@@ -116,12 +116,12 @@ def evaluate(
 
 def _evaluate_with_pictures(results: Path, video: Path, *, as_json: bool) -> None:
     """Print how many delivered frames of each camera the pictures confirm."""
-    from bodycap_batch.cli.job_places import capture_of_results, find_job
     from bodycap_batch.cli.progress_display import make_progress_display
     from bodycap_batch.config.job import load_job
     from bodycap_batch.config.overrides import Overrides
     from bodycap_batch.core.progress import Event
     from bodycap_batch.evaluate.picture_check import check_with_pictures, read_delivered, to_dict
+    from bodycap_batch.job_places import capture_of_results, find_job
 
     delivered = read_delivered(results)
     capture = capture_of_results(load_job(find_job(video).file, Overrides()), results)

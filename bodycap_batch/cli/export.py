@@ -8,13 +8,11 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.job_places import find_store, load_last_run
 from bodycap_batch.cli.progress_display import make_progress_display
 from bodycap_batch.cli.shared_options import (
     JobArgument,
     StoreOption,
     ThreadsOption,
-    cores,
     make_overrides,
     results_folder,
 )
@@ -22,6 +20,8 @@ from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.config.bounds import MAX_FPS, MIN_FPS
 from bodycap_batch.config.export_targets import TARGETS
+from bodycap_batch.core.context import cores
+from bodycap_batch.job_places import find_store, load_last_run
 
 
 @app.command(short_help="Write the files for one program: Blender, Unreal, Unity and others.")

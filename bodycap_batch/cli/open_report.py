@@ -5,10 +5,10 @@ from __future__ import annotations
 import webbrowser
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.job_places import load_last_run
 from bodycap_batch.cli.shared_options import JobArgument, OutOption, make_overrides, results_folder
 from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.core.errors import JobError
+from bodycap_batch.job_places import load_last_run
 
 REPORTS = ("report.html", "partial/report.html")
 """Names of the report in a folder of results. The second one is that of a job that stopped early."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.job_places import find_store, load_last_run
 from bodycap_batch.cli.progress_display import make_progress_display
 from bodycap_batch.cli.shared_options import (
     HeightOption,
@@ -12,12 +11,13 @@ from bodycap_batch.cli.shared_options import (
     SkeletonOption,
     StoreOption,
     ThreadsOption,
-    cores,
     make_overrides,
     results_folder,
 )
 from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line
+from bodycap_batch.core.context import cores
+from bodycap_batch.job_places import find_store, load_last_run
 
 
 @app.command()

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.job_places import find_job, find_store
 from bodycap_batch.cli.progress_display import JsonLines, ProgressDisplay, make_progress_display, print_event
 from bodycap_batch.cli.shared_options import (
     ActivityOption,
@@ -23,19 +21,17 @@ from bodycap_batch.cli.shared_options import (
     SkeletonOption,
     StoreOption,
     ThreadsOption,
-    cores,
     make_overrides,
-    results_folder,
 )
 from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.core.errors import BodycapError, JobError
 from bodycap_batch.core.progress import Event
+from bodycap_batch.job_places import find_job
 from bodycap_batch.tasks.order import STAGE_ORDER, StageName, stages_from
 
 if TYPE_CHECKING:
-    from bodycap_batch.config.models import Job
-    from bodycap_batch.pipeline import RunSummary, Settings
+    from bodycap_batch.pipeline import RunSummary
 
 
 @app.command()
@@ -81,9 +77,9 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap run jobs/cpl_lab.yaml
       bodycap run my_walk/ --from merge
     """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.api import Execution, execute_job, prepare_job
     from bodycap_batch.config.body_height import describe_height
     from bodycap_batch.config.folder import RUN_FILE, job_file_in
-    from bodycap_batch.config.job import load_job_with_origins
     from bodycap_batch.runner import Children
     from bodycap_batch.tasks.check import CHECK
 
@@ -94,64 +90,44 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
             hint="use only one of the two options",
         )
     first_repeated: StageName | None = "check" if force else from_
-    redo = frozenset[str]() if first_repeated is None else stages_from(first_repeated)
     with (
         event_on_signal() as stop,
         make_progress_display(as_json=json_progress) as display,
         _report_errors_as_json(display),
     ):
-        children, place = Children(), find_job(job)
-        overrides = make_overrides(out or place.results, skeleton, height, camera, activity, places)
 
-        def settings(out_dir: Path) -> Settings:
-            from bodycap_batch.pipeline import Settings
-            from bodycap_batch.store.artefacts import Store
+        def announce(text: str) -> None:
+            display(Event(kind="note", stage="", what=text))
 
-            return Settings(
-                store=Store(store or find_store(out_dir)),
-                threads=threads or cores(),
-                children=children,
-                listener=display,
-                cancelled=stop.is_set,
-                redo=redo,
-                until=until or "",
-                memory_mb=memory_mb,
-                results_ready=announce_results,
-                overrides=overrides,
-            )
-
-        def announce_results(folder: Path) -> None:
-            display(
-                Event(
-                    kind="note",
-                    stage="",
-                    what=f"the results are in {folder}; only preview.mp4 is still being made",
-                )
-            )
-
-        def prepare(options: Mapping[str, Any], folder: Path, out_dir: Path) -> None:
-            from bodycap_batch.pipeline import prepare_capture
-
-            prepare_capture(options, folder, settings(out_dir))
-
+        execution = Execution(
+            store=store,
+            threads=threads,
+            memory_mb=memory_mb,
+            progress=display,
+            cancelled=stop.is_set,
+            children=Children(),
+            redo=frozenset() if first_repeated is None else stages_from(first_repeated),
+            until=until or "",
+            results_ready=lambda folder: announce(
+                f"the results are in {folder}; only preview.mp4 is still being made"
+            ),
+        )
+        place = find_job(job)
         job_file = place.file if place.results else job_file_in(job) if job.is_dir() else None
         if job_file is not None:
-            display(Event(kind="note", stage="", what=f"the settings are taken from {job_file}"))
-        loaded = load_job_with_origins(place.file, overrides, prepare=prepare)
-        if height is not None and loaded.job.height_m is not None:
-            shown = describe_height(loaded.job.height_m)
-            display(Event(kind="note", stage="", what=f"height of the subject: {shown}"))
-        for text in loaded.warnings_of_run():
-            display(Event(kind="note", stage="", what=text))
-        resolved = loaded.job
-        out_dir = results_folder(resolved)
-        if not (out_dir / RUN_FILE).exists():  # With results, all stages may be stored, which needs no child.
-            children.start_ahead(CHECK.modules)
-        # This import takes long. Meanwhile, the child loads the libraries of the first stage.
-        from bodycap_batch.pipeline import run_job
-
-        summary = run_job(resolved, out_dir=out_dir, settings=settings(out_dir))
-    _print_summary(summary, resolved, display, verbose=verbose)
+            announce(f"the settings are taken from {job_file}")
+        overrides = make_overrides(out, skeleton, height, camera, activity, places)
+        loaded = prepare_job(job, overrides, execution)
+        if height is not None and loaded.options.height_m is not None:
+            announce(f"height of the subject: {describe_height(loaded.options.height_m)}")
+        for text in loaded.warnings:
+            announce(text)
+        if execution.children is not None and not (loaded.out / RUN_FILE).exists():
+            # With results, all stages may be stored, which needs no child. The child loads the libraries of
+            # the first stage while this process imports the pipeline.
+            execution.children.start_ahead(CHECK.modules)
+        summary = execute_job(loaded, execution)
+    _print_summary(summary, loaded.name, display, verbose=verbose)
 
 
 @contextmanager
@@ -165,7 +141,7 @@ def _report_errors_as_json(display: ProgressDisplay) -> Iterator[None]:
         raise
 
 
-def _print_summary(summary: RunSummary, job: Job, display: ProgressDisplay, *, verbose: bool) -> None:
+def _print_summary(summary: RunSummary, name: str, display: ProgressDisplay, *, verbose: bool) -> None:
     if isinstance(display, JsonLines):
         last = {"kind": "done", "out_dir": str(summary.out_dir), "files": list(summary.files)}
         verdict = None if summary.verdict is None else summary.verdict.to_dict()
@@ -182,14 +158,14 @@ def _print_summary(summary: RunSummary, job: Job, display: ProgressDisplay, *, v
         # registration.
         reached = next(stage.stage for stage in reversed(summary.stages) if stage.stage in STAGE_ORDER)
         print_line(
-            f"{job.name}: stopped after the stage {reached}, as requested; run the job again without "
+            f"{name}: stopped after the stage {reached}, as requested; run the job again without "
             "--until to compute the other stages"
         )
         return
     from bodycap_batch.report import REPORT_FILE
 
     if summary.executed == 0:
-        print_line(f"{job.name}: nothing to do, because all {len(summary.stages)} stages were already done")
+        print_line(f"{name}: nothing to do, because all {len(summary.stages)} stages were already done")
     for line in () if summary.verdict is None else summary.verdict.lines():
         print_line(line)
     print_line(f"open first: {summary.out_dir / REPORT_FILE}")

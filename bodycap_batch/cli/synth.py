@@ -11,9 +11,10 @@ import typer
 
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.progress_display import make_progress_display
-from bodycap_batch.cli.shared_options import ThreadsOption, cores
+from bodycap_batch.cli.shared_options import ThreadsOption
 from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line
+from bodycap_batch.core.context import cores
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.progress import Event, StepProgress
 

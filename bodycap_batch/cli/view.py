@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.job_places import capture_of_results, find_store, load_last_run
 from bodycap_batch.cli.open_report import REPORTS
 from bodycap_batch.cli.shared_options import (
     JobArgument,
@@ -20,6 +19,7 @@ from bodycap_batch.cli.shared_options import (
 )
 from bodycap_batch.cli.terminal import print_line, print_message
 from bodycap_batch.core.errors import BodycapError, JobError
+from bodycap_batch.job_places import capture_of_results, find_store, load_last_run
 
 if TYPE_CHECKING:
     from bodycap_batch.config.models import Job

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.shared_options import MemoryOption, ThreadsOption, WatchStoreOption, cores
+from bodycap_batch.cli.shared_options import MemoryOption, ThreadsOption, WatchStoreOption
 from bodycap_batch.cli.signals import event_on_signal, signal_exit_code
 from bodycap_batch.cli.terminal import print_timed_message
+from bodycap_batch.core.context import cores
 
 if TYPE_CHECKING:
     from bodycap_batch.watch import Watcher, WatchOptions

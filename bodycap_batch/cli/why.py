@@ -10,7 +10,6 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.job_places import find_job, find_store, is_store
 from bodycap_batch.cli.shared_options import (
     STORE_VARIABLE,
     ActivityOption,
@@ -27,6 +26,7 @@ from bodycap_batch.cli.shared_options import (
 )
 from bodycap_batch.cli.terminal import print_json, print_line
 from bodycap_batch.core.errors import StoreError
+from bodycap_batch.job_places import find_job, find_store, is_store
 
 
 @app.command()

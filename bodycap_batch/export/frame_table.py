@@ -9,14 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.target_frames import target_numbers, trajectories_in_target_frames
 from bodycap_batch.formats.atomic_files import write_text
+from bodycap_batch.formats.frame_table import COLUMNS, LOST
 from bodycap_batch.formats.tum import seconds_text
 from bodycap_batch.model.scene import FrameStatus, Trajectory
-
-COLUMNS = ("camera", "frame", "time", "common_time", "status", "reason", "inliers", "error", "map")
-LOST = "LOST"
 
 
 def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
@@ -29,6 +28,9 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
     The column `map` is the number of the map to which the pose refers, as in the names ``map_<n>.ply``; 0 is
     ``map.ply``. A lost frame with a pose in another map than that of the camera's path has the reason
     OTHER_MAP and the number of this map.
+
+    The sigmas are those of the pose as measured, per axis: the centre in metres, or in units of the map
+    without a world; the rotation in degrees.
 
     Args:
         path: Path of the file to write.
@@ -44,8 +46,8 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
     for trajectory in trajectories_in_target_frames(inputs):
         map_numbers = _map_numbers(trajectory, inputs.other_paths, numbers)
         common = inputs.clocks[trajectory.camera].common_times_ns(trajectory.times_ns)
+        sigma_position, sigma_rotation_deg = _sigmas(trajectory)
         for index, status in enumerate(trajectory.status):
-            error = trajectory.error_px[index]
             writer.writerow(
                 (
                     trajectory.camera,
@@ -54,8 +56,10 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
                     seconds_text(int(common[index])),
                     *_status_and_reason(status),
                     int(trajectory.inliers[index]),
-                    f"{error:.3f}" if np.isfinite(error) else "",
+                    _number_text(trajectory.error_px[index], 3),
                     map_numbers.get(int(trajectory.frame_numbers[index]), ""),
+                    _number_text(sigma_position[index], 6),
+                    _number_text(sigma_rotation_deg[index], 6),
                 )
             )
     write_text(path, text.getvalue())
@@ -73,6 +77,18 @@ def _map_numbers(
         for frame in part.frame_numbers[part.localised]
         if part.gauge in numbers
     }
+
+
+def _number_text(value: float, decimals: int) -> str:
+    """Return a number with these decimals; "" for NaN."""
+    return f"{value:.{decimals}f}" if np.isfinite(value) else ""
+
+
+def _sigmas(trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
+    """Return the sigmas per axis of the centre and of the rotation (degrees) of each frame; NaN: lost."""
+    variance = np.diagonal(trajectory.covariance, axis1=1, axis2=2)
+    rotation_rad, position = (np.sqrt(variance[:, part].mean(axis=1)) for part in (slice(3), slice(3, 6)))
+    return position, np.degrees(rotation_rad)
 
 
 def _status_and_reason(status: FrameStatus) -> tuple[str, str]:

@@ -10,11 +10,10 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 from bodycap_batch.formats.dataclass_files import write_npz
+from bodycap_batch.formats.joint_table import COLUMNS
 from bodycap_batch.formats.tum import seconds_text
 from bodycap_batch.model.geometry import continuous_quat_xyzw
 from bodycap_batch.model.skeleton import Motion
-
-COLUMNS = "time,joint,x_m,y_m,z_m,qx,qy,qz,qw,local_qx,local_qy,local_qz,local_qw,observed,sigma_m"
 
 
 def write_joint_table(path: Path, motion: Motion, sigma_m: FloatArray | None = None) -> Path:

@@ -91,7 +91,7 @@ def _parse_line(path: Path, number: int, words: list[str]) -> tuple[int, list[fl
         message = f"the line has {len(words)} columns, but must have 8"
         raise JobError(message, path=path, line=number, hint=f"write one pose on each line: {_COLUMNS}")
     try:
-        time_ns = int((Decimal(words[0]) * _NS_PER_S).to_integral_value())
+        time_ns = nanoseconds(words[0])
         row = [float(word) for word in words[1:]]
     except (ValueError, InvalidOperation, OverflowError):
         raise JobError(
@@ -146,3 +146,12 @@ def seconds_text(time_ns: int) -> str:
     sign = "-" if time_ns < 0 else ""
     whole, rest = divmod(abs(int(time_ns)), _NS_PER_S)
     return f"{sign}{whole}.{rest:09d}"
+
+
+def nanoseconds(text: str) -> int:
+    """Return a time in seconds, written as a decimal number of any length, in nanoseconds.
+
+    Raises:
+        ArithmeticError: The text is not a finite number.
+    """
+    return int((Decimal(text) * _NS_PER_S).to_integral_value())

@@ -20,20 +20,26 @@ from pydantic.fields import FieldInfo
 from bodycap_batch import cli
 from bodycap_batch.cli.application import app
 from bodycap_batch.config.models import Job
-from bodycap_batch.export.frame_table import COLUMNS as FRAME_COLUMNS
-from bodycap_batch.export.joint_tables import COLUMNS as JOINT_COLUMNS
+from bodycap_batch.formats.frame_table import COLUMNS as FRAME_COLUMNS
+from bodycap_batch.formats.joint_table import COLUMNS as JOINT_COLUMNS
 from bodycap_batch.model import merge_report
 from tests import error_table
 
 DESCRIPTIONS = Path(__file__).with_name("descriptions.yaml")
 """Descriptions of the columns and keys of the results, which no type of the code holds."""
 PYTHON_API = (
-    ("Load a job", "bodycap_batch.config.job", ("Overrides", "load_job", "load_job_with_origins")),
-    ("Run a job", "bodycap_batch.pipeline", ("Settings", "RunSummary", "run_job")),
+    ("Load and run a job", "bodycap_batch.api", ("load_job", "run_job", "Job")),
+    (
+        "Read results",
+        "bodycap_batch.results",
+        ("Result", "CameraPath", "ClockEstimate"),
+    ),
+    ("Frames", "bodycap_batch.formats.frame_table", ("FrameTable",)),
+    ("The motion of the body", "bodycap_batch.formats.joint_table", ("BodyMotion",)),
+    ("Progress", "bodycap_batch.core.progress", ("Event",)),
+    ("Errors", "bodycap_batch.core.errors", ("BodycapError",)),
     ("Run many jobs", "bodycap_batch.pipeline", ("Batch", "BatchJob", "Outcome")),
-    ("The store", "bodycap_batch.store.artefacts", ("Store",)),
-    ("Read results", "bodycap_batch.formats.bvh", ("read_bvh",)),
-    ("The verdict", "bodycap_batch.report.summary", ("ResultSummary", "summary_of_folder")),
+    ("Read a BVH file", "bodycap_batch.formats.bvh", ("read_bvh",)),
 )
 """Title, module and names of each part of the Python API."""
 

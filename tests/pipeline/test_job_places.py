@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bodycap_batch.cli.job_places import find_job, find_store
+from bodycap_batch.job_places import find_job, find_store
 from tests.pipeline.test_cli import Bench
 
 

@@ -17,13 +17,13 @@ from bodycap_batch.capture.damage import find_damage_and_copies
 from bodycap_batch.capture.frame_index import index_videos
 from bodycap_batch.capture.kept import FrameKeeper
 from bodycap_batch.capture.timeline import join_chapters
-from bodycap_batch.cli.job_places import capture_of_results
 from bodycap_batch.clocks.sound_track import read_sound_track
 from bodycap_batch.config import KeyframeOptions
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.job_places import capture_of_results
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.model.copied_frames import copied_notes
 from bodycap_batch.model.scene import KeyframeSelection
