@@ -113,21 +113,23 @@ def is_store(folder: Path) -> bool:
 
 def capture_of_results(job: Job, out_dir: Path) -> Capture:
     """Open the videos of a job with the frames, and their times, that its results list in ``frames.csv``."""
-    import csv
     from dataclasses import replace
 
     import numpy as np
 
     from bodycap_batch.capture import open_capture
+    from bodycap_batch.formats.frame_table import read_frame_table
     from bodycap_batch.model.copied_frames import Pictures
 
-    capture, table = open_capture(job.capture), out_dir / "frames.csv"
-    rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines())) if table.is_file() else []
+    capture, file = open_capture(job.capture), out_dir / "frames.csv"
+    tables = read_frame_table(file) if file.is_file() else {}
     cameras = []
     for camera in capture.cameras:
-        listed = {int(row["frame"]): float(row["time"]) for row in rows if row["camera"] == camera.name}
-        frames = np.flatnonzero(np.isin(camera.frame_numbers, list(listed)))
-        times_s = [listed[number] for number in camera.frame_numbers[frames].tolist()]
-        pictures = Pictures(frames=frames, times_ns=np.round(np.array(times_s) * 1e9).astype(np.int64))
-        cameras.append(camera.only(pictures) if 1 < len(frames) < len(camera.frame_numbers) else camera)
+        numbers = tables[camera.name].frame_numbers if camera.name in tables else []
+        _, frames, rows = np.intersect1d(camera.frame_numbers, numbers, return_indices=True)
+        if 1 < len(frames) < len(camera.frame_numbers):
+            listed = Pictures(frames=frames, times_ns=tables[camera.name].times_ns[rows])
+            cameras.append(camera.only(listed))
+        else:
+            cameras.append(camera)
     return replace(capture, cameras=tuple(cameras))

@@ -14,7 +14,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, set_array
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.frame_table import FrameTable, read_frame_table
 from bodycap_batch.formats.joint_table import BodyMotion, read_joint_table
-from bodycap_batch.formats.tum import read_tum
+from bodycap_batch.formats.tum import TimedPoses, read_tum
 from bodycap_batch.model.scene import FrameStatus
 
 METRICS_FILE = "metrics.json"
@@ -76,6 +76,12 @@ class CameraPath:
     def localised(self) -> BoolArray:
         """Mask (N,) of the frames with a pose."""
         return self.frames.localised
+
+    @property
+    def poses(self) -> TimedPoses:
+        """The times and poses of the localised frames alone."""
+        posed = self.localised
+        return TimedPoses(times_ns=self.frames.times_ns[posed], world_from_cam=self.world_from_cam[posed])
 
     @property
     def centres(self) -> FloatArray:
@@ -154,6 +160,17 @@ class Result:
         return {
             camera: self._path(table, str(figures[camera]["frame"]))
             for camera, table in self.frames().items()
+        }
+
+    def placed_trajectories(self) -> dict[str, CameraPath]:
+        """Return the paths in the frame of reference of the results, which can be combined.
+
+        Raises:
+            JobError: As `trajectories`.
+        """
+        main = self.metrics()["frame"]
+        return {
+            camera: path for camera, path in self.trajectories().items() if path.frame_of_reference == main
         }
 
     def _path(self, table: FrameTable, frame_of_reference: str) -> CameraPath:

@@ -44,11 +44,8 @@ def draw(results: Path, picture: Path) -> None:
     """Write the picture."""
     cloud = o3d.io.read_point_cloud(str(results / "map.ply"))
     points, colours = np.asarray(cloud.points), np.asarray(cloud.colors)
-    frame = Result(results).metrics()["frame"]
-    trajectories = Result(results).trajectories().items()
-    paths = {
-        name: path.centres[path.localised] for name, path in trajectories if path.frame_of_reference == frame
-    }
+    trajectories = Result(results).placed_trajectories()
+    paths = {name: path.centres[path.localised] for name, path in trajectories.items()}
     centres = np.concatenate(list(paths.values()))
     low, high = np.percentile(points, [3, 97], axis=0)
     low, high = np.minimum(low, centres.min(axis=0)), np.maximum(high, centres.max(axis=0))

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import json
-from collections import Counter
 from collections.abc import Iterable
 from enum import StrEnum
 from pathlib import Path
@@ -16,7 +14,6 @@ from bodycap_batch.cli.application import app
 from bodycap_batch.cli.terminal import print_json, print_line
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.percent import format_percent
-from bodycap_batch.core.text_encoding import encoding_of_file
 
 TUM_SUFFIXES = (".tum", ".txt")
 _MOTION_FILE = "motion.bvh"
@@ -190,13 +187,12 @@ def _motion_figures(results: Path) -> dict[str, Any]:
 
 def _frame_counts(results: Path) -> dict[str, int]:
     """Return the number of video frames of each camera, by camera name, from frames.csv in the results."""
+    from bodycap_batch.formats.frame_table import read_frame_table
+
     table = results / "frames.csv"
-    try:
-        with table.open(newline="", encoding=encoding_of_file(table)) as stream:
-            rows = csv.DictReader(line for line in stream if not line.startswith("#"))
-            return dict(Counter(row["camera"] for row in rows))
-    except (FileNotFoundError, KeyError):
+    if not table.is_file():
         return {}
+    return {camera: len(frames.status) for camera, frames in read_frame_table(table).items()}
 
 
 def _table_lines(reports: dict[str, Any]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,10 +13,10 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, runs
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.core.text_encoding import encoding_of_file
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.bvh import inspect_rig
 from bodycap_batch.formats.joint_positions import motion_from_positions, read_joint_positions
+from bodycap_batch.formats.joint_table import read_joint_table
 from bodycap_batch.model.joint_angles import angle_curves, foot_curves
 from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.report.figures.motion_curves import Take, draw_motion_curves
@@ -107,23 +106,21 @@ def _observed(table: Path, motion: Motion) -> BoolArray:
     try:
         facts = json.loads(table.with_name("metrics.json").read_bytes())["motion"]
         role_of = {name: joint["role"] for name, joint in facts["joints"].items()}
-        with table.open(newline="", encoding=encoding_of_file(table)) as stream:
-            rows = [
-                (float(r["time"]), role_of.get(r["joint"], ""), r["observed"] == "1")
-                for r in csv.DictReader(stream)
-            ]
+        start_s = float(facts["start_s"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise JobError(
-            f"the table of joints cannot be read: {error}", path=table, hint="run the job again"
+            f"the figures of the motion cannot be read: {error}",
+            path=table.with_name("metrics.json"),
+            hint="run the job again",
         ) from error
+    solved = read_joint_table(table)
+    of_role = {role_of.get(name, ""): joint for joint, name in enumerate(solved.joints)}
     out = np.ones_like(motion.observed)
-    times = np.arange(len(out)) / motion.fps + float(facts["start_s"])
+    times_s = np.arange(len(out)) / motion.fps + start_s
+    nearest = np.clip(np.searchsorted(solved.times_s, times_s - 0.5 / motion.fps), 0, len(solved.times_s) - 1)
     for joint, role in enumerate(motion.skeleton.roles):
-        mine = [(time, seen) for time, found, seen in rows if role and found == role]
-        if mine:
-            at = np.array([time for time, _ in mine])
-            nearest = np.clip(np.searchsorted(at, times - 0.5 / motion.fps), 0, len(at) - 1)
-            out[:, joint] = np.array([seen for _, seen in mine])[nearest]
+        if role and role in of_role:
+            out[:, joint] = solved.observed[nearest, of_role[role]]
     return out
 
 

@@ -21,6 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from bodycap_batch import Result
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.formats.tum import TimedPoses, read_tum
 from bodycap_batch.model.camera import Camera
@@ -127,18 +128,16 @@ def run_and_score(capture: Path, work: Path, motions: Path) -> dict[str, Any]:
 
 def score(capture: Path, results: Path, store: Path, motions: Path) -> dict[str, Any]:
     """Return the figures of a job's results."""
-    metrics = json.loads((results / "metrics.json").read_text(encoding="utf-8"))
+    found = Result(results)
     failure = {"stage": "merge", "message": ""} if results.name == "partial" else None
-    verdict = judge(metrics, failure)
+    verdict = judge(found.metrics(), failure)
     paths = poses.last_poses(results, store)
     truth = {name: read_tum(capture / "gt" / f"{name}.tum") for name in paths}
-    delivered = {
-        name: read_tum(results / "trajectories" / f"{name}.tum")
-        for name in paths
-        if (results / "trajectories" / f"{name}.tum").exists() and paths[name].localised.any()
+    matched = {
+        name: _matched(path.poses, truth[name])
+        for name, path in sorted(found.placed_trajectories().items())
+        if path.localised.any()
     }
-    main_frame = {name for name in delivered if metrics["cameras"][name]["frame"] == metrics["frame"]}
-    matched = {name: _matched(delivered[name], truth[name]) for name in sorted(main_frame)}
     truth_from_world = robust_alignment(matched)
     errors = {
         name: np.linalg.norm(truth_from_world.apply(mine) - true, axis=1)
@@ -266,11 +265,10 @@ def _frames_that_see(
 
 def _last_map(results: Path, store: Path, paths: Mapping[str, Trajectory]) -> Map | None:
     """Return the map that most cameras were registered against last."""
-    record = json.loads((results / "run.json").read_text(encoding="utf-8"))
     gauges = [path.gauge for path in paths.values() if path.localised.any()]
     folders = [
         store / stage["artefact"]
-        for stage in record["stages"]
+        for stage in Result(results).record()["stages"]
         if stage["stage"] in ("map", "extend", "refine") and stage.get("artefact")
     ]
     for folder in reversed(folders):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import resource
 import subprocess
@@ -12,6 +11,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from bodycap_batch import Result
 from tests.bench import poses
 from tests.bench.rows import BODYCAP, REPOSITORY, Row
 
@@ -49,8 +51,8 @@ def run(row: Row, work: Path, store: Path | None = None) -> dict[str, Any]:
         last_errors = errors.read().strip().splitlines()[-3:]
     if not (out / "run.json").exists():
         return {"name": row.name, "exit": job.returncode, "error": last_errors}
-    record = json.loads((out / "run.json").read_text(encoding="utf-8"))
-    metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+    found = Result(out)
+    record = found.record()
     stages: dict[str, float] = defaultdict(float)
     for stage in record["stages"]:
         stages[stage["stage"]] += stage["seconds"]
@@ -62,11 +64,11 @@ def run(row: Row, work: Path, store: Path | None = None) -> dict[str, Any]:
         "wall_seconds": wall,
         "stage_seconds": dict(stages),
         "registration_cpu_s": registration_cpu_s(record["stages"]),
-        "camera_seconds": camera_seconds(out / "frames.csv"),
+        "camera_seconds": sum(float(np.ptp(frames.times_s)) for frames in found.frames().values()),
         "peak_memory_mb": record["peak_memory_mb"],
         "report": score(out, row),
         "covariance": poses.consistency(out, store, row.truth),
-        "metrics": metrics,
+        "metrics": found.metrics(),
     }
 
 
@@ -110,15 +112,6 @@ def _wall_seconds(lines: Iterable[str]) -> dict[str, float]:
             if not running[stage]:
                 out[stage] += now - since.pop(stage)
     return dict(out)
-
-
-def camera_seconds(frames: Path) -> float:
-    """Return the duration of all cameras' videos together, from a job's frames.csv."""
-    with frames.open(newline="", encoding="utf-8") as stream:
-        times: dict[str, list[float]] = defaultdict(list)
-        for line in csv.DictReader(row for row in stream if not row.startswith("#")):
-            times[line["camera"]].append(float(line["time"]))
-    return sum(max(values) - min(values) for values in times.values())
 
 
 def mapping_seconds(result: dict[str, Any]) -> float:

@@ -22,7 +22,8 @@ import pycolmap
 
 from bodycap_batch.capture import Capture, open_capture
 from bodycap_batch.config.job import load_job
-from bodycap_batch.formats.tum import TimedPoses, write_tum
+from bodycap_batch.formats.frame_table import COLUMNS, LOST
+from bodycap_batch.formats.tum import TimedPoses, seconds_text, write_tum
 from tests.bench import peer_database
 from tests.bench.peer_database import DATABASE_NAME
 
@@ -103,18 +104,21 @@ def write_results(capture: Capture, models: list[Any], out: Path, report: Report
     sizes = sorted((int(model.num_reg_images()) for model in models), reverse=True)
     report.values["models"] = sizes
     out.mkdir(parents=True)
-    lines = ["camera"] + [camera.name for camera in capture.cameras for _ in camera.times_ns]
-    (out / "frames.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    if not models:
-        return
-    largest = max(models, key=lambda model: int(model.num_reg_images()))
     posed: dict[str, dict[int, np.ndarray]] = {camera.name: {} for camera in capture.cameras}
-    for image_id in largest.reg_image_ids():
+    largest = max(models, key=lambda model: int(model.num_reg_images()), default=None)
+    for image_id in () if largest is None else largest.reg_image_ids():
         image = largest.image(image_id)
         camera_name, _, frame = image.name.rpartition("/")
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().inverse().matrix()
         posed[camera_name][int(frame)] = pose
+    lines = [",".join(COLUMNS)]
+    for camera in capture.cameras:
+        for frame, time_ns in enumerate(camera.times_ns.tolist()):
+            status = "REGISTERED," if frame in posed[camera.name] else f"{LOST},NO_MAP"
+            time = seconds_text(time_ns)
+            lines.append(f"{camera.name},{camera.frame_numbers[frame]},{time},{time},{status},0,,,")
+    (out / "frames.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     for camera in capture.cameras:
         frames = sorted(posed[camera.name])
         if frames:

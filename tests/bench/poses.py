@@ -8,7 +8,6 @@ frames are correlated, so a clip's mean has no useful confidence band; the fract
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
+from bodycap_batch import Result
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.evaluate.association import interpolate_truth
 from bodycap_batch.formats.tum import TimedPoses, read_tum
@@ -48,10 +48,9 @@ _PARTS = {"rotation": slice(0, 3), "centre": slice(3, 6), "pose": slice(0, 6)}
 
 def last_poses(results: Path, store: Path) -> dict[str, Trajectory]:
     """Return the poses of every camera after the last stage that estimated them."""
-    record = json.loads((results / "run.json").read_text(encoding="utf-8"))
     folders = {
         stage["camera"]: store / stage["artefact"]
-        for stage in record["stages"]
+        for stage in Result(results).record()["stages"]
         if stage["stage"] in _SOLVERS and stage["camera"] and stage.get("artefact")
     }
     return {name: load_registration(folder).trajectory for name, folder in sorted(folders.items())}

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from bodycap_batch import Result
 from tests.bench import ours
 from tests.bench.rows import BODYCAP, DATA, REPOSITORY, row_of
 
@@ -176,7 +177,7 @@ def _run(capture: Path, jobs: Path) -> dict[str, Any]:
         result = ours.run(row_of(capture), jobs / capture.name)
         record = jobs / capture.name / "out" / "run.json"
         if record.exists():
-            stages = json.loads(record.read_text(encoding="utf-8"))["stages"]
+            stages = Result(record.parent).record()["stages"]
             result["mapping_cpu_s"] = sum(
                 stage["cpu_seconds"] or 0.0 for stage in stages if stage["stage"] in _MAPPING
             )
@@ -189,10 +190,9 @@ def readouts_in(results: Path) -> dict[str, Readout]:
 
     They are those that were found last: in the refined map, else from matches.
     """
-    file = results / "metrics.json"
-    if not file.exists():
+    if not (results / "metrics.json").exists():
         return {}
-    mapping = json.loads(file.read_text(encoding="utf-8"))["mapping"]
+    mapping = Result(results).metrics()["mapping"]
     found = dict(mapping.get("readouts_from_matches", {}))
     for part in mapping.get("rolling_shutter", [])[:1]:
         found.update(part)

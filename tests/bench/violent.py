@@ -12,11 +12,9 @@ lost stretches have a pose, and the errors on the frames that both jobs localise
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import shutil
 import tempfile
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,8 +23,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from bodycap_batch import Result
 from bodycap_batch.core.arrays import BoolArray, FloatArray, runs
 from bodycap_batch.model.geometry import align_points, make_transform, rotation_from_quat_xyzw
+from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.synthetic.imu import write_imu
 from bodycap_batch.synthetic.imu_options import ImuOptions
 from tests.bench import ours
@@ -123,26 +123,21 @@ class Frames:
 
 def frames_of(results: Path, truth: Path) -> Frames:
     """Read the frames of a job, and compare their poses with the truth under one similarity."""
-    status: dict[str, list[tuple[float, str]]] = defaultdict(list)
-    with (results / "frames.csv").open(newline="", encoding="utf-8") as stream:
-        for line in csv.DictReader(row for row in stream if not row.startswith("#")):
-            status[line["camera"]].append((float(line["time"]), line["status"]))
-    times_s = {camera: np.array([row[0] for row in rows]) for camera, rows in status.items()}
-    posed = {camera: np.array([row[1] != "LOST" for row in rows]) for camera, rows in status.items()}
-    inertial = {camera: np.array([row[1] == "INERTIAL" for row in rows]) for camera, rows in status.items()}
-    found, true, error_cm = {}, {}, {}
-    for camera in status:
-        found[camera] = np.full((len(times_s[camera]), 3), np.nan)
-        path = results / "trajectories" / f"{camera}.tum"
-        if path.exists():
-            found[camera][posed[camera]] = np.loadtxt(path, ndmin=2)[:, 1:4]
-        else:  # no pose, or poses in another map
-            posed[camera][:] = False
-        true[camera] = smooth_path(truth / f"{camera}.tum")[0](times_s[camera])[:, :3, 3]
-    known = np.concatenate([posed[camera] for camera in status])
+    paths = Result(results).trajectories()
+    placed = Result(results).placed_trajectories()  # the others have no pose, or poses in another map
+    times_s = {camera: path.times_s for camera, path in paths.items()}
+    posed = {camera: path.localised & (camera in placed) for camera, path in paths.items()}
+    inertial = {
+        camera: np.array([status is FrameStatus.INERTIAL for status in path.status])
+        for camera, path in paths.items()
+    }
+    found = {camera: np.where(posed[camera][:, None], path.centres, np.nan) for camera, path in paths.items()}
+    true = {camera: smooth_path(truth / f"{camera}.tum")[0](times_s[camera])[:, :3, 3] for camera in paths}
+    error_cm = {}
+    known = np.concatenate(list(posed.values()))
     places, truths = (np.concatenate(list(each.values())) for each in (found, true))
     fit = align_points(places[known], truths[known])
-    for camera in status:
+    for camera in paths:
         error_cm[camera] = 100.0 * np.linalg.norm(fit.apply(found[camera]) - true[camera], axis=1)
     return Frames(posed, inertial, times_s, error_cm)
 

@@ -17,29 +17,34 @@ import pytest
 from bodycap_batch.cli import main
 from bodycap_batch.evaluate import evaluate_trajectories
 from bodycap_batch.formats.bvh import read_bvh
+from bodycap_batch.formats.tum import read_tum
 from tests.pipeline.tiny_job import JOB, Place
 from tests.results import results_of
 
 pytestmark = pytest.mark.slow
 
+ROOT = Path(__file__).resolve().parents[2]
 FRAMES = {"torso": 60, "left_palm": 60}
 
 
 def example(name: str, *words: str, cwd: Path) -> str:
     """Run a script of ``examples/`` as a user would; returns what it printed."""
-    root = Path(__file__).resolve().parents[2]
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    done = subprocess.run(
-        [sys.executable, str(root / "examples" / name), *words],
-        env=environment,
+    done = script_run(ROOT / "examples" / name, *words, cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def script_run(script: Path, *words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run a script in an interpreter of its own."""
+    return subprocess.run(
+        [sys.executable, str(script), *words],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
         cwd=cwd,
         capture_output=True,
         text=True,
         check=False,
         timeout=300,
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +114,35 @@ def test_the_python_example_runs_the_job_and_reads_its_results(folder: Path) -> 
         "m over the floor",
     ):
         assert words in said
+
+
+@pytest.mark.parametrize(("bar", "code"), [("0.0", 0), ("1.01", 1)])
+def test_the_gate_script_of_the_documentation_reads_the_verdict(folder: Path, bar: str, code: int) -> None:
+    page = (ROOT / "docs" / "how-to" / "python.md").read_text(encoding="utf-8")
+    (script,) = [
+        text for part in page.split("```python\n")[1:] if "sys.exit" in (text := part.split("```")[0])
+    ]
+    verdict = folder / "out" / "verdict.json"
+    if not verdict.exists():
+        keys = {
+            "schema_version": 1,
+            "grade": "good",
+            "coverage": 1.0,
+            "cameras": {},
+            "body": {},
+            "criteria": [],
+        }
+        verdict.write_text(json.dumps(keys), encoding="utf-8")
+    grade = json.loads(verdict.read_text(encoding="utf-8"))["grade"]
+    for stated, here in (('"my_walk/"', '"tiny.yaml", out="out"'), ('"good"', repr(grade)), ("0.9", bar)):
+        assert script.count(stated) == 1
+        script = script.replace(stated, here)
+    (folder / "gate.py").write_text(script, encoding="utf-8")
+    done = script_run(folder / "gate.py", cwd=folder)
+    assert done.returncode == code, done.stderr
+    assert ("coverage" in done.stderr) == (code == 1)
+    centres = read_tum(folder / "out" / "trajectories" / "left_palm.tum").world_from_cam[:, :3, 3]
+    assert (str(centres) in done.stdout) == (code == 0)
 
 
 def test_the_drawing_example_draws_the_results(folder: Path, tmp_path: Path) -> None:

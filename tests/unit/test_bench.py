@@ -1,9 +1,12 @@
 """Parts of the benchmarks: the peers' pairs, their time limit, reading a job's events."""
 
+import json
+
 import av
 import numpy as np
 
 from bodycap_batch.evaluate.association import interpolate_truth
+from bodycap_batch.formats.frame_table import COLUMNS
 from bodycap_batch.formats.tum import TimedPoses
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 from bodycap_batch.synthetic import SynthOptions
@@ -278,9 +281,14 @@ def test_frames_of_a_violent_capture_are_compared_with_the_truth_and_with_the_jo
         status = ["LOST" if frame in lost else "REGISTERED" for frame in range(12)]
         if name == "with":
             status[3] = "INERTIAL"
-        rows = [f"torso,{time},{each}" for time, each in zip(times_s.tolist(), status, strict=True)]
-        text = "# a comment\ncamera,time,status\n" + "\n".join(rows) + "\n"
+        rows = [
+            f"torso,{frame},{times_s[frame]:.9f},{times_s[frame]:.9f},{each},{'BLUR' * (each == 'LOST')},0,,,"
+            for frame, each in enumerate(status)
+        ]
+        text = "# a comment\n" + "\n".join([",".join(COLUMNS), *rows]) + "\n"
         (tmp_path / name / "frames.csv").write_text(text, encoding="utf-8")
+        metrics = {"frame": "map-0", "cameras": {"torso": {"frame": "map-0"}}}
+        (tmp_path / name / "metrics.json").write_text(json.dumps(metrics), encoding="utf-8")
         found[name] = violent.frames_of(tmp_path / name, tmp_path / "gt")
     plain = violent.figures(found["without"], None)
     assert (plain["posed"], plain["short"], plain["long"], plain["off"]) == (9, 1, 2, 0)

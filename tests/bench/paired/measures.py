@@ -5,9 +5,7 @@ The measures are those of this working tree for both sides, so both are measured
 
 from __future__ import annotations
 
-import csv
 import hashlib
-from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from bodycap_batch import Result
 from bodycap_batch.config.calibration import read_calibration
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import BodycapError
@@ -114,17 +113,17 @@ class TruthFigures:
 def read_paths(results: Path, truth: Path) -> Paths | None:
     """Return the posed frames of a result with their true poses; None without any.
 
-    Cameras whose poses are in a map of their own (``trajectories/unplaced``) have no frames here.
+    Cameras whose poses are in a map of their own have no frames here.
     """
     truth, parts = shown_truth(truth), []
-    for file in sorted((results / "trajectories").glob("*.tum")):
-        known = truth / file.name if truth.is_dir() else truth
+    for name, path in sorted(Result(results).placed_trajectories().items()):
+        known = truth / f"{name}.tum" if truth.is_dir() else truth
         if not known.exists():
             continue
-        mine = read_tum(file)
+        mine = path.poses
         true, found = interpolate_truth(read_tum(known), mine.times_ns, _MAX_GAP_S)
         parts.append(
-            (np.full(found.sum(), file.stem), mine.times_ns[found], mine.world_from_cam[found], true[found])
+            (np.full(found.sum(), name), mine.times_ns[found], mine.world_from_cam[found], true[found])
         )
     if sum(len(part[0]) for part in parts) < _LEAST:
         return None
@@ -208,7 +207,7 @@ def rotation_errors_deg(mine: FloatArray, true: FloatArray, *, is_measured: bool
 
 def palm_error_m(results: Path, truth: Path, reference: str) -> float | None:
     """Return the mean error of the positions of the cameras from the reference; None if it is unknown."""
-    estimates = {file.stem: read_tum(file) for file in (results / "trajectories").glob("*.tum")}
+    estimates = {name: path.poses for name, path in Result(results).placed_trajectories().items()}
     if reference not in estimates or not truth.is_dir():
         return None
     errors = []
@@ -262,11 +261,9 @@ def lens_angles_deg(lens: Camera) -> FloatArray:
 
 def frame_counts(results: Path) -> tuple[int, int]:
     """Return the number of frames of all cameras, and of those with a pose in the main map."""
-    with (results / "frames.csv").open(newline="", encoding="utf-8") as stream:
-        rows = csv.DictReader(line for line in stream if not line.startswith("#"))
-        frames = Counter(row["camera"] for row in rows)
-    poses = [read_tum(file) for file in (results / "trajectories").glob("*.tum")]
-    return sum(frames.values()), sum(len(path.times_ns) for path in poses)
+    found = Result(results)
+    posed = sum(int(path.localised.sum()) for path in found.placed_trajectories().values())
+    return sum(len(frames.status) for frames in found.frames().values()), posed
 
 
 def digest_of_results(results: Path) -> str:

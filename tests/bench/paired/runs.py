@@ -18,6 +18,7 @@ from typing import Any
 
 import av
 
+from bodycap_batch import Result
 from bodycap_batch.core.errors import BodycapError
 from tests.bench import poses
 from tests.bench.paired import measures
@@ -318,7 +319,7 @@ def _ended(process: subprocess.Popen[bytes]) -> float:
 def _measure(side: Side, capture: BenchCapture, folder: Path) -> dict[str, Any]:
     """Measure the results of a job, and delete what the measures do not need again."""
     out = folder / "out"
-    record = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    record = Result(out).record()
     frames, posed = measures.frame_counts(out)
     values: dict[str, Any] = {
         "memory_mb": record.get("peak_memory_mb"),

@@ -23,6 +23,7 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.formats.frame_table import COLUMNS
 from bodycap_batch.job_places import capture_of_results
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.model.copied_frames import copied_notes
@@ -407,8 +408,10 @@ def test_a_camera_that_stands_still_has_no_copies(tmp_path: Path) -> None:
 def test_the_served_videos_have_the_frames_of_the_results(tmp_path: Path) -> None:
     folder = tmp_path / "walk"
     write_video(folder / "torso.mp4", FRAMES)
-    lines = [f"torso,{number},{number / 24:.9f}" for number in range(0, COUNT, 2)]
-    (tmp_path / "frames.csv").write_text("\n".join(["camera,frame,time", *lines]))
+    lines = [
+        f"torso,{number},{number / 24:.9f},{number / 24:.9f},LOST,BLUR,0,,," for number in range(0, COUNT, 2)
+    ]
+    (tmp_path / "frames.csv").write_text("\n".join([",".join(COLUMNS), *lines]))
     job = load_job(folder)
     (camera,) = capture_of_results(job, tmp_path).cameras
     assert camera.frame_numbers.tolist() == list(range(0, COUNT, 2))

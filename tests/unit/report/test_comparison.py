@@ -135,5 +135,5 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text("{")
     (tmp_path / "joints.csv").write_text("time,joint,observed\n")
     a.rename(tmp_path / "motion.bvh")
-    with pytest.raises(JobError, match="table of joints cannot be read"):
+    with pytest.raises(JobError, match="figures of the motion cannot be read"):
         compare(tmp_path, tmp_path / "motion.bvh")
