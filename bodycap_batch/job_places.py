@@ -125,11 +125,12 @@ def capture_of_results(job: Job, out_dir: Path) -> Capture:
     tables = read_frame_table(file) if file.is_file() else {}
     cameras = []
     for camera in capture.cameras:
-        numbers = tables[camera.name].frame_numbers if camera.name in tables else []
-        _, frames, rows = np.intersect1d(camera.frame_numbers, numbers, return_indices=True)
-        if 1 < len(frames) < len(camera.frame_numbers):
-            listed = Pictures(frames=frames, times_ns=tables[camera.name].times_ns[rows])
-            cameras.append(camera.only(listed))
+        numbers = camera.frame_numbers
+        listed = tables[camera.name].frame_numbers if camera.name in tables else numbers[:0]
+        _, frames, rows = np.intersect1d(numbers, listed, return_indices=True)
+        if 1 < len(frames) < len(numbers):
+            pictures = Pictures(frames=frames, times_ns=tables[camera.name].times_ns[rows])
+            cameras.append(camera.only(pictures))
         else:
             cameras.append(camera)
     return replace(capture, cameras=tuple(cameras))
