@@ -13,7 +13,12 @@ from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.report.drawn_scene import DrawnScene, common_times_s
 from bodycap_batch.report.figures.before_after import draw_before_and_after, find_unoptimised_bones
 from bodycap_batch.report.figures.camera_landmark_matrix import draw_camera_landmark_matrix
-from bodycap_batch.report.figures.camera_timeline import MAX_COLUMNS, column_count, draw_camera_timeline
+from bodycap_batch.report.figures.camera_timeline import (
+    MAX_COLUMNS,
+    column_count,
+    draw_camera_timeline,
+    draw_coverage,
+)
 from bodycap_batch.report.figures.motion_curves import Take, draw_motion_curves
 from bodycap_batch.report.figures.pictogram import draw_pictogram
 from bodycap_batch.report.figures.shared_landmarks import draw_shared_landmarks
@@ -30,6 +35,8 @@ from bodycap_batch.report.verdict import judge
 
 _SHEET_PICTURES = 24
 """Maximum number of pictures of lost frames on the page: six rows of four pictures on a wide screen."""
+_LISTED_LOSSES = 6
+"""Maximum number of lost intervals in the list below the verdict: it fits on the screen of a phone."""
 _WHOLE_SHARE = 0.95
 """Share of ticks from which a part of the body counts as measured or as not measured. Evidence: none."""
 _PROGRESS_AT_FAILURE = {
@@ -85,6 +92,7 @@ def page_content(
         and not all(camera.shows_only_room for camera in inputs.capture.cameras),
         "has_body": inputs.merge is not None,
         "cameras": _cameras(inputs, losses, colours, budget),
+        "missing": _missing(inputs, losses, colours),
         "causes": {cause.value: criterion for cause, criterion in _CAUSE_CRITERIA.items()},
         "lost_pictures": _lost_pictures(losses, budget.scaled(_SHEET_PICTURES)),
         "loss_count": len(losses),
@@ -165,7 +173,7 @@ def _cameras(
     """Return the content of each camera's section."""
     span = _time_span(inputs)
     causes = count_frames_by_cause(losses)
-    used = set() if inputs.merge is None else {path.camera for path in inputs.merge.trajectories}
+    used = _cameras_of_body(inputs)
     sections = []
     if budget.share < 1.0:
         budget.record("points of each curve over time", column_count(budget.share), MAX_COLUMNS)
@@ -187,6 +195,60 @@ def _cameras(
             }
         )
     return sections
+
+
+def _missing(
+    inputs: ReportInputs, losses: Sequence[DiagnosedLoss], colours: dict[str, str]
+) -> dict[str, Any]:
+    """Return a bar of the poses over time for each camera, and the longest lost intervals with their causes.
+
+    Empty if no frame is lost.
+    """
+    if not losses:
+        return {}
+    span, used = _time_span(inputs), _cameras_of_body(inputs)
+    bars = []
+    for name in inputs.cameras:
+        path = inputs.path(name)
+        if path is not None and len(path.times_ns):
+            own = [diagnosed.loss for diagnosed in losses if diagnosed.loss.camera == name]
+            times_s = common_times_s(inputs, name, path.times_ns)
+            bridged_s = inputs.max_gap_s if name in used else 0.0
+            bars.append(
+                {
+                    "name": name,
+                    "tone": colours[name],
+                    "share": float(path.registered.mean()),
+                    "bar": draw_coverage(path, times_s, span, own, bridged_s),
+                }
+            )
+    longest = sorted(losses, key=lambda diagnosed: -diagnosed.loss.frame_count)[:_LISTED_LOSSES]
+    return {
+        "bars": bars,
+        "start": _clock_text(span[0]),
+        "end": _clock_text(span[1]),
+        "more": len(losses) - len(longest),
+        "intervals": [
+            {
+                "time": f"{_clock_text(each.loss.start_s)} to {_clock_text(each.loss.end_s)}",
+                "camera": each.loss.camera,
+                "frames": each.loss.frame_count,
+                "cause": each.cause.value,
+            }
+            for each in sorted(longest, key=lambda each: (each.loss.start_s, each.loss.camera))
+        ],
+    }
+
+
+def _clock_text(time_s: float) -> str:
+    """Return a time as minutes, seconds and tenths: 1:02.5."""
+    tenths = round(10 * time_s)
+    return f"{'-' if tenths < 0 else ''}{abs(tenths) // 600}:{abs(tenths) % 600 / 10:04.1f}"
+
+
+def _cameras_of_body(inputs: ReportInputs) -> set[str]:
+    """Return the names of the cameras whose gaps the motion of the body bridges."""
+    return set() if inputs.merge is None else {path.camera for path in inputs.merge.trajectories}
 
 
 def _time_span(inputs: ReportInputs) -> tuple[float, float]:

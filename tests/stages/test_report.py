@@ -44,7 +44,7 @@ from bodycap_batch.report.verdict import judge
 from bodycap_batch.report.viewer_data import make_viewer_data
 from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.report import load_inputs
-from tests.reports import written
+from tests.reports import report_inputs, written
 from tests.videos import textured_frame, write_video
 
 
@@ -821,13 +821,43 @@ def test_the_page_says_how_well_the_elbows_are_known(inputs: ReportInputs, tmp_p
     assert "± 31°" in table
 
 
-def test_the_page_leads_with_the_person_and_links_the_files(inputs: ReportInputs, tmp_path: Path) -> None:
+def test_the_page_leads_with_the_verdict_and_links_the_files(inputs: ReportInputs, tmp_path: Path) -> None:
     text = written(replace(inputs, files=("motion.bvh", "metrics.json")), tmp_path)
-    places = [text.index(f'id="{name}"') for name in ("person", "verdict", "viewer-title", "motion", "files")]
+    places = [
+        text.index(f'id="{name}"')
+        for name in ("verdict", "missing", "person", "viewer-title", "motion", "files")
+    ]
     assert places == sorted(places)
     assert "No camera measured: head, pelvis, left leg, right leg." in text
     assert '<a href="motion.bvh">' in text
     assert 'class="strip motion"' in text
     without = written(ReportInputs(name="x"), tmp_path)
+    assert 'id="missing"' not in without
     assert 'id="person"' not in without
     assert 'id="files"' not in without
+
+
+def test_the_verdict_shows_when_frames_are_lost_and_why(inputs: ReportInputs, tmp_path: Path) -> None:
+    """Frames 20 to 24 of each camera are blurred; the clock begins at 5 s, with 30 frames a second."""
+    text = written(inputs, tmp_path)
+    block = text[text.index('id="missing"') : text.index("What is not good")]
+    assert block.count('<span class="share">91.7 %</span>') == len(inputs.cameras)
+    assert block.count("0:05.7 to 0:05.8</span> <strong>motion blur</strong>") == len(inputs.cameras)
+    assert block.count(", 5 frames</span>") == len(inputs.cameras)
+    assert "not listed" not in block
+    for bar in re.findall(r"<svg.*?</svg>", block):
+        (place,) = re.findall(r'<rect class="(?:lost|bridged)" x="([\d.]+)"', bar)
+        (width,) = re.findall(r'data-width="([\d.]+)"', bar)
+        # The bars are shifted by the left margin of the timelines below, 92 units.
+        assert (float(place) - 92.0) / float(width) == pytest.approx(20 / 59, abs=1e-3)
+
+
+def test_only_some_lost_intervals_are_listed_below_the_verdict(tmp_path: Path) -> None:
+    text = written(report_inputs(lost=slice(9, None, 10)), tmp_path)  # six intervals of each of three cameras
+    block = text[text.index('id="missing"') : text.index("What is not good")]
+    assert block.count('class="time"') == 6
+    assert "12 other intervals are not listed." in block
+
+
+def test_a_capture_without_losses_has_no_list_of_them(tmp_path: Path) -> None:
+    assert 'id="missing"' not in written(report_inputs(lost=slice(0, 0)), tmp_path)

@@ -129,6 +129,43 @@ def draw_camera_timeline(
     )
 
 
+def draw_coverage(
+    path: Trajectory,
+    times_s: FloatArray,
+    span_s: tuple[float, float],
+    losses: list[FrameLoss],
+    bridged_s: float,
+) -> str:
+    """Draw the intervals in which a camera has poses, as one bar that can be stretched to any width.
+
+    Args:
+        path: The trajectory of the camera.
+        times_s: (N,) common times of its frames, seconds.
+        span_s: First and last common time of the axis, seconds.
+        losses: The lost intervals of the camera.
+        bridged_s: As in `draw_camera_timeline`.
+
+    Returns:
+        The drawing as SVG.
+    """
+    bars = _draw_bars(path, times_s, span_s, [_lost_bar(loss, times_s, bridged_s) for loss in losses])
+    width = WIDTH - LEFT - RIGHT
+    return svg_image(
+        width,
+        _STATUS_HEIGHT,
+        element("rect", class_="plate", x=0, y=0, width=width, height=_STATUS_HEIGHT)
+        + element("g", bars, transform=f"translate({number(-LEFT)} -4)")
+        + element("line", class_="now", x1=0.0, x2=0.0, y1=0.0, y2=_STATUS_HEIGHT),
+        f"{path.camera} over time: {_summary(path)}",
+        class_="strip",
+        preserveAspectRatio="none",
+        data_left=0.0,
+        data_width=width,
+        data_start=f"{span_s[0]:.6f}",
+        data_end=f"{span_s[1]:.6f}",
+    )
+
+
 def _times_without_path(
     inputs: ReportInputs, camera: str, span_s: tuple[float, float], count: int
 ) -> FloatArray:
@@ -200,24 +237,35 @@ def _draw_status(
     lost_bars: list[_StatusBar],
     columns: int,
 ) -> str:
-    """Draw bars for registered and lost intervals, and a line for each keyframe.
-
-    The title of a lost bar gives the reasons for the loss. It also says if the body's motion bridges the gap.
-    """
-    interval = _frame_interval_s(times)
-    resolution_s = (span_s[1] - span_s[0]) / (2 * columns)
+    """Draw bars for registered and lost intervals, and a line for each keyframe."""
     parts = [text(LEFT - 8.0, 17.0, "status", class_="label", text_anchor="end")]
-    registered = [
-        _StatusBar("reg", float(times[first]), float(times[stop - 1] + interval))
-        for first, stop in runs(path.localised)
-    ]
-    parts += [_draw_bar(bar, span_s, "registered") for bar in _merge_close_bars(registered, resolution_s)]
     is_keyframe = np.array([status is FrameStatus.KEYFRAME for status in path.status], dtype=bool)
     if is_keyframe.any():
         resolution = (WIDTH - LEFT - RIGHT) / (2 * columns)
         positions = np.unique((x_from_time(times[is_keyframe], span_s) / resolution).round()) * resolution
         lines = "".join(f"M{number(x)} 4V{number(4.0 + _STATUS_HEIGHT / 3)}" for x in positions)
         parts.append(element("path", class_="key", d=lines))
+    return _draw_bars(path, times, span_s, lost_bars, columns) + "".join(parts)
+
+
+def _draw_bars(
+    path: Trajectory,
+    times: FloatArray,
+    span_s: tuple[float, float],
+    lost_bars: list[_StatusBar],
+    columns: int = MAX_COLUMNS,
+) -> str:
+    """Draw bars for registered and lost intervals.
+
+    The title of a lost bar gives the reasons for the loss. It also says if the body's motion bridges the gap.
+    """
+    interval = _frame_interval_s(times)
+    resolution_s = (span_s[1] - span_s[0]) / (2 * columns)
+    registered = [
+        _StatusBar("reg", float(times[first]), float(times[stop - 1] + interval))
+        for first, stop in runs(path.localised)
+    ]
+    parts = [_draw_bar(bar, span_s, "registered") for bar in _merge_close_bars(registered, resolution_s)]
     for bar in _merge_close_bars(lost_bars, resolution_s):
         title = f"{bar.frames} frames lost: {', '.join(bar.reasons)}"
         if bar.kind == "bridged":
