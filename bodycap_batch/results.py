@@ -237,7 +237,7 @@ class Result:
     def verdict(self) -> Mapping[str, Any]:
         """Return the verdict (``verdict.json``), as plain JSON values.
 
-        Its keys are ``schema_version``, ``grade``, ``coverage``, ``cameras``, ``body`` and ``criteria``.
+        Among its keys are ``grade``, ``coverage`` (with ``share``, from 0 to 1), ``cameras`` and ``body``.
 
         Raises:
             JobError: The file is missing, because an earlier version made the results, or it cannot be read.

@@ -1,4 +1,4 @@
-"""Show the progress of a job: as bars on a terminal, as lines in a log, or as JSON for other programs."""
+"""Show the progress of a job: live on a terminal, as lines in a log, or as JSON for other programs."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
+from bodycap_batch.cli.job_progress import READING_VIDEOS, JobProgress
 from bodycap_batch.cli.terminal import print_json, print_timed_message
 from bodycap_batch.core.percent import format_percent
 from bodycap_batch.core.printable import printable
 from bodycap_batch.core.progress import Event
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, Task, TaskID
+    from rich.console import RenderableType
 
 _LINE_PERIOD_S = 5.0
 """Maximum time (seconds) between two progress lines of a stage. Evidence: none."""
@@ -25,7 +26,8 @@ _LINE_PAUSE_S = 1.0
 _LINE_PROGRESS = 0.1
 """A stage prints its next progress line before `_LINE_PERIOD_S` if it has advanced at least by this fraction
 since the last line. Unit: 1 (the whole stage). Evidence: none."""
-
+_BAR_WIDTH = 30
+"""Width of the bar of a job, characters."""
 
 _SCHEMA = 1
 """Number of the form of the JSON lines. It changes if a field changes its meaning or is removed."""
@@ -46,19 +48,22 @@ class ProgressDisplay(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
 
+    def expect_cameras(self, count: int) -> None:
+        """Tell the display how many cameras the job has."""
+
     def __call__(self, event: Event) -> None:
         """Show one event."""
 
 
 def make_progress_display(*, as_json: bool) -> ProgressDisplay:
-    """Return a display: JSON lines if `as_json` is True, else bars on a terminal, else plain lines."""
+    """Return a display: JSON lines if `as_json` is True, else a live one on a terminal, else plain lines."""
     if as_json:
         return JsonLines()
-    return ProgressBars() if sys.stderr.isatty() else ProgressLines()
+    return LiveProgress() if sys.stderr.isatty() else ProgressLines()
 
 
-class JsonLines:
-    """Prints each event as one line with a JSON object on standard output."""
+class _Display:
+    """What all displays have: events come from several threads, and some displays have nothing to close."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -66,8 +71,17 @@ class JsonLines:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Do nothing: there is nothing to close."""
+
+    def expect_cameras(self, count: int) -> None:
+        """Do nothing: the number of cameras changes nothing in the lines."""
+
+
+class JsonLines(_Display):
+    """Prints each event as one line with a JSON object on standard output."""
 
     def __call__(self, event: Event) -> None:
         """Print one event."""
@@ -75,18 +89,12 @@ class JsonLines:
             print_event(event.to_dict())
 
 
-class ProgressLines:
+class ProgressLines(_Display):
     """Prints plain lines on standard error: every few seconds, or after every tenth of a stage."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        super().__init__()
         self._pace: dict[str, _LinePacer] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing: there is nothing to close."""
 
     def __call__(self, event: Event) -> None:
         """Print one event. Progress is printed only if a new progress line of the stage is due."""
@@ -131,83 +139,94 @@ class _LinePacer:
         return text
 
 
-class ProgressBars:
-    """Shows one bar for each stage and camera on standard error, with the speed and the remaining time."""
+class LiveProgress(_Display):
+    """Shows on a terminal one line for the job, with the time left, and the current tasks beneath it."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._bars: dict[str, TaskID] = {}
-        self._progress = _make_rich_progress()
+        from rich.console import Console
+        from rich.live import Live
+
+        super().__init__()
+        self._job, self._begun = JobProgress(), time.monotonic()
+        self._tasks: dict[str, str] = {}
+        self._last_line = ""
+        self._console = Console(stderr=True)
+        self._live = Live(get_renderable=self._render, console=self._console, refresh_per_second=4)
 
     def __enter__(self) -> Self:
-        self._progress.start()
+        self._live.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Stop the bars and restore the terminal."""
-        self._progress.stop()
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop the display and restore the terminal. The line of the whole job stays."""
+        with self._lock:
+            if kind is None:
+                self._tasks.clear()
+                self._last_line = f"done in {_duration_text(time.monotonic() - self._begun)}"
+            else:
+                self._last_line = "stopped"
+        self._live.stop()
+
+    def expect_cameras(self, count: int) -> None:
+        """Tell the display how many cameras the job has."""
+        self._job.expect_cameras(count)
 
     def __call__(self, event: Event) -> None:
-        """Update the bar of the event's stage and camera."""
+        """Show an event. A task disappears when it has finished."""
+        if event.kind == "note":
+            # Without the lock: the console waits for the thread that draws, which waits for the lock.
+            self._console.print(printable(event.what), highlight=False, markup=False)
+            return
         with self._lock:
-            if event.kind == "note":
-                self._progress.console.print(printable(event.what), highlight=False, markup=False)
+            self._job.update(event)
+            if event.kind in ("finished", "reused"):
+                self._tasks.pop(event.label, None)
                 return
-            bar = self._bars.get(event.label)
-            if bar is None:
-                bar = self._progress.add_task(printable(event.label), total=None, what="")
-                self._bars[event.label] = bar
-            if event.kind == "progress":
-                self._progress.update(
-                    bar, completed=event.done, total=event.total or None, what=printable(event.what)
-                )
-            elif event.kind != "started":
-                self._close(bar, event)
+            if event.kind == "started":
+                self._tasks.pop(READING_VIDEOS, None)  # it has no event at its end
+            self._tasks[event.label] = printable(_task_text(event))
 
-    def _close(self, bar: TaskID, event: Event) -> None:
-        total = self._progress.tasks[bar].total or 1
-        words = {
-            "reused": "already done",
-            "finished": f"done in {_duration_text(event.seconds)}",
-            "failed": "failed",
-            "stopped": "stopped",
-        }
-        if event.kind not in ("failed", "stopped"):
-            self._progress.update(bar, completed=total, total=total)
-        self._progress.update(bar, what=words[event.kind])
-        self._progress.stop_task(bar)
+    def _render(self) -> RenderableType:
+        from rich.console import Group
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+        from rich.text import Text
+
+        with self._lock:
+            is_done = self._last_line.startswith("done")
+            fraction = 1.0 if is_done else self._job.fraction
+            words = self._last_line or _left_text(self._job.left_s())
+            tasks = list(self._tasks.values())
+        line = Table.grid(padding=(0, 2, 0, 0))
+        line.add_row(
+            ProgressBar(total=1.0, completed=fraction, width=_BAR_WIDTH),
+            Text(f"{format_percent(fraction):>4}"),
+            Text(words),
+        )
+        texts = [Text(f"  {task}", style="dim", no_wrap=True, overflow="ellipsis") for task in tasks]
+        return Group(line, *texts)
 
 
-def _make_rich_progress() -> Progress:
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
-    from rich.text import Text
+def _task_text(event: Event) -> str:
+    if event.kind == "progress":
+        count = f" {event.done} of {event.total}" if event.total else ""
+        return f"{event.label}:{count} {event.what}".rstrip()
+    return event.label if event.kind == "started" else f"{event.label}: {event.kind}"
 
-    class Rate(ProgressColumn):
-        """Column of a progress bar: the number of units (for example frames) that are done per second."""
 
-        def render(self, task: Task) -> Text:
-            """Return the speed; empty if it is unknown or the stage has finished."""
-            speed = task.finished_speed or task.speed
-            return Text("" if speed is None or task.finished else f"{speed:.3g}/s", style="dim")
-
-    class Count(ProgressColumn):
-        """Column of a progress bar: the number of finished units and the total number of units."""
-
-        def render(self, task: Task) -> Text:
-            """Return both numbers; empty if the total is unknown or the stage has finished."""
-            known = task.total is not None and not task.finished
-            return Text(f"{int(task.completed)}/{int(task.total or 0)}" if known else "")
-
-    return Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=30),
-        Count(),
-        TextColumn("{task.fields[what]}", markup=False),
-        Rate(),
-        TimeRemainingColumn(compact=True, elapsed_when_finished=False),
-        console=Console(stderr=True),
-    )
+def _left_text(seconds: float | None) -> str:
+    """Return a text for the estimated time to the end of a job; None means that it is unknown."""
+    if seconds is None:
+        return "time left: not known yet"
+    if seconds < 10:
+        return "a few seconds left"
+    if seconds < 55:
+        return f"about {10 * round(seconds / 10)} s left"
+    minutes = round(seconds / 60)
+    hours, rest = divmod(minutes, 60)
+    return f"about {hours} h {rest:02d} min left" if hours else f"about {minutes} min left"
 
 
 def text_from_event(event: Event) -> str:

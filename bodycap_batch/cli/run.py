@@ -24,7 +24,7 @@ from bodycap_batch.cli.shared_options import (
     make_overrides,
 )
 from bodycap_batch.cli.signals import event_on_signal
-from bodycap_batch.cli.terminal import print_line
+from bodycap_batch.cli.terminal import print_line, print_text
 from bodycap_batch.core.errors import BodycapError, JobError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.job_places import find_job
@@ -120,6 +120,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         loaded = prepare_job(job, overrides, execution)
         if height is not None and loaded.options.height_m is not None:
             announce(f"height of the subject: {describe_height(loaded.options.height_m)}")
+        display.expect_cameras(len(loaded.cameras))
         for text in loaded.warnings:
             announce(text)
         if execution.children is not None and not (loaded.out / RUN_FILE).exists():
@@ -167,6 +168,6 @@ def _print_summary(summary: RunSummary, name: str, display: ProgressDisplay, *, 
     if summary.executed == 0:
         print_line(f"{name}: nothing to do, because all {len(summary.stages)} stages were already done")
     for line in () if summary.verdict is None else summary.verdict.lines():
-        print_line(line)
+        print_text(line)
     print_line(f"open first: {summary.out_dir / REPORT_FILE}")
     print_line(f"results: {summary.out_dir}")

@@ -10,7 +10,9 @@ import contextlib
 import io
 import json
 import os
+import shutil
 import sys
+import textwrap
 import time
 from typing import Any, TextIO
 
@@ -21,6 +23,11 @@ from bodycap_batch.core.printable import printable
 def print_line(text: str = "") -> None:
     """Print one line on standard output. Raises `StoreError` if standard output cannot be written."""
     _write_output(printable(text) + "\n")
+
+
+def print_text(text: str) -> None:
+    """Print one line as `print_line` does; on a terminal, it breaks only between words."""
+    _write_output(_wrapped(printable(text), sys.stdout) + "\n")
 
 
 def print_json(value: Any, *, indent: int | None = None) -> None:
@@ -34,8 +41,11 @@ def print_message(text: str) -> None:
 
 
 def print_messages(text: str) -> None:
-    """Print one or more lines on standard error. If standard error cannot be written, do nothing."""
-    lines = "".join(f"{printable(line)}\n" for line in text.rstrip().split("\n"))
+    """Print one or more lines on standard error. If standard error cannot be written, do nothing.
+
+    On a terminal, lines break only between words.
+    """
+    lines = "".join(f"{_wrapped(printable(line), sys.stderr)}\n" for line in text.rstrip().split("\n"))
     with contextlib.suppress(OSError):
         sys.stderr.write(_encodable(lines, sys.stderr))
         sys.stderr.flush()
@@ -86,6 +96,21 @@ def _discard_output() -> None:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
+
+
+def _wrapped(line: str, stream: TextIO) -> str:
+    """Return a line with breaks between words where a terminal would break it inside of them.
+
+    The parts after the first one are indented by two more columns. Words that are longer than a line, such as
+    paths, are not broken.
+    """
+    width = shutil.get_terminal_size().columns
+    if not stream.isatty() or len(line) <= width:
+        return line
+    indent = line[: len(line) - len(line.lstrip())]
+    return textwrap.fill(
+        line, width, subsequent_indent=f"{indent}  ", break_long_words=False, break_on_hyphens=False
+    )
 
 
 def _encodable(text: str, stream: TextIO) -> str:

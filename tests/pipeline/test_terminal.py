@@ -136,7 +136,7 @@ def test_names_in_the_display_of_progress_are_escaped(
     monkeypatch.setattr(
         "rich.console.Console", lambda **_: Console(file=stream, width=400, color_system=None)
     )
-    with shown.ProgressBars() as bars:
+    with shown.LiveProgress() as bars:
         for event in events:
             bars(event)
     text = stream.getvalue()

@@ -206,4 +206,4 @@ def test_the_reading_script_of_the_page_runs(tmp_path: Path) -> None:
 
 def test_the_gate_script_is_short() -> None:
     (script,) = [text for text in scripts() if "sys.exit" in text]
-    assert len(script.strip().splitlines()) == 10
+    assert len([line for line in script.splitlines() if line]) == 10
