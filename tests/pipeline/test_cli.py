@@ -20,6 +20,7 @@ import yaml
 
 import bodycap_batch
 from bodycap_batch.cli import main
+from bodycap_batch.formats.frame_table import COLUMNS
 from bodycap_batch.runner import Children
 from bodycap_batch.tasks.check import CHECK
 from tests.pipeline.fake_bodycap import run_here
@@ -183,7 +184,7 @@ def test_json_progress_includes_a_failure(bench: Bench) -> None:
     assert "map does not work out" in err
 
 
-def test_a_terminal_gets_bars(bench: Bench) -> None:
+def test_a_terminal_gets_one_line_for_the_job(bench: Bench) -> None:
     ours, theirs = pty.openpty()
     bench.environment |= {"TERM": "xterm", "COLUMNS": "120"}
     with bench.start("run", "my walk", stderr=theirs) as process:
@@ -198,9 +199,10 @@ def test_a_terminal_gets_bars(bench: Bench) -> None:
                 break
             text += data
         assert process.wait(60) == 0
-    assert b"keyframes torso" in text
     assert b"\x1b[" in text
     assert "━" in text.decode()
+    assert b"100%" in text
+    assert b"done in " in text
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -405,8 +407,13 @@ def test_evaluate_aligns_all_cameras_together_and_counts_lost_frames(
         centres = rng.normal(size=(50, 3))
         _write_tum(tmp_path / "gt" / f"{name}.tum", centres)
         _write_tum(tmp_path / "mine" / "trajectories" / f"{name}.tum", 2.0 * centres + 1.0)
-    rows = [f"{name},{i}" for name in ("torso", "left_palm") for i in range(100)]
-    (tmp_path / "mine" / "frames.csv").write_text("\n".join(["# a comment", "camera,frame", *rows]) + "\n")
+    rows = [
+        f"{name},{i},{0.1 * i},{0.1 * i},{'REGISTERED,' if i < 50 else 'LOST,BLUR'},0,,,"
+        for name in ("torso", "left_palm")
+        for i in range(100)
+    ]
+    table = "\n".join(["# a comment", ",".join(COLUMNS), *rows]) + "\n"
+    (tmp_path / "mine" / "frames.csv").write_text(table)
     assert main(["evaluate", str(tmp_path / "mine"), str(tmp_path), "--json"]) == 0
     report = json.loads(capfd.readouterr().out)["trajectories"]
     assert report["scale"] == pytest.approx(0.5, abs=1e-9)
