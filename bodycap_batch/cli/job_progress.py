@@ -63,7 +63,7 @@ class JobProgress:
         self._cameras = 1
         self._parts: dict[tuple[str, str], float] = {}
         self._is_job = False
-        self._begun: tuple[float, float] | None = None
+        self._start: tuple[float, float] | None = None
         self.fraction = 0.0
 
     def expect_cameras(self, count: int) -> None:
@@ -76,15 +76,15 @@ class JobProgress:
             return
         if event.stage in _SHARES and not self._is_job:
             # What ran before the job, such as rendering its videos, does not count.
-            self._is_job, self._begun, self.fraction = True, None, 0.0
+            self._is_job, self._start, self.fraction = True, None, 0.0
             self._parts.clear()
         key = (event.stage, event.camera)
         self._parts[key] = max(self._parts.get(key, 0.0), _part_of_task(event))
         self.fraction = max(self.fraction, self._fraction_at(event.stage))
         if event.kind == "reused":  # it took no time, so the estimate begins with the next task
-            self._begun = None
-        elif self._begun is None:
-            self._begun = (self._clock(), self.fraction)
+            self._start = None
+        elif self._start is None:
+            self._start = (self._clock(), self.fraction)
 
     def _fraction_at(self, stage: str) -> float:
         parts = [part for (name, _), part in self._parts.items() if name == stage]
@@ -102,9 +102,9 @@ class JobProgress:
 
         It follows from the time that the part computed so far took.
         """
-        if self._begun is None or self.fraction - self._begun[1] < _LEAST_PART:
+        if self._start is None or self.fraction - self._start[1] < _LEAST_PART:
             return None
-        seconds, done = self._clock() - self._begun[0], self.fraction - self._begun[1]
+        seconds, done = self._clock() - self._start[0], self.fraction - self._start[1]
         return seconds * (1.0 - self.fraction) / done
 
 

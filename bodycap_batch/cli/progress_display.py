@@ -147,7 +147,7 @@ class LiveProgress(_Display):
         from rich.live import Live
 
         super().__init__()
-        self._job, self._begun = JobProgress(), time.monotonic()
+        self._job, self._start = JobProgress(), time.monotonic()
         self._tasks: dict[str, str] = {}
         self._last_line = ""
         self._console = Console(stderr=True)
@@ -164,7 +164,7 @@ class LiveProgress(_Display):
         with self._lock:
             if kind is None:
                 self._tasks.clear()
-                self._last_line = f"done in {_duration_text(time.monotonic() - self._begun)}"
+                self._last_line = f"done in {_duration_text(time.monotonic() - self._start)}"
             else:
                 self._last_line = "stopped"
         self._live.stop()

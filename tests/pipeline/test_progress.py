@@ -80,12 +80,12 @@ def test_the_time_left_follows_from_the_time_that_was_needed() -> None:
     job = JobProgress(clock)
     job.update(event("started", "check"))
     assert job.left_s() is None
-    begun = job.fraction
+    start = job.fraction
     clock.now = 100.0
     job.update(event("finished", "map"))
-    assert job.left_s() == pytest.approx(100.0 * (1.0 - job.fraction) / (job.fraction - begun))
+    assert job.left_s() == pytest.approx(100.0 * (1.0 - job.fraction) / (job.fraction - start))
     clock.now = 200.0  # without progress, the rest is expected to take longer
-    assert job.left_s() == pytest.approx(200.0 * (1.0 - job.fraction) / (job.fraction - begun))
+    assert job.left_s() == pytest.approx(200.0 * (1.0 - job.fraction) / (job.fraction - start))
 
 
 def test_reused_stages_do_not_count_as_fast() -> None:
