@@ -64,6 +64,7 @@ class JobProgress:
         self._parts: dict[tuple[str, str], float] = {}
         self._is_job = False
         self._start: tuple[float, float] | None = None
+        self._estimate: tuple[float, float] | None = None
         self.fraction = 0.0
 
     def expect_cameras(self, count: int) -> None:
@@ -76,15 +77,20 @@ class JobProgress:
             return
         if event.stage in _SHARES and not self._is_job:
             # What ran before the job, such as rendering its videos, does not count.
-            self._is_job, self._start, self.fraction = True, None, 0.0
+            self._is_job, self._start, self._estimate, self.fraction = True, None, None, 0.0
             self._parts.clear()
         key = (event.stage, event.camera)
         self._parts[key] = max(self._parts.get(key, 0.0), _part_of_task(event))
+        before = self.fraction
         self.fraction = max(self.fraction, self._fraction_at(event.stage))
         if event.kind == "reused":  # it took no time, so the estimate begins with the next task
-            self._start = None
+            self._start = self._estimate = None
         elif self._start is None:
             self._start = (self._clock(), self.fraction)
+        elif self.fraction > before:
+            seconds, done = self._clock() - self._start[0], self.fraction - self._start[1]
+            if done >= _LEAST_PART:
+                self._estimate = (self._clock(), seconds * (1.0 - self.fraction) / done)
 
     def _fraction_at(self, stage: str) -> float:
         parts = [part for (name, _), part in self._parts.items() if name == stage]
@@ -98,14 +104,15 @@ class JobProgress:
         return before + part * _SHARES[stage]
 
     def left_s(self) -> float | None:
-        """Return the estimated time to the end, seconds; None if it is not known yet.
+        """Return the estimated time to the end, seconds; None if it is not known.
 
-        It follows from the time that the part computed so far took.
+        It follows from the time that the part computed so far took. It is not known before there is such a
+        part, and after a step without progress has taken longer than all that was expected to follow.
         """
-        if self._start is None or self.fraction - self._start[1] < _LEAST_PART:
+        if self._estimate is None:
             return None
-        seconds, done = self._clock() - self._start[0], self.fraction - self._start[1]
-        return seconds * (1.0 - self.fraction) / done
+        left = self._estimate[1] - (self._clock() - self._estimate[0])
+        return left if left > 0.0 else None
 
 
 def _part_of_task(event: Event) -> float:

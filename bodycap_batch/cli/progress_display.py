@@ -219,7 +219,7 @@ def _task_text(event: Event) -> str:
 def _left_text(seconds: float | None) -> str:
     """Return a text for the estimated time to the end of a job; None means that it is unknown."""
     if seconds is None:
-        return "time left: not known yet"
+        return "time left: not known"
     if seconds < 10:
         return "a few seconds left"
     if seconds < 55:

@@ -84,8 +84,14 @@ def test_the_time_left_follows_from_the_time_that_was_needed() -> None:
     clock.now = 100.0
     job.update(event("finished", "map"))
     assert job.left_s() == pytest.approx(100.0 * (1.0 - job.fraction) / (job.fraction - start))
-    clock.now = 200.0  # without progress, the rest is expected to take longer
-    assert job.left_s() == pytest.approx(200.0 * (1.0 - job.fraction) / (job.fraction - start))
+    expected = 100.0 * (1.0 - job.fraction) / (job.fraction - start)
+    clock.now = 120.0
+    assert job.left_s() == pytest.approx(expected - 20.0)
+    clock.now = 100.0 + expected  # a step without progress takes longer than everything was expected to
+    assert job.left_s() is None
+    clock.now = 400.0
+    job.update(event("finished", "registration"))
+    assert job.left_s() == pytest.approx(400.0 * (1.0 - job.fraction) / (job.fraction - start))
 
 
 def test_reused_stages_do_not_count_as_fast() -> None:
@@ -156,7 +162,7 @@ def test_the_current_tasks_stand_below_the_line_of_the_job(monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("seconds", "text"),
     [
-        (None, "time left: not known yet"),
+        (None, "time left: not known"),
         (4.0, "a few seconds left"),
         (34.0, "about 30 s left"),
         (57.0, "about 1 min left"),
