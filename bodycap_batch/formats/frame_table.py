@@ -44,6 +44,9 @@ class FrameTable:
         status: (N,) status of each frame: localised, or the reason why the frame is lost.
         inliers: (N,) number of map points that agree with the pose.
         error_px: (N,) reprojection error of the measured pose, pixels at the work size; NaN without a pose.
+        map_numbers: (N,) number of the map to which the pose of each frame refers: 0 is ``map.ply``, n is
+            ``map_<n>.ply``; -1 without a pose, and in results of earlier versions. A lost frame with the
+            status OTHER_MAP has a pose in another map, in ``trajectories/map_<n>/<camera>.tum``.
         sigma_position: (N,) standard deviation per axis of the measured camera centre: metres in the world,
             units of the map without a world. NaN without a pose, and in results of earlier versions, whose
             tables lack this column.
@@ -58,12 +61,13 @@ class FrameTable:
     status: tuple[FrameStatus, ...]
     inliers: IntArray
     error_px: FloatArray
+    map_numbers: IntArray
     sigma_position: FloatArray
     sigma_rotation_deg: FloatArray
 
     def __post_init__(self) -> None:
         count = len(self.status)
-        for name in ("frame_numbers", "times_ns", "common_times_ns", "inliers"):
+        for name in ("frame_numbers", "times_ns", "common_times_ns", "inliers", "map_numbers"):
             set_array(self, name, (count,), np.int64)
         for name in ("error_px", "sigma_position", "sigma_rotation_deg"):
             set_array(self, name, (count,), finite=False)
@@ -118,6 +122,7 @@ def _table(camera: str, rows: list[dict[str, str]]) -> FrameTable:
         status=tuple(FrameStatus(row["reason"] if row["status"] == LOST else row["status"]) for row in rows),
         inliers=np.array([int(row["inliers"]) for row in rows]),
         error_px=numbers("error"),
+        map_numbers=np.array([int(row.get("map") or -1) for row in rows]),
         sigma_position=numbers("sigma_position"),
         sigma_rotation_deg=numbers("sigma_rotation_deg"),
     )

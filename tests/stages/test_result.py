@@ -52,6 +52,7 @@ def test_the_paths_are_those_of_the_cameras(tmp_path: Path) -> None:
         np.testing.assert_array_equal(path.frames.times_ns, truth.times_ns)
         np.testing.assert_array_equal(path.frames.frame_numbers, truth.frame_numbers)
         np.testing.assert_array_equal(path.frames.inliers, truth.inliers)
+        np.testing.assert_array_equal(path.frames.map_numbers, np.where(truth.localised, 0, -1))
         np.testing.assert_allclose(path.centres, truth.gauge_from_cam[:, :3, 3], atol=2 * NUMBER)
         turned = path.rotations[path.localised] @ truth.gauge_from_cam[path.localised, :3, :3].swapaxes(1, 2)
         assert rotation_angle_rad(turned).max() < 1e-7
@@ -74,13 +75,14 @@ def test_the_sigmas_are_those_of_the_covariances(tmp_path: Path) -> None:
         assert (frames.sigma_position[posed] > 0).all()
 
 
-def test_a_table_of_an_earlier_version_has_no_sigmas(tmp_path: Path) -> None:
+def test_a_table_of_an_earlier_version_has_no_sigmas_and_maps(tmp_path: Path) -> None:
     _, result = exported(tmp_path)
     table = result.folder / "frames.csv"
     lines = table.read_text(encoding="utf-8").splitlines()
-    table.write_text("\n".join(line.rsplit(",", 2)[0] for line in lines), encoding="utf-8")
+    table.write_text("\n".join(line.rsplit(",", 3)[0] for line in lines), encoding="utf-8")
     frames = result.frames()["torso"]
     assert np.isnan(frames.sigma_position).all()
+    assert (frames.map_numbers == -1).all()
     assert np.isfinite(frames.error_px[frames.localised]).all()
 
 
