@@ -34,12 +34,12 @@ because it would make the row hard to read."""
 @app.command(short_help="List the jobs of a watched folder and their states.")
 def status(
     spool: SpoolArgument = Path("jobs"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print jobs and watchers as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the jobs and the watcher as JSON.")] = False,
 ) -> None:
     """List the jobs of a watched folder with state, stage, progress, time, verdict and cause of failure.
 
-    The time is the duration of a job that has ended, and else the time since it waits or runs. Also lists the
-    watchers of the folder.
+    The time is the duration of a job that has ended, and else the time since it waits or runs. Also shows the
+    watcher of the folder.
 
     \b
     Examples:
@@ -47,23 +47,23 @@ def status(
       bodycap status /mnt/nas/jobs --json
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.store.artefacts import disk_errors
-    from bodycap_batch.watch import active_watchers, job_rows
+    from bodycap_batch.watch import active_watcher, job_rows
 
     watched = _find_spool(spool)
     with disk_errors(watched.root):
-        rows, watchers = job_rows(watched), active_watchers(watched)
+        rows, watcher = job_rows(watched), active_watcher(watched)
     if as_json:
         found = {
             "jobs": [row.to_dict() for row in rows],
-            "watchers": [watcher.to_dict() for watcher in watchers],
+            "watchers": [] if watcher is None else [watcher.to_dict()],
         }
         print_json(found, indent=1)
         return
     for line in _job_table(rows):
         print_line(line)
-    for watcher in watchers:
+    if watcher is not None:
         print_line(str(watcher))
-    if not watchers and any(row.state in ("waiting", "interrupted", "stopped") for row in rows):
+    elif any(row.state in ("waiting", "interrupted", "stopped") for row in rows):
         print_line(f"no watcher runs for this folder; start a watcher with: bodycap watch {watched.inbox}")
 
 

@@ -86,14 +86,6 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
             help="Read the folder regularly to find changes (default: only on network disks).",
         ),
     ] = None,
-    stale: Annotated[
-        float,
-        typer.Option(
-            min=1.0,
-            metavar="SECONDS",
-            help="If a watcher has shown no activity for this time, another watcher takes over its jobs.",
-        ),
-    ] = 60.0,
     web: WebOption = None,
     web_token: TokenOption = "",
     once: Annotated[bool, typer.Option("--once", help="Stop when nothing is left to do.")] = False,
@@ -105,7 +97,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     ends after 30 minutes. A folder with a file named READY is complete at once. Jobs move from inbox/ to
     running/, then to done/ or failed/. These folders are next to inbox/. done/NAME/result/ holds the results,
     done/NAME/input/ holds the dropped files. Stop the command with Ctrl-C at any time: the jobs continue when
-    you start the command again. Several watchers, also on several machines, may share the folders.
+    you start the command again. One watcher at a time may work on the folders.
 
     A dropped job may only use files in its own folder and in the folders given by --root.
 
@@ -130,7 +122,6 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
         threads=threads or cores(),
         memory_mb=memory_mb,
         unchanged_s=unchanged_s,
-        stale_s=stale,
         poll=poll,
         once=once,
     )

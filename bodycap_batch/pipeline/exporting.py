@@ -76,7 +76,7 @@ def export_for(
             path=out_dir,
             hint="look at the report: it says what is missing and why",
         )
-    settings.require_owner()
+    settings.raise_if_cancelled()
     publish(files, folder)
     if SCENE_FILE in files:
         _name_videos(folder, results.job or job)

@@ -80,7 +80,7 @@ def remake_report(job: Job, *, out_dir: Path, settings: Settings) -> Path:
         reported = flow.report(results, stopped_by)
     is_complete = results.exported is not None and results.failure is None
     folder = out_dir if is_complete else out_dir / PARTIAL
-    settings.require_owner()
+    settings.raise_if_cancelled()
     files = dict(files_of(reported))
     publish(files, folder)
     return folder / next(iter(files))

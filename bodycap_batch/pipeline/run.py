@@ -78,7 +78,7 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
             in `out_dir`.
     """
     settings.store.sweep()
-    settings.require_owner()
+    settings.raise_if_cancelled()
     results, runs_to_end = StageResults(), settings.until in ("", STAGE_ORDER[-1])
     with Flow(job, settings, logs=out_dir / "logs") as flow:
         stopped_by = _run_until(job, flow, results, out_dir, settings)
@@ -193,7 +193,7 @@ def _publish_failure_report(
     """Publish the report of a job that was stopped by an error before results were written."""
     try:
         results.reported = flow.report(results, error)
-        settings.require_owner()
+        settings.raise_if_cancelled()
         publish(dict(files_of(results.reported)), out_dir / PARTIAL)
     except BodycapError as another:
         error.add_note(f"the report about this job could not be written: {another.message}")
@@ -219,7 +219,7 @@ def _summary(flow: Flow, results: StageResults, out_dir: Path) -> RunSummary:
 
 def _publish_results(job: Job, flow: Flow, results: StageResults, out_dir: Path, settings: Settings) -> Path:
     """Publish the results and return their folder: ``partial`` if the skeleton could not be solved."""
-    settings.require_owner()
+    settings.raise_if_cancelled()
     if results.failure is None:
         _write_results(job, results, _summary(flow, results, out_dir), settings)
         clear_partial(out_dir)

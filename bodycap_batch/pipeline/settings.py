@@ -11,7 +11,8 @@ from bodycap_batch.config.overrides import Overrides
 from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.core.progress import Listener
 from bodycap_batch.runner import CHILD_COMMAND, Children, Executor, Rules, Runner, Task
-from bodycap_batch.runner.task_runner import allow, always
+from bodycap_batch.runner.child_pool import STOPPED
+from bodycap_batch.runner.task_runner import allow
 from bodycap_batch.runner.turns import Turns, TurnTakingExecutor
 from bodycap_batch.store.artefacts import Store
 
@@ -34,8 +35,6 @@ class Settings:
             task may use this number of cores.
         listener: Receives the events of the job.
         cancelled: Called several times a second; True stops the job.
-        may_commit: Called before each artefact is committed and before results are published. False stops the
-            job, because another process has taken the job over.
         command: Command line of the child processes.
         executor: Runs the tasks of several jobs, on this machine or on other machines. None starts child
             processes for this job only.
@@ -59,7 +58,6 @@ class Settings:
     threads: int
     listener: Listener
     cancelled: Callable[[], bool]
-    may_commit: Callable[[], bool] = always
     command: Sequence[str] = CHILD_COMMAND
     executor: Executor | None = None
     children: Children | None = None
@@ -91,7 +89,6 @@ class Settings:
             listener=self.listener,
             rules=Rules(
                 cancelled=lambda: self.cancelled() or stop_also(),
-                may_commit=self.may_commit,
                 before=before,
                 compute=self.compute,
                 redo=self.redo,
@@ -99,13 +96,10 @@ class Settings:
             ),
         )
 
-    def require_owner(self) -> None:
-        """Raise `Cancelled` if another process has taken the job over."""
-        if not self.may_commit():
-            raise Cancelled(
-                "the job was stopped, or another process runs it now; the results of finished stages stay "
-                "in the store"
-            )
+    def raise_if_cancelled(self) -> None:
+        """Raise `Cancelled` if the job must stop."""
+        if self.cancelled():
+            raise Cancelled(STOPPED, hint="run the job again to continue")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

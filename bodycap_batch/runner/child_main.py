@@ -116,7 +116,7 @@ class _Parent:
         answer = self.orders.next()
         if answer is None or not answer["commit"]:
             raise Cancelled(
-                "the result was not stored, because the job was stopped or another process runs it now",
+                "the result was not stored, because the job was stopped",
                 hint="run the job again to continue",
             )
 

@@ -56,8 +56,7 @@ class TaskEnvironment:
         store: The store into which the artefact is committed.
         logs: Folder for the log file and the task file of each task.
         progress: Called as ``progress(done, total, what)``.
-        cancelled: Called several times a second; True stops the task.
-        may_commit: Called before the artefact is committed; False stops the task.
+        cancelled: Called several times a second, and before the artefact is committed; True stops the task.
         preload: Modules that idle children load while the task runs.
         memory_mb: Memory limit (MB) of the task; None for four fifths of the machine's memory.
     """
@@ -66,7 +65,6 @@ class TaskEnvironment:
     logs: Path
     progress: Callable[[int, int, str], None]
     cancelled: Callable[[], bool]
-    may_commit: Callable[[], bool]
     preload: Preload = NOTHING_TO_LOAD
     memory_mb: int | None = None
 
@@ -235,7 +233,7 @@ class Children:
 def _answer(child: Child, message: dict[str, Any], environment: TaskEnvironment) -> None:
     """Answer the child's question before a commit, or report the child's progress."""
     if message["event"] == "ready":
-        child.order({"commit": environment.may_commit()})
+        child.order({"commit": not environment.cancelled()})
     elif message["event"] == "progress":
         environment.progress(message["done"], message["total"], message.get("what", ""))
 

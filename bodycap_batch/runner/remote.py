@@ -53,7 +53,6 @@ def run_order(
             logs=Path(order["logs"]),
             progress=progress,
             cancelled=cancelled,
-            may_commit=lambda: not cancelled(),
             memory_mb=order["memory_mb"],
         )
         _children_of(tuple(order["command"])).execute(task, environment)

@@ -31,11 +31,6 @@ class NotStored(StoreError):
         self.tasks = tuple(tasks)
 
 
-def always() -> bool:
-    """Return True: the default of `Rules.may_commit`, which permits every commit."""
-    return True
-
-
 def allow(task: Task) -> None:
     """Do nothing: the default of `Rules.before`, which allows every task."""
 
@@ -46,7 +41,6 @@ class Rules:
 
     Attributes:
         cancelled: Called several times a second; True stops the running tasks.
-        may_commit: Called before an artefact is committed; False stops the task that computed the artefact.
         before: Called before a task runs; may raise an error to forbid the task.
         compute: If False, only stored artefacts are returned; `NotStored` is raised for a missing artefact.
         redo: Names of the stages that are computed again even if their artefacts are stored.
@@ -54,7 +48,6 @@ class Rules:
     """
 
     cancelled: Callable[[], bool]
-    may_commit: Callable[[], bool] = always
     before: Callable[[Task], None] = allow
     compute: bool = True
     redo: frozenset[str] = frozenset()
@@ -128,7 +121,6 @@ class Runner:
                 task, "progress", done=done, total=total, what=what
             ),
             cancelled=self._rules.cancelled,
-            may_commit=self._rules.may_commit,
             preload=preload,
             memory_mb=self._rules.memory_mb,
         )

@@ -6,7 +6,7 @@ from bodycap_batch.watch.job_status import read_status
 from bodycap_batch.watch.spool import Spool, spool_from_path
 from bodycap_batch.watch.watch_options import WatchOptions
 from bodycap_batch.watch.watcher import Watcher
-from bodycap_batch.watch.watcher_status import active_watchers
+from bodycap_batch.watch.watcher_status import active_watcher
 
 __all__ = [
     "JobPermissions",
@@ -14,7 +14,7 @@ __all__ = [
     "Spool",
     "WatchOptions",
     "Watcher",
-    "active_watchers",
+    "active_watcher",
     "cancel_job",
     "job_rows",
     "read_status",

@@ -47,7 +47,7 @@ class AccessFailures:
     @property
     def text(self) -> str:
         """The current failure as text; "" if there is no failure."""
-        failure = self.current  # read only once: another thread may set `current` to None
+        failure = self.current  # read only once: the live page reads it in another thread
         return "" if failure is None else f"{failure.path}: {failure.message}"
 
     @property

@@ -17,11 +17,9 @@ from typing import Any
 from bodycap_batch.core.errors import Cancelled, JobError
 from bodycap_batch.store.artefacts import Store, disk_errors
 from bodycap_batch.store.references import moving
-from bodycap_batch.watch.claim import create_claim, remove_claim_files
 from bodycap_batch.watch.inbox_claim import (
     dropped_name,
     input_path,
-    move_to_running,
     path_exists,
     return_to_inbox,
 )
@@ -35,8 +33,7 @@ from bodycap_batch.watch.inbox_entries import (
     take_snapshot,
 )
 from bodycap_batch.watch.job_status import FINAL, JobStatusFile, read_status, utc_text
-from bodycap_batch.watch.ownership import read_owner
-from bodycap_batch.watch.process_identity import machine_id, process_start, process_tag
+from bodycap_batch.watch.process_identity import process_tag
 from bodycap_batch.watch.spool import (
     CLAIM_PREFIX,
     DONE,
@@ -48,6 +45,7 @@ from bodycap_batch.watch.spool import (
     move_to_free_name,
     visible_entries,
 )
+from bodycap_batch.watch.watcher_status import active_watcher
 
 _MAX_SNAPSHOT_FILES = 1000
 """Maximum number of files of a waiting entry that are inspected for the list of jobs. Evidence: none."""
@@ -97,7 +95,8 @@ class JobRow:
 
 def job_rows(spool: Spool) -> list[JobRow]:
     """Return a row for every job of a spool (waiting, running, done, failed) and every ignored path."""
-    claimed = [job_row(JobDir(path)) for path in visible_entries(spool.running) if path.is_dir()]
+    is_watched = active_watcher(spool) is not None
+    claimed = [job_row(JobDir(path), is_watched) for path in visible_entries(spool.running) if path.is_dir()]
     ended = [
         job_row(JobDir(path)) for folder in (spool.done, spool.failed) for path in visible_entries(folder)
     ]
@@ -146,7 +145,7 @@ def retry_job(spool: Spool, name: str) -> Path:
                 hint="put the videos into the inbox again",
             )
         dropped = dropped_name(job)
-        hidden = JobDir(spool.failed / f"{RETRY_PREFIX}{process_tag()}-{uuid.uuid4().hex}")
+        hidden = _hidden_folder(spool)
         with _keep_artefacts(job, hidden, spool) as keep_for:
             keep_for(spool.inbox / dropped)
             try:
@@ -245,9 +244,8 @@ def _cancel_waiting(spool: Spool, entry: InboxEntry) -> JobDir:
 
     Raise `FileNotFoundError` if another process has claimed the entry.
     """
-    job_dir = JobDir(spool.running / f"{CLAIM_PREFIX}{uuid.uuid4().hex}")
+    job_dir = _hidden_folder(spool)
     job_dir.path.mkdir()
-    claim = create_claim(job_dir)
     status = JobStatusFile(job_dir)
     status.update(kind="file" if entry.is_file else "folder", dropped=entry.path.name)
     if entry.is_file:
@@ -257,20 +255,19 @@ def _cancel_waiting(spool: Spool, entry: InboxEntry) -> JobDir:
     except FileNotFoundError:
         shutil.rmtree(job_dir.path)
         raise
-    move_to_running(spool, claim)
-    status.set_job_dir(claim.job)
+    name = spool.free_name(folder_name_from_text(entry.name))
     error = Cancelled(
-        "the job was cancelled before it started",
-        hint=f"run `bodycap retry {claim.job.name}` to start the job",
+        "the job was cancelled before it started", hint=f"run `bodycap retry {name}` to start the job"
     )
     target = move_to_free_name(
-        claim.job.path,
-        spool.failed,
-        claim.job.name,
-        lambda path: status.finish("cancelled", error, path, spool.inbox),
+        job_dir.path, spool.failed, name, lambda path: status.finish("cancelled", error, path, spool.inbox)
     )
-    remove_claim_files(JobDir(target))
     return JobDir(target)
+
+
+def _hidden_folder(spool: Spool) -> JobDir:
+    """Return a new folder for a job that this process moves. If it is killed, the watcher moves the job."""
+    return JobDir(spool.failed / f"{RETRY_PREFIX}{process_tag()}-{uuid.uuid4().hex}")
 
 
 def _waiting_row(entry: InboxEntry) -> JobRow:
@@ -291,11 +288,16 @@ def _waiting_row(entry: InboxEntry) -> JobRow:
     )
 
 
-def job_row(job: JobDir) -> JobRow:
-    """Return the row of a claimed job. The row is read from the job's files."""
+def job_row(job: JobDir, is_watched: bool = True) -> JobRow:
+    """Return the row of a claimed job. The row is read from the job's files.
+
+    Args:
+        job: The job's folder.
+        is_watched: True if a watcher runs.
+    """
     status = read_status(job)
     state = str(status.get("state") or _STATE_BY_FOLDER.get(job.path.parent.name, "claimed"))
-    if state == "running" and _is_watcher_gone(job):
+    if state == "running" and not is_watched:
         state = "interrupted"
     error = status.get("error") or {}
     since = (
@@ -322,15 +324,6 @@ def job_row(job: JobDir) -> JobRow:
         path=str(job.path),
         verdict=str(verdict.get("grade", "")),
         headline=str(verdict.get("headline", "")),
-    )
-
-
-def _is_watcher_gone(job: JobDir) -> bool:
-    """Return True if the job's watcher released the job, or was a process of this machine that has ended."""
-    owner = read_owner(job.owner)
-    is_local = bool(machine_id()) and owner.get("machine") == machine_id()
-    return bool(owner.get("released")) or (
-        is_local and process_start(int(owner.get("pid", 0))) != owner.get("process")
     )
 
 

@@ -13,7 +13,6 @@ from bodycap_batch.config.folder import JOB_FILES
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import BodycapError, StoreError
 from bodycap_batch.store.artefacts import store_error
-from bodycap_batch.watch.claim import Claim, create_claim
 from bodycap_batch.watch.dropped_job import JobPermissions, read_dropped_job, unread_job_files, write_job
 from bodycap_batch.watch.inbox_entries import YAML_SUFFIXES, EntrySnapshot, InboxEntry, take_snapshot
 from bodycap_batch.watch.job_status import JobStatusFile, read_status
@@ -33,12 +32,13 @@ _UNKNOWN_NAME = "job"
 
 def claim_entry(
     spool: Spool, entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
-) -> tuple[Claim, BodycapError | None] | None:
+) -> tuple[JobDir, BodycapError | None] | None:
     """Claim a complete entry of the inbox.
 
     First the job is read in the inbox and written to a hidden folder. Then the entry is renamed into that
-    folder. This rename is the claim, because only one of several watchers can succeed. Finally the hidden
-    folder gets its visible name in `running`.
+    folder. This rename is the claim: if the watcher is killed before it, the entry is still in the inbox; if
+    the watcher is killed after it, the next watcher runs the job. Finally the hidden folder gets its visible
+    name in `running`.
 
     Args:
         spool: The folders of the watcher.
@@ -47,8 +47,8 @@ def claim_entry(
         permissions: Which folders the job may read, and the maximum size of the job.
 
     Returns:
-        The claim, and the error that was found when the job was read (or None). The whole result is None if
-        another watcher was faster, or if the entry is still changing.
+        The job's folder, and the error that was found when the job was read (or None). The whole result is
+        None if the entry is gone, or if it is still changing.
 
     Raises:
         StoreError: The entry cannot be moved.
@@ -57,51 +57,41 @@ def claim_entry(
     try:
         spool.running.mkdir(exist_ok=True)  # a user may have removed the folder
         job_dir.path.mkdir()
-        claim = create_claim(job_dir)
         error = _write_job_files(job_dir, entry, snapshot, permissions)
         if not _move_entry(job_dir, entry, snapshot, permissions):
             shutil.rmtree(job_dir.path)
             return None
-        move_to_running(spool, claim)
+        return move_to_running(spool, job_dir), error
     except (OSError, StoreError) as failed:
-        with contextlib.suppress(OSError, StoreError):  # else a watcher takes the job over later
+        with contextlib.suppress(OSError, StoreError):  # else the watcher completes the claim later
             return_to_inbox(spool, job_dir)
         raise store_error(failed, entry.path) if isinstance(failed, OSError) else failed from failed
-    return claim, error
 
 
-def move_to_running(spool: Spool, claim: Claim) -> None:
-    """Give a claimed hidden folder its visible name in `running`."""
-    previous = read_status(claim.job, strict=True)
-    status = JobStatusFile(claim.job, previous)
-    dropped = dropped_name(claim.job)
-    is_file = input_path(claim.job) != claim.job.input
+def move_to_running(spool: Spool, job_dir: JobDir) -> JobDir:
+    """Give a claimed hidden folder its visible name in `running`, and return the renamed folder."""
+    previous = read_status(job_dir, strict=True)
+    status = JobStatusFile(job_dir, previous)
+    dropped = dropped_name(job_dir)
+    is_file = input_path(job_dir) != job_dir.input
     wanted = folder_name_from_text(Path(dropped).stem if is_file else dropped)
 
     def rename(target: Path) -> None:
         status.update(name=target.name)
 
-    claim.set_job_dir(
-        JobDir(move_to_free_name(claim.job.path, spool.running, spool.free_name(wanted), rename))
-    )
+    return JobDir(move_to_free_name(job_dir.path, spool.running, spool.free_name(wanted), rename))
 
 
-def remove_empty_claim(job_dir: JobDir) -> bool:
-    """Remove the hidden folder of a claim if no entry was moved into it.
+def finish_interrupted_claims(spool: Spool) -> None:
+    """Complete the claims of a watcher that was killed, or whose disk failed.
 
-    The folder is renamed before it is inspected. The watcher that created the folder may have been suspended.
-    If that watcher resumes now, it can no longer move an entry into the folder.
-
-    Returns:
-        True if the folder was removed, False if the folder holds an entry.
+    The hidden folder of a claim gets its visible name. If no entry was moved into it, it is removed.
     """
-    hidden = JobDir(job_dir.path.with_name(f"{CLAIM_PREFIX}{uuid.uuid4().hex}"))
-    os.rename(job_dir.path, hidden.path)
-    if path_exists(input_path(hidden)):
-        os.rename(hidden.path, job_dir.path)
-        return False
-    shutil.rmtree(hidden.path, ignore_errors=True)
-    return True
+    for path in sorted(spool.running.glob(f"{CLAIM_PREFIX}*")):
+        if path_exists(input_path(JobDir(path))):
+            move_to_running(spool, JobDir(path))
+        else:
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def path_exists(path: Path) -> bool:
@@ -155,28 +145,22 @@ def return_to_inbox(
         before_move: Function that is called with the target path just before the move.
 
     Returns:
-        The new path in the inbox. None if the job's folder holds no input, or if another process has already
-        moved the input.
+        The new path in the inbox; None if the job's folder holds no input.
     """
     dropped, target = input_path(job_dir), None
     if path_exists(dropped):
         name = dropped_name(job_dir)
         suffix = dropped.suffix if dropped != job_dir.input else ""
-        try:
-            target = move_to_free_name(dropped, spool.inbox, name, before_move, suffix=suffix)
-        except FileNotFoundError:
-            if path_exists(dropped):
-                raise
+        target = move_to_free_name(dropped, spool.inbox, name, before_move, suffix=suffix)
     shutil.rmtree(job_dir.path, ignore_errors=True)
     return target
 
 
 def finish_interrupted_retries(spool: Spool) -> None:
-    """Find jobs whose `retry` command was killed during the move, and move these jobs to the inbox."""
+    """Find jobs whose `retry` or `cancel` command was killed during the move, and move them to the inbox."""
     for path in sorted(spool.failed.glob(f"{RETRY_PREFIX}*")):
         if not is_process_running(path.name.removeprefix(RETRY_PREFIX)):
-            with contextlib.suppress(FileNotFoundError):  # another watcher is moving the job
-                return_to_inbox(spool, JobDir(path))
+            return_to_inbox(spool, JobDir(path))
 
 
 def _write_job_files(

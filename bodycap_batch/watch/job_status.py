@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from types import NoneType
@@ -50,18 +50,10 @@ class JobStatusFile:
     Args:
         job: The job's folder.
         previous: Content of an earlier `status.json` of the job, or None.
-        may_write: Function that is called before each write. It returns False once the job belongs to another
-            watcher.
     """
 
-    def __init__(
-        self,
-        job: JobDir,
-        previous: Mapping[str, Any] | None = None,
-        may_write: Callable[[], bool] = lambda: True,
-    ) -> None:
+    def __init__(self, job: JobDir, previous: Mapping[str, Any] | None = None) -> None:
         self._job = job
-        self._may_write = may_write
         self._lock = threading.Lock()
         self._written = 0.0
         self._failed = False
@@ -83,7 +75,6 @@ class JobStatusFile:
             "finished_at": None,
             "attempts": int(previous.get("attempts", 0)),
             "host": None,
-            "generation": None,
             "store": previous.get("store"),
             "exit_code": None,
             "error": None,
@@ -151,7 +142,7 @@ class JobStatusFile:
     def _write(self) -> None:
         self.document["updated_at"] = utc_text()
         self._written = time.monotonic()
-        if not self._job.path.is_dir() or not self._may_write():  # another watcher has the job
+        if not self._job.path.is_dir():  # a user deleted the job
             return
         temporary = self._job.path / f".status.{os.getpid()}.{threading.get_ident()}.part"
         with disk_errors(self._job.path):
@@ -162,8 +153,7 @@ class JobStatusFile:
         text = event.what if event.kind == "note" else f"{event.label}: {event.kind}"
         if event.kind == "finished":
             text += f" in {event.seconds:.1f} s"
-        if self._may_write():
-            append_log(self._job, text)
+        append_log(self._job, text)
 
 
 def append_log(job: JobDir, text: str) -> None:

@@ -17,8 +17,8 @@ from bodycap_batch.store.artefacts import disk_errors
 INBOX, RUNNING, DONE, FAILED = "inbox", "running", "done", "failed"
 _JOB_FOLDERS = (RUNNING, DONE, FAILED)
 CLAIM_PREFIX, RETRY_PREFIX = ".claim-", ".retry-"
-"""Name prefixes of the hidden folders of jobs that are being claimed (``.claim-``) or retried (``.retry-``).
-If the process that moves such a job is killed, a watcher completes the move."""
+"""Name prefixes of the hidden folders of jobs that a watcher is claiming (``.claim-``) or that a command is
+moving (``.retry-``). If the process that moves such a job is killed, the watcher completes the move."""
 _MAX_NAME_BYTES = 200
 """Maximum length (bytes) of a job's name. File systems usually permit 255 bytes. The remaining bytes
 are for a number and the suffixes of temporary files."""
@@ -56,11 +56,6 @@ class JobDir:
     def status(self) -> Path:
         """File with the state of the job, for other programs."""
         return self.path / "status.json"
-
-    @property
-    def owner(self) -> Path:
-        """File that identifies the watcher that runs the job."""
-        return self.path / "owner.json"
 
     @property
     def cancel(self) -> Path:

@@ -9,12 +9,6 @@ from pathlib import Path
 from bodycap_batch.runner import CHILD_COMMAND
 from bodycap_batch.watch.dropped_job import JobPermissions
 
-_MAX_HEARTBEAT_S = 5.0
-"""Maximum time (seconds) between two heartbeats. Evidence: none."""
-_HEARTBEATS_PER_TIMEOUT = 4
-"""Minimum number of heartbeats within `stale_s`. With several heartbeats, one late heartbeat does not make a
-job look abandoned. Evidence: none."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WatchOptions:
@@ -27,7 +21,8 @@ class WatchOptions:
         threads: Number of processor cores that all running jobs share.
         memory_mb: Memory limit (MB) of one task; None for four fifths of the machine's memory.
         unchanged_s: Time (seconds) for which an entry must not change before it is treated as complete.
-        stale_s: Time (seconds) without a heartbeat after which another watcher's job is taken over.
+        retry_s: Time (seconds) until a job or an entry that a disk failure stopped is tried again. With
+            `once`, also the maximum time for which the watcher waits for a missing disk.
         poll: True: poll the inbox for changes (network disks need this). False: do not poll. None: poll only
             if the inbox is on a network disk.
         once: True: stop when nothing is left to do.
@@ -40,12 +35,7 @@ class WatchOptions:
     threads: int = 1
     memory_mb: int | None = None
     unchanged_s: float = 10.0
-    stale_s: float = 60.0
+    retry_s: float = 60.0
     poll: bool | None = None
     once: bool = False
     command: Sequence[str] = CHILD_COMMAND
-
-    @property
-    def heartbeat_period_s(self) -> float:
-        """Time (seconds) between two heartbeats."""
-        return min(_MAX_HEARTBEAT_S, self.stale_s / _HEARTBEATS_PER_TIMEOUT)

@@ -1,4 +1,4 @@
-"""Watch a folder: claim complete jobs, run them, and take over abandoned jobs."""
+"""Watch a folder: claim complete jobs, run them, and continue jobs that were stopped."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from pathlib import Path
 from bodycap_batch.core.errors import BodycapError, StoreError, one_line
 from bodycap_batch.watch.access_failures import AccessFailures
 from bodycap_batch.watch.change_notifier import ChangeNotifier
-from bodycap_batch.watch.claim import Claim, HeartbeatMonitor, take_over_job
 from bodycap_batch.watch.inbox_claim import (
     claim_entry,
+    finish_interrupted_claims,
     finish_interrupted_retries,
-    move_to_running,
-    remove_empty_claim,
+    path_exists,
 )
 from bodycap_batch.watch.inbox_entries import (
     NOT_A_JOB,
@@ -28,26 +27,26 @@ from bodycap_batch.watch.inbox_entries import (
     ignored_paths_in,
 )
 from bodycap_batch.watch.job_worker import JobOutcome, JobWorker
-from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir, Spool, visible_entries
+from bodycap_batch.watch.spool import JobDir, Spool, visible_entries
 from bodycap_batch.watch.watch_options import WatchOptions
 from bodycap_batch.watch.watcher_status import WatcherStatusFile
 
 MessageSink = Callable[[str], None]
 _BUSY_POLL_S = 1.0
-"""Time (seconds) between two scans of the inbox while a job runs, an entry is in the inbox, or jobs of other
-watchers may have to be taken over. Evidence: none."""
+"""Time (seconds) between two scans of the inbox while a job runs, an entry is in the inbox, or a stopped job
+continues. Evidence: none."""
 _IDLE_POLL_S = 5.0
-"""Time (seconds) between two scans while no job runs, the inbox is empty, and no jobs are left to take over.
-The scans find changes that the system does not report. Evidence: none."""
+"""Time (seconds) between two scans while no job runs, the inbox is empty, and no job is stopped. The
+scans find changes that the system does not report. Evidence: none."""
 _SCAN_PAUSE_FACTOR = 20.0
 """Minimum ratio of the time between two scans to the duration of a scan. With a ratio of 20, scans take at
 most 5 % of the time. A scan of a thousand large folders on a slow disk takes several seconds."""
-_TAKEOVER_PERIOD_S = 2.0
-"""Minimum time (seconds) between two searches for abandoned jobs. Evidence: none."""
+_CONTINUE_PERIOD_S = 2.0
+"""Minimum time (seconds) between two searches for stopped jobs. Evidence: none."""
 
 
 class Watcher:
-    """One process that runs the jobs of a spool. Several processes may work on the same spool.
+    """The process that runs the jobs of a spool. A lock keeps a second watcher out.
 
     Args:
         spool: The folders of the watcher.
@@ -59,11 +58,13 @@ class Watcher:
         access_failures: Tracker of failures to access the folders.
 
     Raises:
-        StoreError: A folder cannot be created or written, or the folders are on different file systems.
+        StoreError: A folder cannot be created or written, the folders are on different file systems, or
+            another watcher works on them.
     """
 
     def __init__(self, spool: Spool, options: WatchOptions, write_line: MessageSink) -> None:
         spool.make()
+        self._status_file = WatcherStatusFile(spool)
         self.access_failures = AccessFailures(spool, write_line)
         self.spool = spool
         self._options = options
@@ -71,18 +72,18 @@ class Watcher:
         self._stop = threading.Event()
         self._woken = threading.Event()
         self._tracker = CompletionTracker(options.unchanged_s, int(options.permissions.limits.files))
-        self._heartbeat_monitor = HeartbeatMonitor(options.stale_s)
         self._worker = JobWorker(spool, options, self._stop)
-        self._running: dict[Future[JobOutcome], Claim] = {}
+        self._running: dict[Future[JobOutcome], JobDir] = {}
+        self._stuck_until: dict[str, float] = {}
         self._unmovable: dict[str, tuple[str, float]] = {}
         self._reported: dict[Path, str] = {}
         self._complete: collections.deque[tuple[InboxEntry, EntrySnapshot]] = collections.deque()
-        self._retry_failure_reported = False
+        self._reported_once: set[str] = set()
         self._last_reports: dict[str, str] = {}
         self._has_waiting = False
-        self._has_left_jobs = False
+        self._has_stopped_jobs = False
         self._next_scan_at = 0.0
-        self._next_takeover_at = 0.0
+        self._next_continue_at = 0.0
         self._worst_exit_code = 0
 
     def stop(self) -> None:
@@ -97,30 +98,31 @@ class Watcher:
         """Watch until `stop` is called. With the option `once`, also end when nothing is left to do.
 
         The watcher waits for a missing disk, with growing pauses between its attempts. With `once`, it waits
-        for at most `stale_s` seconds. A job without a heartbeat is taken over after the same time.
+        for at most `retry_s` seconds.
 
         Returns:
             The highest exit code of the jobs that ended and of the watcher's own disk failures.
         """
-        heartbeat = threading.Thread(target=self._write_heartbeats, name="heartbeat")
         with (
             ChangeNotifier(
                 self.spool.inbox, self._woken, poll=self._options.poll, write_line=self._write_line
             ),
             ThreadPoolExecutor(max_workers=self._options.jobs, thread_name_prefix="job") as pool,
         ):
-            heartbeat.start()
             try:
+                self._status_file.write("")
                 while not self._stop.is_set():
                     self._collect()
-                    if (pause_s := self._step(pool)) is None:
+                    pause_s = self._step(pool)
+                    self._status_file.write(self.access_failures.text)
+                    if pause_s is None:
                         break
                     self._woken.wait(pause_s)
                     self._woken.clear()  # no stop is lost: `stop` sets `_stop` before `_woken`
             finally:
                 self._stop.set()
-                heartbeat.join()
         self._collect()
+        self._status_file.remove()
         return self._worst_exit_code
 
     def _step(self, pool: ThreadPoolExecutor) -> float | None:
@@ -131,7 +133,7 @@ class Watcher:
                 self._report_left_entries()
         except (OSError, StoreError) as error:
             pause_s = self.access_failures.record(error)
-            if not self._options.once or self.access_failures.duration_s < self._options.stale_s:
+            if not self._options.once or self.access_failures.duration_s < self._options.retry_s:
                 return pause_s
             self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
             return None
@@ -140,18 +142,26 @@ class Watcher:
             return None
         return (
             _BUSY_POLL_S
-            if self._tracker.is_tracking or self._running or self._has_left_jobs
+            if self._tracker.is_tracking or self._running or self._has_stopped_jobs
             else _IDLE_POLL_S
         )
 
-    def _finish_retries(self) -> None:
-        try:
-            finish_interrupted_retries(self.spool)
-        except (OSError, StoreError) as error:
-            if not self._retry_failure_reported:
-                where = f"an interrupted retry in {self.spool.failed}"
-                self._write_line(f"{where} cannot be completed: {one_line(error)}")
-            self._retry_failure_reported = True
+    def _finish_moves(self) -> None:
+        """Complete the moves of commands and watchers that were killed. Report a failure once."""
+        for finish, folder in (
+            (finish_interrupted_retries, self.spool.failed),
+            (finish_interrupted_claims, self.spool.running),
+        ):
+            try:
+                finish(self.spool)
+            except (OSError, StoreError) as error:
+                self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
+                self._report_once(f"an interrupted move in {folder} cannot be completed: {one_line(error)}")
+
+    def _report_once(self, line: str) -> None:
+        if line not in self._reported_once:
+            self._reported_once.add(line)
+            self._write_line(line)
 
     def _report_left_entries(self) -> None:
         """Report for each path that stays in the inbox why it is not processed."""
@@ -160,22 +170,15 @@ class Watcher:
         for path in ignored_paths_in(self.spool.inbox):
             self._write_line(f"{path.name} stays in the inbox: {NOT_A_JOB}")
 
-    def _write_heartbeats(self) -> None:
-        status_file = WatcherStatusFile(self.spool)
-        status_file.write(self.access_failures.text)
-        while not self._stop.wait(self._options.heartbeat_period_s):
-            status_file.write(self.access_failures.text)
-            for claim in list(self._running.values()):
-                claim.write_heartbeat()
-        status_file.remove()
-
     def _collect(self) -> None:
         """Report the jobs that have ended."""
         for future in [future for future in self._running if future.done()]:
-            del self._running[future]
+            job_dir = self._running.pop(future)
             outcome = future.result()
-            self._has_left_jobs |= outcome.state == "stopped"
-            if outcome.state not in ("lost", "stopped"):
+            if outcome.state == "stuck":
+                self._stuck_until[job_dir.name] = time.monotonic() + self._options.retry_s
+            self._has_stopped_jobs |= outcome.state == "stopped"
+            if outcome.state != "stopped":
                 self._worst_exit_code = max(self._worst_exit_code, outcome.exit_code)
             self._report_end(outcome)
 
@@ -194,15 +197,15 @@ class Watcher:
     def _fill(self, pool: ThreadPoolExecutor) -> bool:
         """Start jobs up to the maximum number. Return False if no job runs and no job is expected."""
         free = self._options.jobs - len(self._running)
-        for claim in self._take_over_abandoned(free):
-            self._start(pool, claim, None)
+        for job_dir in self._stopped_jobs(free):
+            self._start(pool, job_dir, None)
             free -= 1
         self._scan_inbox()
         while free > 0 and self._complete:
             if (claimed := self._try_claim(*self._complete.popleft())) is not None:
                 self._start(pool, *claimed)
                 free -= 1
-        return bool(self._running or self._complete or self._has_waiting or self._has_left_jobs)
+        return bool(self._running or self._complete or self._has_waiting or self._has_stopped_jobs)
 
     def _scan_inbox(self) -> None:
         """Scan the inbox if enough time has passed since the last scan (see `_SCAN_PAUSE_FACTOR`)."""
@@ -237,19 +240,19 @@ class Watcher:
                 self._write_line(f"{path.name} waits: {reason}")
         self._reported = found
 
-    def _start(self, pool: ThreadPoolExecutor, claim: Claim, read_error: BodycapError | None) -> None:
-        if read_error is None and claim.job.name not in self._last_reports:
-            self._write_line(f"{claim.job.name}: started")
-        future = pool.submit(self._worker.process, claim, read_error)
-        self._running[future] = claim
+    def _start(self, pool: ThreadPoolExecutor, job_dir: JobDir, read_error: BodycapError | None) -> None:
+        if read_error is None and job_dir.name not in self._last_reports:
+            self._write_line(f"{job_dir.name}: started")
+        future = pool.submit(self._worker.process, job_dir, read_error)
+        self._running[future] = job_dir
         future.add_done_callback(lambda _: self._woken.set())
 
     def _try_claim(
         self, entry: InboxEntry, snapshot: EntrySnapshot
-    ) -> tuple[Claim, BodycapError | None] | None:
+    ) -> tuple[JobDir, BodycapError | None] | None:
         """Claim an entry. Return None if it cannot be claimed.
 
-        If the entry cannot be moved, report this once, and try again after `stale_s` seconds or when the
+        If the entry cannot be moved, report this once, and try again after `retry_s` seconds or when the
         entry changes.
         """
         digest, until = self._unmovable.get(str(entry.path), ("", 0.0))
@@ -258,47 +261,31 @@ class Watcher:
         try:
             return claim_entry(self.spool, entry, snapshot, self._options.permissions)
         except StoreError as error:
-            self._unmovable[str(entry.path)] = (snapshot.digest, time.monotonic() + self._options.stale_s)
+            self._unmovable[str(entry.path)] = (snapshot.digest, time.monotonic() + self._options.retry_s)
             self._worst_exit_code = max(self._worst_exit_code, error.exit_code)
             if digest != snapshot.digest:
                 self._write_line(f"{entry.name}: cannot be moved out of the inbox: {error.one_line}")
             return None
 
-    def _take_over_abandoned(self, max_jobs: int) -> list[Claim]:
-        """Take over at most `max_jobs` jobs that other watchers abandoned."""
-        now = time.monotonic()
-        if max_jobs <= 0 or now < self._next_takeover_at:
-            return []
-        own_jobs = {claim.job.path for claim in self._running.values()}
-        unfinished_claims = [JobDir(path) for path in sorted(self.spool.running.glob(f"{CLAIM_PREFIX}*"))]
-        jobs = [
-            *unfinished_claims,
-            *(JobDir(path) for path in visible_entries(self.spool.running) if path.is_dir()),
-        ]
-        self._finish_retries()
-        self._next_takeover_at = now + _TAKEOVER_PERIOD_S
-        found: list[Claim] = []
-        for job in self._heartbeat_monitor.find_abandoned([job for job in jobs if job.path not in own_jobs]):
-            if len(found) < max_jobs and (claim := self._take_over(job)) is not None:
-                found.append(claim)
-        self._has_left_jobs = bool(found)  # more abandoned jobs may be left
-        return found
+    def _stopped_jobs(self, max_jobs: int) -> list[JobDir]:
+        """Return at most `max_jobs` jobs in `running` that nobody runs and that may continue now.
 
-    def _take_over(self, job: JobDir) -> Claim | None:
-        """Take a job over. Return None if there is nothing to run, or if another watcher was faster.
-
-        If the disk fails, also return None. The next attempt follows when the claim is stale again, that is,
-        after `stale_s` seconds without a heartbeat.
+        No other watcher works on the spool, so these jobs were left by an earlier watcher, or stopped.
         """
-        try:
-            claim = take_over_job(job)
-            if claim is None or not job.path.name.startswith(CLAIM_PREFIX):
-                return claim
-            if remove_empty_claim(job):  # the claiming watcher ended before it moved the entry
-                return None
-            move_to_running(self.spool, claim)
-        except (StoreError, OSError) as error:
-            self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
-            self._write_line(f"{job.name}: cannot be taken over: {one_line(error)}")
-            return None
-        return claim
+        now = time.monotonic()
+        if max_jobs <= 0 or now < self._next_continue_at:
+            return []
+        self._finish_moves()
+        own_jobs = {job_dir.path for job_dir in self._running.values()}
+        found = []
+        paths = visible_entries(self.spool.running)
+        self._next_continue_at = now + _CONTINUE_PERIOD_S
+        for path in paths:
+            if not path.is_dir() or path in own_jobs or self._stuck_until.get(path.name, now) > now:
+                continue
+            if path_exists(JobDir(path).input):
+                found.append(JobDir(path))
+            else:
+                self._report_once(f"{path.name} stays in {self.spool.running}: the videos no longer exist")
+        self._has_stopped_jobs = bool(found)  # more stopped jobs may be left
+        return found[:max_jobs]

@@ -1,25 +1,31 @@
-"""Show which watchers run, and which of them cannot access their folders.
+"""Let one watcher at a time work on a spool, and show other processes that it runs.
 
-Each watcher writes a small file in `running`. `bodycap status` reads these files.
+The watcher holds a lock, which the system releases if the watcher is killed. It also writes a small file, so
+that `bodycap status` can show since when it runs and whether it can access its folders.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import socket
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
+from bodycap_batch.core.errors import StoreError
+from bodycap_batch.store.artefacts import disk_errors
 from bodycap_batch.store.checked_json import checked_json, parse_checked_json
 from bodycap_batch.store.digests import write_atomically
 from bodycap_batch.watch.job_status import utc_text
 from bodycap_batch.watch.process_identity import is_from_this_machine, is_process_running, process_tag
 from bodycap_batch.watch.spool import Spool
 
-_PREFIX, _SUFFIX = ".watcher-", ".json"
+_LOCK, _STATUS = ".watcher.lock", ".watcher.json"
+"""Names of the lock file and of the status file in the parent folder of `running`."""
+_WRITE_PERIOD_S = 5.0
+"""Time (seconds) between two writes of the status file while nothing changes. Evidence: none."""
 _MAX_SILENCE_S = 86_400.0
 """Maximum age (seconds) of the status file of a watcher on another machine: one day. A watcher with an older
 file is not listed, because this machine cannot check whether that watcher still runs."""
@@ -55,83 +61,80 @@ class WatcherStatus:
 
 
 class WatcherStatusFile:
-    """Write the status file of this watcher, so that other processes can see that the watcher runs.
-
-    Write errors are ignored. Their cause may be the disk failure that the file should report.
+    """Hold the lock of a spool for this watcher, and write the watcher's status file.
 
     Args:
         spool: The folders of the watcher.
+
+    Raises:
+        StoreError: Another watcher works on the spool.
     """
 
     def __init__(self, spool: Spool) -> None:
-        self._path = spool.running / f"{_PREFIX}{process_tag()}-{id(self):x}{_SUFFIX}"
+        self._path = spool.root / _STATUS
         self._since = utc_text()
+        self._written: str | None = None
+        self._write_again_at = 0.0
+        with disk_errors(spool.root):
+            self._lock = (spool.root / _LOCK).open("ab")
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                self._lock.close()
+                found = active_watcher(spool)
+                raise StoreError(
+                    "another watcher works on this folder" if found is None else f"this folder is {found}",
+                    path=spool.root,
+                    hint="stop that watcher, or watch another folder; one watcher can run several jobs "
+                    "(`--jobs`), and `bodycap batch` can use several machines",
+                ) from None
 
     def write(self, trouble: str) -> None:
-        """Record that the watcher runs, and why it cannot access its folders ("" if it can access them)."""
+        """Record that the watcher runs, and why it cannot access its folders ("" if it can access them).
+
+        Write errors are ignored. Their cause may be the disk failure that the file should report.
+        """
+        now = time.monotonic()
+        if self._written == trouble and now < self._write_again_at:
+            return
         document = {
             "host": socket.gethostname(),
             "pid": os.getpid(),
+            "process": process_tag(),
             "since": self._since,
             "seen": utc_text(),
             "trouble": trouble,
         }
         with contextlib.suppress(OSError):
             write_atomically(self._path, checked_json(document).encode())
+            self._written, self._write_again_at = trouble, now + _WRITE_PERIOD_S
 
     def remove(self) -> None:
-        """Remove the file of this watcher, and the files of watchers that are no longer active."""
+        """Remove the status file, and release the lock."""
         with contextlib.suppress(OSError):
             self._path.unlink(missing_ok=True)
-            for path in self._path.parent.glob(f"{_PREFIX}*{_SUFFIX}"):
-                if _is_abandoned(path):
-                    path.unlink(missing_ok=True)
+        self._lock.close()
 
 
-def active_watchers(spool: Spool) -> list[WatcherStatus]:
-    """Return the running watchers of a spool.
+def active_watcher(spool: Spool) -> WatcherStatus | None:
+    """Return the running watcher of a spool; None if there is none, or if its file is damaged.
 
     A watcher of another machine is treated as running if its file was updated within the last
     `_MAX_SILENCE_S` seconds.
     """
-    paths = sorted(spool.running.glob(f"{_PREFIX}*{_SUFFIX}"))
-    found = (_read_watcher_status(path) for path in paths if not _is_abandoned(path))
-    return [watching for watching in found if watching is not None]
-
-
-def _is_abandoned(path: Path) -> bool:
-    """Return True if the watcher of a status file has ended, or has not updated the file for too long."""
-    tag = path.name.removeprefix(_PREFIX)
-    if is_from_this_machine(tag):
-        return not is_process_running(tag)
+    path = spool.root / _STATUS
     try:
-        return time.time() - path.stat().st_mtime > _MAX_SILENCE_S
-    except OSError:
-        return False
-
-
-def _read_watcher_status(path: Path) -> WatcherStatus | None:
-    """Return the content of a watcher's file.
-
-    If the file is damaged, return what the file's name states. Return None if the file cannot be read, or if
-    its name is not that of a watcher's file.
-    """
-    here = is_from_this_machine(path.name.removeprefix(_PREFIX))
-    try:
-        data = path.read_bytes()
-    except OSError:
-        return None
-    try:
-        found = parse_checked_json(data)
-        return WatcherStatus(
+        found = parse_checked_json(path.read_bytes())
+        process = str(found["process"])
+        here = is_from_this_machine(process)
+        age_s = time.time() - path.stat().st_mtime
+        status = WatcherStatus(
             host=str(found["host"]),
             pid=int(found["pid"]),
             since=str(found["since"]),
             seen="" if here else str(found["seen"]),
             trouble=str(found["trouble"]),
         )
-    except (ValueError, KeyError, TypeError):
-        process = "".join(path.name.removeprefix(_PREFIX).split("-")[1:2])
-        host = socket.gethostname() if here else "another machine"
-        known = process.isdecimal()
-        return WatcherStatus(host=host, pid=int(process), since="an unknown time") if known else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return status if (is_process_running(process) if here else age_s <= _MAX_SILENCE_S) else None

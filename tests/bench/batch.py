@@ -134,6 +134,5 @@ def _make(executor: Executor, store: Store, folder: Path, value: str) -> None:
         logs=folder / "logs",
         progress=lambda done, total, what: None,
         cancelled=lambda: False,
-        may_commit=lambda: True,
     )
     executor.execute(Task(key=key, arguments={"value": value}), environment)

@@ -72,11 +72,6 @@ class SpoolFixture:
     def status(self, name: str) -> dict[str, Any]:
         return dict(json.loads(self.job(name).status.read_text()))
 
-    def generation(self, name: str) -> int:
-        """Return how often a running job has been claimed."""
-        found = self.spool.find(name)
-        return 0 if found is None else len(list(found.path.glob(".generation-*")))
-
     def start(self, *arguments: str) -> subprocess.Popen[str]:
         """Start the command with stand-in stages in a process of its own."""
         environment = {**os.environ, "PYTHONPATH": str(ROOT), ORDERS: str(self.orders)}

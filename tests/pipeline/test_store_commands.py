@@ -95,29 +95,6 @@ def test_until_a_stage_before_the_last_no_result_is_touched(done: Bench, stage: 
     assert done.results() != before
 
 
-def test_a_job_taken_over_publishes_nothing(done: Bench) -> None:
-    before = done.results()
-    with pytest.raises(Cancelled, match="another process runs it now"):
-        run_job(
-            done.job(map={"features": 1024}),
-            out_dir=done.out,
-            settings=settings(done, may_commit=lambda: False),
-        )
-    assert done.results() == before
-
-
-def test_a_job_is_taken_over_while_it_runs(bench: Bench) -> None:
-    def until_the_map() -> bool:
-        return not any(event.stage == "map" for event in bench.events)
-
-    with pytest.raises(Cancelled, match="another process runs it now"):
-        executed(bench, may_commit=until_the_map)
-    stored = {name.split("/")[0] for name in artefacts(bench)}
-    # The sound is compared beside the other stages, so it is stored only if it ends before the map starts.
-    assert stored - {"sound"} == {"check", "keyframes"}
-    assert bench.results() == {}
-
-
 def test_why_a_finished_job_would_do_nothing(done: Bench) -> None:
     assert steps(done) == dict.fromkeys(ALL, "")
 

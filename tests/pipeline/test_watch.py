@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import threading
 import time
 from pathlib import Path
@@ -18,15 +19,20 @@ import yaml
 from bodycap_batch.cli import main
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.core.errors import CaptureError, JobError, StoreError
-from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.garbage_collection import collect_garbage
-from bodycap_batch.watch import JobPermissions, cancel_job, inbox_claim, inbox_entries, job_rows, retry_job
-from bodycap_batch.watch.claim import Claim, create_claim, take_over_job
+from bodycap_batch.watch import (
+    JobPermissions,
+    cancel_job,
+    inbox_claim,
+    inbox_entries,
+    job_rows,
+    job_worker,
+    retry_job,
+)
 from bodycap_batch.watch.commands import job_row
 from bodycap_batch.watch.inbox_entries import EntrySnapshot, InboxEntry, take_snapshot
 from bodycap_batch.watch.job_status import JobStatusFile
-from bodycap_batch.watch.ownership import read_owner
 from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir
 from tests.pipeline.spools import SpoolFixture, remove_in_use, wait_for
 from tests.pipeline.test_watch_disk import running
@@ -245,15 +251,23 @@ def test_a_job_waits_while_the_store_is_cleaned(bench: SpoolFixture) -> None:
 
 
 @pytest.mark.slow
-def test_waiting_for_gc_is_reported_once(bench: SpoolFixture) -> None:
+def test_waiting_for_gc_is_reported_once(bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.drop("walk")
     watcher = bench.watcher(once=False)
     thread = threading.Thread(target=watcher.run)
+    attempts: list[object] = []
+    process = job_worker.JobWorker.process
+
+    def counted(*arguments: object) -> object:
+        attempts.append(arguments)
+        return process(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(job_worker.JobWorker, "process", counted)
     with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
         fcntl.flock(cleaning, fcntl.LOCK_EX)
         thread.start()
         try:
-            wait_for(lambda: bool(bench.lines) and bench.generation("walk") > 2)
+            wait_for(lambda: len(attempts) > 2)
             lines = list(bench.lines)
         finally:
             watcher.stop()
@@ -267,8 +281,7 @@ def test_a_watcher_with_once_leaves_no_job_behind(bench: SpoolFixture) -> None:
         bench.drop(name)
     bench.run_once()
     for name in ("one", "two"):
-        job_dir = JobDir(Path(shutil.move(bench.job(name).path, bench.spool.running / name)))
-        create_claim(job_dir).release()
+        shutil.move(bench.job(name).path, bench.spool.running / name)
     bench.drop("walk")
     with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
         fcntl.flock(cleaning, fcntl.LOCK_EX)
@@ -294,7 +307,7 @@ def test_removed_folders_are_created_again(bench: SpoolFixture) -> None:
 @pytest.mark.slow
 def test_a_job_that_cannot_be_filed_is_reported_and_filed_later(bench: SpoolFixture) -> None:
     bench.drop("walk")
-    watcher = bench.watcher(stale_s=1.0, once=False)
+    watcher = bench.watcher(retry_s=1.0, once=False)
     bench.spool.done.rmdir()
     bench.spool.done.write_text("a file where a folder should be")
     thread = threading.Thread(target=watcher.run)
@@ -311,7 +324,7 @@ def test_a_job_that_cannot_be_filed_is_reported_and_filed_later(bench: SpoolFixt
 
 def test_an_entry_that_cannot_be_moved_is_reported_once_and_tried_again(bench: SpoolFixture) -> None:
     bench.drop("walk")
-    watcher = bench.watcher(stale_s=1.0, once=False)
+    watcher = bench.watcher(retry_s=1.0, once=False)
     shutil.rmtree(bench.spool.running)
     bench.spool.running.write_text("a file where a folder should be")
     thread = threading.Thread(target=watcher.run)
@@ -349,7 +362,6 @@ def test_an_abandoned_claim_is_removed_only_if_it_is_empty(bench: SpoolFixture) 
     for name, dropped in (("empty", False), ("full", True)):
         job_dir = JobDir(bench.spool.running / f"{CLAIM_PREFIX}{name}")
         job_dir.path.mkdir()
-        create_claim(job_dir).release()
         if dropped:
             bench.drop("walk").rename(job_dir.input)
             JobStatusFile(job_dir).update(dropped="walk")
@@ -362,19 +374,41 @@ def test_an_abandoned_claim_is_removed_only_if_it_is_empty(bench: SpoolFixture) 
     assert leftovers(bench) == []
 
 
-def test_a_job_that_cannot_be_taken_over_stops_no_watcher(
+def test_a_claim_that_cannot_be_completed_stops_no_watcher(
     bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    create_claim(JobDir(bench.drop("left").rename(bench.spool.running / "left"))).release()
     bench.drop("walk")
 
-    def fail(*_: object) -> Claim:
+    def fail(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("bodycap_batch.watch.watcher.take_over_job", fail)
+    monkeypatch.setattr("bodycap_batch.watch.watcher.finish_interrupted_claims", fail)
     assert bench.run_once() == StoreError.exit_code
     assert bench.status("walk")["state"] == "done"
-    assert any(line.startswith("left: cannot be taken over") for line in bench.lines)
+    start = f"an interrupted move in {bench.spool.running} cannot be completed: "
+    assert sum(line.startswith(start) for line in bench.lines) == 1
+
+
+def test_only_one_watcher_works_on_a_folder(bench: SpoolFixture) -> None:
+    watcher = bench.watcher(once=False)
+    with running(watcher):
+        wait_for((bench.spool.root / ".watcher.json").is_file)
+        process = bench.start("watch", "jobs/inbox", "--once")
+        _, err = process.communicate(timeout=30)
+    assert process.returncode == StoreError.exit_code
+    assert f"this folder is watched by {socket.gethostname()} (process {os.getpid()})" in err
+    assert "hint: stop that watcher" in err
+    assert bench.run_once() == 0, "the first watcher has ended"
+
+
+def test_a_folder_in_running_that_is_not_a_job_keeps_its_files(bench: SpoolFixture) -> None:
+    own = bench.spool.running / "mine"
+    own.mkdir()
+    (own / "notes.txt").write_text("keep")
+    bench.drop("walk")
+    assert bench.run_once() == 0
+    assert (own / "notes.txt").read_text() == "keep"
+    assert sum(line.startswith("mine stays in") for line in bench.lines) == 1
 
 
 def test_paths_that_are_not_jobs_stay_in_the_inbox_and_are_listed(bench: SpoolFixture) -> None:
@@ -519,7 +553,7 @@ def test_the_next_watcher_continues_the_job_of_a_stopped_one(
 
 
 @pytest.mark.slow
-def test_a_killed_watcher_is_replaced_at_once_on_the_same_machine(bench: SpoolFixture) -> None:
+def test_a_killed_watcher_is_replaced_at_once(bench: SpoolFixture) -> None:
     bench.drop("walk")
     bench.order(hang="map")
     process = bench.start("watch", "jobs/inbox", "--threads", "1")
@@ -529,7 +563,7 @@ def test_a_killed_watcher_is_replaced_at_once_on_the_same_machine(bench: SpoolFi
     (row,) = job_rows(bench.spool)
     assert row.state == "interrupted"
     bench.order()
-    assert bench.run_once(stale_s=1000.0) == 0
+    assert bench.run_once(retry_s=1000.0) == 0
     assert bench.job("walk").path.parent == bench.spool.done
 
 
@@ -577,65 +611,17 @@ def test_a_waiting_job_can_be_cancelled(bench: SpoolFixture) -> None:
             action(bench.spool, "walk")
 
 
-@pytest.mark.slow
-def test_two_watchers_share_the_work_and_never_a_job(bench: SpoolFixture) -> None:
-    names = [f"walk {number}" for number in range(6)]
-    for name in names:
-        bench.drop(name)
-    watchers = [bench.watcher() for _ in range(3)]
-    threads = [threading.Thread(target=watcher.run) for watcher in watchers]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(120)
-    assert sorted(job.name for job in bench.spool.jobs()) == sorted(names)
-    assert all((bench.spool.done / name / "result" / "metrics.json").is_file() for name in names)
-    assert all(bench.status(name)["attempts"] == 1 for name in names)
-    assert leftovers(bench) == []
-
-
-@pytest.mark.slow
-def test_a_suspended_watcher_gives_up_a_lost_job_when_it_resumes(bench: SpoolFixture) -> None:
-    bench.drop("walk")
-    bench.order(hang="map")
-    process = bench.start("watch", "jobs/inbox", "--threads", "1")
-    child = bench.wait_until_hanging()
-    process.send_signal(signal.SIGSTOP)
-    bench.order()
-    try:
-        # As seen from another machine, which sees only that the heartbeat has stopped.
-        owner = bench.job("walk").owner
-        owner.write_text(json.dumps({**read_owner(owner), "machine": "elsewhere"}))
-        watcher = bench.watcher(stale_s=1.0, once=False)
-        thread = threading.Thread(target=watcher.run)
-        thread.start()
-        wait_for((bench.spool.done / "walk").is_dir)
-        watcher.stop()
-        thread.join()
-        assert bench.status("walk")["generation"] == 2
-        before = {path: path.stat().st_mtime_ns for path in bench.spool.done.rglob("*")}
-    finally:
-        process.send_signal(signal.SIGCONT)
-    wait_for(lambda: gone(child))
-    process.terminate()
-    _, err = process.communicate(timeout=30)
-    assert "another watcher runs this job now" in err
-    assert {path: path.stat().st_mtime_ns for path in bench.spool.done.rglob("*")} == before
-    assert leftovers(bench) == []
-
-
 @pytest.mark.parametrize("how", ["all", "all but the logs"])
 def test_a_deleted_running_job_is_reported_as_deleted(bench: SpoolFixture, how: str) -> None:
     bench.drop("walk")
     bench.order(hang="map")
-    with running(bench.watcher(once=False, stale_s=1.0)):
+    with running(bench.watcher(once=False, retry_s=1.0)):
         bench.wait_until_hanging()
         remove_in_use(bench.spool.running / "walk")
         if how == "all but the logs":  # as the start of the next stage does
             (bench.spool.running / "walk" / "result" / "logs").mkdir(parents=True)
         wait_for(lambda: any("walk: deleted" in line for line in bench.lines))
     assert bench.lines.count("walk: deleted: its folder was deleted from running/") == 1
-    assert not any("another watcher" in line for line in bench.lines)
     assert leftovers(bench) == []
     assert [row.name for row in job_rows(bench.spool)] == []
 
@@ -670,43 +656,6 @@ def test_a_job_on_a_missing_disk_is_not_taken_for_deleted(
     assert (bench.folder / "away" / "walk" / "input" / "torso.mp4").is_file()
 
 
-def test_a_replaced_owner_writes_nothing_more(bench: SpoolFixture) -> None:
-    job = JobDir(bench.drop("walk").rename(bench.spool.running / "walk"))
-    first = create_claim(job)
-    status = JobStatusFile(job, None, first.ownership.is_held)
-    status.update(state="running")
-    status(Event(kind="started", stage="map"))
-    before = {path: path.read_bytes() for path in job.path.rglob("*") if path.is_file() and path != job.owner}
-    assert take_over_job(job) is not None
-    status(Event(kind="finished", stage="map"))
-    status.update(state="done")
-    status.finish("done", None, bench.spool.done / "walk", bench.spool.inbox)
-    assert {path: path.read_bytes() for path in before} == before
-
-
-def test_only_one_watcher_takes_a_job_over(bench: SpoolFixture) -> None:
-    job = JobDir(bench.drop("walk").rename(bench.spool.running / "walk"))
-    first = create_claim(job)
-    claims: list[object] = []
-    barrier = threading.Barrier(8)
-
-    def contend() -> None:
-        barrier.wait()
-        claims.append(take_over_job(job))
-
-    threads = [threading.Thread(target=contend) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    held = [claim for claim in claims if claim is not None]
-    # A watcher that fails to get a generation may get the next one. Only the last one holds the job.
-    assert sum(claim.ownership.is_held() for claim in held) == 1  # type: ignore[attr-defined]
-    assert not first.ownership.is_held()
-    first.write_heartbeat()
-    assert first.lost.is_set()
-
-
 def test_a_job_with_a_final_status_is_filed_by_the_next_watcher(
     bench: SpoolFixture,
 ) -> None:
@@ -714,8 +663,7 @@ def test_a_job_with_a_final_status_is_filed_by_the_next_watcher(
     bench.run_once()
     job = bench.job("walk")
     metrics = (job.result / "metrics.json").stat().st_mtime_ns
-    job_dir = JobDir(Path(shutil.move(job.path, bench.spool.running / "walk")))
-    create_claim(job_dir).release()
+    shutil.move(job.path, bench.spool.running / "walk")
     assert bench.run_once() == 0
     assert (bench.job("walk").result / "metrics.json").stat().st_mtime_ns == metrics
     assert bench.job("walk").path.parent == bench.spool.done

@@ -19,7 +19,8 @@ from bodycap_batch.cli import main
 from bodycap_batch.core.errors import DiskAway, StoreError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import Store
-from bodycap_batch.watch import Watcher, active_watchers, inbox_claim, job_rows
+from bodycap_batch.store.checked_json import checked_json, parse_checked_json
+from bodycap_batch.watch import Watcher, active_watcher, inbox_claim, job_rows, job_worker
 from bodycap_batch.watch.access_failures import AccessFailures
 from bodycap_batch.watch.job_status import JobStatusFile, read_status
 from bodycap_batch.watch.job_worker import JobWorker
@@ -91,7 +92,7 @@ def test_the_watcher_waits_for_a_missing_inbox_and_does_not_create_it(bench: Spo
 
 
 def test_a_watcher_with_once_does_not_wait_for_ever(bench: SpoolFixture) -> None:
-    watcher = bench.watcher(stale_s=1.0)
+    watcher = bench.watcher(retry_s=1.0)
     bench.spool.inbox.rmdir()
     assert watcher.run() == StoreError.exit_code
     assert any("the inbox no longer exists" in line for line in bench.lines)
@@ -111,7 +112,7 @@ def test_pauses_grow_and_each_cause_is_reported_once(bench: SpoolFixture) -> Non
     assert failures.record(OSError(errno.EIO, "x", "a")) == 1
 
 
-def test_a_failure_that_ends_while_it_is_read_stops_no_heartbeat(bench: SpoolFixture) -> None:
+def test_a_failure_that_ends_while_it_is_read_does_no_harm(bench: SpoolFixture) -> None:
     failures = AccessFailures(bench.spool, bench.lines.append)
     failures.record(OSError(errno.EIO, "x", "a"))
 
@@ -150,15 +151,18 @@ def test_a_full_disk_while_the_store_is_cleaned_stops_no_watcher(
     bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A user runs `gc` on a full disk while a finished job waits to be filed."""
-    claim = inbox_claim.create_claim(JobDir(bench.drop("walk").rename(bench.spool.running / "walk")))
-    JobStatusFile(claim.job).update(state="done")
+    job_dir = JobDir(bench.spool.running / "walk")
+    job_dir.path.mkdir()
+    bench.drop("walk").rename(job_dir.input)
+    JobStatusFile(job_dir).update(state="done")
     worker = JobWorker(bench.spool, bench.options(), threading.Event())
-    monkeypatch.setattr(inbox_claim.Claim, "release", failing(1, inbox_claim.Claim.release, errno.ENOSPC))
+    monkeypatch.setattr(job_worker, "moving", failing(1, job_worker.moving, errno.ENOSPC))
     with (bench.spool.root / ".store" / "in-use").open("w") as cleaning:
         fcntl.flock(cleaning, fcntl.LOCK_EX)
-        outcome = worker.process(claim)
-    assert (outcome.state, outcome.exit_code) == ("stuck", StoreError.exit_code)
-    assert worker.process(claim).path == bench.spool.done / "walk"
+        outcome = worker.process(job_dir)
+        assert (outcome.state, outcome.exit_code) == ("stuck", StoreError.exit_code)
+        assert worker.process(job_dir).state == "stopped"
+    assert worker.process(job_dir).path == bench.spool.done / "walk"
 
 
 def test_a_job_that_ends_while_the_store_is_cleaned_is_filed_later(bench: SpoolFixture) -> None:
@@ -189,8 +193,6 @@ def test_a_job_that_ends_while_the_store_is_cleaned_is_filed_later(bench: SpoolF
 def test_a_job_with_a_missing_disk_continues_later(
     bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    from bodycap_batch.watch import job_worker
-
     bench.drop("walk")
     error = DiskAway("Stale file handle", path="videos") if how == "in a stage" else None
     run_job, left = job_worker.run_job, [1]
@@ -201,7 +203,7 @@ def test_a_job_with_a_missing_disk_continues_later(
         return run_job(*arguments, **values)
 
     monkeypatch.setattr(job_worker, "run_job", fail)
-    with running(bench.watcher(once=False, stale_s=1.0)):
+    with running(bench.watcher(once=False, retry_s=1.0)):
         wait_for((bench.spool.done / "walk").is_dir)
     (line,) = [line for line in bench.lines if line.startswith("walk: stuck")]
     assert "Stale file handle" in line
@@ -218,14 +220,12 @@ def test_a_job_with_repeated_disk_failures_fails(
     monkeypatch.setattr("bodycap_batch.watch.job_worker.run_job", fail)
     worker = JobWorker(bench.spool, bench.options(), threading.Event())
     snapshot = inbox_claim.take_snapshot(entry := inbox_claim.InboxEntry(bench.drop("walk")), 100)
-    claim, _ = inbox_claim.claim_entry(
+    job_dir, _ = inbox_claim.claim_entry(
         bench.spool, entry, snapshot, bench.options().permissions
     ) or pytest.fail("no claim")
     states = []
     while not states or states[-1] == "stuck":
-        states.append(worker.process(claim).state)
-        if states[-1] == "stuck":
-            claim = inbox_claim.Claim(claim.job, claim.generation, claim._token)
+        states.append(worker.process(job_dir).state)
     assert states == ["stuck"] * 5 + ["failed"]
     assert bench.status("walk")["error"]["message"] == "Input/output error"
 
@@ -253,16 +253,15 @@ def test_a_job_waits_for_missing_videos_without_a_limit(
     monkeypatch.setattr("bodycap_batch.watch.job_worker.run_job", fail)
     worker = JobWorker(bench.spool, bench.options(), threading.Event())
     snapshot = inbox_claim.take_snapshot(entry := inbox_claim.InboxEntry(bench.drop("walk")), 100)
-    claim, _ = inbox_claim.claim_entry(
+    job_dir, _ = inbox_claim.claim_entry(
         bench.spool, entry, snapshot, bench.options().permissions
     ) or pytest.fail("no claim")
     for _ in range(20):
-        assert worker.process(claim).state == "stuck"
-        claim = inbox_claim.Claim(claim.job, claim.generation, claim._token)
+        assert worker.process(job_dir).state == "stuck"
     assert main(["status"]) == 0
     assert f"continues later: {footage / 'torso.mp4'}: Stale file handle" in capfd.readouterr().out
-    claim.job.cancel.touch()
-    assert worker.process(claim).path == bench.spool.failed / "walk"
+    job_dir.cancel.touch()
+    assert worker.process(job_dir).path == bench.spool.failed / "walk"
     assert bench.status("walk")["state"] == "cancelled"
 
 
@@ -271,11 +270,9 @@ def test_a_job_waits_for_missing_videos_without_a_limit(
 def test_a_repeated_disk_failure_is_reported_once(
     bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from bodycap_batch.watch import job_worker
-
     bench.drop("walk")
     monkeypatch.setattr(job_worker, "run_job", failing(2, job_worker.run_job, errno.ESTALE))
-    with running(bench.watcher(once=False, stale_s=0.2)):
+    with running(bench.watcher(once=False, retry_s=0.2)):
         wait_for((bench.spool.done / "walk").is_dir)
     assert sum("Stale file handle" in line for line in bench.lines) == 1
     assert bench.lines.count("walk: started") == 1
@@ -337,20 +334,15 @@ def test_an_unreadable_entry_is_reported_and_delays_no_other(
         '{"attempts": "many", "notes": 3, "error": "x", "active": 1, "dropped": 5, "progress": "a"}',
     ],
 )
-@pytest.mark.usefixtures("impatient")
 def test_a_damaged_status_file_does_no_harm(bench: SpoolFixture, text: str) -> None:
     bench.drop("walk")
     bench.run_once()
     job = bench.job("walk")
     job.status.write_text(text)
     assert [row.name for row in job_rows(bench.spool)] == ["walk"]
-    left = JobDir(job.path.rename(bench.spool.running / "walk"))
-    inbox_claim.create_claim(left)
-    left.owner.write_text('{"generation": "one", "pid": [], "token": 5, "machine": null, "process": {}}')
+    job.path.rename(bench.spool.running / "walk")
     assert [row.name for row in job_rows(bench.spool)] == ["walk"]
-    assert bench.run_once() == 0, "a job without an owner is treated as that of another machine"
-    with running(bench.watcher(once=False, stale_s=1.0)):
-        wait_for((bench.spool.done / "walk").is_dir)
+    assert bench.run_once() == 0
     assert json.loads(bench.job("walk").status.read_text())["attempts"] in (1, 2)
     assert read_status(bench.job("walk"))["state"] == "done"
     assert Store(bench.spool.root / ".store").root.is_dir()
@@ -368,7 +360,7 @@ def test_watchers_and_their_failures_are_listed_with_the_jobs(
     assert reported() == [
         f"no watcher runs for this folder; start a watcher with: bodycap watch {bench.spool.inbox}"
     ]
-    with running(bench.watcher(once=False, unchanged_s=1000.0, stale_s=1.0)):
+    with running(bench.watcher(once=False, unchanged_s=1000.0, retry_s=1.0)):
         wait_for(lambda: any(f"(process {os.getpid()}) since" in line for line in reported()))
         assert len(reported()) == 1
         assert main(["status", "--json"]) == 0
@@ -391,16 +383,16 @@ def test_watchers_and_their_failures_are_listed_with_the_jobs(
 def test_a_killed_watcher_is_not_listed(bench: SpoolFixture) -> None:
     status_file = WatcherStatusFile(bench.spool)
     status_file.write("")
-    (own,) = bench.spool.running.glob(".watcher-*")
-    machine, pid, start, *rest = own.name.removeprefix(".watcher-").split("-")
-    text = own.read_text()
-    for name in (f"{machine}-{pid}-{int(start) - 1}", f"elsewhere-{pid}-{start}", f"yesterday-{pid}-{start}"):
-        own.with_name("-".join((f".watcher-{name}", *rest))).write_text(text)
-    old = time.time() - 90_000
-    (yesterday,) = bench.spool.running.glob(".watcher-yesterday*")
-    os.utime(yesterday, (old, old))
-    (bench.spool.running / ".watcher-garbled.json").write_text("{")
-    assert [bool(found.seen) for found in active_watchers(bench.spool)] == [False, True]
+    found = active_watcher(bench.spool)
+    assert found is not None
+    assert (found.pid, found.seen) == (os.getpid(), "")
+    path = bench.spool.root / ".watcher.json"
+    content = parse_checked_json(path.read_bytes())
+    machine, pid, start = content["process"].split("-")
+    for process, listed in ((f"{machine}-{pid}-{int(start) - 1}", False), (f"elsewhere-{pid}-{start}", True)):
+        path.write_text(checked_json({**content, "process": process}))
+        assert (active_watcher(bench.spool) is not None) == listed
+    os.utime(path, (time.time() - 90_000, time.time() - 90_000))
+    assert active_watcher(bench.spool) is None, "it has not been seen for a day"
     status_file.remove()
-    assert [bool(found.seen) for found in active_watchers(bench.spool)] == [True]
-    assert not yesterday.exists()
+    assert not path.exists()

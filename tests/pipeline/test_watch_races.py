@@ -51,11 +51,8 @@ def test_finished_stages_of_a_retried_job_are_kept_until_it_has_run_again(bench:
     retry_job(bench.spool, "walk")
     bench.order()
     entry = InboxEntry(bench.spool.inbox / "walk")
-    claim, _ = inbox_claim.claim_entry(
-        bench.spool, entry, take_snapshot(entry, 100), bench.options().permissions
-    ) or pytest.fail("not claimed")
+    assert inbox_claim.claim_entry(bench.spool, entry, take_snapshot(entry, 100), bench.options().permissions)
     assert keeps_all_artefacts(bench), "claimed, but not yet running"
-    claim.release()
     assert bench.run_once() == 0
     fresh = {
         stage["stage"].split()[0] for stage in bench.status("walk")["finished_stages"] if not stage["reused"]
@@ -135,24 +132,6 @@ def test_a_running_watcher_finishes_a_killed_retry(
     assert sum(line.startswith("walk: failed") for line in bench.lines) == 2
 
 
-def test_two_processes_return_an_entry_once(bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    job_dir = JobDir(bench.spool.failed / f"{RETRY_PREFIX}1")
-    job_dir.path.mkdir()
-    bench.drop("walk").rename(job_dir.input)
-    move = inbox_claim.move_to_free_name
-    first: list[Path | None] = []
-
-    def other() -> None:
-        monkeypatch.setattr(inbox_claim, "move_to_free_name", move)
-        first.append(inbox_claim.return_to_inbox(bench.spool, job_dir))
-
-    monkeypatch.setattr(inbox_claim, "move_to_free_name", preceded_by(move, other))
-    assert inbox_claim.return_to_inbox(bench.spool, job_dir) is None
-    assert first == [bench.spool.inbox / "job"], "a hidden name would never be processed"
-    assert (bench.spool.inbox / "job" / "torso.mp4").is_file()
-    assert list(bench.spool.failed.iterdir()) == []
-
-
 @pytest.mark.parametrize("moment", ["before it is moved", "while it has no name"])
 def test_a_job_that_is_claimed_during_the_cancellation_is_cancelled(
     bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch, moment: str
@@ -193,7 +172,6 @@ def test_a_job_that_is_claimed_during_the_cancellation_is_cancelled(
 def test_a_half_claimed_job_can_be_cancelled(bench: SpoolFixture) -> None:
     job_dir = JobDir(bench.spool.running / f"{CLAIM_PREFIX}1")
     job_dir.path.mkdir()
-    inbox_claim.create_claim(job_dir).release()
     bench.drop("walk").rename(job_dir.input)
     JobStatusFile(job_dir).update(dropped="walk")
     assert cancel_job(bench.spool, "walk", wait_s=0.0) is None, "no watcher has reacted yet"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 import shutil
 import threading
@@ -19,7 +18,6 @@ from bodycap_batch.config.sample_files import SAMPLE_SUFFIXES
 from bodycap_batch.core.errors import CaptureError, JobError, StoreError
 from bodycap_batch.store.artefacts import disk_errors
 from bodycap_batch.watch.inbox_entries import READY
-from bodycap_batch.watch.process_identity import is_from_this_machine, is_process_running, process_tag
 from bodycap_batch.watch.spool import Spool, folder_name_from_text, move_to_free_name
 from bodycap_batch.watch.web.questions import write_answers
 
@@ -41,9 +39,6 @@ _MAX_OPEN_UPLOADS = 8
 """Maximum number of folders that are uploaded at the same time. Evidence: none."""
 _MAX_IDLE_S = 900.0
 """Maximum time (seconds) without data before an upload is removed: 15 minutes. Evidence: none."""
-_MAX_UNCHANGED_S = 86_400.0
-"""Maximum time (seconds) without a new file before an upload of another machine is removed: one day. The time
-is long because the folder's time does not change while a long file is received. Evidence: none."""
 
 
 @dataclass(slots=True)
@@ -103,7 +98,7 @@ class Uploads:
                     "15 minutes",
                 )
             key = uuid.uuid4().hex
-            folder = self._spool.inbox / f"{_PREFIX}{process_tag()}-{key}"
+            folder = self._spool.inbox / f"{_PREFIX}{key}"
             with disk_errors(folder):
                 folder.mkdir()
             self._open[key] = _Upload(name=folder_name_from_text(name), folder=folder, touched=self._clock())
@@ -299,22 +294,9 @@ def _unknown_upload() -> JobError:
 
 
 def remove_abandoned_uploads(inbox: Path) -> None:
-    """Remove the uploads of killed servers. The uploads of other running watchers are not removed."""
+    """Remove the uploads of killed servers. Only one watcher, and so only one server, uses an inbox."""
     for folder in inbox.glob(f"{_PREFIX}*"):
-        with contextlib.suppress(OSError):
-            if _is_abandoned(folder):
-                shutil.rmtree(folder)
-
-
-def _is_abandoned(folder: Path) -> bool:
-    """Return True if the process that receives an upload has ended.
-
-    A process of another machine is treated as ended if the folder has not changed for a day.
-    """
-    tag = folder.name.removeprefix(_PREFIX)
-    if is_from_this_machine(tag):
-        return not is_process_running(tag)
-    return time.time() - folder.stat().st_mtime > _MAX_UNCHANGED_S
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 async def _receive_file(target: Path, size: int, chunks: AsyncIterator[bytes]) -> None:

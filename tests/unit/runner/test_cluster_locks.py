@@ -50,7 +50,6 @@ def make(client: Client, folder: Path, told: list[str], *, cancelled: bool = Fal
         logs=folder,
         progress=lambda done, total, what: told.append(what),
         cancelled=lambda: cancelled,
-        may_commit=lambda: True,
     )
     dask_cluster.Cluster("tcp://nowhere:1").execute(Task(key=key, memory_mb=1500), environment)
 

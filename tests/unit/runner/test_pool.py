@@ -116,7 +116,6 @@ def environment_in(store: Store, cancelled: threading.Event | None = None) -> Ta
         logs=store.root,
         progress=lambda *_: None,
         cancelled=(cancelled or threading.Event()).is_set,
-        may_commit=lambda: True,
     )
 
 

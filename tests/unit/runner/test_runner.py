@@ -51,7 +51,6 @@ class Bench:
         self.events: list[Event] = []
         self.stop = threading.Event()
         self.children = Children(FAKE)
-        self.owner = True
         self.runner = self.with_rules()
 
     def with_rules(self, **rules: Any) -> Runner:
@@ -60,7 +59,7 @@ class Bench:
             self.children,
             logs=self.logs,
             listener=self.events.append,
-            rules=Rules(cancelled=self.stop.is_set, may_commit=lambda: self.owner, **rules),
+            rules=Rules(cancelled=self.stop.is_set, **rules),
         )
 
     def kinds(self) -> list[str]:
@@ -332,16 +331,6 @@ def test_children_do_not_outlive_a_killed_parent(tmp_path: Path) -> None:
     parent.kill()
     parent.wait()
     wait_for(lambda: gone(child))
-
-
-def test_nothing_is_committed_for_a_job_of_another_process(bench: Bench) -> None:
-    bench.owner = False
-    with pytest.raises(Cancelled, match="another process runs it now"):
-        bench.runner.run(a_task("work"))
-    assert bench.store.find(a_task("work").key) is None
-    assert bench.kinds()[-1] == "stopped"
-    bench.owner = True
-    assert bench.runner.run(a_task("work"))[1]
 
 
 def test_missing_artefacts_are_not_computed_if_that_is_forbidden(bench: Bench) -> None:

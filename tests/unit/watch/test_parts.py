@@ -1,4 +1,4 @@
-"""Parts of the watched folder: complete entries, claims, heartbeats, names and paths."""
+"""Parts of the watched folder: complete entries, claims, names and paths."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import CaptureError, JobError, StoreError
 from bodycap_batch.formats.file_completeness import MissingPart
 from bodycap_batch.watch.change_notifier import ChangeNotifier, is_on_network_disk
-from bodycap_batch.watch.claim import HeartbeatMonitor, create_claim, take_over_job
 from bodycap_batch.watch.dropped_job import (
     JobPermissions,
     make_result_paths_relative,
@@ -35,9 +34,7 @@ from bodycap_batch.watch.inbox_entries import (
     reason_to_wait,
     take_snapshot,
 )
-from bodycap_batch.watch.ownership import read_owner
 from bodycap_batch.watch.spool import JobDir, Spool, folder_name_from_text, move_to_free_name, spool_from_path
-from bodycap_batch.watch.watch_options import WatchOptions
 from tests.videos import textured_frame, unopened, write_video
 
 ROOT = Path(__file__).parents[3]
@@ -335,80 +332,6 @@ def test_the_entry_that_is_complete_for_longest_comes_first(tmp_path: Path) -> N
     assert completed(tracker, tmp_path) == ["c", "z"]  # a and b are not job files
 
 
-def test_a_stopped_heartbeat_is_detected_with_the_own_clock_alone(tmp_path: Path) -> None:
-    job = JobDir(tmp_path / "walk")
-    job.path.mkdir()
-    claim = create_claim(job)
-    clock = Clock()
-    monitor = HeartbeatMonitor(60.0, clock)
-
-    def elsewhere() -> None:
-        owner = read_owner(job.owner)
-        job.owner.write_text(json.dumps({**owner, "machine": "another", "pid": 1}))
-
-    for _ in range(5):
-        claim.write_heartbeat()
-        elsewhere()
-        os.utime(job.owner, (1e9, 1e9))  # the clock of that host is years behind, which must not matter
-        assert monitor.find_abandoned([job]) == []
-        clock.now += 59
-    assert monitor.find_abandoned([job]) == []
-    clock.now += 1
-    assert monitor.find_abandoned([job]) == [job]
-
-
-@pytest.mark.parametrize("stale_s", [1.0, 4.0, 60.0, 1000.0])
-def test_several_heartbeats_fit_into_the_time_limit(stale_s: float) -> None:
-    assert WatchOptions(stale_s=stale_s).heartbeat_period_s <= min(5.0, stale_s / 3)
-
-
-def test_there_is_no_wait_for_an_owner_that_released_the_job_or_ended(tmp_path: Path) -> None:
-    job = JobDir(tmp_path / "walk")
-    job.path.mkdir()
-    claim = create_claim(job)
-    monitor = HeartbeatMonitor(1e9)
-    assert monitor.find_abandoned([job]) == []
-    owner = read_owner(job.owner)
-    if owner["machine"]:
-        job.owner.write_text(json.dumps({**owner, "process": "1"}))
-        # the process number belongs to another process now
-        assert monitor.find_abandoned([job]) == [job]
-    job.owner.write_text(json.dumps(owner))
-    claim.release()
-    assert monitor.find_abandoned([job]) == [job]
-
-
-def test_a_late_heartbeat_of_an_earlier_owner_does_not_regain_the_job(tmp_path: Path) -> None:
-    job = JobDir(tmp_path / "walk")
-    job.path.mkdir()
-    first = create_claim(job)
-    stale = job.owner.read_bytes()
-    second = take_over_job(job)
-    assert second is not None
-    assert second.generation == 2
-    job.owner.write_bytes(stale)  # the first owner was suspended between its check and its write
-    assert second.ownership.is_held()
-    assert not first.ownership.is_held()
-    second.write_heartbeat()
-    assert read_owner(job.owner)["generation"] == 2
-    shutil.rmtree(job.path)
-    assert not second.ownership.is_held()
-
-
-def test_a_new_job_of_the_same_name_is_another_job(tmp_path: Path) -> None:
-    job = JobDir(tmp_path / "walk")
-    job.path.mkdir()
-    first = create_claim(job)
-    job.path.rename(tmp_path / "filed away")
-    job.path.mkdir()
-    other = create_claim(job)
-    assert other.ownership.is_held()
-    assert not first.ownership.is_held()
-    first.write_heartbeat()
-    assert first.lost.is_set()
-    assert other.ownership.is_held()
-
-
 def test_moves_never_overwrite(tmp_path: Path) -> None:
     for number in range(3):
         (tmp_path / "from" / "walk").mkdir(parents=True)
@@ -464,7 +387,7 @@ def test_a_video_that_is_not_used_is_a_note_of_a_dropped_job(tmp_path: Path) -> 
     entry = InboxEntry(walk)
     claimed = claim_entry(spool, entry, take_snapshot(entry, 100), JobPermissions())
     assert claimed is not None
-    job_dir = claimed[0].job
+    job_dir = claimed[0]
     job = read_job(job_dir, JobPermissions())
     assert [camera.name for camera in job.capture.cameras] == ["torso", "left_palm"]
     assert job.capture.cameras_only
