@@ -5,42 +5,16 @@ COLMAP, add-ons for Blender, nerfstudio and tools for Gaussian splatting read th
 
 from __future__ import annotations
 
-import struct
+import tempfile
 from collections.abc import Mapping
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.formats.atomic_files import atomic_replacement
-from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.geometry import Similarity, invert, quat_xyzw_from_rotation
+from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.formats.atomic_files import atomic_replacement, store_error_from_os_error
+from bodycap_batch.model.geometry import Similarity, invert
 from bodycap_batch.model.scene import Map
-
-_COLMAP_MODEL_IDS = {
-    "SIMPLE_PINHOLE": 0,
-    "PINHOLE": 1,
-    "SIMPLE_RADIAL": 2,
-    "RADIAL": 3,
-    "OPENCV": 4,
-    "OPENCV_FISHEYE": 5,
-    "FULL_OPENCV": 6,
-    "FOV": 7,
-    "SIMPLE_RADIAL_FISHEYE": 8,
-    "RADIAL_FISHEYE": 9,
-    "THIN_PRISM_FISHEYE": 10,
-    "EUCM": 16,
-}
-"""Number of each camera model in COLMAP's binary files. The keys are the names of the models. Source: COLMAP,
-sensor/models.h."""
-
-_POINT2D = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
-"""Type of one 2D point of an image in images.bin: pixel position, and id of the 3D point."""
-
-_TRACK = np.dtype([("image", "<i4"), ("index", "<i4")])
-"""Type of one element of a 3D point's track in points3D.bin: the id of an image, and the index among the 2D
-points of this image."""
 
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
@@ -76,6 +50,8 @@ def write_colmap_model(
     Raises:
         StoreError: A file cannot be written.
     """
+    import pycolmap
+
     transform = target_from_map or Similarity(1.0, np.eye(3), np.zeros(3))
     numbers = frame_numbers or {}
     names = sorted(scene.cameras)
@@ -92,92 +68,38 @@ def write_colmap_model(
     images = image_of[scene.obs_keyframe][by_image]
     starts = np.searchsorted(images, np.arange(1, len(order) + 2))
     cam_from_target = invert(transform.apply_to_poses(scene.map_from_cam[order]))
-    blobs = (
-        _encode_cameras([(index, scene.cameras[name]) for index, name in enumerate(names, start=1)]),
-        _encode_images(
-            cam_from_target,
-            [names.index(scene.keyframe_camera[keyframe]) + 1 for keyframe in order],
-            image_names,
-            _encode_observations(scene, by_image, starts),
-        ),
-        _encode_points(scene, transform.apply(scene.points), by_image, images, starts),
-    )
-    written = []
-    for file, blob in zip(MODEL_FILES, blobs, strict=True):
-        written.append(folder / file)
-        with atomic_replacement(written[-1]) as temporary:
-            temporary.write_bytes(blob)
-    return tuple(written)
-
-
-def _encode_cameras(cameras: list[tuple[int, Camera]]) -> bytes:
-    """Return the content of cameras.bin for pairs of camera id and camera."""
-    parts = [struct.pack("<Q", len(cameras))]
-    for index, camera in cameras:
-        parts.append(
-            struct.pack("<iiQQ", index, _COLMAP_MODEL_IDS[camera.model], camera.width_px, camera.height_px)
+    model = pycolmap.Reconstruction()
+    for index, name in enumerate(names, start=1):
+        camera = scene.cameras[name].to_pycolmap()
+        camera.camera_id = index
+        model.add_camera_with_trivial_rig(camera)
+    for index, keyframe in enumerate(order):
+        image = pycolmap.Image(
+            name=image_names[index],
+            keypoints=scene.obs_px[by_image[starts[index] : starts[index + 1]]],
+            camera_id=names.index(scene.keyframe_camera[keyframe]) + 1,
+            image_id=index + 1,
         )
-        parts.append(np.asarray(camera.params, dtype="<f8").tobytes())
-    return b"".join(parts)
-
-
-def _encode_observations(scene: Map, by_image: IntArray, starts: IntArray) -> list[bytes]:
-    """Return the encoded 2D points of each image.
-
-    Args:
-        scene: The map.
-        by_image: (M,) indices of the map's observations, ordered by image.
-        starts: (K+1,) position in `by_image` at which each image begins, followed by M.
-    """
-    table = np.empty(len(by_image), dtype=_POINT2D)
-    table["x"], table["y"] = scene.obs_px[by_image].T
-    table["point"] = scene.obs_point[by_image] + 1
-    return [table[start:end].tobytes() for start, end in pairwise(starts)]
-
-
-def _encode_images(
-    cam_from_target: FloatArray, camera_ids: list[int], image_names: list[str], points2d: list[bytes]
-) -> bytes:
-    """Return the content of images.bin.
-
-    Args:
-        cam_from_target: (K,4,4) pose of each image: the transform from the target frame to the camera.
-        camera_ids: (K,) camera id of each image.
-        image_names: (K,) name of each image.
-        points2d: (K,) encoded 2D points of each image.
-    """
-    quats = np.roll(quat_xyzw_from_rotation(cam_from_target[:, :3, :3]), 1, axis=-1)
-    parts = [struct.pack("<Q", len(image_names))]
-    for index, name in enumerate(image_names):
-        pose = (*quats[index], *cam_from_target[index, :3, 3])
-        parts.append(struct.pack("<i7di", index + 1, *pose, camera_ids[index]))
-        parts.append(name.encode("utf-8") + b"\0")
-        parts.append(struct.pack("<Q", len(points2d[index]) // _POINT2D.itemsize) + points2d[index])
-    return b"".join(parts)
-
-
-def _encode_points(
-    scene: Map, positions: FloatArray, by_image: IntArray, images: IntArray, starts: IntArray
-) -> bytes:
-    """Return the content of points3D.bin.
-
-    Args:
-        scene: The map.
-        positions: (P,3) positions of the map's points in the target frame.
-        by_image: (M,) indices of the map's observations, ordered by image.
-        images: (M,) image id of each observation, in the order of `by_image`.
-        starts: (K+1,) position in `by_image` at which each image begins, followed by M.
-    """
-    track = np.empty(len(by_image), dtype=_TRACK)
-    track["image"] = images
-    track["index"] = np.arange(len(by_image)) - starts[images - 1]
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(cam_from_target[index, :3]))
     points = scene.obs_point[by_image]
     by_point = np.argsort(points, kind="stable")
-    track, bounds = track[by_point], np.searchsorted(points[by_point], np.arange(len(positions) + 1))
-    parts = [struct.pack("<Q", len(positions))]
-    for index, position in enumerate(positions):
-        elements = track[bounds[index] : bounds[index + 1]]
-        color = scene.colors[index].tolist()
-        parts.append(struct.pack("<Q3d3Bd", index + 1, *position, *color, scene.point_error_px[index]))
-        parts.append(struct.pack("<Q", len(elements)) + elements.tobytes())
-    return b"".join(parts)
+    bounds = np.searchsorted(points[by_point], np.arange(len(scene.points) + 1))
+    place = np.arange(len(by_image)) - starts[images - 1]
+    for index, position in enumerate(transform.apply(scene.points)):
+        track = pycolmap.Track()
+        for observation in by_point[bounds[index] : bounds[index + 1]]:
+            track.add_element(images[observation], place[observation])
+        added = model.add_point3D(position, track, scene.colors[index])
+        model.point3D(added).error = scene.point_error_px[index]
+    written = tuple(folder / file for file in MODEL_FILES)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # COLMAP reports no full disk. The copies are written to the same disk, and fail if it is full.
+        with tempfile.TemporaryDirectory(dir=folder) as made:
+            model.write_binary(made)
+            for path in written:
+                with atomic_replacement(path) as temporary:
+                    temporary.write_bytes((Path(made) / path.name).read_bytes())
+    except OSError as error:
+        raise store_error_from_os_error(error, folder) from error
+    return written

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
+from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.colmap import write_colmap_model
-from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, invert
 from tests.scenes import small_map
 
@@ -58,15 +59,8 @@ def test_observations_still_reproject(tmp_path: Path) -> None:
         assert point.track.length() == int((scene.obs_point == index - 1).sum())
 
 
-def test_every_camera_model_has_the_number_of_colmap(tmp_path: Path) -> None:
-    import pycolmap
-
-    from bodycap_batch.formats.colmap import _COLMAP_MODEL_IDS
-    from bodycap_batch.model.camera import CAMERA_MODELS, parameter_count
-
-    assert set(_COLMAP_MODEL_IDS) == set(CAMERA_MODELS)
-    for model in CAMERA_MODELS:
-        params = [100.0] * parameter_count(model)
-        camera = Camera(model=model, width_px=200, height_px=200, params=np.array(params))
-        assert int(camera.to_pycolmap().model) == _COLMAP_MODEL_IDS[model]
-        assert pycolmap.CameraModelId(_COLMAP_MODEL_IDS[model]).name == model
+def test_a_model_that_cannot_be_written_is_an_error_of_the_disk(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(StoreError):
+        write_colmap_model(tmp_path / "file" / "0", small_map())
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
