@@ -156,9 +156,9 @@ def test_every_vertex_follows_one_joint_or_two(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
     corners = parsed.array(attributes["POSITION"])
     faces = parsed.array(primitive["indices"]).reshape(-1, 3)
-    # the volume is positive, so the faces are counter-clockwise from outside
+    # the volume is positive, so the faces are counter-clockwise from outside; parts overlap by a quarter
     volume = np.einsum("fi,fi->f", corners[faces[:, 0]], np.cross(corners[faces[:, 1]], corners[faces[:, 2]]))
-    assert 0.05 < volume.sum() / 6 < 0.08
+    assert 0.05 < volume.sum() / 6 < 1.25 * 0.08
     # a small mesh
     assert len(corners) < 8000
 

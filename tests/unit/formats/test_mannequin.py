@@ -1,4 +1,4 @@
-"""The mannequin: a closed surface around the skeleton, which bends smoothly with its joints."""
+"""The mannequin: closed parts around the skeleton, which move with its joints."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.export.layout import apply_layout
@@ -29,7 +31,34 @@ def volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
 
 
-def test_the_surface_is_closed_and_its_normals_point_out() -> None:
+def inside(mesh: Mannequin, points: np.ndarray) -> np.ndarray:
+    """Return which points are inside of a part of the mannequin."""
+    import open3d as o3d
+
+    edges = mesh.faces[:, [0, 1]].T
+    pairs = coo_array((np.ones(edges.shape[1]), edges), shape=(len(mesh.vertices_m),) * 2)
+    count, part = connected_components(pairs, directed=False)
+    found = np.zeros(len(points), dtype=bool)
+    for index in range(count):
+        scene = o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(
+            o3d.core.Tensor(mesh.vertices_m.astype(np.float32)),
+            o3d.core.Tensor(mesh.faces[part[mesh.faces[:, 0]] == index].astype(np.uint32)),
+        )
+        found |= scene.compute_occupancy(o3d.core.Tensor(points.astype(np.float32))).numpy() > 0.5
+    return found
+
+
+def body_volume_m3(mesh: Mannequin) -> float:
+    """Return the volume of all parts together. Where parts overlap, the volume counts once."""
+    low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
+    cell = (high[2] - low[2]) / 87.0  # 2 cm: the standard error of the count is below 1 %
+    axes = [np.arange(a + cell / 2.0, b, cell) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return float(inside(mesh, points).sum() * cell**3)
+
+
+def test_the_parts_are_closed_and_its_normals_point_out() -> None:
     _, mesh = person()
     edges = np.concatenate([mesh.faces[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))])
     there = {tuple(edge) for edge in edges.tolist()}
@@ -45,7 +74,7 @@ def test_the_surface_is_closed_and_its_normals_point_out() -> None:
 def test_it_has_the_size_of_a_person() -> None:
     _, mesh = person()
     # An adult of 1.75 m weighs 50 to 80 kg, and a body has nearly the density of water.
-    assert 0.050 < volume_m3(mesh.vertices_m, mesh.faces) < 0.080
+    assert 0.050 < body_volume_m3(mesh) < 0.080
     low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
     assert 1.70 < high[2] < 1.80
     assert low[2] >= 0.0
@@ -62,9 +91,8 @@ def test_it_scales_with_the_person() -> None:
 
 def test_every_joint_is_inside() -> None:
     body, mesh = person()
-    for joint, at in enumerate(rest_pose(body)[:, :3, 3]):
-        nearest = np.argmin(np.linalg.norm(mesh.vertices_m - at, axis=1))
-        assert (at - mesh.vertices_m[nearest]) @ mesh.normals[nearest] < 0.0, body.joints[joint]
+    found = inside(mesh, rest_pose(body)[:, :3, 3])
+    assert found.all(), [name for name, is_inside in zip(body.joints, found, strict=True) if not is_inside]
 
 
 def test_weights_are_shared_by_neighbours_and_smooth() -> None:
@@ -82,7 +110,7 @@ def test_weights_are_shared_by_neighbours_and_smooth() -> None:
 
 
 def test_bent_limbs_keep_their_surface() -> None:
-    """With elbows and knees bent by 90°, no edge is torn, and the volume stays."""
+    """Elbows and knees that bend by 90° change no edge. A trunk that bends by 30° at a joint tears none."""
     body, mesh = person()
     local = np.tile(np.eye(3), (1, len(body.joints), 1, 1))
     for role, turn in (
@@ -90,6 +118,7 @@ def test_bent_limbs_keep_their_surface() -> None:
         ("RightForeArm", [0, 0, 1.57]),
         ("LeftLeg", [1.57, 0, 0]),
         ("RightArm", [0, 1.2, 0]),
+        ("Spine", [0.52, 0, 0]),
     ):
         local[:, body.roles.index(role)] = so3_exp(turn)
     posed = forward_kinematics(body, body.offsets_m[:1], local)[0]
@@ -98,8 +127,11 @@ def test_bent_limbs_keep_their_surface() -> None:
     bent = np.einsum("vk,vkab,vb->va", mesh.weights, moved[mesh.joints], at)[:, :3]
     edges = np.unique(np.sort(np.concatenate([mesh.faces[:, :2], mesh.faces[:, 1:]]), axis=1), axis=0)
     before, after = (np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (mesh.vertices_m, bent))
-    assert after.max() < 0.13
-    assert np.percentile(after / before, 99) < 2.5
+    blended = ((mesh.weights > 0.0).sum(axis=1) > 1)[edges].any(axis=1)
+    np.testing.assert_allclose(after[~blended], before[~blended], atol=1e-9)
+    # A ring at 11 cm from the axis of the bend moves by 0.52 · 11 cm = 6 cm, spread over a blend of 12 cm.
+    assert np.ptp((after / before)[blended]) > 0.1
+    assert (after / before)[blended].max() < 1.0 + 1.5 * 0.06 / 0.12
     assert volume_m3(bent, mesh.faces) == pytest.approx(volume_m3(mesh.vertices_m, mesh.faces), rel=0.06)
 
 
@@ -168,6 +200,6 @@ def test_hands_of_hanging_arms_do_not_hold_the_hips() -> None:
     lifted = np.einsum("vk,vkij,vj->vi", mesh.weights, moved[mesh.joints], at)[:, :3]
     edges = mesh.faces[:, [0, 1]]
     longest = np.linalg.norm(lifted[edges[:, 0]] - lifted[edges[:, 1]], axis=1).max()
-    # The grid has cells of 22 mm; an edge crosses two cells, and bends stretch it to twice its length.
-    assert longest < 0.12
+    # A bone of the arm has no ring between its ends, and no edge is longer than the bone.
+    assert longest < 1.01 * np.linalg.norm(skeleton.offsets_m[1:], axis=1).max()
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-6)
