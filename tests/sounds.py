@@ -8,8 +8,10 @@ from pathlib import Path
 
 import av
 import numpy as np
+from scipy.signal import butter, sosfilt
 
 from bodycap_batch.clocks.sound_track import RATE_HZ, SoundPiece, SoundTrack
+from bodycap_batch.formats.file_url import file_url
 from bodycap_batch.formats.sound_frames import sound_frames
 from bodycap_batch.synthetic.sound import Microphone, Samples, Scene, make_scene, record
 from tests.videos import textured_frame
@@ -97,3 +99,32 @@ def heard(of: Scene, seed: int, seconds: float, offset_s: float = 0.0, **more: f
     """Return what a microphone records of a scene, with cloth noise 6 dB below it unless given."""
     options = {"noise_ratio_db": 6.0, "gain_db": -6.0, **more}
     return record(of, Microphone(seed=seed, seconds=seconds, offset_s=offset_s, **options))  # type: ignore[arg-type]
+
+
+def wind_noise(count: int, rate_hz: int, rng: np.random.Generator) -> Samples:
+    """Return the noise (N,) of wind: strong, below some 200 Hz, with gusts."""
+    band = butter(2, (5.0, 150.0), "bandpass", fs=rate_hz, output="sos").astype(np.float32)
+    low = sosfilt(band, rng.standard_normal(count, np.float32))
+    knots = max(2, int(count / rate_hz))
+    gusts = np.interp(np.arange(count), np.linspace(0, count, knots + 1), rng.uniform(0.2, 1.0, knots + 1))
+    return (low * gusts).astype(np.float32)
+
+
+def write_sound(
+    path: Path, samples: np.ndarray, rate_hz: int, *, codec: str = "aac", layout: str = "mono"
+) -> Path:
+    """Encode sound into a media file without pictures.
+
+    Args:
+        path: Path of the file; its suffix determines the container.
+        samples: (N,) or (channels,N) samples.
+        rate_hz: Samples per second.
+        codec: Name of the encoder.
+        layout: Channels, for example ``mono``, ``stereo`` or ``5.1``.
+    """
+    with av.open(file_url(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate_hz, layout=layout)
+        for frame in sound_frames(samples, rate_hz, layout):
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path

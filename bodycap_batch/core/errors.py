@@ -10,8 +10,6 @@ from pathlib import Path
 
 from bodycap_batch.core.printable import printable
 
-EXIT_OK = 0
-"""Exit code after success."""
 EXIT_BUG = 70
 """Exit code after an unexpected exception. Source: EX_SOFTWARE of sysexits.h."""
 

@@ -1,11 +1,7 @@
-"""Compare results with ground truth: trajectories, relative camera poses, motions and covariances."""
+"""Compare results with ground truth: trajectories, relative camera poses and motions."""
 
 from bodycap_batch.evaluate.motion import MotionOptions, MotionReport, evaluate_motion, score_motion
-from bodycap_batch.evaluate.relative_cameras import (
-    RelativeCameraError,
-    normalised_errors,
-    relative_camera_error,
-)
+from bodycap_batch.evaluate.relative_cameras import RelativeCameraError, relative_camera_error
 from bodycap_batch.evaluate.trajectories import (
     CameraScore,
     ErrorSummary,
@@ -25,7 +21,6 @@ __all__ = [
     "TrajectoryReport",
     "evaluate_motion",
     "evaluate_trajectories",
-    "normalised_errors",
     "relative_camera_error",
     "score_motion",
     "score_trajectories",

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.evaluate.trajectories import ErrorSummary, TrajectoryOptions, truth_at
 from bodycap_batch.formats.tum import TimedPoses
-from bodycap_batch.model.geometry import align_points, invert, so3_log
+from bodycap_batch.model.geometry import align_points, invert
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,25 +86,3 @@ def relative_camera_error(
         vector_m=ErrorSummary.of(np.linalg.norm(vector - true_vector, axis=1)),
         in_reference_m=ErrorSummary.of(np.linalg.norm(in_reference, axis=1)),
     )
-
-
-def normalised_errors(
-    gauge_from_cam: FloatArray, covariance: FloatArray, true_gauge_from_cam: FloatArray
-) -> FloatArray:
-    """Return the normalised squared errors (N,) of N poses: squared Mahalanobis distances from the truth.
-
-    If the covariances are correct, the mean of the normalised squared errors is 6.
-
-    Args:
-        gauge_from_cam: (N,4,4) estimated poses.
-        covariance: (N,6,6) covariance of each estimated pose, for a perturbation on the right: rotation
-            (rad), then translation (gauge units).
-        true_gauge_from_cam: (N,4,4) true poses in the gauge of the estimated poses.
-
-    Source: Y. Bar-Shalom et al., "Estimation with Applications to Tracking and Navigation", 2001, 5.4
-        (normalised estimation error squared).
-    """
-    difference = invert(gauge_from_cam) @ true_gauge_from_cam
-    error = np.concatenate([so3_log(difference[:, :3, :3]), difference[:, :3, 3]], axis=1)
-    solved = np.linalg.solve(covariance, error[..., None])[..., 0]
-    return np.asarray((error * solved).sum(axis=1))

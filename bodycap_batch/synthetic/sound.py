@@ -9,15 +9,12 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from scipy.signal import butter, oaconvolve, sosfilt
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.formats.file_url import file_url
-from bodycap_batch.formats.sound_frames import sound_frames
 
 Samples = npt.NDArray[np.float32]
 """Samples (N,) of mono sound, full scale −1 to 1."""
@@ -165,36 +162,6 @@ def cloth_noise(count: int, rate_hz: int, rng: np.random.Generator) -> Samples:
     loudness = rng.gamma(0.7, 1.4, knots + 1).astype(np.float32)
     envelope = np.interp(np.arange(count, dtype=np.float32), np.linspace(0, count, knots + 1), loudness)
     return ((2.0 * low + 0.7 * high) * (0.15 + envelope)).astype(np.float32)
-
-
-def wind_noise(count: int, rate_hz: int, rng: np.random.Generator) -> Samples:
-    """Return the noise (N,) of wind: strong, below some 200 Hz, with gusts."""
-    low = sosfilt(_filter(2, (5.0, 150.0), rate_hz), rng.standard_normal(count, np.float32))
-    knots = max(2, int(count / rate_hz))
-    gusts = np.interp(np.arange(count), np.linspace(0, count, knots + 1), rng.uniform(0.2, 1.0, knots + 1))
-    return (low * gusts).astype(np.float32)
-
-
-def write_sound(
-    path: Path, samples: npt.NDArray[np.float32], rate_hz: int, *, codec: str = "aac", layout: str = "mono"
-) -> Path:
-    """Encode sound into a media file without pictures.
-
-    Args:
-        path: Path of the file; its suffix determines the container.
-        samples: (N,) or (channels,N) samples.
-        rate_hz: Samples per second.
-        codec: Name of the encoder.
-        layout: Channels, for example ``mono``, ``stereo`` or ``5.1``.
-    """
-    import av
-
-    with av.open(file_url(path), "w") as container:
-        stream = container.add_stream(codec, rate=rate_hz, layout=layout)
-        for frame in sound_frames(samples, rate_hz, layout):
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return path
 
 
 @dataclass(frozen=True, slots=True)

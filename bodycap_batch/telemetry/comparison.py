@@ -62,11 +62,6 @@ class PictureGyroComparison:
             return self.fit
         return self.undone if self.undone is not None and _is_good(self.undone) else None
 
-    @property
-    def can_be_undone(self) -> bool:
-        """True if the video is stabilised, and the recorded orientations undo it."""
-        return self.verdict == "stabilised" and self.best is not None
-
 
 def compare_picture_and_gyro(camera: CaptureCamera, telemetry: CameraTelemetry) -> PictureGyroComparison:
     """Compare the rotations of the pictures with the gyroscope of the same camera.

@@ -99,12 +99,6 @@ class JobStatusFile:
             self.document.update(values)
             self._write()
 
-    def set_job_dir(self, job: JobDir) -> None:
-        """Record that the job's folder has been renamed."""
-        with self._lock:
-            self._job = job
-            self.document["name"] = job.name
-
     def add_note(self, text: str) -> None:
         """Add a note for the user."""
         with self._lock:

@@ -26,9 +26,10 @@ from bodycap_batch.clocks.joint_offsets import solve_clocks
 from bodycap_batch.clocks.pair_offsets import measure_pair
 from bodycap_batch.clocks.sound_track import RATE_HZ, SoundPiece, SoundTrack, read_sound_file
 from bodycap_batch.config.job import load_job
-from bodycap_batch.synthetic.sound import Microphone, Samples, make_scene, record, write_sound
+from bodycap_batch.synthetic.sound import Microphone, Samples, make_scene, record
 from tests.bench import motion_clocks
 from tests.bench.rows import DATA
+from tests.sounds import write_sound
 
 RATIOS_DB = (6.0, 0.0, -6.0)
 DURATIONS_S = (6.0, 20.0, 60.0, 300.0, 600.0)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.geometry import Similarity, interpolate_pose
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.nominal_mounts import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_M
@@ -177,8 +177,3 @@ def inflate_sigmas(track: CameraTrack, mount: Mount) -> CameraTrack:
         sigma_rad=np.hypot(track.sigma_rad, mount.sigma_rad),
         sigma_map=np.hypot(track.sigma_map, mount.sigma_m),
     )
-
-
-def pick_evenly(pool: IntArray, count: int) -> IntArray:
-    """Return up to `count` evenly spaced items of a pool (N,)."""
-    return np.asarray(pool[evenly_spaced(len(pool), count)])

@@ -7,8 +7,8 @@ import pytest
 
 from bodycap_batch.clocks.pair_offsets import measure_pair
 from bodycap_batch.clocks.sound_track import RATE_HZ, SoundTrack
-from bodycap_batch.synthetic.sound import cloth_noise, wind_noise
-from tests.sounds import heard, scene, track
+from bodycap_batch.synthetic.sound import cloth_noise
+from tests.sounds import heard, scene, track, wind_noise
 
 WAY_S = 0.004
 """The way of sound to two cameras on one body differs by up to 1.3 m."""

@@ -13,7 +13,7 @@ from bodycap_batch.clocks.phase_correlation import (
     transform_size,
 )
 from bodycap_batch.clocks.sound_track import RATE_HZ
-from bodycap_batch.synthetic.sound import wind_noise
+from tests.sounds import wind_noise
 
 
 def correlated(first, second):

@@ -8,8 +8,7 @@ import pytest
 from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.capture.timeline import join_chapters
 from bodycap_batch.clocks.sound_track import RATE_HZ, read_sound_file, read_sound_track
-from bodycap_batch.synthetic.sound import wind_noise
-from tests.sounds import burst, burst_time, write_video_with_sound
+from tests.sounds import burst, burst_time, wind_noise, write_video_with_sound
 
 TOLERANCE_S = 0.0015
 """AAC smears a burst by some samples before its start."""

@@ -15,7 +15,6 @@ from bodycap_batch.core.errors import JobError
 from bodycap_batch.evaluate import (
     TrajectoryOptions,
     evaluate_trajectories,
-    normalised_errors,
     relative_camera_error,
     score_trajectories,
 )
@@ -254,18 +253,3 @@ def test_relative_error_of_two_cameras() -> None:
     )
     in_reference = relative_camera_error(bigger, truths, "palm", "torso").in_reference_m
     assert in_reference.mean == pytest.approx(0.2 * span.mean())
-
-
-def test_normalised_errors_are_one_per_dimension() -> None:
-    """Poses sampled from their covariance have a mean of 6, and of 24 after doubling the error."""
-    rng = np.random.default_rng(2)
-    count = 4000
-    root = rng.normal(size=(6, 6)) * np.array([[0.01], [0.01], [0.02], [0.05], [0.02], [0.01]])
-    covariance = root @ root.T
-    draws = rng.multivariate_normal(np.zeros(6), covariance, size=count)
-    estimate = walk(0, count).world_from_cam
-    for factor, expected in ((1.0, 6.0), (2.0, 24.0)):
-        step = make_transform(so3_exp(factor * draws[:, :3]), factor * draws[:, 3:])
-        errors = normalised_errors(estimate, np.tile(covariance, (count, 1, 1)), estimate @ step)
-        # chi-square with mean 6 and variance 12: ± 4 sigma of the mean
-        assert errors.mean() == pytest.approx(expected, rel=4 * np.sqrt(12 / count) / 6)

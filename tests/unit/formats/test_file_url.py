@@ -10,7 +10,7 @@ import pytest
 from bodycap_batch.capture import open_camera
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.formats.mp4_writer import Sound, VideoWriter
-from bodycap_batch.synthetic.sound import write_sound
+from tests.sounds import write_sound
 
 NAMES = ("2024-03-05T10:11:12.mp4", "http:torso.mp4", "concat:a.mp4|b.mp4", "torso%03d.mp4", "pipe:0.mp4")
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from bodycap_batch.clocks.sound_track import read_sound_file
-from bodycap_batch.synthetic.sound import SOURCES, Microphone, make_scene, record, write_sound
+from bodycap_batch.synthetic.sound import SOURCES, Microphone, make_scene, record
+from tests.sounds import write_sound
 
 RATE_HZ = 16_000
 
