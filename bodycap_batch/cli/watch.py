@@ -79,13 +79,6 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
             help="If a folder has not changed for this time, the folder is complete and its job starts.",
         ),
     ] = 10.0,
-    poll: Annotated[
-        bool | None,
-        typer.Option(
-            "--poll/--no-poll",
-            help="Read the folder regularly to find changes (default: only on network disks).",
-        ),
-    ] = None,
     web: WebOption = None,
     web_token: TokenOption = "",
     once: Annotated[bool, typer.Option("--once", help="Stop when nothing is left to do.")] = False,
@@ -104,7 +97,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     \b
     Examples:
       bodycap watch jobs/inbox
-      bodycap watch /mnt/nas/jobs/inbox --root /mnt/nas/footage --jobs 2 --poll
+      bodycap watch /mnt/nas/jobs/inbox --root /mnt/nas/footage --jobs 2
       bodycap watch jobs/inbox --once          run the jobs that are there, then stop
       bodycap watch jobs/inbox --web 127.0.0.1:8080
       bodycap status jobs                      list the jobs
@@ -122,7 +115,6 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
         threads=threads or cores(),
         memory_mb=memory_mb,
         unchanged_s=unchanged_s,
-        poll=poll,
         once=once,
     )
     with event_on_signal() as stop:

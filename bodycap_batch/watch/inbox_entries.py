@@ -242,11 +242,6 @@ class CompletionTracker:
             self._reasons[entry.path] = (snapshot.changes, reason)
         return reason
 
-    @property
-    def is_tracking(self) -> bool:
-        """True if the last scan found entries. Some of the entries may still be changing."""
-        return bool(self._seen)
-
 
 def _try_snapshot(entry: InboxEntry, max_files: int) -> tuple[EntrySnapshot | None, str]:
     """Return a snapshot of an entry and an error text.

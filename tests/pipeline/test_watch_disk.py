@@ -41,12 +41,6 @@ def running(watcher: Watcher) -> Iterator[Watcher]:
     assert not thread.is_alive()
 
 
-@pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A watcher that has nothing to do looks again at once, and not after some seconds."""
-    monkeypatch.setattr("bodycap_batch.watch.watcher._IDLE_POLL_S", 0.1)
-
-
 def failing(times: int, function: Callable[..., Any], number: int = errno.EIO) -> Callable[..., Any]:
     """Return the function, which raises a disk error for the first `times` calls."""
     left = [times]
@@ -189,7 +183,6 @@ def test_a_job_that_ends_while_the_store_is_cleaned_is_filed_later(bench: SpoolF
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["in the watcher", "in a stage"])
-@pytest.mark.usefixtures("impatient")
 def test_a_job_with_a_missing_disk_continues_later(
     bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
@@ -266,7 +259,6 @@ def test_a_job_waits_for_missing_videos_without_a_limit(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("impatient")
 def test_a_repeated_disk_failure_is_reported_once(
     bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import subprocess
-import threading
 import time
 from pathlib import Path
 
@@ -18,7 +17,6 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import CaptureError, JobError, StoreError
 from bodycap_batch.formats.file_completeness import MissingPart
-from bodycap_batch.watch.change_notifier import ChangeNotifier, is_on_network_disk
 from bodycap_batch.watch.dropped_job import (
     JobPermissions,
     make_result_paths_relative,
@@ -416,28 +414,6 @@ def test_the_folders_that_jobs_are_moved_to_are_not_watched(tmp_path: Path) -> N
     for folder in (spool.running, spool.done, spool.failed):
         with pytest.raises(StoreError, match="moved to this folder"):
             spool_from_path(folder)
-
-
-@pytest.mark.parametrize("poll", [False, True])
-def test_a_change_wakes_the_watcher(tmp_path: Path, poll: bool) -> None:
-    woken = threading.Event()
-    with ChangeNotifier(tmp_path, woken, poll=poll, write_line=lambda _: None):
-        end = time.monotonic() + 20
-        number = 0
-        while not woken.is_set() and time.monotonic() < end:
-            (tmp_path / str(number)).mkdir()
-            number += 1
-            time.sleep(0.1)
-    assert woken.is_set()
-
-
-def test_a_network_disk_is_recognised_by_its_mount(tmp_path: Path) -> None:
-    mounts = tmp_path / "mounts"
-    nas = f"{tmp_path}/my\\040nas"
-    mounts.write_text(f"/dev/sda / ext4 rw 0 0\nhost:/x {nas} nfs4 rw 0 0\n/dev/sdb {nas}/disk xfs rw 0 0\n")
-    assert is_on_network_disk(tmp_path / "my nas" / "jobs", mounts)
-    assert not is_on_network_disk(tmp_path / "my nas" / "disk" / "jobs", mounts)
-    assert not is_on_network_disk(tmp_path, mounts)
 
 
 def test_the_service_example_is_a_valid_unit(tmp_path: Path) -> None:
