@@ -16,6 +16,13 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.blender_scene import collect_blender_scene
+from bodycap_batch.export.camera_animation import collect_camera_scene
+from bodycap_batch.export.camera_files import (
+    CAMERA_FACTS_FILE,
+    CAMERA_FORMATS,
+    camera_writers,
+    write_camera_facts,
+)
 from bodycap_batch.export.earth import earth_of_world
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.fill_report import FILL_FILE, write_fill_report
@@ -69,18 +76,20 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
     require_libraries(options.formats)
     left_out: list[str] = []
     motion, gap = _exported_motion(inputs, options, left_out)
+    animated = None if motion is None else apply_layout(_with_all_joints(inputs, motion, options), options)
     sigma_m = None if inputs.merge is None or motion is None else _exported_sigma_m(inputs.merge, motion)
     steps: dict[str, Callable[[], list[Path]]] = {"tum": lambda: write_trajectories(inputs, left_out)}
     if inputs.maps:
         steps |= {"ply": lambda: write_maps(inputs, left_out), "colmap": lambda: write_colmap(inputs)}
     steps["csv"] = lambda: [write_frame_table(inputs.out_dir / "frames.csv", inputs)]
-    if motion is not None:
-        steps |= _motion_writers(inputs, motion, options, sigma_m, left_out)
+    if motion is not None and animated is not None:
+        steps |= _motion_writers(inputs, motion, animated, options, sigma_m, left_out)
         steps["csv"] = lambda: [
             write_frame_table(inputs.out_dir / "frames.csv", inputs),
             write_joint_table(inputs.out_dir / "joints.csv", motion, sigma_m),
         ]
     steps = {name: write for name, write in steps.items() if name in options.formats}
+    _add_cameras(steps, inputs, animated, options, left_out)
     merge = inputs.merge
     if merge is not None and merge.fill is not None:
         steps["fill"] = lambda: [write_fill_report(inputs.out_dir / FILL_FILE, merge)]
@@ -94,9 +103,35 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
     return tuple(path.relative_to(inputs.out_dir) for path in written)
 
 
+def _add_cameras(
+    steps: dict[str, Callable[[], list[Path]]],
+    inputs: ExportInputs,
+    animated: Motion | None,
+    options: ExportOptions,
+    left_out: list[str],
+) -> None:
+    """Add the files of the animated cameras to the steps of their formats."""
+    chosen = [name for name in CAMERA_FORMATS if name in options.formats]
+    scene = collect_camera_scene(inputs, animated, options.fps, left_out) if chosen else None
+    if scene is None:
+        return
+    writers = camera_writers(inputs.out_dir, scene)
+    for name in chosen:
+        steps[name] = _both(steps.get(name), writers[name])
+    steps["cameras"] = lambda: [write_camera_facts(inputs.out_dir / CAMERA_FACTS_FILE, scene)]
+
+
+def _both(
+    first: Callable[[], list[Path]] | None, second: Callable[[], list[Path]]
+) -> Callable[[], list[Path]]:
+    """Return a function that calls both functions and returns both lists of files."""
+    return second if first is None else lambda: [*first(), *second()]
+
+
 def _motion_writers(
     inputs: ExportInputs,
     motion: Motion,
+    animated: Motion,
     options: ExportOptions,
     sigma_m: FloatArray | None,
     left_out: list[str],
@@ -108,7 +143,6 @@ def _motion_writers(
     measurement formats (C3D, TRC, NPZ) contain the solved motion.
     """
     folder, measured = inputs.out_dir, _measured_joints(inputs, motion)
-    animated = apply_layout(_with_all_joints(inputs, motion, options), options)
     centres = points_from_motion(motion, measured)
     aligned, place = align_axes_with_bones(animated), earth_of_world(inputs)
     earth = None if place is None else place.figures()

@@ -45,16 +45,9 @@ def write_usd(path: Path, motion: Motion, earth: Mapping[str, Any] | None = None
     Raises:
         StoreError: The file cannot be written.
     """
-    from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+    from pxr import Gf, UsdSkel, Vt
 
-    stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    frames = len(motion.root_in_world_m)
-    stage.SetTimeCodesPerSecond(motion.fps)
-    stage.SetFramesPerSecond(motion.fps)
-    stage.SetStartTimeCode(0.0)
-    stage.SetEndTimeCode(float(frames - 1))
+    stage = new_stage(motion.fps, len(motion.root_in_world_m))
     body = UsdSkel.Root.Define(stage, _BODY_PATH)
     stage.SetDefaultPrim(body.GetPrim())
     centres = motion.world_from_joint()[..., :3, 3].reshape(-1, 3)
@@ -72,7 +65,30 @@ def write_usd(path: Path, motion: Motion, earth: Mapping[str, Any] | None = None
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
     _define_mesh(stage, make_mannequin(motion.skeleton), skeleton)
     if earth is not None:
-        stage.GetRootLayer().customLayerData = {"earth": _layer_data(earth)}
+        stage.GetRootLayer().customLayerData = {"earth": layer_data(earth)}
+    return export_stage(stage, path)
+
+
+def new_stage(fps: float, frames: int) -> Any:
+    """Return an empty stage in metres, Z up, with a number of frames that are counted from 0."""
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(fps)
+    stage.SetFramesPerSecond(fps)
+    stage.SetStartTimeCode(0.0)
+    stage.SetEndTimeCode(float(frames - 1))
+    return stage
+
+
+def export_stage(stage: Any, path: Path) -> Path:
+    """Write a stage to a file, which is replaced atomically, and return the path of the file.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
     with atomic_replacement(path) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
             raise StoreError(
@@ -229,7 +245,7 @@ def read_usd(path: Path) -> Motion:
     )
 
 
-def _layer_data(earth: Mapping[str, Any]) -> dict[str, Any]:
+def layer_data(earth: Mapping[str, Any]) -> dict[str, Any]:
     """Return plain JSON values as values of a layer: lists of numbers as arrays."""
     from pxr import Vt
 

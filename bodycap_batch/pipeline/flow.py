@@ -456,16 +456,18 @@ class Flow:
         """
         assert results.map is not None
         assert results.clocks is not None
-        segments = (results.job or self._job).capture.segments()
+        capture = (results.job or self._job).capture
         task = ExportTask(
             options=self._job.export,
+            take=self._job.name,
+            capture=capture_ref(capture, self._cameras),
             map=artefact_ref(results.map),
             registrations=refs_by_camera(results.registrations),
             clocks=artefact_ref(results.clocks),
             keyframes=refs_by_camera(results.keyframes),
             merge=optional_ref(results.filled),
             failure=None if results.failure is None else results.failure.message,
-            segments=tuple(tuple(camera.name for camera in cameras) for cameras in segments),
+            segments=tuple(tuple(camera.name for camera in cameras) for cameras in capture.segments()),
         )
         artefact = self.runner.run(make_task(EXPORT, task, threads=self._threads))
         self.runner.report_notes(artefact, "export")
@@ -563,9 +565,8 @@ class Flow:
         self._cameras = camera_digests(
             self._capture, self._settings.store.digests, self._settings.listener, self._settings.cancelled
         )
-        if has_body(self._job):
-            # Each run checks the installed libraries: they can change after the check stage is stored.
-            require_libraries(self._job.export.formats)
+        # Each run checks the installed libraries: they can change after the check stage is stored.
+        require_libraries(self._job.export.formats)
         # Places that an earlier run found are not part of the key: the check of that run did not know them.
         found = {camera.name for camera in self._capture.cameras if camera.mount_source is not None}
         clocks, body = stated_clocks(self._job.capture), self._body

@@ -7,20 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.formats.gltf.axes import (
     ARRAY_BUFFER,
-    COMPONENT_DTYPES,
     ELEMENT_ARRAY_BUFFER,
     FILE_FROM_WORLD,
-    FLOAT,
     UINT16,
     UINT32,
     poses_in_file_axes,
 )
+from bodycap_batch.formats.gltf.binary_buffer import BinaryBuffer
 from bodycap_batch.formats.mannequin import make_mannequin
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, make_transform, quat_xyzw_from_rotation
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
@@ -58,7 +56,7 @@ def write_glb(
     """
     import pygltflib as gl
 
-    buffer = _BinaryBuffer()
+    buffer = BinaryBuffer()
     turn = make_transform(np.eye(3) if file_from_up is None else file_from_up, np.zeros(3))
     body = _body_primitive(motion.skeleton, turn, buffer)
     animation = _motion_animation(motion, turn, buffer)
@@ -106,50 +104,6 @@ def write_glb(
         document.save_binary(str(temporary))
 
 
-class _BinaryBuffer:
-    """Collects the arrays of a GLB file for its binary part. Each array has a buffer view and an accessor."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-        self.views: list[Any] = []
-        self.accessors: list[Any] = []
-
-    def add(
-        self, array: npt.NDArray[Any], kind: str, *, target: int | None = None, component: int = FLOAT
-    ) -> int:
-        """Append an array to the buffer.
-
-        Args:
-            array: (N,...) array.
-            kind: Accessor type, a key of `ELEMENT_WIDTHS`.
-            target: Target of the buffer view; None for no target.
-            component: Number of the component type.
-
-        Returns:
-            The index of the accessor of the array.
-        """
-        import pygltflib as gl
-
-        values = np.ascontiguousarray(array, dtype=COMPONENT_DTYPES[component])
-        self.data += bytes(-len(self.data) % 4)
-        view = gl.BufferView(buffer=0, byteOffset=len(self.data), byteLength=values.nbytes, target=target)
-        self.views.append(view)
-        flat = values.reshape(len(values), -1)
-        self.accessors.append(
-            gl.Accessor(
-                bufferView=len(self.views) - 1,
-                byteOffset=0,
-                componentType=component,
-                count=len(values),
-                type=kind,
-                min=flat.min(axis=0).tolist(),
-                max=flat.max(axis=0).tolist(),
-            )
-        )
-        self.data += values.tobytes()
-        return len(self.accessors) - 1
-
-
 def _joint_nodes(motion: Motion, rest: FloatArray) -> list[Any]:
     """Return one node per joint, in the T-pose.
 
@@ -184,7 +138,7 @@ def _properties(motion: Motion, joint: int) -> dict[str, Any]:
     return out
 
 
-def _body_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
+def _body_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: BinaryBuffer) -> Any:
     """Return the mannequin as a primitive. Each vertex is bound to one joint or two.
 
     Args:
@@ -215,7 +169,7 @@ def _body_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _BinaryBu
     return gl.Primitive(attributes=attributes, indices=faces, material=0)
 
 
-def _motion_animation(motion: Motion, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
+def _motion_animation(motion: Motion, turn: FloatArray, buffer: BinaryBuffer) -> Any:
     """Return the animation: rotations of all joints, translations of the root and of freely moving hips.
 
     Args:

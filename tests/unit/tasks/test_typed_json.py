@@ -147,6 +147,8 @@ def tasks(folder: Path) -> dict[str, Any]:
         "fill": FillTask(mode="rest", merge=scene_map),
         "export": ExportTask(
             options=ExportOptions(formats=("bvh", "ply")),
+            take="walk",
+            capture=capture,
             map=scene_map,
             registrations=stored,
             clocks=scene_map,
