@@ -21,7 +21,7 @@ from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.frame_choice import nearest_frames
 from bodycap_batch.model.geometry import interpolate_pose
 from bodycap_batch.model.pinhole import pinhole_of
-from bodycap_batch.model.scene import Trajectory
+from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.model.take import Take
 
@@ -84,7 +84,7 @@ def picture_size(lens: Camera, shown: tuple[int, int] | None) -> tuple[int, int]
 
 
 def _animated(inputs: ExportInputs, path: Trajectory, take: Take, count: int) -> AnimatedCamera:
-    """Return one camera with its pose at each frame."""
+    """Return one camera with its pose at each frame: that of the nearest picture that can be shown."""
     lens, clock, video = (
         lens_of(inputs, path.camera),
         inputs.clocks[path.camera],
@@ -93,7 +93,9 @@ def _animated(inputs: ExportInputs, path: Trajectory, take: Take, count: int) ->
     assert lens is not None
     common = clock.common_times_ns(path.times_ns)
     frames = frame_times_ns(take, count)
-    shown = nearest_frames(common, frames, clock.nominal_fps)
+    pictures = np.flatnonzero([status is not FrameStatus.DAMAGED for status in path.status])
+    shown = nearest_frames(common[pictures], frames, clock.nominal_fps)
+    shown = np.where(shown >= 0, pictures[shown], -1)
     valid = (shown >= 0) & path.localised[shown]
     poses = _middle_row_poses(path, clock, inputs.row_fraction.get(path.camera))
     size = picture_size(lens, None if video is None else (video.width_px, video.height_px))

@@ -56,6 +56,7 @@ from bodycap_batch.tasks.registration import REGISTRATION, RegistrationTask
 from bodycap_batch.tasks.report import REPORT
 from bodycap_batch.tasks.sound import SOUND, SoundTask, known_from_sound
 from bodycap_batch.tasks.stage import Stage, read_summary
+from bodycap_batch.tasks.undistort import UNDISTORT, UndistortTask
 
 _REFINEMENTS = 2
 """Maximum number of passes of the correction of rolling shutters. Evidence: docs/decisions/mapping.md."""
@@ -472,6 +473,30 @@ class Flow:
         artefact = self.runner.run(make_task(EXPORT, task, threads=self._threads))
         self.runner.report_notes(artefact, "export")
         return artefact
+
+    def undistort(self, results: StageResults, exported: Artefact, cameras: Sequence[str]) -> ByCamera:
+        """Write the undistorted clip of each of these cameras, and return the artefact of each camera.
+
+        Args:
+            results: The results of the stages before the export.
+            exported: The artefact of the result files, which contain the facts about the cameras.
+            cameras: Names of the cameras.
+        """
+        assert results.map is not None
+        return self.runner.run_all(
+            make_task(
+                UNDISTORT,
+                UndistortTask(
+                    camera=camera.name,
+                    capture=self._footage([camera]),
+                    map=artefact_ref(results.map),
+                    export=artefact_ref(exported),
+                ),
+                camera=camera.name,
+            )
+            for camera in self._capture.cameras
+            if camera.name in cameras
+        )
 
     def start_preview(self, results: StageResults) -> Future[Artefact] | None:
         """Start to render the video of the results while later stages run.
