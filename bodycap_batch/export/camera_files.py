@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,13 @@ def camera_writers(folder: Path, scene: CameraScene) -> dict[str, Callable[[], l
         "usd": usd,
         "fbx": lambda: [write_cameras_with_blender(folder / "cameras.fbx", scene)],
         "chan": chan,
-        "abc": lambda: [write_cameras_with_blender(folder / "cameras.abc", scene)],
+        # Blender writes several cameras into an Alembic file in another order each time.
+        "abc": lambda: [
+            write_cameras_with_blender(
+                folder / "cameras" / f"{camera.name}.abc", replace(scene, cameras=(camera,))
+            )
+            for camera in scene.cameras
+        ],
     }
 
 

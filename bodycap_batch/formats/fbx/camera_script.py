@@ -129,7 +129,10 @@ def look_at_cameras(scene: Any, frames: int, step: float = 1.0) -> dict[str, Any
         at = FIRST_FRAME + number * step
         scene.frame_set(int(at), subframe=at - int(at))
         for item in items:
-            poses[item.name].append([list(row) for row in item.matrix_world][:3])
+            # An importer may scale a camera to the unit of the file, which changes nothing of its view.
+            place, turn, _ = item.matrix_world.decompose()
+            rows = turn.to_matrix()
+            poses[item.name].append([[*rows[axis], place[axis]] for axis in range(3)])
     return {
         item.name: {
             "focal_mm": item.data.lens,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,10 @@ from bodycap_batch.formats.fbx.blender_process import run_script
 from bodycap_batch.model.animated_camera import FAR_PLANE, NEAR_PLANE, CameraScene
 
 _CAMERA_SCRIPT = Path(__file__).with_name("camera_script.py")
+
+_WRITTEN_AT = re.compile(rb"_ai_DateWritten=[^;]{24}")
+_CONSTANT_TIME = b"_ai_DateWritten=Thu Jan  1 00:00:00 1970"
+"""Time in the header of an Alembic file, of the same length, so that equal cameras give equal bytes."""
 
 _TOLERANCE = 1e-5
 """Maximum difference of the elements of the poses that are read back, relative to the largest distance from
@@ -29,7 +34,7 @@ def write_cameras_with_blender(path: Path, scene: CameraScene) -> Path:
 
     Args:
         path: Path of the file, which is replaced atomically.
-        scene: The cameras.
+        scene: The cameras. For equal bytes, an Alembic file must have one camera only.
 
     Returns:
         The path of the file.
@@ -54,6 +59,8 @@ def write_cameras_with_blender(path: Path, scene: CameraScene) -> Path:
                 path=path,
                 hint="check the disk; if the disk has no errors, report this as a bug",
             )
+        if path.suffix == ".abc":
+            temporary.write_bytes(_WRITTEN_AT.sub(_CONSTANT_TIME, temporary.read_bytes()))
     return path
 
 
