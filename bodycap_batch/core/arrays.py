@@ -95,3 +95,8 @@ def true_spans(mask: BoolArray) -> list[list[int]]:
     edges = np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))
     starts, ends = np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist()
     return [[start, end] for start, end in zip(starts, ends, strict=True)]
+
+
+def json_numbers(values: FloatArray, decimals: int) -> list[float | None]:
+    """Return rounded values (T,) as JSON values; None for NaN."""
+    return [value if np.isfinite(value) else None for value in np.round(values, decimals).tolist()]

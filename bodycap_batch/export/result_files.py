@@ -32,12 +32,14 @@ from bodycap_batch.export.layout import added_root, apply_layout
 from bodycap_batch.export.metrics import collect_metrics
 from bodycap_batch.export.motion_files import (
     points_from_motion,
+    sigma_in_layout,
     without_unsolved_branches,
     write_verified_bvh,
     write_verified_glb,
     write_verified_usd,
 )
 from bodycap_batch.export.scene_files import write_colmap, write_maps, write_trajectories
+from bodycap_batch.export.take_time import take_of_motion
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.blender import write_blender_files
 from bodycap_batch.formats.c3d import write_c3d
@@ -143,7 +145,9 @@ def _motion_writers(
     measurement formats (C3D, TRC, NPZ) contain the solved motion.
     """
     folder, measured = inputs.out_dir, _measured_joints(inputs, motion)
-    centres = points_from_motion(motion, measured)
+    take, solved_take = take_of_motion(inputs, animated), take_of_motion(inputs, motion)
+    centres = points_from_motion(motion, measured, sigma_m)
+    sigma = None if sigma_m is None else sigma_in_layout(motion, animated, sigma_m)
     aligned, place = align_axes_with_bones(animated), earth_of_world(inputs)
     earth = None if place is None else place.figures()
     markers = points_from_motion(motion, None if options.filled_markers else measured)
@@ -156,12 +160,12 @@ def _motion_writers(
 
     return {
         "bvh": lambda: [write_verified_bvh(folder / "motion.bvh", animated, options)],
-        "glb": lambda: [write_verified_glb(folder / "motion.glb", aligned, earth)],
-        "fbx": lambda: [write_fbx(folder / "motion.fbx", aligned)],
-        "usd": lambda: [write_verified_usd(folder / "motion.usd", animated, earth)],
-        "c3d": lambda: [write_c3d(folder / "joints.c3d", centres)],
+        "glb": lambda: [write_verified_glb(folder / "motion.glb", aligned, earth, take=take, sigma_m=sigma)],
+        "fbx": lambda: [write_fbx(folder / "motion.fbx", aligned, take)],
+        "usd": lambda: [write_verified_usd(folder / "motion.usd", animated, earth, take=take, sigma_m=sigma)],
+        "c3d": lambda: [write_c3d(folder / "joints.c3d", centres, solved_take)],
         "trc": trc,
-        "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m)],
+        "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m, solved_take)],
         "blender": lambda: write_blender_files(folder, collect_blender_scene(inputs, aligned, options)),
     }
 

@@ -14,6 +14,7 @@ from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.formats.mannequin import Mannequin, make_mannequin
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, rotation_from_quat_xyzw
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
+from bodycap_batch.model.take import Take
 
 _BODY_PATH, _SKELETON_PATH, _MESH_PATH = "/Body", "/Body/Skeleton", "/Body/Mannequin"
 _MOTION_PATH = "/Body/Skeleton/Motion"
@@ -25,19 +26,30 @@ _EXTENT_MARGIN_M = 0.3
 and feet extend beyond their joints by less than this margin."""
 
 
-def write_usd(path: Path, motion: Motion, earth: Mapping[str, Any] | None = None) -> Path:
+def write_usd(
+    path: Path,
+    motion: Motion,
+    earth: Mapping[str, Any] | None = None,
+    *,
+    take: Take | None = None,
+    sigma_m: FloatArray | None = None,
+) -> Path:
     """Write a motion as a skinned, animated mannequin.
 
     The time codes are frame numbers, counted from 0. The mesh is bound to the joints in the T-pose. The joint
     tokens are paths of names that USD allows (``mixamorig_Hips``). The original names are stored in
     ``jointNames``. The custom data ``unobservedJoints`` of the skeleton lists the joints that no camera
-    measured. Translations, rotations and scales are written for every frame.
+    measured. Translations, rotations and scales are written for every frame. So are the primvars ``measured``
+    and ``sigmaMetres`` of the skeleton, with a value for each joint.
 
     Args:
         path: Path of the file (``.usd``, ``.usda``, ``.usdc``), which is replaced atomically.
         motion: The motion, in world axes and metres.
         earth: Place of the world on the Earth as plain JSON values, for the custom data ``earth`` of the
             layer; None if it is unknown. The transform is a list of 16 numbers, row by row.
+        take: Name, exact rate and timecode, for the custom data of the layer; None if they are unknown.
+        sigma_m: (T,J) standard deviation per axis of each joint's centre, metres; NaN if it is unknown. None
+            leaves it out.
 
     Returns:
         The path of the file.
@@ -64,8 +76,12 @@ def write_usd(path: Path, motion: Motion, earth: Mapping[str, Any] | None = None
     animation = _define_animation(stage, motion, tokens)
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
     _define_mesh(stage, make_mannequin(motion.skeleton), skeleton)
+    _add_validity(skeleton, motion, sigma_m)
+    facts = {} if take is None else layer_data(take.figures())
     if earth is not None:
-        stage.GetRootLayer().customLayerData = {"earth": layer_data(earth)}
+        facts["earth"] = layer_data(earth)
+    if facts:
+        stage.GetRootLayer().customLayerData = facts
     return export_stage(stage, path)
 
 
@@ -154,6 +170,20 @@ def _define_animation(stage: Any, motion: Motion, tokens: list[str]) -> Any:
         ):
             attribute.Set(value, float(frame))
     return animation
+
+
+def _add_validity(skeleton: Any, motion: Motion, sigma_m: FloatArray | None) -> None:
+    """Add primvars to the skeleton that state for each frame which joints were measured, and how well."""
+    from pxr import Sdf, UsdGeom, Vt
+
+    variables = UsdGeom.PrimvarsAPI(skeleton)
+    measured = variables.CreatePrimvar("measured", Sdf.ValueTypeNames.BoolArray)
+    for frame, row in enumerate(motion.observed.tolist()):
+        measured.Set(Vt.BoolArray(row), float(frame))
+    if sigma_m is not None:
+        sigma = variables.CreatePrimvar("sigmaMetres", Sdf.ValueTypeNames.FloatArray)
+        for frame, values in enumerate(sigma_m.astype(np.float32)):
+            sigma.Set(Vt.FloatArray.FromNumpy(values), float(frame))
 
 
 def _define_mesh(stage: Any, body_mesh: Mannequin, skeleton: Any) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array, true_spans
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, json_numbers, set_array, true_spans
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.take import Take
 
@@ -94,9 +94,9 @@ class AnimatedCamera:
             "clock_is_known": self.clock_is_known,
             "valid_frames": true_spans(self.valid),
             "video_frame": self.video_frame.tolist(),
-            "shift_s": _rounded(self.shift_s, 6),
-            "sigma_deg": _rounded(np.degrees(self.sigma_rad), 4),
-            "sigma_position": _rounded(self.sigma_position, 6),
+            "shift_s": json_numbers(self.shift_s, 6),
+            "sigma_deg": json_numbers(np.degrees(self.sigma_rad), 4),
+            "sigma_position": json_numbers(self.sigma_position, 6),
         }
 
 
@@ -134,8 +134,3 @@ class CameraScene:
     def figures(self) -> dict[str, Any]:
         """Return the take and the frame of reference as plain JSON values."""
         return {**self.take.figures(), "frame_of_reference": self.frame_of_reference}
-
-
-def _rounded(values: FloatArray, decimals: int) -> list[float | None]:
-    """Return values (T,) as JSON values; None for NaN."""
-    return [value if np.isfinite(value) else None for value in np.round(values, decimals).tolist()]
