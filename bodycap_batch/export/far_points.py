@@ -7,21 +7,26 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.model.scene import Map
 
-_MAX_DEPTH_SIGMA = 0.2
-"""Maximum standard deviation of the depth of a point of the room, relative to the median distance of all
-points from their cameras. Evidence: docs/decisions/export.md."""
+_MAX_DEPTH_SIGMA = 0.1
+"""Maximum standard deviation of the depth of a certain point, relative to the median distance of all points
+from their cameras. Evidence: docs/decisions/export.md."""
 
 
 def is_far(scene: Map) -> BoolArray:
-    """Return (P,) True for each far point: its depth is too uncertain for the size of the room.
+    """Return (P,) True for each far point: its depth is uncertain, and it is farther than all certain points.
 
-    The depth of a point has a standard deviation that grows with the square of its distance. Points that are
-    far from all cameras, and points that were seen from nearly one place, have a large one.
+    The standard deviation of a depth grows with the square of the distance. So points that are far from all
+    cameras are uncertain, and points that were seen from nearly one place. The certain points are the room:
+    it reaches from the median of all points to the farthest certain point. Uncertain points in it are kept.
     """
     sigma, distance = depth_sigma(scene)
     known = np.isfinite(distance)
-    typical = float(np.median(distance[known])) if known.any() else 0.0
-    return np.asarray(sigma > _MAX_DEPTH_SIGMA * typical)
+    if not known.any():
+        return np.zeros(len(scene.points), dtype=bool)
+    certain = sigma <= _MAX_DEPTH_SIGMA * float(np.median(distance[known]))
+    from_middle = np.linalg.norm(scene.points - np.median(scene.points, axis=0), axis=1)
+    reach = float(from_middle[certain].max()) if certain.any() else np.inf
+    return np.asarray(~certain & (from_middle > reach))
 
 
 def depth_sigma(scene: Map) -> tuple[FloatArray, FloatArray]:

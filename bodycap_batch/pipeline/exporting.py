@@ -69,7 +69,7 @@ def export_for(
         raise error
     asked = job.model_copy(update={"export": options})
     with Flow(asked, replace(settings, until=STAGE_ORDER[-1]), logs=out_dir / "logs") as flow:
-        flow.check()
+        flow.identify_videos()
         exported = flow.export(results)
     files = {name: path for name, path in files_of(exported) if name not in _NOT_FOR_PROGRAMS}
     if program.file not in files:
@@ -117,7 +117,7 @@ def export_undistorted(
     options = job.export.model_copy(update={"formats": ("chan",), "fps": fps or job.export.fps})
     asked = job.model_copy(update={"export": options})
     with Flow(asked, replace(settings, until=STAGE_ORDER[-1]), logs=out_dir / "logs") as flow:
-        flow.check()
+        flow.identify_videos()
         exported = flow.export(results)
         files = {name: path for name, path in files_of(exported) if name not in _NOT_FOR_PROGRAMS}
         if CAMERA_FACTS_FILE not in files:

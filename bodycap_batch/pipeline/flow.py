@@ -577,19 +577,25 @@ class Flow:
                     "end_s do not apply to it and all its frames are used; state offset_s to use a part of it"
                 )
                 self._settings.listener(Event(kind="note", stage="clocks", what=f"note: {note}"))
-        self._cameras = camera_digests(
-            self._capture, self._settings.store.digests, self._settings.listener, self._settings.cancelled
-        )
+        self.identify_videos()
 
     @cached_property
     def _body(self) -> BodyInput | None:
         """The body of the job; None if the job asks for no skeleton."""
         return body_input(self._job, self._settings.store.digests) if has_body(self._job) else None
 
-    def _check_task(self) -> Task:
+    def identify_videos(self) -> None:
+        """Determine the digest of each camera's frames, for a run that starts with stored results.
+
+        Raises:
+            BodycapError: A video cannot be read, or the job was stopped.
+        """
         self._cameras = camera_digests(
             self._capture, self._settings.store.digests, self._settings.listener, self._settings.cancelled
         )
+
+    def _check_task(self) -> Task:
+        self.identify_videos()
         # Each run checks the installed libraries: they can change after the check stage is stored.
         require_libraries(self._job.export.formats)
         # Places that an earlier run found are not part of the key: the check of that run did not know them.

@@ -74,12 +74,12 @@ def write_undistorted_clip(clip: UndistortedClip, context: StageContext) -> Path
         for number, frame in enumerate(clip.frames.tolist()):
             context.check_cancelled()
             if number % _REPORT_EACH == 0:
-                context.progress(number, len(clip.frames), clip.camera.name)
+                context.progress(number, len(clip.frames), "pictures")
             while shown < frame:
                 shown, picture = next(stream)
                 image = np.asarray(cv2.remap(picture, *maps, cv2.INTER_CUBIC), dtype=np.uint8)
             video.add(image if frame >= 0 else np.zeros_like(image))
-    context.progress(len(clip.frames), len(clip.frames), clip.camera.name)
+    context.progress(len(clip.frames), len(clip.frames), "")
     return clip.path
 
 
