@@ -36,22 +36,27 @@ def collect_camera_scene(
         motion: The motion in the layout of the files for animation: its ticks are the frames. None without a
             body; the frames are then those of a camera.
         fps: Frames per second without a body; None for the rate of this camera.
-        left_out: Receives a sentence for the user about each camera that is left out.
+        left_out: Receives a sentence for the user about each camera whose poses are in another frame, and
+            about missing files.
 
     Returns:
         The scene; None if no camera has a pose in the main target frame.
     """
     target = main_target_name(inputs)
-    paths = []
-    for path in trajectories_in_target_frames(inputs):
-        if path.gauge == target and path.localised.any() and lens_of(inputs, path.camera) is not None:
-            paths.append(path)
-        else:
-            left_out.append(
-                f"the files of the cameras do not contain {path.camera}: it has no pose in {target}"
-            )
+    posed = [
+        path
+        for path in trajectories_in_target_frames(inputs)
+        if path.localised.any() and lens_of(inputs, path.camera) is not None
+    ]
+    paths = [path for path in posed if path.gauge == target]
     if not paths:
+        left_out.append(f"the files of the cameras are not written: no camera has a pose in {target}")
         return None
+    left_out += [
+        f"the files of the cameras do not contain {path.camera}: its poses are not in {target}"
+        for path in posed
+        if path.gauge != target
+    ]
     if motion is None:
         take, count = frames_without_motion(inputs, [path.camera for path in paths], fps)
     else:
