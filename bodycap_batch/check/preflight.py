@@ -377,9 +377,9 @@ def _check_formats(job: Job, _findings: list[CameraSummary]) -> list[str]:
 
     Also check that the job does not rename the joints of a user's own skeleton.
     """
+    require_formats(job.export.formats)
     if job.skeleton == NO_SKELETON:
         return []
-    require_formats(job.export.formats)
     target = job.export.target
     of_target = None if target is None else export_target(target).options["names"]
     if job.export.names not in ("hik", of_target) and job.skeleton not in SKELETON_PRESETS:

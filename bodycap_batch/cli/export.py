@@ -24,16 +24,25 @@ from bodycap_batch.core.context import cores
 from bodycap_batch.job_places import find_store, load_last_run
 
 
-@app.command(short_help="Write the files for one program: Blender, Unreal, Unity and others.")
-def export(
+@app.command(short_help="Write the files for one program, or undistorted clips with their cameras.")
+def export(  # noqa: PLR0913, PLR0917 - each option is a parameter
     job: JobArgument,
     target: Annotated[
-        str, typer.Option("--for", metavar="PROGRAM", help=f"The program: {', '.join(TARGETS)}.")
-    ],
+        str | None, typer.Option("--for", metavar="PROGRAM", help=f"The program: {', '.join(TARGETS)}.")
+    ] = None,
+    undistorted: Annotated[
+        bool,
+        typer.Option(
+            "--undistorted",
+            help="Write the video of each camera without distortion, which matches the animated cameras.",
+        ),
+    ] = False,
     to: Annotated[
         Path | None,
         typer.Option(
-            "--to", metavar="DIR", help="Folder for the files (default: a folder PROGRAM in the results)."
+            "--to",
+            metavar="DIR",
+            help="Folder for the files (default: a folder PROGRAM or undistorted in the results).",
         ),
     ] = None,
     fps: Annotated[
@@ -45,23 +54,35 @@ def export(
     threads: ThreadsOption = None,
     store: StoreOption = None,
 ) -> None:
-    """Write the files that one program expects, from the results of a finished job.
+    """Write the files that one program expects, or undistorted clips, from the results of a finished job.
 
     The program decides the file formats, the joint names, the root joint, the units and the T-pose. The
     motion is not computed again. The file HOW_TO_IMPORT.txt says what to do in the program. The job may also
     be given by its results folder. To write the same files with every run, use `export: {target: PROGRAM}` in
     the job.
 
+    The undistorted clip of a camera is an MP4 file with one picture for each frame of the animated cameras
+    (cameras.glb and others). It has square pixels, and the principal point is in the centre. Beside it are a
+    .chan file with the poses of the camera, and cameras.json with lens, picture size, rate and timecode.
+
     \b
     Examples:
       bodycap export out/my_walk --for unreal
       bodycap export out/my_walk --for blender --to ~/scenes/walk
+      bodycap export out/my_walk --undistorted
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.export_targets import export_target
-    from bodycap_batch.pipeline import Settings, export_for
+    from bodycap_batch.core.errors import JobError
+    from bodycap_batch.pipeline import Settings, export_for, export_undistorted
     from bodycap_batch.store.artefacts import Store
 
-    export_target(target)
+    if target is not None:
+        export_target(target)
+    elif not undistorted:
+        raise JobError(
+            "neither a program nor --undistorted is given, so there is nothing to export",
+            hint=f"add --undistorted, or --for with one of {', '.join(TARGETS)}",
+        )
     resolved = load_last_run(job, make_overrides())
     out_dir = results_folder(resolved)
     with event_on_signal() as stop, make_progress_display(as_json=False) as display:
@@ -71,8 +92,15 @@ def export(
             listener=display,
             cancelled=stop.is_set,
         )
-        written = export_for(
-            resolved, target, out_dir=out_dir, folder=to or out_dir / target, fps=fps, settings=settings
-        )
+        written = []
+        if target is not None:
+            written += export_for(
+                resolved, target, out_dir=out_dir, folder=to or out_dir / target, fps=fps, settings=settings
+            )
+        if undistorted:
+            folder = to or out_dir / "undistorted"
+            written += export_undistorted(
+                resolved, out_dir=out_dir, folder=folder, fps=fps, settings=settings
+            )
     for path in written:
         print_line(str(path))

@@ -82,10 +82,7 @@ def read_container_time(videos: Sequence[VideoFile], first_frame_s: float) -> Co
     Raises:
         CaptureError: The file cannot be opened.
     """
-    video = videos[0]
-    with open_container(video.path) as container:
-        texts = [container.metadata, *(stream.metadata for stream in container.streams)]
-        timecode = next((text["timecode"] for text in texts if text.get("timecode")), "")
+    video, timecode = videos[0], read_timecode(videos[0])
     fps = video.fps or 30.0
     return ContainerTime(
         first_frame_s=first_frame_s,
@@ -94,6 +91,17 @@ def read_container_time(videos: Sequence[VideoFile], first_frame_s: float) -> Co
         frame_s=1.0 / fps,
         gps_s=_gps_start_s(video),
     )
+
+
+def read_timecode(video: VideoFile) -> str:
+    """Return the text of the timecode of the first frame of a file; "" if the file has none.
+
+    Raises:
+        CaptureError: The file cannot be opened.
+    """
+    with open_container(video.path) as container:
+        texts = [container.metadata, *(stream.metadata for stream in container.streams)]
+        return next((text["timecode"] for text in texts if text.get("timecode")), "")
 
 
 def _gps_start_s(video: VideoFile) -> float | None:

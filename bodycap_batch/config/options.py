@@ -14,7 +14,7 @@ FrameName = Annotated[str, StringConstraints(pattern=r"^.+:\d{1,9}$")]
 continues through all chapters. ``start_s`` does not change the count."""
 
 FileFormat = Literal[
-    "ply", "bvh", "glb", "fbx", "usd", "c3d", "trc", "tum", "csv", "npz", "colmap", "blender"
+    "ply", "bvh", "glb", "fbx", "usd", "abc", "chan", "c3d", "trc", "tum", "csv", "npz", "colmap", "blender"
 ]
 NamePreset = Literal["hik", "mixamo", "biped", "unreal", "unity"]
 RootMode = Literal["hips", "ground", "in_place"]

@@ -88,3 +88,15 @@ def evenly_spaced(count: int, limit: int) -> IntArray:
     if count <= 0:
         return np.zeros(0, dtype=np.int64)
     return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))
+
+
+def true_spans(mask: BoolArray) -> list[list[int]]:
+    """Return the first and the last index of each series of True in a mask (T,)."""
+    edges = np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))
+    starts, ends = np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist()
+    return [[start, end] for start, end in zip(starts, ends, strict=True)]
+
+
+def json_numbers(values: FloatArray, decimals: int) -> list[float | None]:
+    """Return rounded values (T,) as JSON values; None for NaN."""
+    return [value if np.isfinite(value) else None for value in np.round(values, decimals).tolist()]

@@ -9,6 +9,7 @@ import numpy as np
 
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.export.export_inputs import ExportInputs
+from bodycap_batch.export.take_time import take_of_motion
 from bodycap_batch.export.target_frames import WORLD, trajectories_in_target_frames
 from bodycap_batch.formats.bvh.axes import UNITS_PER_METRE
 from bodycap_batch.model.bone_axes import bone_ends_m
@@ -35,9 +36,8 @@ def collect_blender_scene(inputs: ExportInputs, motion: Motion, options: ExportO
             cameras[path.camera] = _camera(inputs, path, lens, motion)
     return {
         "name": "bodycap",
-        "fps": motion.fps,
+        **take_of_motion(inputs, motion).figures(),
         "frames": len(motion.root_in_world_m),
-        "start_s": motion.start_ns / 1e9,
         "bvh_scale": 1.0 / UNITS_PER_METRE[options.units],
         "bones": _bones(motion),
         "cameras": cameras,

@@ -13,6 +13,24 @@ from bodycap_batch.model.inertial_camera import InertialCamera
 from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.relative_pose import RelativePose
 from bodycap_batch.model.scene import KeyframeSelection, Map, Trajectory
+from bodycap_batch.model.take import Timecode
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoFacts:
+    """What the files for 3D programs state about the video of a camera.
+
+    Attributes:
+        width_px: Width of the shown pictures.
+        height_px: Height of the shown pictures.
+        timecode: Timecode of the first frame of the file; None if the file has none.
+        first_frame_ns: Time of the first frame of the file on the clock of the camera, nanoseconds.
+    """
+
+    width_px: int
+    height_px: int
+    timecode: Timecode | None = None
+    first_frame_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,6 +56,9 @@ class ExportInputs:
             cameras.
         inertial: What the inertial sensor of each camera gives, by camera name. Only cameras with telemetry
             have an entry.
+        take: Name of the take; "" if it is unknown.
+        videos: What is known about the video of each camera, by camera name. Without an entry, the picture
+            has the work size, and there is no timecode.
         log: Diagnostics of mapping as plain JSON values without run times and file paths. They are written to
             ``metrics.json``.
     """
@@ -54,6 +75,8 @@ class ExportInputs:
     relative_poses: tuple[RelativePose, ...] = ()
     inertial: Mapping[str, InertialCamera] = field(default_factory=dict)
     other_paths: tuple[Trajectory, ...] = ()
+    take: str = ""
+    videos: Mapping[str, VideoFacts] = field(default_factory=dict)
     log: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

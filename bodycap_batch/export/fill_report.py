@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray
+from bodycap_batch.core.arrays import BoolArray, true_spans
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.model.fill_data import SIDES, FillReport
 from bodycap_batch.model.merge_data import MergeResult
@@ -72,9 +72,7 @@ def _footsteps(merge: MergeResult, fill: FillReport) -> list[dict[str, Any]]:
 
 def _spans(merge: MergeResult, mask: BoolArray) -> list[list[float]]:
     """Return the start and the end of each period in which a mask (T,) is True."""
-    edges = np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))
-    starts, ends = np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist()
-    return [[_seconds(merge, start), _seconds(merge, end)] for start, end in zip(starts, ends, strict=True)]
+    return [[_seconds(merge, start), _seconds(merge, end + 1)] for start, end in true_spans(mask)]
 
 
 def _seconds(merge: MergeResult, tick: int) -> float:

@@ -14,6 +14,7 @@ from bodycap_batch.formats.joint_table import COLUMNS
 from bodycap_batch.formats.tum import seconds_text
 from bodycap_batch.model.geometry import continuous_quat_xyzw
 from bodycap_batch.model.skeleton import Motion
+from bodycap_batch.model.take import Take, exact_rate
 
 
 def write_joint_table(path: Path, motion: Motion, sigma_m: FloatArray | None = None) -> Path:
@@ -61,7 +62,9 @@ def _csv_field(name: str) -> str:
     return f'"{doubled}"' if set(name) & set(',"\n') else name
 
 
-def write_joint_arrays(path: Path, motion: Motion, sigma_m: FloatArray | None = None) -> Path:
+def write_joint_arrays(
+    path: Path, motion: Motion, sigma_m: FloatArray | None = None, take: Take | None = None
+) -> Path:
     """Write the motion of J joints at T ticks as NumPy arrays, and return the path of the file.
 
     The arrays are:
@@ -70,7 +73,8 @@ def write_joint_arrays(path: Path, motion: Motion, sigma_m: FloatArray | None = 
     - ``parents`` (J,): index of each joint's parent, −1 for the root;
     - ``offsets_m`` (J,3): offset of each joint in the frame of the parent, metres;
     - ``t`` (T,): common time of each tick, seconds;
-    - ``fps``: number of ticks per second;
+    - ``fps``: number of ticks per second, and ``rate`` (2,): the same as numerator and denominator;
+    - ``take`` and ``start_timecode``: name of the take, and timecode of tick 0, "" if unknown;
     - ``world`` (T,J,3): position of each joint in the world, metres;
     - ``world_quat_xyzw`` (T,J,4): orientation of each joint in the world;
     - ``local_quat_xyzw`` (T,J,4): rotation of each joint in the frame of the parent;
@@ -82,10 +86,13 @@ def write_joint_arrays(path: Path, motion: Motion, sigma_m: FloatArray | None = 
         motion: The motion in the world.
         sigma_m: (T,J) standard deviation per axis of each joint's centre, metres; NaN if unknown. It is
             relative to the centre of the first solved joint.
+        take: Name, exact rate and timecode; None if they are unknown.
 
     Raises:
         StoreError: The file cannot be written.
     """
+    rate = exact_rate(motion.fps) if take is None else take.rate
+    code = "" if take is None or take.timecode is None else str(take.timecode)
     poses, skeleton = motion.world_from_joint(), motion.skeleton
     arrays = {
         "names": np.array(skeleton.joints),
@@ -94,6 +101,9 @@ def write_joint_arrays(path: Path, motion: Motion, sigma_m: FloatArray | None = 
         "offsets_m": skeleton.offsets_m,
         "t": motion.times_ns() / 1e9,
         "fps": np.array(motion.fps),
+        "rate": np.array([rate.numerator, rate.denominator]),
+        "take": np.array("" if take is None else take.name),
+        "start_timecode": np.array(code),
         "world": poses[..., :3, 3],
         "world_quat_xyzw": continuous_quat_xyzw(poses[..., :3, :3]),
         "local_quat_xyzw": continuous_quat_xyzw(motion.local_rotation),

@@ -15,6 +15,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.export.earth import earth_of_world
 from bodycap_batch.export.export_inputs import ExportInputs
+from bodycap_batch.export.far_points import is_far
 from bodycap_batch.export.target_frames import (
     WORLD,
     main_target_name,
@@ -134,9 +135,10 @@ def observation_errors(scene: Map, trajectories: Sequence[Trajectory]) -> FloatA
 
 
 def _map_counts(scene: Map, errors: FloatArray) -> dict[str, Any]:
-    """Return the number of points, the number of observations and the mean reprojection error of one map."""
+    """Return the numbers of points and observations, and the mean reprojection error of one map."""
     return {
         "points": len(scene.points),
+        "far_points": int(is_far(scene).sum()),
         "measurements": len(scene.obs_px),
         "mean_reprojection_error_px": _finite_mean(errors),
     }

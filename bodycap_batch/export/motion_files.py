@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.core.arrays import BoolArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.bvh import read_bvh, write_bvh
 from bodycap_batch.formats.c3d import LabelledPoints
@@ -18,6 +18,7 @@ from bodycap_batch.formats.gltf import read_glb, write_glb
 from bodycap_batch.formats.usd import read_usd, write_usd
 from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
+from bodycap_batch.model.take import Take
 
 POSITION_TOLERANCE_M = 1e-4
 """Maximum accepted distance (metres) between a joint centre in the file and in the motion.
@@ -49,41 +50,84 @@ def write_verified_bvh(path: Path, motion: Motion, options: ExportOptions) -> Pa
     return path
 
 
-def write_verified_glb(path: Path, motion: Motion, earth: Mapping[str, Any] | None = None) -> Path:
+def write_verified_glb(
+    path: Path,
+    motion: Motion,
+    earth: Mapping[str, Any] | None = None,
+    *,
+    take: Take | None = None,
+    sigma_m: FloatArray | None = None,
+) -> Path:
     """Write a GLB file, read it back, compare it with the motion, and return the path.
 
     Raises:
         StoreError: The file cannot be written, or it differs by more than 0.1 mm or 0.01° when read back.
     """
-    write_glb(path, motion, earth=earth)
+    write_glb(path, motion, earth=earth, take=take, sigma_m=sigma_m)
     _verify(path, motion, read_glb)
     return path
 
 
-def write_verified_usd(path: Path, motion: Motion, earth: Mapping[str, Any] | None = None) -> Path:
+def write_verified_usd(
+    path: Path,
+    motion: Motion,
+    earth: Mapping[str, Any] | None = None,
+    *,
+    take: Take | None = None,
+    sigma_m: FloatArray | None = None,
+) -> Path:
     """Write a USD file, read it back, compare it with the motion, and return the path.
 
     Raises:
         StoreError: The file cannot be written, or it differs by more than 0.1 mm or 0.01° when read back.
     """
-    write_usd(path, motion, earth)
+    write_usd(path, motion, earth, take=take, sigma_m=sigma_m)
     _verify(path, motion, read_usd)
     return path
 
 
-def points_from_motion(motion: Motion, measured: BoolArray | None = None) -> LabelledPoints:
+def points_from_motion(
+    motion: Motion, measured: BoolArray | None = None, sigma_m: FloatArray | None = None
+) -> LabelledPoints:
     """Return the joint centres of a motion as labelled points in the world.
 
     Args:
         motion: The motion, with J joints.
         measured: (J,) False for a joint that no camera measured; None if all joints are measured.
+        sigma_m: (T,J) standard deviation per axis of each joint's centre, metres; None if it is unknown.
     """
     return LabelledPoints(
         names=motion.skeleton.joints,
         fps=motion.fps,
         x_in_world_m=motion.world_from_joint()[..., :3, 3],
         measured=measured,
+        observed=motion.observed,
+        sigma_m=sigma_m,
     )
+
+
+def sigma_in_layout(motion: Motion, animated: Motion, sigma_m: FloatArray) -> FloatArray:
+    """Return the standard deviations (T,K) of the joints in the layout of the files for animation.
+
+    A joint is found by its role, else by its name; joints that the layout adds have NaN. A frame has the
+    standard deviation of the nearest tick; a T-pose before the motion has NaN.
+
+    Args:
+        motion: The solved motion, with J joints.
+        animated: The same motion in the layout of the files, with K joints and T frames.
+        sigma_m: (ticks of the solved motion,J) standard deviations, metres.
+    """
+    body, shown = motion.skeleton, animated.skeleton
+    ticks = np.rint((animated.times_ns() - motion.start_ns) * 1e-9 * motion.fps).astype(np.int64)
+    inside = (ticks >= 0) & (ticks < len(sigma_m))
+    out = np.full((len(ticks), len(shown.joints)), np.nan)
+    for joint, (name, role) in enumerate(zip(shown.joints, shown.roles, strict=True)):
+        source = body.index_of_role(role) if role else None
+        if source is None and name in body.joints:
+            source = body.joints.index(name)
+        if source is not None:
+            out[inside, joint] = sigma_m[ticks[inside], source]
+    return out
 
 
 def _verify(path: Path, motion: Motion, read: Callable[[Path], Motion | None]) -> None:

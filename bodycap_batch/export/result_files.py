@@ -16,6 +16,13 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.blender_scene import collect_blender_scene
+from bodycap_batch.export.camera_animation import collect_camera_scene
+from bodycap_batch.export.camera_files import (
+    CAMERA_FACTS_FILE,
+    CAMERA_FORMATS,
+    camera_writers,
+    write_camera_facts,
+)
 from bodycap_batch.export.earth import earth_of_world
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.fill_report import FILL_FILE, write_fill_report
@@ -25,12 +32,14 @@ from bodycap_batch.export.layout import added_root, apply_layout
 from bodycap_batch.export.metrics import collect_metrics
 from bodycap_batch.export.motion_files import (
     points_from_motion,
+    sigma_in_layout,
     without_unsolved_branches,
     write_verified_bvh,
     write_verified_glb,
     write_verified_usd,
 )
 from bodycap_batch.export.scene_files import write_colmap, write_maps, write_trajectories
+from bodycap_batch.export.take_time import take_of_motion
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.blender import write_blender_files
 from bodycap_batch.formats.c3d import write_c3d
@@ -69,18 +78,20 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
     require_libraries(options.formats)
     left_out: list[str] = []
     motion, gap = _exported_motion(inputs, options, left_out)
+    animated = None if motion is None else apply_layout(_with_all_joints(inputs, motion, options), options)
     sigma_m = None if inputs.merge is None or motion is None else _exported_sigma_m(inputs.merge, motion)
     steps: dict[str, Callable[[], list[Path]]] = {"tum": lambda: write_trajectories(inputs, left_out)}
     if inputs.maps:
         steps |= {"ply": lambda: write_maps(inputs, left_out), "colmap": lambda: write_colmap(inputs)}
     steps["csv"] = lambda: [write_frame_table(inputs.out_dir / "frames.csv", inputs)]
-    if motion is not None:
-        steps |= _motion_writers(inputs, motion, options, sigma_m, left_out)
+    if motion is not None and animated is not None:
+        steps |= _motion_writers(inputs, motion, animated, options, sigma_m, left_out)
         steps["csv"] = lambda: [
             write_frame_table(inputs.out_dir / "frames.csv", inputs),
             write_joint_table(inputs.out_dir / "joints.csv", motion, sigma_m),
         ]
     steps = {name: write for name, write in steps.items() if name in options.formats}
+    _add_cameras(steps, inputs, animated, options, left_out)
     merge = inputs.merge
     if merge is not None and merge.fill is not None:
         steps["fill"] = lambda: [write_fill_report(inputs.out_dir / FILL_FILE, merge)]
@@ -94,9 +105,35 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
     return tuple(path.relative_to(inputs.out_dir) for path in written)
 
 
+def _add_cameras(
+    steps: dict[str, Callable[[], list[Path]]],
+    inputs: ExportInputs,
+    animated: Motion | None,
+    options: ExportOptions,
+    left_out: list[str],
+) -> None:
+    """Add the files of the animated cameras to the steps of their formats."""
+    chosen = [name for name in CAMERA_FORMATS if name in options.formats]
+    scene = collect_camera_scene(inputs, animated, options.fps, left_out) if chosen else None
+    if scene is None:
+        return
+    writers = camera_writers(inputs.out_dir, scene)
+    for name in chosen:
+        steps[name] = _both(steps.get(name), writers[name])
+    steps["cameras"] = lambda: [write_camera_facts(inputs.out_dir / CAMERA_FACTS_FILE, scene)]
+
+
+def _both(
+    first: Callable[[], list[Path]] | None, second: Callable[[], list[Path]]
+) -> Callable[[], list[Path]]:
+    """Return a function that calls both functions and returns both lists of files."""
+    return second if first is None else lambda: [*first(), *second()]
+
+
 def _motion_writers(
     inputs: ExportInputs,
     motion: Motion,
+    animated: Motion,
     options: ExportOptions,
     sigma_m: FloatArray | None,
     left_out: list[str],
@@ -108,8 +145,9 @@ def _motion_writers(
     measurement formats (C3D, TRC, NPZ) contain the solved motion.
     """
     folder, measured = inputs.out_dir, _measured_joints(inputs, motion)
-    animated = apply_layout(_with_all_joints(inputs, motion, options), options)
-    centres = points_from_motion(motion, measured)
+    take, solved_take = take_of_motion(inputs, animated), take_of_motion(inputs, motion)
+    centres = points_from_motion(motion, measured, sigma_m)
+    sigma = None if sigma_m is None else sigma_in_layout(motion, animated, sigma_m)
     aligned, place = align_axes_with_bones(animated), earth_of_world(inputs)
     earth = None if place is None else place.figures()
     markers = points_from_motion(motion, None if options.filled_markers else measured)
@@ -122,12 +160,12 @@ def _motion_writers(
 
     return {
         "bvh": lambda: [write_verified_bvh(folder / "motion.bvh", animated, options)],
-        "glb": lambda: [write_verified_glb(folder / "motion.glb", aligned, earth)],
-        "fbx": lambda: [write_fbx(folder / "motion.fbx", aligned)],
-        "usd": lambda: [write_verified_usd(folder / "motion.usd", animated, earth)],
-        "c3d": lambda: [write_c3d(folder / "joints.c3d", centres)],
+        "glb": lambda: [write_verified_glb(folder / "motion.glb", aligned, earth, take=take, sigma_m=sigma)],
+        "fbx": lambda: [write_fbx(folder / "motion.fbx", aligned, take)],
+        "usd": lambda: [write_verified_usd(folder / "motion.usd", animated, earth, take=take, sigma_m=sigma)],
+        "c3d": lambda: [write_c3d(folder / "joints.c3d", centres, solved_take)],
         "trc": trc,
-        "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m)],
+        "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m, solved_take)],
         "blender": lambda: write_blender_files(folder, collect_blender_scene(inputs, aligned, options)),
     }
 

@@ -8,9 +8,11 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.export.export_inputs import ExportInputs
+from bodycap_batch.export.far_points import is_far
 from bodycap_batch.export.target_frames import (
     WORLD,
     ExportedMap,
+    describe_target,
     main_target_name,
     maps_in_target_frames,
     target_numbers,
@@ -39,7 +41,8 @@ def write_maps(inputs: ExportInputs, left_out: list[str]) -> list[Path]:
     """Write one point cloud for each target frame, with the maps and the camera paths in this frame.
 
     The file of the main target frame is ``map.ply``. The file of each other target frame is ``map_<n>.ply``.
-    A cloud without points is left out.
+    Far points are in files of their own, ``map_far.ply`` and ``map_<n>_far.ply``, so that programs show the
+    room when they show everything. A cloud without points is left out.
 
     Args:
         inputs: The results of the earlier stages.
@@ -58,10 +61,10 @@ def write_maps(inputs: ExportInputs, left_out: list[str]) -> list[Path]:
         groups.setdefault(exported.target, []).append(exported)
     for name, number in target_numbers(inputs).items():
         members = groups[name]
-        points = [_points_in_target(member) for member in members]
-        cloud = PointCloud(
-            points=np.concatenate(points), colors=np.concatenate([member.scene.colors for member in members])
-        )
+        far = np.concatenate([is_far(member.scene) for member in members])
+        points = np.concatenate([member.points() for member in members])
+        colors = np.concatenate([member.scene.colors for member in members])
+        cloud = PointCloud(points=points[~far], colors=colors[~far])
         paths = {
             item.camera: _camera_centres(item)
             for item in (*trajectories_in_target_frames(inputs), *inputs.other_paths)
@@ -70,12 +73,15 @@ def write_maps(inputs: ExportInputs, left_out: list[str]) -> list[Path]:
         spacing = PATH_SPACING_M if name == WORLD else _PATH_SPACING_RATIO * _extent(cloud.points)
         file = inputs.out_dir / (f"map_{number}.ply" if number else "map.ply")
         drawn = add_camera_paths(cloud, paths, spacing, colours) if paths else cloud
-        if not len(cloud.points):
+        if not len(points):
             rest = "shows camera paths only" if len(drawn.points) else "is not written"
             left_out.append(f"{file.name} {rest}: its map has no points")
         if len(drawn.points):
             write_ply(file, drawn)
             written.append(file)
+        if far.any():
+            written.append(file.with_name(f"{file.stem}_far.ply"))
+            write_ply(written[-1], PointCloud(points=points[far], colors=colors[far]))
     return written
 
 
@@ -124,9 +130,8 @@ def _write_path(folder: Path, trajectory: Trajectory) -> Path:
 
 def _header_comments(trajectory: Trajectory) -> list[str]:
     """Return the comments at the top of a TUM file: camera, frame of reference and clock."""
-    poses = "world_from_camera: metres, Z up, floor at z = 0"
-    if trajectory.gauge != WORLD:
-        poses = f"map_from_camera: gauge {trajectory.gauge}, its scale and axes are arbitrary"
+    source = "world_from_camera" if trajectory.gauge == WORLD else "map_from_camera"
+    poses = f"{source}: {describe_target(trajectory.gauge)}"
     return [f"camera {trajectory.camera}", poses, "timestamps: the camera's own clock, seconds"]
 
 
@@ -147,12 +152,6 @@ def write_colmap(inputs: ExportInputs) -> list[Path]:
         folder = inputs.out_dir / "colmap" / str(index)
         written += write_colmap_model(folder, exported.scene, exported.target_from_map, numbers)
     return written
-
-
-def _points_in_target(exported: ExportedMap) -> FloatArray:
-    """Return the points (P,3) of a map in its target frame."""
-    points = exported.scene.points
-    return points if exported.target_from_map is None else exported.target_from_map.apply(points)
 
 
 def _camera_centres(trajectory: Trajectory) -> FloatArray:

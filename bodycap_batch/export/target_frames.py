@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.scene import Map, Trajectory
@@ -28,6 +29,18 @@ class ExportedMap:
     scene: Map
     target: str
     target_from_map: Similarity | None
+
+    def points(self) -> FloatArray:
+        """Return the points (P,3) of the map in its target frame."""
+        points = self.scene.points
+        return points if self.target_from_map is None else self.target_from_map.apply(points)
+
+
+def describe_target(target: str) -> str:
+    """Return the unit and the axes of a target frame, as words for the header of a file."""
+    if target == WORLD:
+        return "metres, Z up, floor at z = 0"
+    return f"gauge {target}, its scale and axes are arbitrary"
 
 
 def maps_in_target_frames(inputs: ExportInputs) -> tuple[ExportedMap, ...]:

@@ -76,6 +76,7 @@ class VideoWriter:
         sound: Mono sound that starts with the first image, to be stored as AAC. None for no sound.
         bit_rate_mbps: Mean bit rate, megabits per second, instead of a constant quality. None: `quality`
             decides.
+        timecode: Timecode of the first image, for a timecode track; "" for none.
 
     Raises:
         StoreError: The file cannot be written.
@@ -90,6 +91,7 @@ class VideoWriter:
         colours: tuple[int, int] | None = None,
         sound: Sound | None = None,
         bit_rate_mbps: float | None = None,
+        timecode: str = "",
     ) -> None:
         import av
 
@@ -119,6 +121,8 @@ class VideoWriter:
                 "bufsize": rate_kbps,
                 "g": f"{max(1, round(fps))}",
             }
+        if timecode:
+            self._stream.metadata["timecode"] = timecode
         self._stream.codec_context.thread_count = 1
         if colours is not None:
             self._stream.codec_context.color_range, self._stream.codec_context.colorspace = colours

@@ -43,7 +43,7 @@ def require_formats(formats: Iterable[str]) -> None:
     """
     names = tuple(formats)
     require_libraries(names)
-    if "fbx" in names:
+    if {"fbx", "abc"} & set(names):
         from bodycap_batch.formats.fbx import require_blender  # this import takes as long as all other code
 
         require_blender()

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
+import numpy.typing as npt
+
+from bodycap_batch.core.arrays import FloatArray
+
 Colour = tuple[int, int, int]
 
 CAMERA_COLOURS: tuple[Colour, ...] = (
@@ -30,3 +35,12 @@ def camera_colours(cameras: Iterable[str]) -> dict[str, Colour]:
 def hex_from_colour(colour: Colour) -> str:
     """Return a colour as a text in the form ``#rrggbb``."""
     return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+def linear_colours(srgb: npt.NDArray[np.uint8]) -> FloatArray:
+    """Return the linear intensities (N,3), 0 to 1, of sRGB colours (N,3).
+
+    Source: IEC 61966-2-1.
+    """
+    value = srgb / 255.0
+    return np.asarray(np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4))

@@ -34,7 +34,7 @@ def write_trc(path: Path, points: LabelledPoints) -> Path:
     """
     measured = points.measured_points()
     names = [" ".join(name.split()) for name, kept in zip(points.names, measured, strict=True) if kept]
-    rate, frames, count = f"{points.fps:g}", len(points.x_in_world_m), len(names)
+    rate, frames, count = f"{points.fps:.10g}", len(points.x_in_world_m), len(names)
     axes = "\t".join(f"{axis}{number}" for number in range(1, count + 1) for axis in "XYZ")
     lines = [
         f"PathFileType\t4\t(X/Y/Z)\t{path.name}",

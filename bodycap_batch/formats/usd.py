@@ -14,6 +14,7 @@ from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.formats.mannequin import Mannequin, make_mannequin
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, rotation_from_quat_xyzw
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
+from bodycap_batch.model.take import Take
 
 _BODY_PATH, _SKELETON_PATH, _MESH_PATH = "/Body", "/Body/Skeleton", "/Body/Mannequin"
 _MOTION_PATH = "/Body/Skeleton/Motion"
@@ -25,19 +26,30 @@ _EXTENT_MARGIN_M = 0.3
 and feet extend beyond their joints by less than this margin."""
 
 
-def write_usd(path: Path, motion: Motion, earth: Mapping[str, Any] | None = None) -> Path:
+def write_usd(
+    path: Path,
+    motion: Motion,
+    earth: Mapping[str, Any] | None = None,
+    *,
+    take: Take | None = None,
+    sigma_m: FloatArray | None = None,
+) -> Path:
     """Write a motion as a skinned, animated mannequin.
 
     The time codes are frame numbers, counted from 0. The mesh is bound to the joints in the T-pose. The joint
     tokens are paths of names that USD allows (``mixamorig_Hips``). The original names are stored in
     ``jointNames``. The custom data ``unobservedJoints`` of the skeleton lists the joints that no camera
-    measured. Translations, rotations and scales are written for every frame.
+    measured. Translations, rotations and scales are written for every frame. So are the primvars ``measured``
+    and ``sigmaMetres`` of the skeleton, with a value for each joint.
 
     Args:
         path: Path of the file (``.usd``, ``.usda``, ``.usdc``), which is replaced atomically.
         motion: The motion, in world axes and metres.
         earth: Place of the world on the Earth as plain JSON values, for the custom data ``earth`` of the
             layer; None if it is unknown. The transform is a list of 16 numbers, row by row.
+        take: Name, exact rate and timecode, for the custom data of the layer; None if they are unknown.
+        sigma_m: (T,J) standard deviation per axis of each joint's centre, metres; NaN if it is unknown. None
+            leaves it out.
 
     Returns:
         The path of the file.
@@ -45,16 +57,9 @@ def write_usd(path: Path, motion: Motion, earth: Mapping[str, Any] | None = None
     Raises:
         StoreError: The file cannot be written.
     """
-    from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+    from pxr import Gf, UsdSkel, Vt
 
-    stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    frames = len(motion.root_in_world_m)
-    stage.SetTimeCodesPerSecond(motion.fps)
-    stage.SetFramesPerSecond(motion.fps)
-    stage.SetStartTimeCode(0.0)
-    stage.SetEndTimeCode(float(frames - 1))
+    stage = new_stage(motion.fps, len(motion.root_in_world_m))
     body = UsdSkel.Root.Define(stage, _BODY_PATH)
     stage.SetDefaultPrim(body.GetPrim())
     centres = motion.world_from_joint()[..., :3, 3].reshape(-1, 3)
@@ -71,8 +76,35 @@ def write_usd(path: Path, motion: Motion, earth: Mapping[str, Any] | None = None
     animation = _define_animation(stage, motion, tokens)
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
     _define_mesh(stage, make_mannequin(motion.skeleton), skeleton)
+    _add_validity(skeleton, motion, sigma_m)
+    facts = {} if take is None else layer_data(take.figures())
     if earth is not None:
-        stage.GetRootLayer().customLayerData = {"earth": _layer_data(earth)}
+        facts["earth"] = layer_data(earth)
+    if facts:
+        stage.GetRootLayer().customLayerData = facts
+    return export_stage(stage, path)
+
+
+def new_stage(fps: float, frames: int) -> Any:
+    """Return an empty stage in metres, Z up, with a number of frames that are counted from 0."""
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(fps)
+    stage.SetFramesPerSecond(fps)
+    stage.SetStartTimeCode(0.0)
+    stage.SetEndTimeCode(float(frames - 1))
+    return stage
+
+
+def export_stage(stage: Any, path: Path) -> Path:
+    """Write a stage to a file, which is replaced atomically, and return the path of the file.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
     with atomic_replacement(path) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
             raise StoreError(
@@ -138,6 +170,20 @@ def _define_animation(stage: Any, motion: Motion, tokens: list[str]) -> Any:
         ):
             attribute.Set(value, float(frame))
     return animation
+
+
+def _add_validity(skeleton: Any, motion: Motion, sigma_m: FloatArray | None) -> None:
+    """Add primvars to the skeleton that state for each frame which joints were measured, and how well."""
+    from pxr import Sdf, UsdGeom, Vt
+
+    variables = UsdGeom.PrimvarsAPI(skeleton)
+    measured = variables.CreatePrimvar("measured", Sdf.ValueTypeNames.BoolArray)
+    for frame, row in enumerate(motion.observed.tolist()):
+        measured.Set(Vt.BoolArray(row), float(frame))
+    if sigma_m is not None:
+        sigma = variables.CreatePrimvar("sigmaMetres", Sdf.ValueTypeNames.FloatArray)
+        for frame, values in enumerate(sigma_m.astype(np.float32)):
+            sigma.Set(Vt.FloatArray.FromNumpy(values), float(frame))
 
 
 def _define_mesh(stage: Any, body_mesh: Mannequin, skeleton: Any) -> None:
@@ -229,7 +275,7 @@ def read_usd(path: Path) -> Motion:
     )
 
 
-def _layer_data(earth: Mapping[str, Any]) -> dict[str, Any]:
+def layer_data(earth: Mapping[str, Any]) -> dict[str, Any]:
     """Return plain JSON values as values of a layer: lists of numbers as arrays."""
     from pxr import Vt
 

@@ -1,7 +1,7 @@
 """Run a job from its videos to its results: all stages, one after another."""
 
 from bodycap_batch.pipeline.batch import Batch, BatchJob, Outcome
-from bodycap_batch.pipeline.exporting import export_for
+from bodycap_batch.pipeline.exporting import export_for, export_undistorted
 from bodycap_batch.pipeline.reporting import remake_report, stored_for_report
 from bodycap_batch.pipeline.run import RunSummary, run_job
 from bodycap_batch.pipeline.sample import prepare_capture
@@ -18,6 +18,7 @@ __all__ = [
     "Step",
     "explain_job",
     "export_for",
+    "export_undistorted",
     "prepare_capture",
     "remake_report",
     "run_job",

@@ -11,6 +11,7 @@ from bodycap_batch.config.models import Job
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.errors import EstimationError, JobError
 from bodycap_batch.core.progress import Event
+from bodycap_batch.export.camera_files import CAMERA_FACTS_FILE
 from bodycap_batch.export.fill_report import FILL_FILE
 from bodycap_batch.formats.blender import write_blend
 from bodycap_batch.formats.blender.scene_script import SCENE_FILE, SCRIPT_FILE
@@ -68,6 +69,7 @@ def export_for(
         raise error
     asked = job.model_copy(update={"export": options})
     with Flow(asked, replace(settings, until=STAGE_ORDER[-1]), logs=out_dir / "logs") as flow:
+        flow.identify_videos()
         exported = flow.export(results)
     files = {name: path for name, path in files_of(exported) if name not in _NOT_FOR_PROGRAMS}
     if program.file not in files:
@@ -85,6 +87,51 @@ def export_for(
         written += _blend_file(folder, settings)
     write_results_file(folder, GUIDE_FILE, _guide(job, program, options))
     return [*written, folder / GUIDE_FILE]
+
+
+def export_undistorted(
+    job: Job, *, out_dir: Path, folder: Path, fps: float | None, settings: Settings
+) -> list[Path]:
+    """Write the undistorted clip of each camera, and the animated cameras that match the clips.
+
+    Only the export stage and the clips are computed.
+
+    Args:
+        job: A resolved job. Its export options decide the frames, as for the other files for animation.
+        out_dir: Folder of the job's results.
+        folder: Folder for the clips.
+        fps: Frames per second; None for the job's rate.
+        settings: Settings of the run: store, threads, listener, cancellation.
+
+    Returns:
+        The paths of the files: one clip and one .chan file for each camera, and ``cameras.json``.
+
+    Raises:
+        BodycapError: A video cannot be read, the disk fails, the store does not hold the results, or no
+            camera was localised. Then the folder is unchanged.
+    """
+    results, stopped_by = find_stored(job, out_dir, settings, last="fill")
+    if results.map is None or results.clocks is None:
+        assert stopped_by is not None
+        raise stopped_by
+    options = job.export.model_copy(update={"formats": ("chan",), "fps": fps or job.export.fps})
+    asked = job.model_copy(update={"export": options})
+    with Flow(asked, replace(settings, until=STAGE_ORDER[-1]), logs=out_dir / "logs") as flow:
+        flow.identify_videos()
+        exported = flow.export(results)
+        files = {name: path for name, path in files_of(exported) if name not in _NOT_FOR_PROGRAMS}
+        if CAMERA_FACTS_FILE not in files:
+            raise EstimationError(
+                "no camera was localised, so there is no clip to undistort",
+                path=out_dir,
+                hint="look at the report: it says what is missing and why",
+            )
+        facts = json.loads(files[CAMERA_FACTS_FILE].read_text(encoding="utf-8"))
+        for clip in flow.undistort(results, exported, list(facts["cameras"])).values():
+            files |= dict(files_of(clip))
+    settings.require_owner()
+    publish(files, folder)
+    return [folder / name for name in files]
 
 
 def _name_videos(folder: Path, job: Job) -> None:

@@ -56,6 +56,7 @@ from bodycap_batch.tasks.registration import REGISTRATION, RegistrationTask
 from bodycap_batch.tasks.report import REPORT
 from bodycap_batch.tasks.sound import SOUND, SoundTask, known_from_sound
 from bodycap_batch.tasks.stage import Stage, read_summary
+from bodycap_batch.tasks.undistort import UNDISTORT, UndistortTask
 
 _REFINEMENTS = 2
 """Maximum number of passes of the correction of rolling shutters. Evidence: docs/decisions/mapping.md."""
@@ -456,20 +457,46 @@ class Flow:
         """
         assert results.map is not None
         assert results.clocks is not None
-        segments = (results.job or self._job).capture.segments()
+        capture = (results.job or self._job).capture
         task = ExportTask(
             options=self._job.export,
+            take=self._job.name,
+            capture=capture_ref(capture, self._cameras),
             map=artefact_ref(results.map),
             registrations=refs_by_camera(results.registrations),
             clocks=artefact_ref(results.clocks),
             keyframes=refs_by_camera(results.keyframes),
             merge=optional_ref(results.filled),
             failure=None if results.failure is None else results.failure.message,
-            segments=tuple(tuple(camera.name for camera in cameras) for cameras in segments),
+            segments=tuple(tuple(camera.name for camera in cameras) for cameras in capture.segments()),
         )
         artefact = self.runner.run(make_task(EXPORT, task, threads=self._threads))
         self.runner.report_notes(artefact, "export")
         return artefact
+
+    def undistort(self, results: StageResults, exported: Artefact, cameras: Sequence[str]) -> ByCamera:
+        """Write the undistorted clip of each of these cameras, and return the artefact of each camera.
+
+        Args:
+            results: The results of the stages before the export.
+            exported: The artefact of the result files, which contain the facts about the cameras.
+            cameras: Names of the cameras.
+        """
+        assert results.map is not None
+        return self.runner.run_all(
+            make_task(
+                UNDISTORT,
+                UndistortTask(
+                    camera=camera.name,
+                    capture=self._footage([camera]),
+                    map=artefact_ref(results.map),
+                    export=artefact_ref(exported),
+                ),
+                camera=camera.name,
+            )
+            for camera in self._capture.cameras
+            if camera.name in cameras
+        )
 
     def start_preview(self, results: StageResults) -> Future[Artefact] | None:
         """Start to render the video of the results while later stages run.
@@ -550,22 +577,27 @@ class Flow:
                     "end_s do not apply to it and all its frames are used; state offset_s to use a part of it"
                 )
                 self._settings.listener(Event(kind="note", stage="clocks", what=f"note: {note}"))
-        self._cameras = camera_digests(
-            self._capture, self._settings.store.digests, self._settings.listener, self._settings.cancelled
-        )
+        self.identify_videos()
 
     @cached_property
     def _body(self) -> BodyInput | None:
         """The body of the job; None if the job asks for no skeleton."""
         return body_input(self._job, self._settings.store.digests) if has_body(self._job) else None
 
-    def _check_task(self) -> Task:
+    def identify_videos(self) -> None:
+        """Determine the digest of each camera's frames, for a run that starts with stored results.
+
+        Raises:
+            BodycapError: A video cannot be read, or the job was stopped.
+        """
         self._cameras = camera_digests(
             self._capture, self._settings.store.digests, self._settings.listener, self._settings.cancelled
         )
-        if has_body(self._job):
-            # Each run checks the installed libraries: they can change after the check stage is stored.
-            require_libraries(self._job.export.formats)
+
+    def _check_task(self) -> Task:
+        self.identify_videos()
+        # Each run checks the installed libraries: they can change after the check stage is stored.
+        require_libraries(self._job.export.formats)
         # Places that an earlier run found are not part of the key: the check of that run did not know them.
         found = {camera.name for camera in self._capture.cameras if camera.mount_source is not None}
         clocks, body = stated_clocks(self._job.capture), self._body

@@ -16,6 +16,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.formats.mp4_writer import VideoWriter
 from bodycap_batch.formats.palette import camera_colours
+from bodycap_batch.model.frame_choice import nearest_frames
 from bodycap_batch.overlay import BoneMotion, CameraView, RgbImage
 from bodycap_batch.preview.labels import AMBER, GREY, draw_text, shorten_to_width
 from bodycap_batch.preview.layout import HEIGHT, ROOM_WIDTH, WIDTH, lay_out_videos
@@ -31,7 +32,7 @@ from bodycap_batch.preview.room_drawing import (
     draw_points,
     floor_grid,
 )
-from bodycap_batch.preview.tiles import WORLD, VideoTile, draw_tile, nearest_frames
+from bodycap_batch.preview.tiles import WORLD, VideoTile, draw_tile
 from bodycap_batch.preview.viewpoint import Viewpoint, follow_target
 
 _BODY_RADIUS_M = 1.05
@@ -154,7 +155,7 @@ def make_tiles(inputs: PreviewInputs, timeline: PreviewTimeline) -> list[VideoTi
         VideoTile(
             camera=camera,
             view=views.get(camera.name),
-            frames=nearest_frames(camera, timeline.times_ns),
+            frames=nearest_frames(camera.common_times_ns(), timeline.times_ns, camera.nominal_fps),
             video_box=video_box,
             label_box=label_box,
             colour=colours[camera.name],

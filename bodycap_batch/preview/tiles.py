@@ -99,25 +99,6 @@ def resize_image(image: RgbImage, size: tuple[int, int]) -> RgbImage:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
 
 
-def nearest_frames(camera: CaptureCamera, times_ns: IntArray) -> IntArray:
-    """Return the index (F,) of the frame nearest to each common time.
-
-    The index is −1 for a time before the start or after the end of the video.
-    """
-    frame_times = camera.common_times_ns()
-    if not len(frame_times):
-        return np.full(len(times_ns), -1, dtype=np.int64)
-    after = np.clip(np.searchsorted(frame_times, times_ns), 1, max(1, len(frame_times) - 1))
-    after = np.minimum(after, len(frame_times) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(
-        np.abs(frame_times[before] - times_ns) <= np.abs(frame_times[after] - times_ns), before, after
-    )
-    interval = np.median(np.diff(frame_times)) if len(frame_times) > 1 else 1e9 / camera.nominal_fps
-    inside = (times_ns >= frame_times[0] - 0.5 * interval) & (times_ns <= frame_times[-1] + 0.5 * interval)
-    return np.asarray(np.where(inside, nearest, -1), dtype=np.int64)
-
-
 def draw_tile(
     image: RgbImage,
     tile: VideoTile,

@@ -23,6 +23,13 @@ _FILES = {
     "joints.npz": ("joint poses, and which were measured", "NumPy"),
     "frames.csv": ("the status of every video frame", "spreadsheets, pandas"),
     "map.ply": ("the room as points, and the camera paths", "MeshLab, CloudCompare, Blender"),
+    "cameras.glb": ("the animated cameras, and the room as points", "Blender, three.js, web viewers"),
+    "cameras.usd": ("the animated cameras, and the room as points", "Omniverse, Houdini, Blender, usdview"),
+    "cameras.fbx": ("the animated cameras", "Maya, MotionBuilder, Unreal, Unity"),
+    "cameras.json": (
+        "lens, picture size and frames of the animated cameras, rate and timecode",
+        "any program that reads JSON",
+    ),
     "metrics.json": ("all figures of this page", "any program that reads JSON"),
 }
 """Content of each result file, and what opens it, by file name. The order is that of the page."""
@@ -57,12 +64,18 @@ def describe_files(paths: Iterable[str]) -> list[ResultLink]:
     ]
     for name in names:
         folder = PurePosixPath(name)
-        if name.startswith("map_") and folder.suffix == ".ply":
+        if folder.stem.endswith("_far") and folder.suffix == ".ply":
+            content = "points that are far away: their depth is uncertain"
+            out.append(ResultLink(path=name, content=content, opens_in="MeshLab, CloudCompare"))
+        elif name.startswith("map_") and folder.suffix == ".ply":
             out.append(ResultLink(path=name, content="a map that could not be placed", opens_in="MeshLab"))
         elif folder.suffix == ".tum":
             out.append(
                 ResultLink(path=name, content=f"the path of camera {folder.stem}", opens_in="evo, any editor")
             )
+        elif folder.suffix in (".chan", ".abc"):
+            opens_in = "Nuke" if folder.suffix == ".chan" else "Nuke, Maya, Houdini, Blender"
+            out.append(ResultLink(path=name, content=f"the animated camera {folder.stem}", opens_in=opens_in))
         elif folder.parts[0] == "colmap" and folder.name == "cameras.bin":
             out.append(
                 ResultLink(

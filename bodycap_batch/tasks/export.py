@@ -6,14 +6,18 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.tasks.inputs import ArtefactRef, paths_of
-from bodycap_batch.tasks.loading import load_clocks, load_keyframes, load_map
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
+from bodycap_batch.tasks.loading import load_capture, load_clocks, load_keyframes, load_map
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
 from bodycap_batch.tasks.stage import RESULTS_FOLDER, Stage, read_summary, write_summary
 from bodycap_batch.tasks.typed_json import omitted_from_key
+
+if TYPE_CHECKING:
+    from bodycap_batch.export.export_inputs import VideoFacts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,6 +27,8 @@ class ExportTask:
     Attributes:
         options: The stage's options. The option `preview` is not part of the artefact's key, because a
             separate stage renders the preview.
+        take: Name of the take, which is that of the job.
+        capture: The videos of all cameras: their picture sizes and timecodes.
         map: The map.
         registrations: The registration of each camera, by camera name.
         clocks: The clocks of all cameras.
@@ -33,6 +39,8 @@ class ExportTask:
     """
 
     options: ExportOptions = field(metadata=omitted_from_key("preview"))
+    take: str
+    capture: CaptureRef
     map: ArtefactRef
     registrations: Mapping[str, ArtefactRef]
     clocks: ArtefactRef
@@ -66,11 +74,35 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
         inertial=found.inertial,
         other_paths=found.other_paths,
         relative_poses=found.relative_poses(task.segments),
+        take=task.take,
+        videos=_video_facts(task.capture),
         log={**scene.log, "reach": read_summary(task.clocks.path)["distances"]},
     )
     export_results(inputs, task.options, context)
     metrics = json.loads((inputs.out_dir / "metrics.json").read_text(encoding="utf-8"))
     write_summary(files, notes=metrics[LEFT_OUT])
+
+
+def _video_facts(capture: CaptureRef) -> dict[str, VideoFacts]:
+    """Return what the files for 3D programs state about the video of each camera."""
+    from bodycap_batch.capture.timeline import join_chapters
+    from bodycap_batch.clocks.container_times import read_timecode
+    from bodycap_batch.export.export_inputs import VideoFacts
+    from bodycap_batch.model.take import Timecode, exact_rate
+
+    facts = {}
+    sidecars = {camera.name: camera.timestamps for camera in capture.config.cameras}
+    for camera in load_capture(capture).cameras:
+        first = camera.videos[0]
+        width, height = first.shown_size
+        times_ns = join_chapters(camera.videos, sidecars[camera.name]).times_ns
+        facts[camera.name] = VideoFacts(
+            width_px=width,
+            height_px=height,
+            timecode=Timecode.parse(read_timecode(first), exact_rate(first.fps or 30.0)),
+            first_frame_ns=int(times_ns[0]),
+        )
+    return facts
 
 
 EXPORT = Stage(

@@ -22,6 +22,7 @@ from bodycap_batch.tasks.report import REPORT
 from bodycap_batch.tasks.sound import SOUND
 from bodycap_batch.tasks.stage import Stage
 from bodycap_batch.tasks.synth import SYNTH
+from bodycap_batch.tasks.undistort import UNDISTORT
 
 STAGES: Mapping[str, Stage[Any]] = {
     stage.name: stage
@@ -45,5 +46,6 @@ STAGES: Mapping[str, Stage[Any]] = {
         EXPORT,
         REPORT,
         PREVIEW,
+        UNDISTORT,
     )
 }

@@ -9,9 +9,11 @@ import shutil
 import signal
 import subprocess
 from collections.abc import Callable
+from fractions import Fraction
 from http.client import HTTPConnection
 from pathlib import Path
 
+import av
 import bvhio
 import numpy as np
 import pytest
@@ -173,6 +175,25 @@ def is_export(target: str, folder: str) -> Callable[[Site, Done], None]:
     return check
 
 
+def are_clips(site: Site, done: Done) -> None:
+    """Check that each camera has a clip with one picture for each of its frames, and a .chan file."""
+    out = site.folder / "out/my_walk/undistorted"
+    assert done.code == 0, done.err
+    facts = json.loads((out / "cameras.json").read_text())
+    assert sorted(facts["cameras"]) == ["left_palm", "torso"]
+    main = json.loads((site.folder / "out/my_walk/cameras.json").read_text())
+    assert facts["frames"] == main["frames"] > 10
+    for name, camera in facts["cameras"].items():
+        assert camera == main["cameras"][name]
+        with av.open(str(out / f"{name}.mp4")) as container:
+            stream = container.streams.video[0]
+            assert stream.average_rate == Fraction(facts["rate"])
+            assert (stream.width, stream.height) == (camera["width_px"], camera["height_px"])
+            assert sum(1 for _ in container.decode(video=0)) == facts["frames"]
+        lines = (out / "cameras" / f"{name}.chan").read_text().splitlines()
+        assert len(lines) == sum(last - first + 1 for first, last in camera["valid_frames"])
+
+
 def is_made(*words: str) -> Callable[[Site, Done], None]:
     """Return a check of a target of the Makefile: its recipe runs this program."""
 
@@ -198,6 +219,7 @@ CHECKS: dict[str, Callable[[Site, Done], None]] = {
     "bodycap export out/my_walk --for blender": is_export("blender", "out/my_walk/blender"),
     "bodycap export out/cpl_lab --for blender": is_export("blender", "out/cpl_lab/blender"),
     "bodycap export out/cpl_lab --for unreal": is_export("unreal", "out/cpl_lab/unreal"),
+    "bodycap export out/my_walk --undistorted": are_clips,
     "bodycap compare out/monday out/tuesday": page_with("monday", "tuesday", "<svg"),
     "bodycap compare out/my_walk mocap.bvh --shift 0.4 --out walk.html": page_with("mocap", "<svg"),
     "bodycap compare out/my_walk capture/gt/joints.npz": page_with("my_walk", "<svg"),

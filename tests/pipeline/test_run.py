@@ -174,7 +174,7 @@ def test_moving_the_capture_executes_nothing(done: Bench) -> None:
         ({"torso": {"drift_ppm": 10.0}}, ["check", *CLOCKED]),
         ({"capture": {"clocks": "common"}}, CLOCKED),
         ({"capture": {"work_px": 640}}, ALL),
-        ({"name": "other", "out": "/elsewhere"}, ["report"]),
+        ({"name": "other", "out": "/elsewhere"}, ["export", "report"]),
     ],
     ids=lambda value: str(value)[:40],
 )

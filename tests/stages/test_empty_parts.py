@@ -23,6 +23,7 @@ from tests.stages.conftest import Estimated, context
 from tests.stages.test_export import inputs_of
 from tests.stages.test_preview import decode, preview_inputs
 
+CAMERAS = {"cameras.glb", "cameras.usd", "cameras.json"}
 FORMATS = ("ply", "bvh", "glb", "tum", "csv", "colmap", "blender", "usd", "c3d", "trc", "npz")
 MOTION = {"motion.bvh", "motion.glb", "motion.usd", "joints.c3d", "joints.trc", "joints.npz", "joints.csv"}
 
@@ -90,11 +91,15 @@ def no_frames(inputs: ExportInputs) -> ExportInputs:
         (lost_camera, set(), ["trajectories/torso.tum has no poses"]),
         (
             nothing_at_all,
-            {"map.ply", "map_1.ply", *MOTION},
+            {"map.ply", "map_1.ply", *MOTION, *CAMERAS},
             ["map.ply is not written", "left_palm.tum has no"],
         ),
         (no_measured_joint, {"joints.trc"}, ["joints.trc is not written: no exported joint was measured"]),
-        (no_frames, MOTION, ["the files of the motion are not written: the motion has no frames"]),
+        (
+            no_frames,
+            {*MOTION, *CAMERAS},
+            ["the files of the motion are not written: the motion has no frames"],
+        ),
     ],
 )
 def test_an_empty_part_is_left_out_and_said_and_the_rest_is_written(

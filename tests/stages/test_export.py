@@ -69,6 +69,8 @@ def test_all_files_are_there(tmp_path: Path) -> None:
         "map_1.ply",
         "motion.bvh",
         "motion.glb",
+        "cameras.glb",
+        "cameras.json",
         "joints.csv",
         "frames.csv",
         "metrics.json",
@@ -227,7 +229,8 @@ def test_further_formats_hold_the_same_joints(tmp_path: Path) -> None:
     run(inputs, formats=("usd", "c3d", "trc", "npz", "csv"), names="mixamo", root="in_place")
     names = {path.name for path in inputs.out_dir.iterdir()}
     assert names == {
-        *("motion.usd", "joints.c3d", "joints.trc", "joints.npz", "joints.csv", "frames.csv", "metrics.json")
+        *("motion.usd", "joints.c3d", "joints.trc", "joints.npz", "joints.csv", "frames.csv", "metrics.json"),
+        *("cameras.usd", "cameras.json"),
     }
     assert inputs.merge is not None
     motion = inputs.merge.motion

@@ -63,6 +63,9 @@ def build_scene(folder: Path) -> list[str]:
     scene = bpy.context.scene
     collection = bpy.data.collections.new(data["name"])
     scene.collection.children.link(collection)
+    for key in ("take", "rate", "start_timecode"):
+        if key in data:
+            collection[key] = data[key]
     notes = [_add_body(folder, data, collection), _add_room(folder, collection)]
     _set_time(scene, data["fps"], data["frames"])
     scene.unit_settings.system = "METRIC"

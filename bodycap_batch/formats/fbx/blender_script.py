@@ -1,6 +1,6 @@
 """Convert a GLB file to FBX and report the joints of the result. This script runs in Blender's Python.
 
-    python blender_script.py in.glb out.fbx report.json fps frames
+    python blender_script.py in.glb out.fbx report.json fps frames facts
 
 The unit of length of the Blender scene is the centimetre. Blender's glTF importer converts metres to
 centimetres, so the FBX file needs no scale.
@@ -29,7 +29,7 @@ _COMPARED_FRAMES = 20
 enough to detect a wrong frame rate or a wrong axis."""
 
 
-def convert(source: str, target: str, fps: float, frames: int) -> None:
+def convert(source: str, target: str, fps: float, frames: int, facts: dict[str, Any]) -> None:
     """Import the GLB file and export the FBX file, without leaf bones and with a key at every frame.
 
     Args:
@@ -37,6 +37,7 @@ def convert(source: str, target: str, fps: float, frames: int) -> None:
         target: Path of the FBX file.
         fps: Frames per second of the motion.
         frames: Number of frames.
+        facts: Name of the take, exact rate and timecode, as custom properties of the armature.
     """
     import bpy
 
@@ -44,11 +45,14 @@ def convert(source: str, target: str, fps: float, frames: int) -> None:
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
-    scene.name = "Motion"  # the name of the animation in the file
+    scene.name = facts.get("take", "Motion")  # the name of the animation in the file
     _set_rate(scene, GLB_FPS)
     scene.unit_settings.system, scene.unit_settings.scale_length = "METRIC", 0.01
     bpy.ops.import_scene.gltf(filepath=source, disable_bone_shape=True)
     _set_rate(scene, fps)
+    (body,) = [item for item in bpy.data.objects if item.type == "ARMATURE"]
+    for key, value in facts.items():
+        body[key] = value
     scene.frame_start, scene.frame_end = 0, frames - 1
     _go_to_bind_pose(scene)
     header = export_fbx_bin.fbx_header_elements
@@ -69,6 +73,7 @@ def convert(source: str, target: str, fps: float, frames: int) -> None:
         bake_anim_use_all_actions=False,
         bake_anim_step=1.0,
         bake_anim_simplify_factor=0.0,
+        use_custom_props=True,
         use_metadata=False,
     )
 
@@ -127,8 +132,8 @@ def _set_rate(scene: Any, fps: float) -> None:
 
 def main(arguments: list[str]) -> None:
     """Convert a file, read the result back and write the report."""
-    source, target, report, fps, frames = arguments
-    convert(source, target, float(fps), int(frames))
+    source, target, report, fps, frames, facts = arguments
+    convert(source, target, float(fps), int(frames), json.loads(facts))
     Path(report).write_text(json.dumps(read_back(target, float(fps))), encoding="utf-8")
 
 

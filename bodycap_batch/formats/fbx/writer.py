@@ -17,6 +17,7 @@ from bodycap_batch.formats.fbx.blender_script import GLB_FPS
 from bodycap_batch.formats.gltf import write_glb
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion, rest_pose
+from bodycap_batch.model.take import Take
 
 POSITION_TOLERANCE_M = 1e-4
 """Maximum distance, metres, between a joint that is read back from the file and the same joint in the motion.
@@ -29,7 +30,7 @@ _BEFORE_BLENDER_IMPORT = (-np.pi / 2, 0.0, 0.0)
 90° about X. Both rotations cancel, so the axes of the joints are unchanged."""
 
 
-def write_fbx(path: Path, motion: Motion) -> Path:
+def write_fbx(path: Path, motion: Motion, take: Take | None = None) -> Path:
     """Write a motion as an FBX file.
 
     Blender converts a GLB file to FBX and reads the FBX file back. Then the joint centres are compared with
@@ -39,6 +40,8 @@ def write_fbx(path: Path, motion: Motion) -> Path:
     Args:
         path: Path of the file, which is replaced atomically.
         motion: The motion, in world axes and metres.
+        take: Name, exact rate and timecode: the name of the animation, and custom properties of the armature.
+            None if they are unknown.
 
     Returns:
         The path of the file.
@@ -50,9 +53,10 @@ def write_fbx(path: Path, motion: Motion) -> Path:
     with tempfile.TemporaryDirectory() as folder, atomic_replacement(path) as temporary:
         figure, report = Path(folder) / "figure.glb", Path(folder) / "report.json"
         write_glb(figure, replace(motion, fps=GLB_FPS), file_from_up=so3_exp(_BEFORE_BLENDER_IMPORT))
-        frames = len(motion.root_in_world_m)
+        frames, facts = len(motion.root_in_world_m), json.dumps({} if take is None else take.figures())
         done = run_script(
-            _CONVERT_SCRIPT, [str(figure), str(temporary), str(report), repr(motion.fps), str(frames)]
+            _CONVERT_SCRIPT,
+            [str(figure), str(temporary), str(report), repr(motion.fps), str(frames), facts],
         )
         if done.returncode != 0 or not report.is_file():
             last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]

@@ -53,12 +53,12 @@ def _read_motion(document: Any, name: str) -> Motion:
     skin, animation = document.skins[0], document.animations[0]
     joint_of_node = {node: joint for joint, node in enumerate(skin.joints)}
     skeleton = _read_skeleton(document, name, joint_of_node)
-    times = _read_accessor(document, animation.samplers[0].input)[:, 0]
+    times = read_accessor(document, animation.samplers[0].input)[:, 0]
     shape = (len(times), len(joint_of_node))
     local = np.tile(np.eye(3), (*shape, 1, 1))
     position: dict[int, FloatArray] = {}
     for channel in animation.channels:
-        values = _read_accessor(document, animation.samplers[channel.sampler].output)
+        values = read_accessor(document, animation.samplers[channel.sampler].output)
         joint = joint_of_node[channel.target.node]
         if channel.target.path == "rotation":
             local[:, joint] = rotations_in_world_axes(rotation_from_quat_xyzw(values))
@@ -102,7 +102,7 @@ def _read_skeleton(document: Any, name: str, joint_of_node: dict[int, int]) -> S
     )
 
 
-def _read_accessor(document: Any, accessor: int) -> FloatArray:
+def read_accessor(document: Any, accessor: int) -> FloatArray:
     """Return the values (N, number of components) of the accessor with this index."""
     entry = document.accessors[accessor]
     view = document.bufferViews[entry.bufferView]

@@ -7,23 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray, json_numbers, true_spans
 from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.formats.gltf.axes import (
     ARRAY_BUFFER,
-    COMPONENT_DTYPES,
     ELEMENT_ARRAY_BUFFER,
     FILE_FROM_WORLD,
-    FLOAT,
     UINT16,
     UINT32,
     poses_in_file_axes,
 )
+from bodycap_batch.formats.gltf.binary_buffer import BinaryBuffer
 from bodycap_batch.formats.mannequin import make_mannequin
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, make_transform, quat_xyzw_from_rotation
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
+from bodycap_batch.model.take import Take
 
 _MAX_SHORT_VERTICES = 65_535
 """Number of vertices below which an index fits into 16 bits. Source: glTF 2.0 specification, 3.7.2.1."""
@@ -38,6 +37,8 @@ def write_glb(
     *,
     file_from_up: FloatArray | None = None,
     earth: Mapping[str, Any] | None = None,
+    take: Take | None = None,
+    sigma_m: FloatArray | None = None,
 ) -> None:
     """Write a motion as a skinned, animated mannequin.
 
@@ -52,16 +53,20 @@ def write_glb(
             converter, such as Blender, applies the inverse rotation to the scene.
         earth: Place of the world on the Earth as plain JSON values, for the extras of the file; None if it is
             unknown. Its transform starts from the world (z up), not from the axes of the file.
+        take: Name, exact rate and timecode, for the extras of the file; None if they are unknown.
+        sigma_m: (T,J) standard deviation per axis of each joint's centre, metres, for the extras of the
+            joints; NaN if it is unknown. None leaves it out.
 
     Raises:
         StoreError: The file cannot be written.
     """
     import pygltflib as gl
 
-    buffer = _BinaryBuffer()
+    buffer = BinaryBuffer()
     turn = make_transform(np.eye(3) if file_from_up is None else file_from_up, np.zeros(3))
     body = _body_primitive(motion.skeleton, turn, buffer)
-    animation = _motion_animation(motion, turn, buffer)
+    name = "Motion" if take is None or not take.name else take.name
+    animation = _motion_animation(motion, turn, buffer, name)
     rest = turn @ poses_in_file_axes(rest_pose(motion.skeleton))
     binds = buffer.add(np.swapaxes(invert(rest), -1, -2).reshape(-1, 16), "MAT4")
     joints = len(motion.skeleton.joints)
@@ -70,7 +75,7 @@ def write_glb(
         scene=0,
         scenes=[gl.Scene(nodes=[joints + 1])],
         nodes=[
-            *_joint_nodes(motion, rest),
+            *_joint_nodes(motion, rest, sigma_m),
             gl.Node(name="Mannequin", mesh=0, skin=0),
             gl.Node(name="Armature", children=[0, joints]),
         ],
@@ -98,6 +103,7 @@ def write_glb(
         extras={
             "fps": motion.fps,
             "start_s": motion.start_ns / 1e9,
+            **({} if take is None else take.figures()),
             **({} if earth is None else {"earth": dict(earth)}),
         },
     )
@@ -106,56 +112,13 @@ def write_glb(
         document.save_binary(str(temporary))
 
 
-class _BinaryBuffer:
-    """Collects the arrays of a GLB file for its binary part. Each array has a buffer view and an accessor."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-        self.views: list[Any] = []
-        self.accessors: list[Any] = []
-
-    def add(
-        self, array: npt.NDArray[Any], kind: str, *, target: int | None = None, component: int = FLOAT
-    ) -> int:
-        """Append an array to the buffer.
-
-        Args:
-            array: (N,...) array.
-            kind: Accessor type, a key of `ELEMENT_WIDTHS`.
-            target: Target of the buffer view; None for no target.
-            component: Number of the component type.
-
-        Returns:
-            The index of the accessor of the array.
-        """
-        import pygltflib as gl
-
-        values = np.ascontiguousarray(array, dtype=COMPONENT_DTYPES[component])
-        self.data += bytes(-len(self.data) % 4)
-        view = gl.BufferView(buffer=0, byteOffset=len(self.data), byteLength=values.nbytes, target=target)
-        self.views.append(view)
-        flat = values.reshape(len(values), -1)
-        self.accessors.append(
-            gl.Accessor(
-                bufferView=len(self.views) - 1,
-                byteOffset=0,
-                componentType=component,
-                count=len(values),
-                type=kind,
-                min=flat.min(axis=0).tolist(),
-                max=flat.max(axis=0).tolist(),
-            )
-        )
-        self.data += values.tobytes()
-        return len(self.accessors) - 1
-
-
-def _joint_nodes(motion: Motion, rest: FloatArray) -> list[Any]:
+def _joint_nodes(motion: Motion, rest: FloatArray, sigma_m: FloatArray | None) -> list[Any]:
     """Return one node per joint, in the T-pose.
 
     Args:
         motion: The motion, with J joints.
         rest: (J,4,4) joint poses in the T-pose, in file axes.
+        sigma_m: (T,J) standard deviation of each joint's centre, metres; None if it is unknown.
     """
     import pygltflib as gl
 
@@ -169,22 +132,29 @@ def _joint_nodes(motion: Motion, rest: FloatArray) -> list[Any]:
             translation=local[joint, :3, 3].tolist(),
             rotation=quats[joint].tolist(),
             children=[child for child, parent in enumerate(parents) if parent == joint],
-            extras=_properties(motion, joint),
+            extras=_properties(motion, joint, None if sigma_m is None else sigma_m[:, joint]),
         )
         for joint, name in enumerate(skeleton.joints)
     ]
 
 
-def _properties(motion: Motion, joint: int) -> dict[str, Any]:
-    """Return the custom properties of a joint: its role, and ``observed: false`` if it was never measured."""
+def _properties(motion: Motion, joint: int, sigma_m: FloatArray | None) -> dict[str, Any]:
+    """Return the custom properties of a joint.
+
+    They are its role, ``observed: false`` if it was never measured, and, with a standard deviation, the first
+    and the last frame of each span in which it was measured, and the standard deviation of each frame.
+    """
     role = motion.skeleton.roles[joint]
     out: dict[str, Any] = {"role": role} if role else {}
     if not motion.observed[:, joint].any():
         out["observed"] = False
+    elif sigma_m is not None:
+        out["measured_frames"] = true_spans(motion.observed[:, joint])
+        out["sigma_m"] = json_numbers(sigma_m, 5)
     return out
 
 
-def _body_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
+def _body_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: BinaryBuffer) -> Any:
     """Return the mannequin as a primitive. Each vertex is bound to one joint or two.
 
     Args:
@@ -215,13 +185,14 @@ def _body_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: _BinaryBu
     return gl.Primitive(attributes=attributes, indices=faces, material=0)
 
 
-def _motion_animation(motion: Motion, turn: FloatArray, buffer: _BinaryBuffer) -> Any:
+def _motion_animation(motion: Motion, turn: FloatArray, buffer: BinaryBuffer, name: str) -> Any:
     """Return the animation: rotations of all joints, translations of the root and of freely moving hips.
 
     Args:
         motion: The motion.
         turn: (4,4) rotation of the whole scene.
         buffer: The buffer to which the arrays are appended.
+        name: Name of the animation.
     """
     import pygltflib as gl
 
@@ -234,7 +205,7 @@ def _motion_animation(motion: Motion, turn: FloatArray, buffer: _BinaryBuffer) -
     translated = range(1 if motion.hips_in_root_m is None else 2)
     curves += [(joint, "translation", buffer.add(position[:, joint], "VEC3")) for joint in translated]
     return gl.Animation(
-        name="Motion",
+        name=name,
         samplers=[
             gl.AnimationSampler(input=times, output=out, interpolation="LINEAR") for _, _, out in curves
         ],

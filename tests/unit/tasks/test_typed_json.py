@@ -41,6 +41,7 @@ from bodycap_batch.tasks.sound import SoundTask
 from bodycap_batch.tasks.stages import STAGES
 from bodycap_batch.tasks.synth import SynthTask
 from bodycap_batch.tasks.typed_json import from_json, key_inputs, key_options, to_json
+from bodycap_batch.tasks.undistort import UndistortTask
 
 
 def tasks(folder: Path) -> dict[str, Any]:
@@ -147,6 +148,8 @@ def tasks(folder: Path) -> dict[str, Any]:
         "fill": FillTask(mode="rest", merge=scene_map),
         "export": ExportTask(
             options=ExportOptions(formats=("bvh", "ply")),
+            take="walk",
+            capture=capture,
             map=scene_map,
             registrations=stored,
             clocks=scene_map,
@@ -166,6 +169,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             body=body,
             places_from_motion={"gopro1": "torso"},
         ),
+        "undistort": UndistortTask(camera="torso", capture=capture, map=scene_map, export=stored["torso"]),
         "preview": PreviewTask(**together, clocks=scene_map, merge=scene_map, failure=None),
     }
 
