@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.fill.leg_geometry import LegGeometry
+from bodycap_batch.fill.leg_geometry import LegGeometry, soft_length
 from bodycap_batch.model.fill_data import Footsteps
 
 _HEEL_RISE_RAD = np.radians(62.0)
@@ -48,9 +48,22 @@ _LOW_CLEARANCE_M = 0.05
 docs/decisions/filling.md."""
 _FULL_CLEARANCE_AT = 0.7
 """Speed, as a share of `_FULL_SPEED`, above which the foot is lifted by `_CLEARANCE_M`. Evidence: none."""
-REACH_SHARE = 0.992
-"""Maximum distance between hip and ankle of a standing foot, as a share of the length of the leg. With a
-longer distance, the heel is raised. Derivation: the limit at which the knee is kept from a sudden stop."""
+REACH_SHARE = 0.997
+"""Maximum distance between hip and ankle of a foot that lands, as a share of the length of the leg.
+Derivation: the knee is bent by 5 to 10° when the heel touches the floor (Murray and others, 1964)."""
+_SLACK = 0.003
+"""Slack of the leg of a standing foot that is just within reach, as a share of its length: with less, the
+heel rises. Derivation: the knee is bent by 9°, and by 3 to 9° when the heel rises."""
+_ROLLING_M = 0.08
+"""Distance (metres) of the hip ahead of the ankle from which the heel rises as far as the reach needs.
+Evidence: none."""
+_SWING_KNEE_RAD = np.radians(62.0)
+"""Flexion of the knee in the swing, where it is largest, at 1.3 m/s: the least flexion of a swinging leg.
+Source: as `_HEEL_RISE_RAD`, fig. of the knee angle."""
+_LEAVING_KNEE_RAD = np.radians(35.0)
+"""Flexion of the knee when the foot leaves the floor, at 1.3 m/s. Source: as `_SWING_KNEE_RAD`."""
+_SWING_KNEE_AT = 0.38
+"""Share of the swing at which it is largest. Source: as `_SWING_KNEE_RAD`."""
 _CLEARANCE_POWER = 0.65
 """Exponent of time in the height of a swing: below 1, the foot is highest before the middle. Evidence:
 docs/decisions/filling.md."""
@@ -74,12 +87,14 @@ class FootPath:
         heading_rad: (T,) direction of the foot about z.
         pitch_rad: (T,) angle by which the toes are lowered against the flat foot.
         toe_rad: (T,) angle by which the toes are raised against the foot.
+        knee_rad: (T,) least flexion of the knee. The leg takes it even if the ankle is then not reached.
     """
 
     ankle_m: FloatArray
     heading_rad: FloatArray
     pitch_rad: FloatArray
     toe_rad: FloatArray
+    knee_rad: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +191,7 @@ def foot_path(
         heading_rad=np.zeros(ticks),
         pitch_rad=np.zeros(ticks),
         toe_rad=np.zeros(ticks),
+        knee_rad=np.zeros(ticks),
     )
     forces = [_strength(first, second, fps) for first, second in itertools.pairwise(stances)]
     for position, stance in enumerate(stances):
@@ -183,7 +199,7 @@ def foot_path(
         strike = forces[position - 1] if position > 0 else 0.0
         _stand(path, stance, (rise, strike), leg, hip_m, fps)
     for position, strength in enumerate(forces):
-        _swing(path, stances[position], stances[position + 1], strength, leg)
+        _swing(path, stances[position], stances[position + 1], strength, leg, hip_m)
     return path
 
 
@@ -239,35 +255,39 @@ def _stand(
     length = (stance.end - stance.start) / fps
     before = min(float(np.clip(_HEEL_RISE_SHARE * length, *_HEEL_RISE_S)), 0.6 * length)
     after = min(_LANDING_S, 0.3 * length)
-    up = np.clip((seconds - (length - before)) / before, 0.0, 1.0) ** _HEEL_RISE_POWER
+    late = np.clip((seconds - (length - before)) / before, 0.0, 1.0)
+    up = late**_HEEL_RISE_POWER
+    path.knee_rad[own] = rise * _LEAVING_KNEE_RAD * late**2
     down = 1.0 - _smooth(seconds / after + _LANDED_SHARE)
     pitch = rise * _HEEL_RISE_RAD * up - strike * _HEEL_STRIKE_RAD * down
     if hip_m is not None:
-        pitch = _reaching_pitch(stance, pitch, leg, hip_m[own])
+        pitch = _reaching_pitch(stance, pitch, leg, hip_m[own], path.knee_rad[own])
     path.pitch_rad[own] = pitch
     path.toe_rad[own] = np.maximum(pitch, 0.0)
     path.heading_rad[own] = stance.heading
     path.ankle_m[own] = standing_ankle(leg, stance.place, stance.heading, pitch)
 
 
-def _reaching_pitch(stance: _Stance, pitch: FloatArray, leg: LegGeometry, hip_m: FloatArray) -> FloatArray:
+def _reaching_pitch(
+    stance: _Stance, pitch: FloatArray, leg: LegGeometry, hip_m: FloatArray, knee_rad: FloatArray
+) -> FloatArray:
     """Return the pitch (N,), increased where a foot behind the hip is reached only with a raised heel."""
-    limit = REACH_SHARE * leg.length_m
     low, high = pitch.copy(), np.maximum(pitch, _MAX_HEEL_RISE_RAD)
 
-    def reaches(angle: FloatArray) -> FloatArray:
+    def distance(angle: FloatArray) -> FloatArray:
         ankle = standing_ankle(leg, stance.place, stance.heading, angle)
-        return np.asarray(np.linalg.norm(ankle - hip_m, axis=1) <= limit)
+        return np.asarray(np.linalg.norm(ankle - hip_m, axis=1))
 
     forward = np.array([np.sin(stance.heading), -np.cos(stance.heading)])
-    behind = (hip_m[:, :2] - stance.place[:2]) @ forward > 0.0
-    enough = reaches(low) | ~behind
+    behind = _smooth((hip_m[:, :2] - stance.place[:2]) @ forward / _ROLLING_M)
+    flat = distance(pitch)
+    wanted = flat + behind * (soft_length(flat, leg.reach_m(knee_rad), _SLACK) - flat)
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        good = reaches(middle)
+        good = distance(middle) <= wanted
         high = np.where(good, middle, high)
         low = np.where(good, low, middle)
-    return np.asarray(np.where(enough, pitch, high))
+    return np.asarray(np.where(behind > 0.0, high, pitch))
 
 
 def standing_ankle(leg: LegGeometry, place: FloatArray, heading: float, pitch: FloatArray) -> FloatArray:
@@ -289,7 +309,14 @@ def standing_ankle(leg: LegGeometry, place: FloatArray, heading: float, pitch: F
     return out
 
 
-def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg: LegGeometry) -> None:
+def _swing(
+    path: FootPath,
+    first: _Stance,
+    second: _Stance,
+    strength: float,
+    leg: LegGeometry,
+    hip_m: FloatArray | None,
+) -> None:
     """Write the motion of the foot between two periods of standing."""
     ticks = len(path.pitch_rad)
     inside: IntArray = np.arange(max(first.end, 0), min(second.start, ticks))
@@ -327,6 +354,16 @@ def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg
     # The foot rises before it moves ahead to a higher place, and sinks after it has moved over a lower place.
     late = phase / _RISING_SHARE if rise > 0.0 else 1.0 - (1.0 - phase) / _RISING_SHARE
     floor = first.place[2] + _smooth(late) * rise - leg.ankle_height_m
+    knee = np.array([_LEAVING_KNEE_RAD, _SWING_KNEE_RAD, 0.0]) * strength
+    bending = 0.0
+    if hip_m is not None and 0 <= second.start < ticks:
+        knee[2] = leg.knee_rad(np.linalg.norm(path.ankle_m[second.start] - hip_m[second.start]))
+    if 1 < first.end <= ticks and first.end - 2 >= first.start:
+        knee[0] = path.knee_rad[first.end - 1]
+        bending = float(knee[0] - path.knee_rad[first.end - 2]) * count
+    path.knee_rad[inside] = _hermite(
+        phase, np.array([0.0, _SWING_KNEE_AT, 1.0]), knee, np.array([bending, 0.0, 0.0])
+    )
     path.pitch_rad[inside] = pitch
     path.toe_rad[inside] = toe
     # A person may spin around between two steps. From three quarters of a turn on, the foot leaves out whole

@@ -23,6 +23,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.layout.resampling import resample
 from bodycap_batch.fill import fill_motion
 from bodycap_batch.fill.leg_geometry import leg_geometry
+from bodycap_batch.fill.standing_height import HeightSigmas
 from bodycap_batch.fill.trunk_signals import low_pass
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.tum import read_tum
@@ -45,6 +46,8 @@ TUNED_ON = ("02_01",)
 """Recordings that constants of the stage may be chosen on. All others are only reported."""
 DRAWN = range(8)
 """Seeds of the drawn walks."""
+HEIGHTS = HeightSigmas(0.01, 0.08)
+"""Sigmas (metres) of floor and pelvis as for a merge with a skeleton that is scaled from the stature."""
 _ROLES = {
     "Hips": "root", "Spine1": "torso",
     **{f"{s}{part}": f"{s.lower()}_{name}" for s in SIDES for part, name in (
@@ -371,12 +374,11 @@ def swings(stances: Sequence[tuple[int, int]], fps: float, path: FloatArray) -> 
     return out
 
 
-def score(body: Body, mode: FillMode, *, floor_is_measured: bool = True) -> Score:
+def score(body: Body, mode: FillMode, heights: HeightSigmas = HEIGHTS) -> Score:
     """Fill the legs of a body and compare them with the truth."""
     started = time.perf_counter()
     filled = fill_motion(
-        body.merged, body.solved, floor_is_measured=floor_is_measured, mode=mode,
-        context=StageContext(work_dir=Path()),
+        body.merged, body.solved, heights=heights, mode=mode, context=StageContext(work_dir=Path())
     )  # fmt: skip
     seconds = time.perf_counter() - started
     motion, report, fps = filled.motion, filled.report, body.merged.fps
@@ -554,10 +556,10 @@ def line_of(result: Score) -> str:
         f" {result.true_stance_speed:5.2f} own {result.own_stance_speed:5.3f} m/s | stance"
         f" {100 * result.own_stance_share:3.0f} % (true still {100 * result.true_stance_share:3.0f}) | steps"
         f" {result.recalled:2d}/{result.steps:2d} false {result.false:2d}/{result.claimed:2d} unsure"
-        f" {100 * result.unsure_share:3.0f} % | knee r {result.knee_correlation:5.2f} | twist {result.twist_deg:4.1f}"
-        f" ({result.true_twist_deg:4.1f})° | soles {100 * result.sole_low_m:5.1f}, stance"
-        f" {100 * result.sole_stance_m[0]:4.1f}..{100 * result.sole_stance_m[1]:4.1f} cm |"
-        f" {result.seconds_per_minute:4.1f} s/min"
+        f" {100 * result.unsure_share:3.0f} % | knee r {result.knee_correlation:5.2f} | twist"
+        f" {result.twist_deg:4.1f} ({result.true_twist_deg:4.1f})° | soles"
+        f" {100 * result.sole_low_m:5.1f}, stance {100 * result.sole_stance_m[0]:4.1f}.."
+        f"{100 * result.sole_stance_m[1]:4.1f} cm | {result.seconds_per_minute:4.1f} s/min"
         f"\n{'':18s} crouched {100 * own.crouched_share:3.0f} ({100 * true.crouched_share:3.0f}) % | knee"
         f" straightest {own.straightest_deg:4.1f} ({true.straightest_deg:4.1f})° peak {own.peak_deg:3.0f}"
         f" ({true.peak_deg:3.0f})° speed {own.knee_deg_per_s:4.0f} ({true.knee_deg_per_s:4.0f}) °/s jerk"
@@ -573,20 +575,23 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--rest", action="store_true", help="the rest pose instead of the plausible motion")
     parser.add_argument("--no-floor", action="store_true", help="the floor is not measured")
+    parser.add_argument("--floor", action="store_true", help="the floor takes up the errors")
     parser.add_argument(
         "--errors", type=int, metavar="SEED", help="draw errors of scale, floor and mount from this seed on"
     )
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), help="only these drawn walks")
     options = parser.parse_args(arguments)
+    heights = HeightSigmas(0.06, 0.0) if options.floor else HEIGHTS
+    if options.no_floor:
+        heights = replace(heights, floor_m=np.inf)
     mode: FillMode = "rest" if options.rest else "plausible"
     count = 0
     drawn = (drawn_body(seed) for seed in range(*options.seeds)) if options.seeds else bodies(options.data)
     for body in drawn:
         if options.only and body.name not in options.only:
             continue
-        if options.errors is not None:
-            body = with_errors(body, options.errors + count)
-        result = score(body, mode, floor_is_measured=not options.no_floor)
+        merged = body if options.errors is None else with_errors(body, options.errors + count)
+        result = score(merged, mode, heights)
         held_out = "" if body.name.startswith(TUNED_ON) else "held out"
         sys.stdout.write(f"{line_of(result)} {held_out}\n")
         sys.stdout.flush()

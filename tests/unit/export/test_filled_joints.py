@@ -14,6 +14,7 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.export import ExportInputs, export_results
 from bodycap_batch.fill import fill_motion
+from bodycap_batch.fill.standing_height import HeightSigmas
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.c3d import read_c3d
 from bodycap_batch.model.fill_data import FillMode
@@ -27,7 +28,7 @@ def filled(mode: FillMode = "plausible") -> tuple[MergeResult, dict[str, Any]]:
     found = fill_motion(
         result.motion,
         result.solved,
-        floor_is_measured=True,
+        heights=HeightSigmas(0.01, 0.06),
         mode=mode,
         context=StageContext(work_dir=Path()),
     )

@@ -13,6 +13,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.fill import fill_motion
 from bodycap_batch.fill.foot_paths import foot_path
 from bodycap_batch.fill.leg_geometry import leg_geometry
+from bodycap_batch.fill.standing_height import HeightSigmas
 from bodycap_batch.model.fill_data import FillMode, FillResult, Footsteps
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion
@@ -62,7 +63,11 @@ def fill(
     motion: Motion, solved: BoolArray, mode: FillMode = "plausible", *, floor: bool = True
 ) -> FillResult:
     return fill_motion(
-        motion, solved, floor_is_measured=floor, mode=mode, context=StageContext(work_dir=Path())
+        motion,
+        solved,
+        heights=HeightSigmas(0.01 if floor else np.inf, 0.06),
+        mode=mode,
+        context=StageContext(work_dir=Path()),
     )
 
 

@@ -15,6 +15,7 @@ from bodycap_batch.fill import fill_motion
 from bodycap_batch.fill.foot_paths import FootPath, foot_path
 from bodycap_batch.fill.leg_geometry import leg_geometry
 from bodycap_batch.fill.leg_poses import pose_leg
+from bodycap_batch.fill.standing_height import HeightSigmas
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.completion import complete_skeleton
 from bodycap_batch.model.fill_data import FillResult, Footsteps
@@ -90,7 +91,11 @@ def filled(trunk: Trunk, *, swing: float = 0.0) -> FillResult:
         observed=np.tile(solved, (len(time), 1)),
     )  # fmt: skip
     result = fill_motion(
-        motion, solved, floor_is_measured=True, mode="plausible", context=StageContext(work_dir=Path())
+        motion,
+        solved,
+        heights=HeightSigmas(0.01, 0.06),
+        mode="plausible",
+        context=StageContext(work_dir=Path()),
     )
     after = result.motion.world_from_joint()
     np.testing.assert_allclose(after[:, solved], poses[:, solved], atol=1e-9)
