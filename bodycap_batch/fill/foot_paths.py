@@ -40,14 +40,9 @@ ankle rests. Evidence: docs/decisions/filling.md."""
 _OVERSHOOT = 1.15
 """Ratio of the largest angle of the foot, shortly after it leaves the floor, to the angle when it leaves the
 floor. Source: as `_HEEL_RISE_RAD`."""
-_CLEARANCE_M = 0.075
-"""Height (metres) of the lowest point of the foot above the floor where it is highest in a swing. Evidence:
-docs/decisions/filling.md."""
-_LOW_CLEARANCE_M = 0.05
-"""The same for steps in place, aside and back. For slow steps forward it is between both. Evidence:
-docs/decisions/filling.md."""
-_FULL_CLEARANCE_AT = 0.7
-"""Speed, as a share of `_FULL_SPEED`, above which the foot is lifted by `_CLEARANCE_M`. Evidence: none."""
+_CLEARANCE_M = 0.03
+"""Least height (metres) of the lowest point of the foot above the floor in the middle of a swing. Derivation:
+the toes of walking people pass 1 to 2 cm above the floor (Winter, fig. 3.9), and a margin."""
 REACH_SHARE = 0.997
 """Maximum distance between hip and ankle of a foot that lands, as a share of the length of the leg.
 Derivation: the knee is bent by 5 to 10° when the heel touches the floor (Murray and others, 1964)."""
@@ -57,21 +52,17 @@ heel rises. Derivation: the knee is bent by 9°, and by 3 to 9° when the heel r
 _ROLLING_M = 0.08
 """Distance (metres) of the hip ahead of the ankle from which the heel rises as far as the reach needs.
 Evidence: none."""
-_SWING_KNEE_RAD = np.radians(62.0)
+_SWING_KNEE_RAD = np.radians(67.0)
 """Flexion of the knee in the swing, where it is largest, at 1.3 m/s: the least flexion of a swinging leg.
 Source: as `_HEEL_RISE_RAD`, fig. of the knee angle."""
 _LEAVING_KNEE_RAD = np.radians(35.0)
 """Flexion of the knee when the foot leaves the floor, at 1.3 m/s. Source: as `_SWING_KNEE_RAD`."""
-_SWING_KNEE_AT = 0.38
+_SWING_KNEE_AT = 0.35
 """Share of the swing at which it is largest. Source: as `_SWING_KNEE_RAD`."""
-_CLEARANCE_POWER = 0.65
-"""Exponent of time in the height of a swing: below 1, the foot is highest before the middle. Evidence:
-docs/decisions/filling.md."""
+_EXTENDED_AT = 0.92
+"""Share of the swing at which the knee has the flexion of the landing. Source: as `_SWING_KNEE_RAD`."""
 _RISING_SHARE = 0.7
 """Share of a swing during which the foot rises to a higher place or sinks to a lower one. Evidence: none."""
-_TOLERANCE_M = 0.06
-"""Distance (metres) by which a place may be beyond the reach of the leg before it is moved. Derivation: the
-error of the height of hips and floor in the recordings of the benchmark `body`."""
 _MAX_DELAY_S = 0.1
 """Maximum time (s) by which a foot lands later because it would be out of reach. Evidence: none."""
 _BISECTIONS = 16
@@ -127,7 +118,7 @@ def reachable_steps(
             start += 1
         starts[index] = start
         # What is still too far is nearer than it was taken to be.
-        places[index, :2] = _within_reach(places[index], hips_m[start, side], limit + _TOLERANCE_M)
+        places[index, :2] = _within_reach(places[index], hips_m[start, side], limit)
     return replace(steps, start_tick=starts, ankle_in_world_m=places)
 
 
@@ -257,7 +248,7 @@ def _stand(
     after = min(_LANDING_S, 0.3 * length)
     late = np.clip((seconds - (length - before)) / before, 0.0, 1.0)
     up = late**_HEEL_RISE_POWER
-    path.knee_rad[own] = rise * _LEAVING_KNEE_RAD * late**2
+    path.knee_rad[own] = np.sqrt(rise) * _LEAVING_KNEE_RAD * late**2
     down = 1.0 - _smooth(seconds / after + _LANDED_SHARE)
     pitch = rise * _HEEL_RISE_RAD * up - strike * _HEEL_STRIKE_RAD * down
     if hip_m is not None:
@@ -347,22 +338,26 @@ def _swing(
     end = standing_ankle(leg, second.place, second.heading, np.array([arriving]))[0]
     speed = (start[1] - start[0])[:2] * count
     travel = _quintic(phase, start[1, :2], speed, end[:2])
-    share = min(strength**2 / _FULL_CLEARANCE_AT, 1.0)
-    clearance = _LOW_CLEARANCE_M + share * (_CLEARANCE_M - _LOW_CLEARANCE_M)
     # The drop is limited to what the foot has while it rolls over the ball.
     rise = second.place[2] - first.place[2]
     # The foot rises before it moves ahead to a higher place, and sinks after it has moved over a lower place.
     late = phase / _RISING_SHARE if rise > 0.0 else 1.0 - (1.0 - phase) / _RISING_SHARE
     floor = first.place[2] + _smooth(late) * rise - leg.ankle_height_m
-    knee = np.array([_LEAVING_KNEE_RAD, _SWING_KNEE_RAD, 0.0]) * strength
+    knee = np.array([_LEAVING_KNEE_RAD, _SWING_KNEE_RAD, 0.0]) * np.sqrt(strength)
     bending = 0.0
     if hip_m is not None and 0 <= second.start < ticks:
-        knee[2] = leg.knee_rad(np.linalg.norm(path.ankle_m[second.start] - hip_m[second.start]))
+        away = path.ankle_m[second.start] - hip_m[second.start]
+        knee[2] = max(
+            leg.knee_rad(soft_length(np.linalg.norm(away), leg.length_m, _SLACK)) - np.radians(5.0), 0.0
+        )
     if 1 < first.end <= ticks and first.end - 2 >= first.start:
         knee[0] = path.knee_rad[first.end - 1]
         bending = float(knee[0] - path.knee_rad[first.end - 2]) * count
     path.knee_rad[inside] = _hermite(
-        phase, np.array([0.0, _SWING_KNEE_AT, 1.0]), knee, np.array([bending, 0.0, 0.0])
+        phase,
+        np.array([0.0, _SWING_KNEE_AT, _EXTENDED_AT, 1.0]),
+        knee[[0, 1, 2, 2]],
+        np.array([bending, 0.0, 0.0, 0.0]),
     )
     path.pitch_rad[inside] = pitch
     path.toe_rad[inside] = toe
@@ -372,9 +367,7 @@ def _swing(
     turn -= np.sign(turn) * 2.0 * np.pi * np.floor(abs(turn) / (2.0 * np.pi) + 0.25)
     path.heading_rad[inside] = first.heading + _smooth(phase) * turn
     path.ankle_m[inside, :2] = travel
-    path.ankle_m[inside, 2] = (
-        floor + leg.drop_m(pitch, toe) + clearance * np.sin(np.pi * phase**_CLEARANCE_POWER) ** 2
-    )
+    path.ankle_m[inside, 2] = floor + leg.drop_m(pitch, toe) + _CLEARANCE_M * np.sin(np.pi * phase) ** 2
 
 
 def _quintic(phase: FloatArray, start: FloatArray, speed: FloatArray, end: FloatArray) -> FloatArray:
