@@ -52,7 +52,7 @@ heel rises. Derivation: the knee is bent by 9°, and by 3 to 9° when the heel r
 _ROLLING_M = 0.08
 """Distance (metres) of the hip ahead of the ankle from which the heel rises as far as the reach needs.
 Evidence: none."""
-_SWING_KNEE_RAD = np.radians(67.0)
+_SWING_KNEE_RAD = np.radians(72.0)
 """Flexion of the knee in the swing, where it is largest, at 1.3 m/s: the least flexion of a swinging leg.
 Source: as `_HEEL_RISE_RAD`, fig. of the knee angle."""
 _LEAVING_KNEE_RAD = np.radians(35.0)
