@@ -208,7 +208,9 @@ def _with_neighbours(steps: Footsteps, side: int, velocity: FloatArray, fps: flo
     ]
     if not out:
         return out
-    swing = max(2, round(0.4 * fps))
+    # A swing that is cut off takes as long as the others.
+    gaps = [second.start - first.end for first, second in itertools.pairwise(out)]
+    swing = max(2, int(np.median(gaps)) if gaps else round(0.4 * fps))
     ticks = len(velocity)
     first, last = out[0], out[-1]
     if first.start > 0:

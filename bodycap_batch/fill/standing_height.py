@@ -24,7 +24,7 @@ published gait data 0.98 to 0.99. Evidence: docs/decisions/filling.md."""
 _STANDING = (0.99, 0.03)
 """The same for a person who stands on both feet. Derivation: a knee that is bent by 5 to 15° gives 0.999 to
 0.991, and ankles beside the hips lower them by 0.004."""
-_HIGH_PERCENTILE = 75.0
+_HIGH_PERCENTILE = 90.0
 """Percentile of the heights over which the legs of a person who does not walk are straight. Such a person
 crouches or sits most of the time. Evidence: none."""
 _LEVEL_M = 0.02
@@ -86,8 +86,8 @@ def standing_height(
         floor_m: Height of the floor that is known or taken before, metres.
     """
     prior = float(np.hypot(sigmas.floor_m, sigmas.pelvis_m))
-    hips = 0.5 * (world[:, legs[0].hip, 2, 3] + world[:, legs[1].hip, 2, 3])
-    low, spread, sure = _lowered_m(steps, hips - floor_m, contacts, legs)
+    hips = np.stack([world[:, leg.hip, :3, 3] for leg in legs], axis=1)
+    low, spread, sure = _lowered_m(steps, hips, contacts, legs)
     if not len(low) or prior == 0.0:
         return StandingHeight(floor_m, sigmas.floor_m, 0.0)
     if sure.any():
@@ -99,10 +99,10 @@ def standing_height(
         exact = upright / spread**2
         lowered, weight = float((exact * low).sum() / (exact.sum() + 1e-9)), float(upright.mean())
     else:
-        # Nobody knows whether the knees are bent, but no leg is longer than straight.
-        lowered, weight = float(np.percentile(low, 100.0 - _HIGH_PERCENTILE)), 1.0
-        if np.isfinite(prior):
-            lowered = min(lowered, 0.0)
+        # The knees may be bent, but no leg is longer than straight.
+        lowered, weight = min(float(np.median(low)), 0.0), 1.0
+        if np.isinf(prior):
+            lowered = float(np.percentile(low, 100.0 - _HIGH_PERCENTILE))
     sigma = float(np.hypot(np.mean(spread), np.median(np.abs(low - np.median(low)))))
     if np.isinf(prior):
         return StandingHeight(floor_m - lowered, sigma, 0.0)
@@ -119,7 +119,8 @@ def _lowered_m(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return by stance how far the hips are below upright ones, with the sigma, and if it is certain (N,).
 
-    Stances on stairs are left out, because their height follows from straight legs.
+    A foot of an uncertain stance may stand beside the hips, so that a straight leg leans. Stances on stairs
+    are left out, because their height follows from straight legs.
     """
     level = np.min(steps.ankle_in_world_m[:, 2], initial=np.inf)
     low, spread, sure = [], [], []
@@ -132,7 +133,13 @@ def _lowered_m(
                 continue
             sure.append(bool(contacts.is_sure[chosen].all()))
             share, sigma = usual if sure[-1] else _STANDING
-            low.append(share * leg.length_m + leg.ankle_height_m - float(np.median(hips_m[chosen])))
+            over_m = float(np.median(hips_m[chosen, :, 2])) - steps.ankle_in_world_m[index, 2]
+            reach_m = share * leg.length_m
+            if not sure[-1]:
+                away = hips_m[chosen, side, :2] - steps.ankle_in_world_m[index, :2]
+                away_m = float(np.median(np.linalg.norm(away, axis=1)))
+                reach_m = float(np.sqrt(max(reach_m**2 - away_m**2, 0.0)))
+            low.append(reach_m - over_m)
             spread.append(sigma * leg.length_m)
     return np.array(low), np.array(spread), np.array(sure, dtype=bool)
 

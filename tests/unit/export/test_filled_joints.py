@@ -122,7 +122,10 @@ def test_fill_json_lists_joints_and_steps(tmp_path: Path) -> None:
     assert set(content["filled_joints"]) == others
     assert len(content["footsteps"]) == len(result.fill.footsteps.side) > 0
     assert {step["foot"] for step in content["footsteps"]} == {"left", "right"}
-    assert content["floor"] == {"height_m": 0.0, "sigma_m": 0.0, "source": "measured"}
+    floor = content["floor"]
+    assert floor["source"] == "measured"
+    # The floor takes up its share of what the standing legs measure, less than its sigma of 1 cm.
+    assert abs(floor["height_m"]) < floor["sigma_m"] <= 0.01
 
 
 def test_without_a_pose_unmeasured_joints_are_left_out(tmp_path: Path) -> None:

@@ -362,7 +362,7 @@ def test_knees_do_not_jump_if_the_trunk_turns_around_over_standing_feet() -> Non
     zero = 0.0 * yaw
     pelvis = so3_exp(np.column_stack([zero, zero, yaw]))
     path = FootPath(
-        ankle_m=np.zeros((len(yaw), 3)), heading_rad=zero, pitch_rad=zero, toe_rad=zero,
+        ankle_m=np.zeros((len(yaw), 3)), heading_rad=zero, pitch_rad=zero, toe_rad=zero, knee_rad=zero,
     )  # fmt: skip
     hip = np.tile([0.05, 0.1, 0.9 * leg.length_m], (len(yaw), 1))
     thigh = pose_leg(leg, hip, path, pelvis).thigh
