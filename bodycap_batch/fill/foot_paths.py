@@ -42,7 +42,7 @@ _OVERSHOOT = 1.15
 floor. Source: as `_HEEL_RISE_RAD`."""
 _CLEARANCE_M = 0.03
 """Least height (metres) of the lowest point of the foot above the floor in the middle of a swing. Derivation:
-the toes of walking people pass 1 to 2 cm above the floor (Winter, fig. 3.9), and a margin."""
+the toes of walking people pass 1 to 2 cm above the floor (Winter 1991), and a margin."""
 REACH_SHARE = 0.997
 """Maximum distance between hip and ankle of a foot that lands, as a share of the length of the leg.
 Derivation: the knee is bent by 5 to 10° when the heel touches the floor (Murray and others, 1964)."""
@@ -53,14 +53,17 @@ _ROLLING_M = 0.08
 """Distance (metres) of the hip ahead of the ankle from which the heel rises as far as the reach needs.
 Evidence: none."""
 _SWING_KNEE_RAD = np.radians(72.0)
-"""Flexion of the knee in the swing, where it is largest, at 1.3 m/s: the least flexion of a swinging leg.
-Source: as `_HEEL_RISE_RAD`, fig. of the knee angle."""
+"""Flexion of the knee in the swing, where it is largest, at 1.3 m/s: the least flexion of a swinging leg. It
+is proportional to the fourth root of the speed. Evidence: docs/decisions/filling.md."""
 _LEAVING_KNEE_RAD = np.radians(35.0)
-"""Flexion of the knee when the foot leaves the floor, at 1.3 m/s. Source: as `_SWING_KNEE_RAD`."""
+"""Flexion of the knee when the foot leaves the floor, at 1.3 m/s. Source: as `_HEEL_RISE_RAD`,
+fig. of the knee."""
 _SWING_KNEE_AT = 0.35
-"""Share of the swing at which it is largest. Source: as `_SWING_KNEE_RAD`."""
+"""Share of the swing at which it is largest. Source: as `_LEAVING_KNEE_RAD`."""
+_LOADING_KNEE_RAD = np.radians(5.0)
+"""Flexion that the knee gains when the foot takes the load. Evidence: docs/decisions/filling.md."""
 _EXTENDED_AT = 0.92
-"""Share of the swing at which the knee has the flexion of the landing. Source: as `_SWING_KNEE_RAD`."""
+"""Share of the swing at which the knee is extended for the landing. Source: as `_LEAVING_KNEE_RAD`."""
 _RISING_SHARE = 0.7
 """Share of a swing during which the foot rises to a higher place or sinks to a lower one. Evidence: none."""
 _MAX_DELAY_S = 0.1
@@ -190,7 +193,8 @@ def foot_path(
         strike = forces[position - 1] if position > 0 else 0.0
         _stand(path, stance, (rise, strike), leg, hip_m, fps)
     for position, strength in enumerate(forces):
-        _swing(path, stances[position], stances[position + 1], strength, leg, hip_m)
+        first, second = stances[position], stances[position + 1]
+        _swing(path, first, second, strength, leg, _landing_knee(path, second, leg, hip_m))
     return path
 
 
@@ -308,7 +312,7 @@ def _swing(
     second: _Stance,
     strength: float,
     leg: LegGeometry,
-    hip_m: FloatArray | None,
+    landing_rad: float,
 ) -> None:
     """Write the motion of the foot between two periods of standing."""
     ticks = len(path.pitch_rad)
@@ -345,22 +349,7 @@ def _swing(
     # The foot rises before it moves ahead to a higher place, and sinks after it has moved over a lower place.
     late = phase / _RISING_SHARE if rise > 0.0 else 1.0 - (1.0 - phase) / _RISING_SHARE
     floor = first.place[2] + _smooth(late) * rise - leg.ankle_height_m
-    knee = np.array([_LEAVING_KNEE_RAD, _SWING_KNEE_RAD, 0.0]) * np.sqrt(strength)
-    bending = 0.0
-    if hip_m is not None and 0 <= second.start < ticks:
-        away = path.ankle_m[second.start] - hip_m[second.start]
-        knee[2] = max(
-            leg.knee_rad(soft_length(np.linalg.norm(away), leg.length_m, _SLACK)) - np.radians(5.0), 0.0
-        )
-    if 1 < first.end <= ticks and first.end - 2 >= first.start:
-        knee[0] = path.knee_rad[first.end - 1]
-        bending = float(knee[0] - path.knee_rad[first.end - 2]) * count
-    path.knee_rad[inside] = _hermite(
-        phase,
-        np.array([0.0, _SWING_KNEE_AT, _EXTENDED_AT, 1.0]),
-        knee[[0, 1, 2, 2]],
-        np.array([bending, 0.0, 0.0, 0.0]),
-    )
+    path.knee_rad[inside] = _swing_knee(path, first, count, strength, landing_rad, phase)
     path.pitch_rad[inside] = pitch
     path.toe_rad[inside] = toe
     # A person may spin around between two steps. From three quarters of a turn on, the foot leaves out whole
@@ -370,6 +359,35 @@ def _swing(
     path.heading_rad[inside] = first.heading + _smooth(phase) * turn
     path.ankle_m[inside, :2] = travel
     path.ankle_m[inside, 2] = floor + leg.drop_m(pitch, toe) + _CLEARANCE_M * np.sin(np.pi * phase) ** 2
+
+
+def _landing_knee(path: FootPath, stance: _Stance, leg: LegGeometry, hip_m: FloatArray | None) -> float:
+    """Return the flexion of the knee before the foot takes the load; 0 if the recording has no landing."""
+    if hip_m is None or not 0 <= stance.start < len(hip_m):
+        return 0.0
+    away = np.linalg.norm(path.ankle_m[[stance.start]] - hip_m[[stance.start]], axis=1)
+    landed = leg.knee_rad(soft_length(away, leg.length_m, _SLACK))
+    return float(np.maximum(landed[0] - _LOADING_KNEE_RAD, 0.0))
+
+
+def _swing_knee(
+    path: FootPath, first: _Stance, count: int, strength: float, landing_rad: float, phase: FloatArray
+) -> FloatArray:
+    """Return the least flexion (N,) of the knee at phases (N,) of a swing of `count` ticks.
+
+    The curve continues that of the standing leg before, and ends with the flexion of the landing.
+    """
+    leaving, peak = np.sqrt(strength) * np.array([_LEAVING_KNEE_RAD, _SWING_KNEE_RAD])
+    rate = 0.0
+    if 1 < first.end <= len(path.knee_rad) and first.end - 2 >= first.start:
+        before, leaving = path.knee_rad[first.end - 2 : first.end]
+        rate = float(leaving - before) * count
+    return _hermite(
+        phase,
+        np.array([0.0, _SWING_KNEE_AT, _EXTENDED_AT, 1.0]),
+        np.array([leaving, peak, landing_rad, landing_rad]),
+        np.array([rate, 0.0, 0.0, 0.0]),
+    )
 
 
 def _quintic(phase: FloatArray, start: FloatArray, speed: FloatArray, end: FloatArray) -> FloatArray:
