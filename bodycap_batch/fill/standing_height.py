@@ -21,7 +21,7 @@ _WALKING = (0.967, 0.015)
 """Height of the hips over the standing ankle while the other foot swings, as a share of the length of the
 leg: mean and standard deviation among people. Derivation: recorded walks have 0.957 to 0.978, walks of
 published gait data 0.98 to 0.99. Evidence: docs/decisions/filling.md."""
-_STANDING = (0.99, 0.03)
+_STANDING = (0.99, 0.012)
 """The same for a person who stands on both feet. Derivation: a knee that is bent by 5 to 15° gives 0.999 to
 0.991, and ankles beside the hips lower them by 0.004."""
 _HIGH_PERCENTILE = 90.0
