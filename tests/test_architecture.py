@@ -48,7 +48,7 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
     "fill": (
         {"leg_geometry", "trunk_signals"},
         {"contacts", "head"},
-        {"foot_places", "floor_height", "pelvis", "foot_paths"},
+        {"foot_places", "standing_height", "pelvis", "foot_paths"},
         {"leg_poses", "lying"},
         {"stage"},
     ),

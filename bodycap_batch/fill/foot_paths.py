@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.fill.leg_geometry import LegGeometry
+from bodycap_batch.fill.leg_geometry import LegGeometry, soft_length
 from bodycap_batch.model.fill_data import Footsteps
 
 _HEEL_RISE_RAD = np.radians(62.0)
@@ -40,25 +40,32 @@ ankle rests. Evidence: docs/decisions/filling.md."""
 _OVERSHOOT = 1.15
 """Ratio of the largest angle of the foot, shortly after it leaves the floor, to the angle when it leaves the
 floor. Source: as `_HEEL_RISE_RAD`."""
-_CLEARANCE_M = 0.075
-"""Height (metres) of the lowest point of the foot above the floor where it is highest in a swing. Evidence:
-docs/decisions/filling.md."""
-_LOW_CLEARANCE_M = 0.05
-"""The same for steps in place, aside and back. For slow steps forward it is between both. Evidence:
-docs/decisions/filling.md."""
-_FULL_CLEARANCE_AT = 0.7
-"""Speed, as a share of `_FULL_SPEED`, above which the foot is lifted by `_CLEARANCE_M`. Evidence: none."""
-REACH_SHARE = 0.992
-"""Maximum distance between hip and ankle of a standing foot, as a share of the length of the leg. With a
-longer distance, the heel is raised. Derivation: the limit at which the knee is kept from a sudden stop."""
-_CLEARANCE_POWER = 0.65
-"""Exponent of time in the height of a swing: below 1, the foot is highest before the middle. Evidence:
-docs/decisions/filling.md."""
+_CLEARANCE_M = 0.03
+"""Least height (metres) of the lowest point of the foot above the floor in the middle of a swing. Derivation:
+the toes of walking people pass 1 to 2 cm above the floor (Winter 1991), and a margin."""
+REACH_SHARE = 0.997
+"""Maximum distance between hip and ankle of a foot that lands, as a share of the length of the leg.
+Derivation: the knee is bent by 5 to 10° when the heel touches the floor (Murray and others, 1964)."""
+_SLACK = 0.003
+"""Slack of the leg of a standing foot that is just within reach, as a share of its length: with less, the
+heel rises. Derivation: the knee is bent by 9°, and by 3 to 9° when the heel rises."""
+_ROLLING_M = 0.08
+"""Distance (metres) of the hip ahead of the ankle from which the heel rises as far as the reach needs.
+Evidence: none."""
+_SWING_KNEE_RAD = np.radians(72.0)
+"""Flexion of the knee in the swing, where it is largest, at 1.3 m/s: the least flexion of a swinging leg. It
+is proportional to the fourth root of the speed. Evidence: docs/decisions/filling.md."""
+_LEAVING_KNEE_RAD = np.radians(35.0)
+"""Flexion of the knee when the foot leaves the floor, at 1.3 m/s. Source: as `_HEEL_RISE_RAD`,
+fig. of the knee."""
+_SWING_KNEE_AT = 0.35
+"""Share of the swing at which it is largest. Source: as `_LEAVING_KNEE_RAD`."""
+_LOADING_KNEE_RAD = np.radians(5.0)
+"""Flexion that the knee gains when the foot takes the load. Evidence: docs/decisions/filling.md."""
+_EXTENDED_AT = 0.92
+"""Share of the swing at which the knee is extended for the landing. Source: as `_LEAVING_KNEE_RAD`."""
 _RISING_SHARE = 0.7
 """Share of a swing during which the foot rises to a higher place or sinks to a lower one. Evidence: none."""
-_TOLERANCE_M = 0.06
-"""Distance (metres) by which a place may be beyond the reach of the leg before it is moved. Derivation: the
-error of the height of hips and floor in the recordings of the benchmark `body`."""
 _MAX_DELAY_S = 0.1
 """Maximum time (s) by which a foot lands later because it would be out of reach. Evidence: none."""
 _BISECTIONS = 16
@@ -74,12 +81,14 @@ class FootPath:
         heading_rad: (T,) direction of the foot about z.
         pitch_rad: (T,) angle by which the toes are lowered against the flat foot.
         toe_rad: (T,) angle by which the toes are raised against the foot.
+        knee_rad: (T,) least flexion of the knee. The leg takes it even if the ankle is then not reached.
     """
 
     ankle_m: FloatArray
     heading_rad: FloatArray
     pitch_rad: FloatArray
     toe_rad: FloatArray
+    knee_rad: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +121,7 @@ def reachable_steps(
             start += 1
         starts[index] = start
         # What is still too far is nearer than it was taken to be.
-        places[index, :2] = _within_reach(places[index], hips_m[start, side], limit + _TOLERANCE_M)
+        places[index, :2] = _within_reach(places[index], hips_m[start, side], limit)
     return replace(steps, start_tick=starts, ankle_in_world_m=places)
 
 
@@ -176,6 +185,7 @@ def foot_path(
         heading_rad=np.zeros(ticks),
         pitch_rad=np.zeros(ticks),
         toe_rad=np.zeros(ticks),
+        knee_rad=np.zeros(ticks),
     )
     forces = [_strength(first, second, fps) for first, second in itertools.pairwise(stances)]
     for position, stance in enumerate(stances):
@@ -183,7 +193,8 @@ def foot_path(
         strike = forces[position - 1] if position > 0 else 0.0
         _stand(path, stance, (rise, strike), leg, hip_m, fps)
     for position, strength in enumerate(forces):
-        _swing(path, stances[position], stances[position + 1], strength, leg)
+        first, second = stances[position], stances[position + 1]
+        _swing(path, first, second, strength, leg, _landing_knee(path, second, leg, hip_m))
     return path
 
 
@@ -201,7 +212,9 @@ def _with_neighbours(steps: Footsteps, side: int, velocity: FloatArray, fps: flo
     ]
     if not out:
         return out
-    swing = max(2, round(0.4 * fps))
+    # A swing that is cut off takes as long as the others.
+    gaps = [second.start - first.end for first, second in itertools.pairwise(out)]
+    swing = max(2, int(np.median(gaps)) if gaps else round(0.4 * fps))
     ticks = len(velocity)
     first, last = out[0], out[-1]
     if first.start > 0:
@@ -239,35 +252,39 @@ def _stand(
     length = (stance.end - stance.start) / fps
     before = min(float(np.clip(_HEEL_RISE_SHARE * length, *_HEEL_RISE_S)), 0.6 * length)
     after = min(_LANDING_S, 0.3 * length)
-    up = np.clip((seconds - (length - before)) / before, 0.0, 1.0) ** _HEEL_RISE_POWER
+    late = np.clip((seconds - (length - before)) / before, 0.0, 1.0)
+    up = late**_HEEL_RISE_POWER
+    path.knee_rad[own] = np.sqrt(rise) * _LEAVING_KNEE_RAD * late**2
     down = 1.0 - _smooth(seconds / after + _LANDED_SHARE)
     pitch = rise * _HEEL_RISE_RAD * up - strike * _HEEL_STRIKE_RAD * down
     if hip_m is not None:
-        pitch = _reaching_pitch(stance, pitch, leg, hip_m[own])
+        pitch = _reaching_pitch(stance, pitch, leg, hip_m[own], path.knee_rad[own])
     path.pitch_rad[own] = pitch
     path.toe_rad[own] = np.maximum(pitch, 0.0)
     path.heading_rad[own] = stance.heading
     path.ankle_m[own] = standing_ankle(leg, stance.place, stance.heading, pitch)
 
 
-def _reaching_pitch(stance: _Stance, pitch: FloatArray, leg: LegGeometry, hip_m: FloatArray) -> FloatArray:
+def _reaching_pitch(
+    stance: _Stance, pitch: FloatArray, leg: LegGeometry, hip_m: FloatArray, knee_rad: FloatArray
+) -> FloatArray:
     """Return the pitch (N,), increased where a foot behind the hip is reached only with a raised heel."""
-    limit = REACH_SHARE * leg.length_m
     low, high = pitch.copy(), np.maximum(pitch, _MAX_HEEL_RISE_RAD)
 
-    def reaches(angle: FloatArray) -> FloatArray:
+    def distance(angle: FloatArray) -> FloatArray:
         ankle = standing_ankle(leg, stance.place, stance.heading, angle)
-        return np.asarray(np.linalg.norm(ankle - hip_m, axis=1) <= limit)
+        return np.asarray(np.linalg.norm(ankle - hip_m, axis=1))
 
     forward = np.array([np.sin(stance.heading), -np.cos(stance.heading)])
-    behind = (hip_m[:, :2] - stance.place[:2]) @ forward > 0.0
-    enough = reaches(low) | ~behind
+    behind = _smooth((hip_m[:, :2] - stance.place[:2]) @ forward / _ROLLING_M)
+    flat = distance(pitch)
+    wanted = flat + behind * (soft_length(flat, leg.reach_m(knee_rad), _SLACK) - flat)
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        good = reaches(middle)
+        good = distance(middle) <= wanted
         high = np.where(good, middle, high)
         low = np.where(good, low, middle)
-    return np.asarray(np.where(enough, pitch, high))
+    return np.asarray(np.where(behind > 0.0, high, pitch))
 
 
 def standing_ankle(leg: LegGeometry, place: FloatArray, heading: float, pitch: FloatArray) -> FloatArray:
@@ -289,7 +306,14 @@ def standing_ankle(leg: LegGeometry, place: FloatArray, heading: float, pitch: F
     return out
 
 
-def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg: LegGeometry) -> None:
+def _swing(
+    path: FootPath,
+    first: _Stance,
+    second: _Stance,
+    strength: float,
+    leg: LegGeometry,
+    landing_rad: float,
+) -> None:
     """Write the motion of the foot between two periods of standing."""
     ticks = len(path.pitch_rad)
     inside: IntArray = np.arange(max(first.end, 0), min(second.start, ticks))
@@ -320,13 +344,12 @@ def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg
     end = standing_ankle(leg, second.place, second.heading, np.array([arriving]))[0]
     speed = (start[1] - start[0])[:2] * count
     travel = _quintic(phase, start[1, :2], speed, end[:2])
-    share = min(strength**2 / _FULL_CLEARANCE_AT, 1.0)
-    clearance = _LOW_CLEARANCE_M + share * (_CLEARANCE_M - _LOW_CLEARANCE_M)
     # The drop is limited to what the foot has while it rolls over the ball.
     rise = second.place[2] - first.place[2]
     # The foot rises before it moves ahead to a higher place, and sinks after it has moved over a lower place.
     late = phase / _RISING_SHARE if rise > 0.0 else 1.0 - (1.0 - phase) / _RISING_SHARE
     floor = first.place[2] + _smooth(late) * rise - leg.ankle_height_m
+    path.knee_rad[inside] = _swing_knee(path, first, count, strength, landing_rad, phase)
     path.pitch_rad[inside] = pitch
     path.toe_rad[inside] = toe
     # A person may spin around between two steps. From three quarters of a turn on, the foot leaves out whole
@@ -335,8 +358,35 @@ def _swing(path: FootPath, first: _Stance, second: _Stance, strength: float, leg
     turn -= np.sign(turn) * 2.0 * np.pi * np.floor(abs(turn) / (2.0 * np.pi) + 0.25)
     path.heading_rad[inside] = first.heading + _smooth(phase) * turn
     path.ankle_m[inside, :2] = travel
-    path.ankle_m[inside, 2] = (
-        floor + leg.drop_m(pitch, toe) + clearance * np.sin(np.pi * phase**_CLEARANCE_POWER) ** 2
+    path.ankle_m[inside, 2] = floor + leg.drop_m(pitch, toe) + _CLEARANCE_M * np.sin(np.pi * phase) ** 2
+
+
+def _landing_knee(path: FootPath, stance: _Stance, leg: LegGeometry, hip_m: FloatArray | None) -> float:
+    """Return the flexion of the knee before the foot takes the load; 0 if the recording has no landing."""
+    if hip_m is None or not 0 <= stance.start < len(hip_m):
+        return 0.0
+    away = np.linalg.norm(path.ankle_m[[stance.start]] - hip_m[[stance.start]], axis=1)
+    landed = leg.knee_rad(soft_length(away, leg.length_m, _SLACK))
+    return float(np.maximum(landed[0] - _LOADING_KNEE_RAD, 0.0))
+
+
+def _swing_knee(
+    path: FootPath, first: _Stance, count: int, strength: float, landing_rad: float, phase: FloatArray
+) -> FloatArray:
+    """Return the least flexion (N,) of the knee at phases (N,) of a swing of `count` ticks.
+
+    The curve continues that of the standing leg before, and ends with the flexion of the landing.
+    """
+    leaving, peak = np.sqrt(strength) * np.array([_LEAVING_KNEE_RAD, _SWING_KNEE_RAD])
+    rate = 0.0
+    if 1 < first.end <= len(path.knee_rad) and first.end - 2 >= first.start:
+        before, leaving = path.knee_rad[first.end - 2 : first.end]
+        rate = float(leaving - before) * count
+    return _hermite(
+        phase,
+        np.array([0.0, _SWING_KNEE_AT, _EXTENDED_AT, 1.0]),
+        np.array([leaving, peak, landing_rad, landing_rad]),
+        np.array([rate, 0.0, 0.0, 0.0]),
     )
 
 

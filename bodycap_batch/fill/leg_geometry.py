@@ -97,6 +97,18 @@ class LegGeometry:
         back, down = self.heel_behind_m, -self.ankle_height_m
         return np.array([0.0, cos * back + sin * down, cos * down - sin * back])
 
+    def reach_m(self, knee_rad: FloatArray) -> FloatArray:
+        """Return the distance (N,) between hip and ankle at a flexion (N,) of the knee, metres."""
+        thigh, shin = float(np.linalg.norm(self.thigh_m)), float(np.linalg.norm(self.shin_m))
+        return np.asarray(np.sqrt(thigh**2 + shin**2 + 2.0 * thigh * shin * np.cos(knee_rad)))
+
+    def knee_rad(self, distance: FloatArray) -> FloatArray:
+        """Return the flexion (N,) of the knee at a distance (N,) between hip and ankle, metres."""
+        thigh, shin = float(np.linalg.norm(self.thigh_m)), float(np.linalg.norm(self.shin_m))
+        return np.asarray(
+            np.arccos(np.clip((distance**2 - thigh**2 - shin**2) / (2.0 * thigh * shin), -1.0, 1.0))
+        )
+
     def drop_m(self, pitch_rad: FloatArray, toe_rad: FloatArray) -> FloatArray:
         """Return how far the lowest point of the foot is below the ankle (N,), metres.
 
@@ -112,6 +124,20 @@ class LegGeometry:
         tip = ball + toe_ahead * np.sin(toes) - self.toe_m[2] * np.cos(toes)
         heel = self.ankle_height_m * np.cos(pitch_rad) - self.heel_behind_m * np.sin(pitch_rad)
         return np.asarray(np.maximum.reduce([ball, tip, heel]))
+
+
+def soft_length(distance: FloatArray, length_m: FloatArray | float, slack: float) -> FloatArray:
+    """Return the distance (T,) between hip and ankle that a leg takes for a wanted distance (T,).
+
+    It equals the wanted distance for a bent leg, and approaches the length of the leg smoothly.
+
+    Args:
+        distance: (T,) wanted distance, in metres.
+        length_m: Length of the leg that is as straight as possible; a number or (T,).
+        slack: What a leg that is just long enough lacks to be straight, as a share of its length.
+    """
+    free = 1.0 - distance / length_m
+    return np.asarray(length_m * (1.0 - 0.5 * (free + np.hypot(free, 2.0 * slack))))
 
 
 def leg_geometry(skeleton: SkeletonModel) -> tuple[LegGeometry, LegGeometry] | None:

@@ -8,13 +8,11 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.fill.foot_paths import FootPath
-from bodycap_batch.fill.leg_geometry import LegGeometry
+from bodycap_batch.fill.leg_geometry import LegGeometry, soft_length
 from bodycap_batch.model.geometry import so3_exp
 
-_SOFT_SHARE = 0.012
-"""Share of the length of the leg over which the knee is kept from a sudden stop when the leg is straight.
-Source: L. Kovar, J. Schreiner, M. Gleicher, "Footskate cleanup for motion capture editing", 2002, section 4.
-The value has no evidence."""
+_SLACK = 0.0006
+"""Slack of a leg that is just long enough, as a share of its length. Derivation: the knee is bent by 4°."""
 _MIN_SHARE = 0.25
 """Minimum distance between hip and ankle, as a share of the length of the leg. Evidence: none."""
 
@@ -50,7 +48,7 @@ def pose_leg(leg: LegGeometry, hip_m: FloatArray, path: FootPath, pelvis: FloatA
     to_ankle = path.ankle_m - hip_m
     distance = np.linalg.norm(to_ankle, axis=1)
     thigh_m, shin_m = float(np.linalg.norm(leg.thigh_m)), float(np.linalg.norm(leg.shin_m))
-    reached = soft_length(distance, thigh_m + shin_m)
+    reached = np.maximum(soft_length(distance, leg.reach_m(path.knee_rad), _SLACK), _MIN_SHARE * leg.length_m)
     along = to_ankle / np.maximum(distance, 1e-9)[:, None]
     # The knee points where pelvis and foot point in the mean. Their mean has no direction if the person has
     # turned by 180° over a standing foot, so the pelvis counts less the more it has turned.
@@ -68,19 +66,6 @@ def pose_leg(leg: LegGeometry, hip_m: FloatArray, path: FootPath, pelvis: FloatA
     axis = np.cross(ahead, along)
     return LegPose(
         thigh=_aim(leg.thigh_m, upper, axis), shin=_aim(leg.shin_m, lower, axis), foot=foot, toe=toe
-    )
-
-
-def soft_length(distance: FloatArray, length_m: float) -> FloatArray:
-    """Return the distance (T,) between hip and ankle that a leg takes for a wanted distance (T,).
-
-    It equals the wanted distance for a bent leg, and approaches the length of the leg smoothly.
-    """
-    soft = _SOFT_SHARE * length_m
-    limit = length_m - soft
-    over = np.maximum(distance - limit, 0.0)
-    return np.maximum(
-        np.where(over > 0.0, limit + soft * (1.0 - np.exp(-over / soft)), distance), _MIN_SHARE * length_m
     )
 
 

@@ -10,7 +10,6 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.fill.contacts import STAND, Contacts, find_contacts
-from bodycap_batch.fill.floor_height import FloorHeight, floor_below_legs, lifted_steps
 from bodycap_batch.fill.foot_paths import REACH_SHARE, foot_path, kept_steps, reachable_steps
 from bodycap_batch.fill.foot_places import place_feet
 from bodycap_batch.fill.head import head_rotations
@@ -24,6 +23,7 @@ from bodycap_batch.fill.pelvis import (
     reaching_pelvis,
     reclined_share,
 )
+from bodycap_batch.fill.standing_height import HeightSigmas, StandingHeight, raised_pelvis, standing_height
 from bodycap_batch.fill.trunk_signals import TrunkSignals, trunk_signals
 from bodycap_batch.model.fill_data import SIDES, FillMode, FillReport, FillResult, Footsteps
 from bodycap_batch.model.geometry import make_transform
@@ -45,7 +45,7 @@ def fill_motion(
     motion: Motion,
     solved: BoolArray,
     *,
-    floor_is_measured: bool,
+    heights: HeightSigmas,
     mode: FillMode,
     context: StageContext,
 ) -> FillResult:
@@ -57,7 +57,7 @@ def fill_motion(
     Args:
         motion: The motion from merging, with J joints at T ticks. The floor is at z = 0.
         solved: (J,) True for a measured joint.
-        floor_is_measured: True if the height of the floor was measured; False if it was assumed.
+        heights: How exactly the heights of floor and pelvis are known.
         mode: How unmeasured joints are posed.
         context: Context of the stage.
     """
@@ -66,24 +66,26 @@ def fill_motion(
         return FillResult(motion=motion, report=nothing)
     skeleton = motion.skeleton
     first = int(np.argmax(solved))
-    world, filled = motion.world_from_joint(), np.zeros(len(solved), dtype=bool)
-    signals = trunk_signals(motion, first, _hands(skeleton, solved))
+    hands = _hands(skeleton, solved)
     legs = _unmeasured_legs(skeleton, solved)
-    contacts = find_contacts(signals, _standing_m(legs) if floor_is_measured else None)
+    floor = StandingHeight(0.0, 0.0, 0.0)
+    if legs is not None:
+        motion, floor = _upright(motion, first, hands, legs, heights)
+    skeleton = motion.skeleton
+    world, filled = motion.world_from_joint(), np.zeros(len(solved), dtype=bool)
+    signals = trunk_signals(motion, first, hands)
+    standing_m = None if legs is None else _standing_m(legs) + floor.floor_m
+    contacts = find_contacts(signals, standing_m)
     context.check_cancelled()
     context.progress(1, _PROGRESS_STEPS, "steps")
-    floor = FloorHeight(0.0, 0.0, "measured")
-    if legs is not None and not floor_is_measured:
-        floor = floor_below_legs(world, contacts, legs)
     steps = nothing.footsteps
     if legs is not None:
-        steps = place_feet(contacts, signals, legs, floor.height_m)
-        steps, floor = lifted_steps(steps, floor, world, contacts, legs)
+        steps = place_feet(contacts, signals, legs, floor.floor_m)
     context.progress(2, _PROGRESS_STEPS, "pelvis")
     reclined = np.zeros(len(world))
     may_lie = is_on(Mechanism.LYING)
     if may_lie and legs is not None and split_side(skeleton.roles[first])[0] == "":
-        reclined = reclined_share(world[:, first], floor.height_m, legs[0].length_m)
+        reclined = reclined_share(world[:, first], floor.floor_m, legs[0].length_m)
     if first != 0:
         pelvis = pelvis_rotation(signals, contacts, steps, legs is not None)
         pelvis = following_pelvis(pelvis, world[:, first, :3, :3], reclined)
@@ -98,7 +100,7 @@ def fill_motion(
             missed |= (reclined > 0.0)[:, None]
             steps = kept_steps(steps, missed)
             for leg in legs:
-                lay_legs(skeleton, leg, reclined, floor.height_m, world)
+                lay_legs(skeleton, leg, reclined, floor.floor_m, world)
     context.check_cancelled()
     context.progress(3, _PROGRESS_STEPS, "head")
     _fill_head(skeleton, solved, (signals, reclined), world, filled)
@@ -120,9 +122,9 @@ def fill_motion(
             standing=_standing(steps, missed),
             is_sure=sure,
             footsteps=steps,
-            floor_m=floor.height_m,
-            floor_sigma_m=floor.sigma_m,
-            floor_source=floor.source,
+            floor_m=floor.floor_m,
+            floor_sigma_m=floor.floor_sigma_m,
+            floor_source="measured" if np.isfinite(heights.floor_m) else "legs",
         ),
     )
 
@@ -156,9 +158,29 @@ def _unmeasured_legs(skeleton: SkeletonModel, solved: BoolArray) -> tuple[LegGeo
     return legs
 
 
-def _standing_m(legs: tuple[LegGeometry, LegGeometry] | None) -> float | None:
-    """Return the height (metres) of the hips over the floor on straight legs; None without legs."""
-    return None if legs is None else min(leg.length_m + leg.ankle_height_m for leg in legs)
+def _standing_m(legs: tuple[LegGeometry, LegGeometry]) -> float:
+    """Return the height (metres) of the hips over the floor on straight legs."""
+    return min(leg.length_m + leg.ankle_height_m for leg in legs)
+
+
+def _upright(
+    motion: Motion,
+    first: int,
+    hands: tuple[int | None, int | None],
+    legs: tuple[LegGeometry, LegGeometry],
+    heights: HeightSigmas,
+) -> tuple[Motion, StandingHeight]:
+    """Return the motion and the heights with which the standing legs are nearly straight."""
+    signals = trunk_signals(motion, first, hands)
+    contacts = find_contacts(signals)
+    floor_m = 0.0
+    if np.isinf(heights.floor_m):
+        floor_m = float(np.median(signals.hips_m[:, 2])) - _standing_m(legs)
+    steps = place_feet(contacts, signals, legs, floor_m)
+    if first == 0:
+        heights = replace(heights, pelvis_m=0.0)
+    found = standing_height(steps, motion.world_from_joint(), contacts, legs, heights, floor_m)
+    return (raised_pelvis(motion, first, found.pelvis_m) if found.pelvis_m else motion), found
 
 
 def _hands(skeleton: SkeletonModel, solved: BoolArray) -> tuple[int | None, int | None]:
@@ -323,9 +345,9 @@ def _trunk_is_seen(motion: Motion, solved: BoolArray) -> BoolArray:
     return np.asarray(seen if seen.any() else np.ones_like(seen))
 
 
-def _low_hips(world: FloatArray, legs: tuple[LegGeometry, LegGeometry], floor: FloorHeight) -> BoolArray:
+def _low_hips(world: FloatArray, legs: tuple[LegGeometry, LegGeometry], floor: StandingHeight) -> BoolArray:
     """Return (T,) True if the hips are so low that the person may kneel, sit on the floor or lie."""
-    height = 0.5 * (world[:, legs[0].hip, 2, 3] + world[:, legs[1].hip, 2, 3]) - floor.height_m
+    height = 0.5 * (world[:, legs[0].hip, 2, 3] + world[:, legs[1].hip, 2, 3]) - floor.floor_m
     return np.asarray(height < _LOW_SHARE * 0.5 * (legs[0].length_m + legs[1].length_m))
 
 

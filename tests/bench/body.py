@@ -1,7 +1,8 @@
 """The fill stage on true bodies and true paths of a torso and two hands: errors of the filled legs.
 
 ``python -m tests.bench body``: no map and no merge. Each row is a recorded body whose legs are known. The
-stage gets the true poses of trunk and arms and the body's own skeleton, as from a merge without error.
+stage gets the true poses of trunk and arms and the body's own skeleton, as from a merge without error. With
+``--errors``, the trunk has drawn errors of scale, floor and mount, as from a merge of real pictures.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.layout.resampling import resample
 from bodycap_batch.fill import fill_motion
 from bodycap_batch.fill.leg_geometry import leg_geometry
+from bodycap_batch.fill.standing_height import HeightSigmas
+from bodycap_batch.fill.trunk_signals import low_pass
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.merging.body.bones import kinematic_chain
@@ -43,6 +46,8 @@ TUNED_ON = ("02_01",)
 """Recordings that constants of the stage may be chosen on. All others are only reported."""
 DRAWN = range(8)
 """Seeds of the drawn walks."""
+HEIGHTS = HeightSigmas(0.01, 0.08)
+"""Sigmas (metres) of floor and pelvis as for a merge with a skeleton that is scaled from the stature."""
 _ROLES = {
     "Hips": "root", "Spine1": "torso",
     **{f"{s}{part}": f"{s.lower()}_{name}" for s in SIDES for part, name in (
@@ -57,16 +62,52 @@ _STANCE_S = 0.1
 _TRIM_S = 0.1
 _STEP_TOLERANCE_S = 0.1
 _MIN_SLOPE_M = 1.5
+_SCALE_ERROR = 0.06
+"""Largest drawn error of the metric scale, relative. Origin: merges of walks state a sigma of 4 to 5 %."""
+_FLOOR_ERROR_M = 0.03
+"""Largest drawn error (metres) of the height of the floor. Origin: the slab in which a floor is found."""
+_MOUNT_ERROR_M = 0.03
+"""Largest drawn error (metres) of the mount of the trunk's camera along each axis. Origin: merges of walks
+state a sigma of 2 to 3 cm."""
+_CROUCHED_DEG = 30.0
+"""Flexion (degrees) of the straighter knee beyond which the person looks crouched."""
+_JERK_HZ = 10.0
+"""Cutoff frequency (Hz) of the knees before the third derivative."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Body:
-    """A recorded body: joints (T,3) by role in the world, and what a merge without error would give."""
+    """A recorded body: joints (T,3) by role in the world, and what a merge would give.
+
+    `path_scale` is the scale of the merged path, as a ratio to that of the truth.
+    """
 
     name: str
     joints: Mapping[str, FloatArray]
     merged: Motion
     solved: BoolArray
+    path_scale: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stance:
+    """How straight a body stands and how smoothly its knees move.
+
+    Attributes:
+        crouched_share: Share of the time in which the straighter knee is bent by more than `_CROUCHED_DEG`.
+        straightest_deg: Smallest flexion of a knee.
+        peak_deg: Largest flexion of a knee.
+        pelvis_share: Mean height of the hips over the floor, as a share of that on straight legs.
+        knee_deg_per_s: Largest rate of a knee, from one tick to the next.
+        knee_jerk: Root mean square of the third derivative of the knees below `_JERK_HZ`, degrees/s³.
+    """
+
+    crouched_share: float
+    straightest_deg: float
+    peak_deg: float
+    pelvis_share: float
+    knee_deg_per_s: float
+    knee_jerk: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,8 +127,8 @@ class Score:
     false: int
     unsure_share: float
     knee_correlation: float
-    knee_max_deg: float
-    true_knee_max_deg: float
+    stance: Stance
+    true_stance: Stance
     twist_deg: float
     true_twist_deg: float
     sole_low_m: float
@@ -146,6 +187,28 @@ def drawn_body(seed: int, seconds: float = 20.0) -> Body:
         observed=np.ones(local.shape[:2], dtype=bool),
     )  # fmt: skip
     return motion_body(motion, f"drawn_{seed}")
+
+
+def with_errors(body: Body, seed: int) -> Body:
+    """Return a body whose merge has drawn errors of scale, floor and mount.
+
+    The path of the trunk is longer or shorter by the error of the scale, and so is its height. The trunk is
+    off by the error of the mount in its own axes. The feet are compared with a truth whose path has the same
+    scale, so that their distance does not grow along the path.
+    """
+    rng = np.random.default_rng(seed)
+    scale = 1.0 + float(rng.uniform(-_SCALE_ERROR, _SCALE_ERROR))
+    floor_m = float(rng.uniform(-_FLOOR_ERROR_M, _FLOOR_ERROR_M))
+    mount_m = rng.uniform(-_MOUNT_ERROR_M, _MOUNT_ERROR_M, 3)
+    merged = body.merged
+    trunk = merged.world_from_joint()[:, int(np.argmax(body.solved))]
+    moved = scale * trunk[:, :3, 3] + trunk[:, :3, :3] @ mount_m + [0.0, 0.0, floor_m]
+    root = merged.root_in_world_m + moved - trunk[:, :3, 3]
+    return replace(
+        body,
+        merged=replace(merged, root_in_world_m=root),
+        path_scale=scale,
+    )
 
 
 def motion_body(motion: Motion, name: str) -> Body:
@@ -311,12 +374,11 @@ def swings(stances: Sequence[tuple[int, int]], fps: float, path: FloatArray) -> 
     return out
 
 
-def score(body: Body, mode: FillMode, *, floor_is_measured: bool = True) -> Score:
+def score(body: Body, mode: FillMode, heights: HeightSigmas = HEIGHTS) -> Score:
     """Fill the legs of a body and compare them with the truth."""
     started = time.perf_counter()
     filled = fill_motion(
-        body.merged, body.solved, floor_is_measured=floor_is_measured, mode=mode,
-        context=StageContext(work_dir=Path()),
+        body.merged, body.solved, heights=heights, mode=mode, context=StageContext(work_dir=Path())
     )  # fmt: skip
     seconds = time.perf_counter() - started
     motion, report, fps = filled.motion, filled.report, body.merged.fps
@@ -327,7 +389,8 @@ def score(body: Body, mode: FillMode, *, floor_is_measured: bool = True) -> Scor
     steps = recalled = claimed = false = 0
     for side, name in enumerate(SIDES):
         foot = f"{name}Foot"
-        ankle.append(np.linalg.norm(own[foot] - body.joints[foot], axis=1))
+        scaled = body.joints[foot] * [body.path_scale, body.path_scale, 1.0]
+        ankle.append(np.linalg.norm(own[foot] - scaled, axis=1))
         speed = _speed(own[foot], fps)
         stances = true_stances(body.joints[foot], fps)
         trim = round(_TRIM_S * fps)
@@ -364,8 +427,8 @@ def score(body: Body, mode: FillMode, *, floor_is_measured: bool = True) -> Scor
         false=false,
         unsure_share=unsure,
         knee_correlation=float(np.mean(correlations)),
-        knee_max_deg=float(max(a.max() for a, _ in knees)),
-        true_knee_max_deg=float(max(b.max() for _, b in knees)),
+        stance=_stance(own, motion.skeleton, fps, report.floor_m),
+        true_stance=_stance(body.joints, body.merged.skeleton, fps, 0.0),
         twist_deg=_twist_deg(own, fps),
         true_twist_deg=_twist_deg(body.joints, fps),
         sole_low_m=soles,
@@ -420,6 +483,22 @@ def _knee_deg(joints: Mapping[str, FloatArray], side: str) -> FloatArray:
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
+def _stance(joints: Mapping[str, FloatArray], skeleton: SkeletonModel, fps: float, floor_m: float) -> Stance:
+    legs = leg_geometry(skeleton)
+    assert legs is not None
+    knees = np.column_stack([_knee_deg(joints, side) for side in SIDES])
+    straight_m = np.mean([leg.length_m + leg.ankle_height_m for leg in legs])
+    hips_m = np.mean([joints[side + "UpLeg"][:, 2].mean() for side in SIDES]) - floor_m
+    return Stance(
+        crouched_share=float((knees.min(axis=1) > _CROUCHED_DEG).mean()),
+        straightest_deg=float(knees.min()),
+        peak_deg=float(knees.max()),
+        pelvis_share=float(hips_m / straight_m),
+        knee_deg_per_s=float(np.abs(np.diff(knees, axis=0)).max() * fps),
+        knee_jerk=float(np.sqrt((np.diff(low_pass(knees, _JERK_HZ, fps), 3, axis=0) ** 2).mean()) * fps**3),
+    )
+
+
 def _twist_deg(joints: Mapping[str, FloatArray], fps: float) -> float:
     """Return the range (5th to 95th percentile) of the pelvis's yaw against the shoulders."""
     yaw = []
@@ -470,17 +549,22 @@ def bodies(data: Path) -> Iterator[Body]:
 
 
 def line_of(result: Score) -> str:
-    """Return one line of the table."""
+    """Return the two lines of one body in the table."""
+    own, true = result.stance, result.true_stance
     return (
         f"{result.name:18s} ankle {100 * result.ankle_m:5.1f} cm | speed in true stance"
         f" {result.true_stance_speed:5.2f} own {result.own_stance_speed:5.3f} m/s | stance"
         f" {100 * result.own_stance_share:3.0f} % (true still {100 * result.true_stance_share:3.0f}) | steps"
         f" {result.recalled:2d}/{result.steps:2d} false {result.false:2d}/{result.claimed:2d} unsure"
-        f" {100 * result.unsure_share:3.0f} % | knee r {result.knee_correlation:5.2f} max"
-        f" {result.knee_max_deg:3.0f} ({result.true_knee_max_deg:3.0f})° | twist {result.twist_deg:4.1f}"
-        f" ({result.true_twist_deg:4.1f})° | soles {100 * result.sole_low_m:5.1f}, stance"
-        f" {100 * result.sole_stance_m[0]:4.1f}..{100 * result.sole_stance_m[1]:4.1f} cm |"
-        f" {result.seconds_per_minute:4.1f} s/min"
+        f" {100 * result.unsure_share:3.0f} % | knee r {result.knee_correlation:5.2f} | twist"
+        f" {result.twist_deg:4.1f} ({result.true_twist_deg:4.1f})° | soles"
+        f" {100 * result.sole_low_m:5.1f}, stance {100 * result.sole_stance_m[0]:4.1f}.."
+        f"{100 * result.sole_stance_m[1]:4.1f} cm | {result.seconds_per_minute:4.1f} s/min"
+        f"\n{'':18s} crouched {100 * own.crouched_share:3.0f} ({100 * true.crouched_share:3.0f}) % | knee"
+        f" straightest {own.straightest_deg:4.1f} ({true.straightest_deg:4.1f})° peak {own.peak_deg:3.0f}"
+        f" ({true.peak_deg:3.0f})° speed {own.knee_deg_per_s:4.0f} ({true.knee_deg_per_s:4.0f}) °/s jerk"
+        f" {own.knee_jerk / true.knee_jerk:4.2f} of the truth's | pelvis {100 * own.pelvis_share:5.1f}"
+        f" ({100 * true.pelvis_share:5.1f}) % of standing"
     )
 
 
@@ -491,13 +575,23 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--rest", action="store_true", help="the rest pose instead of the plausible motion")
     parser.add_argument("--no-floor", action="store_true", help="the floor is not measured")
+    parser.add_argument("--floor", action="store_true", help="the floor takes up the errors")
+    parser.add_argument(
+        "--errors", type=int, metavar="SEED", help="draw errors of scale, floor and mount from this seed on"
+    )
+    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), help="only these drawn walks")
     options = parser.parse_args(arguments)
+    heights = HeightSigmas(0.06, 0.0) if options.floor else HEIGHTS
+    if options.no_floor:
+        heights = replace(heights, floor_m=np.inf)
     mode: FillMode = "rest" if options.rest else "plausible"
     count = 0
-    for body in bodies(options.data):
+    drawn = (drawn_body(seed) for seed in range(*options.seeds)) if options.seeds else bodies(options.data)
+    for body in drawn:
         if options.only and body.name not in options.only:
             continue
-        result = score(body, mode, floor_is_measured=not options.no_floor)
+        merged = body if options.errors is None else with_errors(body, options.errors + count)
+        result = score(merged, mode, heights)
         held_out = "" if body.name.startswith(TUNED_ON) else "held out"
         sys.stdout.write(f"{line_of(result)} {held_out}\n")
         sys.stdout.flush()

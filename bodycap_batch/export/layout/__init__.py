@@ -39,4 +39,4 @@ def apply_layout(motion: Motion, options: ExportOptions) -> Motion:
         motion = rename_roles(motion, options.names)
     if options.tpose:
         motion = prepend_tpose(motion)
-    return apply_root_mode(motion, options.root, added_root(motion, options))
+    return apply_root_mode(motion, options.root, added_root(motion, options), tpose=options.tpose)

@@ -26,6 +26,14 @@ FBX importer would then connect the hips to this bone and ignore the hips' motio
 """
 
 
+_ROOT_SIGMA_S = 0.4
+"""Standard deviation (seconds) of the Gaussian filter of the floor root's path and heading.
+
+Derivation: strides take 1 to 1.4 s, so that 4 to 20 % of a sway is left; after a stop, the root stands within
+a second. A Gaussian does not overshoot.
+"""
+
+
 def floor_root_name(names: str, mode: RootMode) -> str | None:
     """Return the name of the root joint on the floor; None if the motion gets no such joint.
 
@@ -57,18 +65,19 @@ def prepend_tpose(motion: Motion) -> Motion:
     )
 
 
-def apply_root_mode(motion: Motion, mode: RootMode, floor: str | None) -> Motion:
+def apply_root_mode(motion: Motion, mode: RootMode, floor: str | None, *, tpose: bool = False) -> Motion:
     """Return the motion with the root motion that a mode selects.
 
     ``hips``: the hips hold the whole root motion. ``ground``: a root joint on the floor below the hips holds
-    the horizontal path and the heading of the hips. The hips hold their height and the remaining rotation. No
-    existing joint moves in the world. ``in_place``: the horizontal path is removed, so that the hips stay
+    the horizontal path and the heading of the hips without the sway of single steps. The hips hold the rest.
+    No existing joint moves in the world. ``in_place``: the horizontal path is removed, so that the hips stay
     above the origin.
 
     Args:
         motion: The motion, with the hips as its root.
         mode: The mode of the root motion.
         floor: Name of the root joint on the floor; None for no such joint.
+        tpose: Whether the first frame is a T-pose.
     """
     if mode == "in_place":
         motion = replace(motion, root_in_world_m=motion.root_in_world_m * [0.0, 0.0, 1.0])
@@ -77,8 +86,10 @@ def apply_root_mode(motion: Motion, mode: RootMode, floor: str | None) -> Motion
     heading = np.zeros(len(motion.root_in_world_m))
     path = np.zeros((len(heading), 3))
     if mode == "ground":
-        heading = heading_rad(motion.local_rotation[:, 0])
-        path[:, :2] = motion.root_in_world_m[:, :2]
+        start = int(tpose)
+        heading[start:] = _smoothed(heading_rad(motion.local_rotation[start:, 0]), motion.fps)
+        path[start:, :2] = _smoothed(motion.root_in_world_m[start:, :2], motion.fps)
+        path[:start, :2] = motion.root_in_world_m[:start, :2]
     world_from_floor = so3_exp(heading[:, None] * [0.0, 0.0, 1.0])
     local = motion.local_rotation.copy()
     local[:, 0] = np.swapaxes(world_from_floor, -1, -2) @ local[:, 0]
@@ -91,6 +102,18 @@ def apply_root_mode(motion: Motion, mode: RootMode, floor: str | None) -> Motion
         observed=np.concatenate([motion.observed[:, :1], motion.observed], axis=1),
         hips_in_root_m=hips,
     )
+
+
+def _smoothed(values: FloatArray, fps: float) -> FloatArray:
+    """Return values (T,...) after a Gaussian filter over time, which keeps the first and the last value."""
+    from scipy.ndimage import gaussian_filter1d
+
+    margin = min(len(values) - 1, round(4.0 * _ROOT_SIGMA_S * fps))
+    before = 2.0 * values[:1] - values[margin:0:-1]
+    after = 2.0 * values[-1:] - values[-2 : -2 - margin : -1]
+    padded = np.concatenate([before, values, after])
+    filtered = gaussian_filter1d(padded, _ROOT_SIGMA_S * fps, axis=0, mode="nearest")
+    return np.asarray(filtered[margin : margin + len(values)])
 
 
 def heading_rad(world_from_hips: FloatArray) -> FloatArray:

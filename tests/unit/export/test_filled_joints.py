@@ -14,6 +14,7 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.export import ExportInputs, export_results
 from bodycap_batch.fill import fill_motion
+from bodycap_batch.fill.standing_height import HeightSigmas
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.c3d import read_c3d
 from bodycap_batch.model.fill_data import FillMode
@@ -27,7 +28,7 @@ def filled(mode: FillMode = "plausible") -> tuple[MergeResult, dict[str, Any]]:
     found = fill_motion(
         result.motion,
         result.solved,
-        floor_is_measured=True,
+        heights=HeightSigmas(0.01, 0.06),
         mode=mode,
         context=StageContext(work_dir=Path()),
     )
@@ -121,7 +122,10 @@ def test_fill_json_lists_joints_and_steps(tmp_path: Path) -> None:
     assert set(content["filled_joints"]) == others
     assert len(content["footsteps"]) == len(result.fill.footsteps.side) > 0
     assert {step["foot"] for step in content["footsteps"]} == {"left", "right"}
-    assert content["floor"] == {"height_m": 0.0, "sigma_m": 0.0, "source": "measured"}
+    floor = content["floor"]
+    assert floor["source"] == "measured"
+    # The floor takes up its share of what the standing legs measure, less than its sigma of 1 cm.
+    assert abs(floor["height_m"]) < floor["sigma_m"] <= 0.01
 
 
 def test_without_a_pose_unmeasured_joints_are_left_out(tmp_path: Path) -> None:

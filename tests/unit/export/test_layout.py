@@ -122,6 +122,36 @@ def test_on_the_ground_the_root_has_path_and_heading() -> None:
     np.testing.assert_allclose(out.hips_in_root_m[:, 2], motion.root_in_world_m[:, 2])
 
 
+def test_the_root_on_the_ground_does_not_sway_and_stops_with_the_person() -> None:
+    motion = reaching(240)
+    time = np.arange(240) / 30.0
+    walked = np.cumsum(np.where(time < 5.0, 1.1, 0.0)) / 30.0
+    sway = np.where(time < 5.0, 0.03 * np.sin(2.0 * np.pi * time), 0.0)
+    zero = 0.0 * time
+    local = motion.local_rotation.copy()
+    local[:, 0] = so3_exp(np.column_stack([zero, zero, np.radians(8.0) * sway / 0.03]))
+    height = motion.root_in_world_m[:1, 2].repeat(240)
+    motion = replace(motion, root_in_world_m=np.column_stack([sway, -walked, height]), local_rotation=local)
+    out = laid_out(motion, root="ground")
+    before, after = motion.world_from_joint(), out.world_from_joint()[:, 1:]
+    np.testing.assert_allclose(after, before, atol=1e-9)
+    path, inside = out.root_in_world_m, slice(30, 120)
+    # A Gaussian of 0.4 s leaves exp(-(2π 0.4)²/2) = 4 % of a sway of 1 Hz.
+    assert np.abs(path[inside, 0]).max() < 0.05 * 0.03
+    assert np.abs(heading_rad(out.local_rotation[:, 0])[inside]).max() < 0.05 * np.radians(8.0)
+    speed = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1) * 30.0
+    np.testing.assert_allclose(speed[inside], 1.1, atol=0.05)
+    # The person stands from 5 s on: 2.5 sigmas later, less than 1 % of the speed is left.
+    assert speed[180:].max() < 0.011
+
+
+def test_a_t_pose_does_not_turn_the_root_that_follows_it() -> None:
+    motion = reaching(60)
+    whole, after = laid_out(motion, root="ground"), laid_out(motion, root="ground", tpose=True)
+    np.testing.assert_allclose(after.local_rotation[1:, 0], whole.local_rotation[:, 0], atol=1e-12)
+    np.testing.assert_allclose(after.root_in_world_m[1:], whole.root_in_world_m, atol=1e-12)
+
+
 def test_heading_is_continuous_and_survives_a_body_upside_down() -> None:
     turns = np.linspace(0.0, 9.0, 200)
     np.testing.assert_allclose(heading_rad(so3_exp(turns[:, None] * [0.0, 0.0, 1.0])), turns, atol=1e-9)

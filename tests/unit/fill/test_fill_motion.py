@@ -13,11 +13,12 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.fill import fill_motion
 from bodycap_batch.fill.foot_paths import foot_path
 from bodycap_batch.fill.leg_geometry import leg_geometry
+from bodycap_batch.fill.standing_height import HeightSigmas
 from bodycap_batch.model.fill_data import FillMode, FillResult, Footsteps
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.model.skeleton_presets import load_skeleton
-from tests.bench.body import drawn_body, score
+from tests.bench.body import drawn_body, score, with_errors
 from tests.bodies import ARMS
 
 SPEED = 1.2
@@ -59,10 +60,19 @@ def walking(
 
 
 def fill(
-    motion: Motion, solved: BoolArray, mode: FillMode = "plausible", *, floor: bool = True
+    motion: Motion,
+    solved: BoolArray,
+    mode: FillMode = "plausible",
+    *,
+    floor: bool = True,
+    sigmas: HeightSigmas | None = None,
 ) -> FillResult:
     return fill_motion(
-        motion, solved, floor_is_measured=floor, mode=mode, context=StageContext(work_dir=Path())
+        motion,
+        solved,
+        heights=sigmas or HeightSigmas(0.01 if floor else np.inf, 0.06),
+        mode=mode,
+        context=StageContext(work_dir=Path()),
     )
 
 
@@ -107,6 +117,52 @@ def test_steps_of_drawn_walks_with_turns_and_steps_aside_and_back_are_found() ->
         assert each.unsure_share < 0.1
         assert each.true_stance_speed < 0.1
         assert each.knee_correlation > 0.75
+
+
+@pytest.mark.parametrize(("seed", "floor"), [(3, False), (5, True)])
+def test_errors_of_scale_mount_and_floor_do_not_crouch_a_walk(seed: int, floor: bool) -> None:
+    """The drawn errors move the trunk by up to 13 cm: pelvis or floor take them up, and not the knees."""
+    heights = HeightSigmas(0.06, 0.0) if floor else HeightSigmas(0.01, 0.08)
+    found = score(with_errors(drawn_body(seed, 10.0), 7), "plausible", heights)
+    own, true = found.stance, found.true_stance
+    # A share of 2 % of the standing height, 2 cm, is the spread of upright walks among people.
+    assert own.pelvis_share == pytest.approx(true.pelvis_share, abs=0.02)
+    assert own.crouched_share == pytest.approx(true.crouched_share, abs=0.1)
+    assert own.straightest_deg == pytest.approx(true.straightest_deg, abs=5.0)
+    assert own.peak_deg == pytest.approx(true.peak_deg, abs=10.0)
+    # The truth is not exact to the tick: 20 % more than its fastest knee.
+    assert own.knee_deg_per_s < 1.2 * true.knee_deg_per_s
+    assert 0.6 < own.knee_jerk / true.knee_jerk < 1.5
+    assert found.sole_low_m > -0.005
+
+
+@pytest.mark.parametrize("lowered_m", [0.05, -0.04])
+def test_the_pelvis_takes_up_an_error_of_the_height_or_the_floor_does(lowered_m: float) -> None:
+    motion, solved = walking(8.0)
+    moved = replace(motion, root_in_world_m=motion.root_in_world_m - [0.0, 0.0, lowered_m])
+    chest = motion.skeleton.roles.index("Spine1")
+    before = moved.world_from_joint()
+    straight, other = fill(motion, solved), fill(moved, solved)
+    after = other.motion.world_from_joint()
+    np.testing.assert_allclose(after[:, solved], before[:, solved], atol=1e-9)
+    # Of 5 cm, 94 % are taken up with sigmas of 6 cm before and 1.5 % of a leg of 0.86 m measured.
+    hips = [each.motion.world_from_joint()[:, 0, 2, 3].mean() for each in (straight, other)]
+    assert hips[0] == pytest.approx(hips[1], abs=0.01)
+    assert abs(other.report.floor_m) < 0.01
+    # Bones that were measured keep their lengths: then the floor takes it up.
+    found = [fill(each, solved, sigmas=HeightSigmas(0.06, 0.0)) for each in (motion, moved)]
+    np.testing.assert_array_equal(found[1].motion.skeleton.offsets_m, motion.skeleton.offsets_m)
+    np.testing.assert_allclose(found[1].motion.world_from_joint()[:, chest], before[:, chest], atol=1e-9)
+    taken = found[1].report.floor_m - found[0].report.floor_m
+    assert taken == pytest.approx(-lowered_m, abs=0.01)
+
+
+def test_a_person_who_crouches_all_the_time_is_not_straightened() -> None:
+    motion, solved = walking(4.0, speed=0.0)
+    low = replace(motion, root_in_world_m=motion.root_in_world_m - [0.0, 0.0, 0.35])
+    result = fill(low, solved)
+    lifted = result.motion.world_from_joint()[:, 0, 2, 3] - low.root_in_world_m[:, 2]
+    assert np.abs(lifted).max() < 0.01
 
 
 @pytest.mark.parametrize(("per_stride", "is_sure"), [(1.0, True), (1.55, False)])

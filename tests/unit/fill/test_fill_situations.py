@@ -15,6 +15,7 @@ from bodycap_batch.fill import fill_motion
 from bodycap_batch.fill.foot_paths import FootPath, foot_path
 from bodycap_batch.fill.leg_geometry import leg_geometry
 from bodycap_batch.fill.leg_poses import pose_leg
+from bodycap_batch.fill.standing_height import HeightSigmas
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.completion import complete_skeleton
 from bodycap_batch.model.fill_data import FillResult, Footsteps
@@ -90,7 +91,11 @@ def filled(trunk: Trunk, *, swing: float = 0.0) -> FillResult:
         observed=np.tile(solved, (len(time), 1)),
     )  # fmt: skip
     result = fill_motion(
-        motion, solved, floor_is_measured=True, mode="plausible", context=StageContext(work_dir=Path())
+        motion,
+        solved,
+        heights=HeightSigmas(0.01, 0.06),
+        mode="plausible",
+        context=StageContext(work_dir=Path()),
     )
     after = result.motion.world_from_joint()
     np.testing.assert_allclose(after[:, solved], poses[:, solved], atol=1e-9)
@@ -357,7 +362,7 @@ def test_knees_do_not_jump_if_the_trunk_turns_around_over_standing_feet() -> Non
     zero = 0.0 * yaw
     pelvis = so3_exp(np.column_stack([zero, zero, yaw]))
     path = FootPath(
-        ankle_m=np.zeros((len(yaw), 3)), heading_rad=zero, pitch_rad=zero, toe_rad=zero,
+        ankle_m=np.zeros((len(yaw), 3)), heading_rad=zero, pitch_rad=zero, toe_rad=zero, knee_rad=zero,
     )  # fmt: skip
     hip = np.tile([0.05, 0.1, 0.9 * leg.length_m], (len(yaw), 1))
     thigh = pose_leg(leg, hip, path, pelvis).thigh
