@@ -129,7 +129,7 @@ def export_undistorted(
         facts = json.loads(files[CAMERA_FACTS_FILE].read_text(encoding="utf-8"))
         for clip in flow.undistort(results, exported, list(facts["cameras"])).values():
             files |= dict(files_of(clip))
-    settings.require_owner()
+    settings.raise_if_cancelled()
     publish(files, folder)
     return [folder / name for name in files]
 

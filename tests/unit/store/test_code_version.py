@@ -189,7 +189,9 @@ HASHED = {
     "fill": BODY | {"fill"},
     # The places of unnamed cameras follow from their paths alone.
     "places": CAMERAS | {"camera_places"},
-    "export": BODY | {"export"},
+    # The files state the timecode of the videos.
+    "export": BODY | {"clocks", "export", "telemetry"},
+    "undistort": BODY | {"export", "overlay", "preview"},
     "report": BODY | {"report", "overlay"},
     "preview": BODY | {"preview", "overlay"},
 }
