@@ -32,8 +32,8 @@ def report(
     """Write a job's report.html again, from the content of the store.
 
     Every run writes the report and verdict.json. This command writes both again, for example with a newer
-    bodycap. The height and the skeleton are those of the last run. No other stage is computed. The report of an
-    interrupted job states how far the job got.
+    bodycap. The height and the skeleton are those of the last run. No other stage is computed. The report of
+    an interrupted job states how far the job got.
 
     \b
     Examples:
