@@ -166,9 +166,7 @@ def error_from_dict(data: dict[str, str | int | None]) -> BodycapError:
 
 def worst_exit_code(codes: Iterable[int]) -> int:
     """Return the exit code of several jobs: the largest; any failure outranks an unmet requirement."""
-    return max(
-        codes, key=lambda code: (code not in (EXIT_OK, RequirementUnmet.exit_code), code), default=EXIT_OK
-    )
+    return max(codes, key=lambda code: (code not in (0, RequirementUnmet.exit_code), code), default=0)
 
 
 def one_error(errors: Sequence[BodycapError]) -> BodycapError:
