@@ -122,7 +122,7 @@ def test_heavy_libraries_load_when_needed() -> None:
     [
         ("bodycap_batch.clocks", "scipy.signal"),
         ("bodycap_batch.mapping", "scipy"),
-        ("bodycap_batch.report.body_doubts", "scipy"),
+        ("bodycap_batch.report.criteria", "scipy"),
     ],
 )
 def test_parts_of_scipy_load_when_needed(loaded: str, unneeded: str) -> None:

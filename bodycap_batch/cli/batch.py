@@ -20,13 +20,15 @@ from bodycap_batch.cli.shared_options import (
     BatchOutOption,
     HeightOption,
     MemoryOption,
+    RequireOption,
     StoreOption,
+    checked_requirement,
     make_overrides,
 )
 from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line, print_message, print_messages
 from bodycap_batch.core.context import cores
-from bodycap_batch.core.errors import Cancelled, JobError
+from bodycap_batch.core.errors import Cancelled, JobError, worst_exit_code
 from bodycap_batch.core.printable import printable
 from bodycap_batch.core.progress import Event
 from bodycap_batch.job_places import find_job, find_store
@@ -59,6 +61,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
     executor: _ExecutorOption = "local",
     out: BatchOutOption = None,
     height: HeightOption = None,
+    require: RequireOption = None,
     store: StoreOption = None,
     memory_mb: MemoryOption = None,
     max_jobs: Annotated[
@@ -84,9 +87,9 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
 
     A failed job does not stop the others. Each job keeps the height and the other settings with which
     `bodycap run` computed it last; --height replaces the height of all jobs. The exit code is the highest
-    exit code of all jobs. If the batch is started again, it continues after the finished stages. On a
-    cluster, the jobs, their videos, the store and the results must be on a disk that all machines mount under
-    the same path.
+    exit code of all jobs, but 6 (not as required) only if no job failed. If the batch is started again, it
+    continues after the finished stages. On a cluster, the jobs, their videos, the store and the results must
+    be on a disk that all machines mount under the same path.
 
     \b
     Examples:
@@ -98,7 +101,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.store.artefacts import Store
 
     batch_jobs = _batch_jobs(_without_results(list(dict.fromkeys(jobs))), priority or [])
-    overrides = replace(make_overrides(height=height), out_parent=out)
+    overrides = replace(make_overrides(height=height), out_parent=out, require=checked_requirement(require))
     reporter = _BatchReporter(as_json=as_json)
     with (
         event_on_signal() as stop,
@@ -124,7 +127,7 @@ def batch(  # noqa: PLR0913, PLR0917 - the flags a user types
                 hint="run the same command again to continue",
             )
     reporter.print_summary(batch_jobs, outcomes)
-    raise typer.Exit(max(outcome.exit_code for outcome in outcomes))
+    raise typer.Exit(worst_exit_code(outcome.exit_code for outcome in outcomes))
 
 
 @contextmanager
@@ -279,4 +282,6 @@ def _outcome_text(outcome: Outcome) -> str:
     work = f"done in {outcome.seconds:.0f} s" if is_new else "nothing to do"
     verdict = outcome.summary.verdict
     grade = "" if verdict is None else f"  verdict: {verdict.grade.word}"
+    if outcome.error is not None:
+        grade += f"  not as required ({outcome.exit_code})"
     return f"{work}{grade}  {outcome.summary.out_dir}"

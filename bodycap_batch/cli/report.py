@@ -31,9 +31,9 @@ def report(
 ) -> None:
     """Write a job's report.html again, from the content of the store.
 
-    Every run writes the report. This command writes the report again, for example with a newer bodycap. The
-    height and the skeleton are those of the last run. No other stage is computed. The report of an
-    interrupted job states how far the job got.
+    Every run writes the report and verdict.json. This command writes both again, for example with a newer
+    bodycap. The height and the skeleton are those of the last run. No other stage is computed. The report of
+    an interrupted job states how far the job got.
 
     \b
     Examples:

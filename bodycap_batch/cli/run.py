@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -18,9 +19,11 @@ from bodycap_batch.cli.shared_options import (
     MemoryOption,
     OutOption,
     PlacesOption,
+    RequireOption,
     SkeletonOption,
     StoreOption,
     ThreadsOption,
+    checked_requirement,
     make_overrides,
 )
 from bodycap_batch.cli.signals import event_on_signal
@@ -42,6 +45,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     height: HeightOption = None,
     camera: CamerasOption = None,
     places: PlacesOption = None,
+    require: RequireOption = None,
     activity: ActivityOption = None,
     threads: ThreadsOption = None,
     store: StoreOption = None,
@@ -76,6 +80,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap run single_camera/ --skeleton none
       bodycap run jobs/cpl_lab.yaml
       bodycap run my_walk/ --from merge
+      bodycap run my_walk/ --require good,0.9   exit code 6 if the result is not good enough
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.api import Execution, execute_job, prepare_job
     from bodycap_batch.config.body_height import describe_height
@@ -117,6 +122,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         if job_file is not None:
             announce(f"the settings are taken from {job_file}")
         overrides = make_overrides(out, skeleton, height, camera, activity, places)
+        overrides = replace(overrides, require=checked_requirement(require))
         loaded = prepare_job(job, overrides, execution)
         if height is not None and loaded.options.height_m is not None:
             announce(f"height of the subject: {describe_height(loaded.options.height_m)}")
@@ -129,6 +135,9 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
             execution.children.start_ahead(CHECK.modules)
         summary = execute_job(loaded, execution)
     _print_summary(summary, loaded.name, display, verbose=verbose)
+    if summary.unmet is not None:
+        with _report_errors_as_json(display):
+            raise summary.unmet
 
 
 @contextmanager

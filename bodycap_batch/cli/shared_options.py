@@ -82,6 +82,14 @@ ActivityOption = Annotated[
     str | None,
     typer.Option(metavar="walk|generic", help="What the subject does (default: generic; walk: only walks)."),
 ]
+RequireOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="GRADE[,SHARE]",
+        help="Grade (good, usable, poor) and share of the recording that each result must reach, for example "
+        "good,0.9. Otherwise the exit code is 6, after all results were written.",
+    ),
+]
 ThreadsOption = Annotated[
     int | None,
     typer.Option(min=1, max=1024, help="Number of cores to use (default: all).", show_default=False),
@@ -126,6 +134,17 @@ def make_overrides(
         activity=activity,
         places=tuple(word.strip() for word in (places or "").split(",") if word.strip()),
     )
+
+
+def checked_requirement(text: str | None) -> str | None:
+    """Return the requirement of the command line. Raises `JobError` if it cannot be understood."""
+    from bodycap_batch.config.requirement import REQUIREMENT_HINT, valid_requirement
+
+    try:
+        return None if text is None else valid_requirement(text)
+    except ValueError as error:
+        message = str(error).partition("; ")[0]
+        raise JobError(message, field="--require", hint=REQUIREMENT_HINT) from error
 
 
 def _mounts(words: list[str]) -> dict[str, str]:

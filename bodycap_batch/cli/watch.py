@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.shared_options import MemoryOption, ThreadsOption, WatchStoreOption
+from bodycap_batch.cli.shared_options import (
+    MemoryOption,
+    RequireOption,
+    ThreadsOption,
+    WatchStoreOption,
+    checked_requirement,
+)
 from bodycap_batch.cli.signals import event_on_signal, signal_exit_code
 from bodycap_batch.cli.terminal import print_timed_message
 from bodycap_batch.core.context import cores
@@ -79,6 +85,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
             help="If a folder has not changed for this time, the folder is complete and its job starts.",
         ),
     ] = 10.0,
+    require: RequireOption = None,
     web: WebOption = None,
     web_token: TokenOption = "",
     once: Annotated[bool, typer.Option("--once", help="Stop when nothing is left to do.")] = False,
@@ -91,6 +98,9 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     running/, then to done/ or failed/. These folders are next to inbox/. done/NAME/result/ holds the results,
     done/NAME/input/ holds the dropped files. Stop the command with Ctrl-C at any time: the jobs continue when
     you start the command again. One watcher at a time may work on the folders.
+
+    With --require, a job whose results do not reach the grade and the share goes to failed/, with its
+    results and exit code 6. `require:` in the job file replaces it.
 
     A dropped job may only use files in its own folder and in the folders given by --root.
 
@@ -115,6 +125,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
         threads=threads or cores(),
         memory_mb=memory_mb,
         unchanged_s=unchanged_s,
+        require=checked_requirement(require),
         once=once,
     )
     with event_on_signal() as stop:

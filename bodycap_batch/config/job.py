@@ -499,6 +499,8 @@ def _with_overrides(job: Job, overrides: Overrides) -> Job:
         update["height_m"] = None if height_m == NO_HEIGHT else height_from_text(height_m)
     if overrides.activity is not None:
         update["activity"] = _known_activity(overrides.activity)
+    if overrides.require is not None:
+        update["require"] = overrides.require
     if overrides.places:
         update["capture"] = job.capture.model_copy(update={"places": overrides.places})
     return job.model_copy(update=update)

@@ -30,6 +30,7 @@ from bodycap_batch.config.options import (
     RegistrationOptions,
     TelemetryOptions,
 )
+from bodycap_batch.config.requirement import valid_requirement
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.model.fill_data import FillMode
@@ -325,6 +326,11 @@ class Job(_Block):
         ge=MIN_HEIGHT_M,
         le=MAX_HEIGHT_M,
         description="the subject's body height in metres, for example 1.75; 175 and 5'9 are understood, too",
+    )
+    require: Annotated[str, AfterValidator(valid_requirement)] | None = Field(
+        None,
+        description="grade (good, usable or poor) and share of the recording that the result must reach, for "
+        "example good,0.9; a run that does not reach them writes all results and ends with exit code 6",
     )
     activity: Activity = Field("generic", description="what the subject does; walk: the subject only walks")
     keyframes: KeyframeOptions = KeyframeOptions()

@@ -67,6 +67,7 @@ class Overrides:
         last_mounts: The same of the last run, for cameras whose place the job file does not give.
         activity: What the subject does.
         places: The places where the cameras were, in any order, if it is unknown which camera was where.
+        require: What the result must reach, such as ``good,0.9``. It is not kept for the next run.
     """
 
     out: Path | None = None
@@ -77,6 +78,7 @@ class Overrides:
     last_mounts: Mapping[str, str] = field(default_factory=dict)
     activity: str | None = None
     places: tuple[str, ...] = ()
+    require: str | None = None
 
     def with_last_run(self, stated: Mapping[str, Any], results: Path) -> tuple[Overrides, str]:
         """Add the values of the last run, and return a sentence about them; "" if none is added.

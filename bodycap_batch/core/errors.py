@@ -5,7 +5,7 @@ Any exception of another type is a bug. It ends the program with the exit code `
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from bodycap_batch.core.printable import printable
@@ -110,6 +110,12 @@ class StoreError(BodycapError):
     exit_code = 5
 
 
+class RequirementUnmet(BodycapError):
+    """The results were written, but they do not reach the grade or the coverage that the job requires."""
+
+    exit_code = 6
+
+
 class DiskAway(StoreError):
     """A disk does not respond, for example an unreachable network disk. A later attempt may succeed."""
 
@@ -137,6 +143,7 @@ _ERROR_TYPES = {
         EstimationError,
         ImplausibleBody,
         StoreError,
+        RequirementUnmet,
         DiskAway,
         OutOfMemory,
         Cancelled,
@@ -155,6 +162,11 @@ def error_from_dict(data: dict[str, str | int | None]) -> BodycapError:
         field=None if data.get("field") is None else str(data["field"]),
         hint=None if data.get("hint") is None else str(data["hint"]),
     )
+
+
+def worst_exit_code(codes: Iterable[int]) -> int:
+    """Return the exit code of several jobs: the largest; any failure outranks an unmet requirement."""
+    return max(codes, key=lambda code: (code not in (0, RequirementUnmet.exit_code), code), default=0)
 
 
 def one_error(errors: Sequence[BodycapError]) -> BodycapError:

@@ -16,6 +16,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.export.earth import earth_of_world
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.far_points import is_far
+from bodycap_batch.export.map_links import weakest_link
 from bodycap_batch.export.target_frames import (
     WORLD,
     main_target_name,
@@ -27,6 +28,10 @@ from bodycap_batch.model.relative_pose import RelativePose
 from bodycap_batch.model.rotation_path import PosePath
 from bodycap_batch.model.scene import FrameStatus, Map, Trajectory
 from bodycap_batch.model.skeleton import Motion
+
+METRICS_SCHEMA = 1
+"""Version of the layout of ``metrics.json``. Another number means that a key was removed, or that it has
+another meaning. Keys can be added at any time."""
 
 
 def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[str, Any]) -> dict[str, Any]:
@@ -42,6 +47,7 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
     trajectories = trajectories_in_target_frames(inputs)
     cameras = {path.camera: _camera_metrics(inputs, path, errors) for path in trajectories}
     out: dict[str, Any] = {
+        "schema_version": METRICS_SCHEMA,
         "frame": main_target_name(inputs),
         "metric": main_target_name(inputs) == WORLD,
         "partial": inputs.partial_reason is not None,
@@ -135,12 +141,13 @@ def observation_errors(scene: Map, trajectories: Sequence[Trajectory]) -> FloatA
 
 
 def _map_counts(scene: Map, errors: FloatArray) -> dict[str, Any]:
-    """Return the numbers of points and observations, and the mean reprojection error of one map."""
+    """Return the numbers of points and observations, the mean reprojection error and the weakest link."""
     return {
         "points": len(scene.points),
         "far_points": int(is_far(scene).sum()),
         "measurements": len(scene.obs_px),
         "mean_reprojection_error_px": _finite_mean(errors),
+        "weakest_link": weakest_link(scene.obs_point, scene.obs_keyframe),
     }
 
 
@@ -172,6 +179,7 @@ def _camera_metrics(
         "frames_registered": int(registered.sum()),
         "frames_in_other_maps": trajectory.status.count(FrameStatus.OTHER_MAP),
         "coverage": float(registered.mean()) if len(registered) else 0.0,
+        "seconds": _duration_s(trajectory),
         "status": dict(sorted(Counter(status.value for status in trajectory.status).items())),
         "keyframes_selected": sum(selected) if selected else None,
         "keyframes": sum(scene.keyframe_camera.count(name) for scene in inputs.maps),
@@ -179,6 +187,30 @@ def _camera_metrics(
         "measurements": sum(int(own.sum()) for own, _ in own_observations),
         "mean_reprojection_error_px": _finite_mean(map_errors),
         "registration": _registration_metrics(trajectory),
+        **path_uncertainty(trajectory),
+    }
+
+
+def _duration_s(trajectory: Trajectory) -> float:
+    """Return the time that the frames of a camera cover, seconds: each frame lasts until the next one."""
+    intervals_s = np.diff(trajectory.seconds)
+    return float(intervals_s.sum() + np.median(intervals_s)) if len(intervals_s) else 0.0
+
+
+def path_uncertainty(trajectory: Trajectory) -> dict[str, Any]:
+    """Return the sigmas of a camera's poses and the extent of its path: root mean squares over its frames.
+
+    Lengths are in the unit of the trajectory's frame. All values are None without a pose.
+    """
+    posed = trajectory.registered
+    if not posed.any():
+        return {"sigma": None, "sigma_deg": None, "extent": None}
+    centres = trajectory.gauge_from_cam[posed, :3, 3]
+    variances = trajectory.covariance[posed].diagonal(axis1=1, axis2=2)
+    return {
+        "sigma": float(np.sqrt(variances[:, 3:].sum(axis=1).mean())),
+        "sigma_deg": float(np.degrees(np.sqrt(variances[:, :3].sum(axis=1).mean()))),
+        "extent": float(np.sqrt(((centres - centres.mean(axis=0)) ** 2).sum(axis=1).mean())),
     }
 
 

@@ -44,7 +44,8 @@ class Outcome:
         job: The job.
         seconds: Time (seconds) from the job's start to its end.
         summary: Summary of the job's results; None if the job failed.
-        error: The error that made the job fail; None if the job succeeded.
+        error: The error that made the job fail, or that the results do not reach what is required; None if
+            the job succeeded.
     """
 
     job: BatchJob
@@ -148,7 +149,8 @@ def _outcome(job: BatchJob, future: Future[RunSummary], seconds: float) -> Outco
     """Return the outcome of a job that has ended; an unexpected exception gives exit code 70."""
     failure = future.exception()
     if failure is None:
-        return Outcome(job=job, seconds=seconds, summary=future.result())
+        summary = future.result()
+        return Outcome(job=job, seconds=seconds, summary=summary, error=summary.unmet)
     if isinstance(failure, BodycapError):
         return Outcome(job=job, seconds=seconds, error=failure)
     disk = disk_error(failure, job.path) if isinstance(failure, OSError) else None

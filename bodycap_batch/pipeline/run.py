@@ -14,9 +14,17 @@ import bodycap_batch
 from bodycap_batch.config.folder import PARTIAL, RUN_FILE
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.overrides import COMMAND_LINE, values_to_record
-from bodycap_batch.core.errors import BodycapError, Cancelled, CaptureError, EstimationError, JobError
+from bodycap_batch.core.errors import (
+    BodycapError,
+    Cancelled,
+    CaptureError,
+    EstimationError,
+    JobError,
+    RequirementUnmet,
+)
 from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.pipeline.inputs import has_body
+from bodycap_batch.pipeline.requirement import unmet_requirement
 from bodycap_batch.pipeline.results import (
     clear_partial,
     publish,
@@ -34,6 +42,9 @@ from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
 JOB_FILE = "job.yaml"
 REPORT_FILE = "report.html"
+RUN_SCHEMA = 1
+"""Version of the layout of ``run.json``. Another number means that a key was removed, or that it has another
+meaning. Keys can be added at any time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,6 +57,7 @@ class RunSummary:
         stages: The record of every task that contributed to the results, computed in this run or reused.
         versions: Versions of Python, of this program and of the libraries that computed the results.
         verdict: The verdict about the results; None if the run ended before the last stage.
+        unmet: The error about results that do not reach what the job requires; None if they do.
     """
 
     out_dir: Path
@@ -53,6 +65,7 @@ class RunSummary:
     stages: tuple[StageRecord, ...]
     versions: Mapping[str, str]
     verdict: ResultSummary | None = None
+    unmet: RequirementUnmet | None = None
 
     @property
     def executed(self) -> int:
@@ -95,7 +108,9 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
         raise error
     if not runs_to_end:
         return replace(summary, files=())
-    return replace(summary, verdict=summary_of_folder(out_dir))
+    verdict = summary_of_folder(out_dir)
+    unmet = None if verdict is None else unmet_requirement(job.require, verdict, out_dir)
+    return replace(summary, verdict=verdict, unmet=unmet)
 
 
 def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
@@ -252,7 +267,9 @@ def _write_results(job: Job, results: StageResults, summary: RunSummary, setting
     )
     write_results_file(out_dir, JOB_FILE, resolved)
     remove_outdated(out_dir, summary.files)
+    verdict = summary_of_folder(out_dir)
     record = {
+        "schema_version": RUN_SCHEMA,
         "versions": dict(summary.versions),
         "store": stored_name(settings.store.root, out_dir),
         COMMAND_LINE: values_to_record(job, settings.overrides, out_dir),
@@ -261,6 +278,7 @@ def _write_results(job: Job, results: StageResults, summary: RunSummary, setting
         "peak_memory_mb": max((stage.peak_memory_mb for stage in summary.stages), default=0.0),
         "stages": [asdict(stage) for stage in summary.stages],
         "files": list(summary.files),
+        "verdict": None if verdict is None else verdict.verdict,
         "videos": {
             camera.name: [_recorded_path(path, out_dir) for path in camera.video]
             for camera in job.capture.cameras

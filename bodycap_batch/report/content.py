@@ -9,7 +9,7 @@ import numpy as np
 
 from bodycap_batch.model.measured_parts import BODY_PARTS, PartState, part_states
 from bodycap_batch.model.merge_data import MergeResult, filled_joints
-from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
+from bodycap_batch.report.advice import recommend_changes
 from bodycap_batch.report.drawn_scene import DrawnScene, common_times_s
 from bodycap_batch.report.figures.before_after import draw_before_and_after, find_unoptimised_bones
 from bodycap_batch.report.figures.camera_landmark_matrix import draw_camera_landmark_matrix
@@ -22,16 +22,14 @@ from bodycap_batch.report.figures.camera_timeline import (
 from bodycap_batch.report.figures.motion_curves import Take, draw_motion_curves
 from bodycap_batch.report.figures.pictogram import draw_pictogram
 from bodycap_batch.report.figures.shared_landmarks import draw_shared_landmarks
-from bodycap_batch.report.frame_losses import FAST_DEG, PLAIN_RATIO, LossCause
-from bodycap_batch.report.frame_pictures import DARK_BRIGHTNESS
 from bodycap_batch.report.grades import Grade
+from bodycap_batch.report.loss_causes import CAUSES
 from bodycap_batch.report.loss_diagnosis import DiagnosedLoss, count_frames_by_cause
 from bodycap_batch.report.metric_tables import headline_figures, make_tables
 from bodycap_batch.report.packing import PageBudget
-from bodycap_batch.report.recommendations import recommend_changes
 from bodycap_batch.report.report_inputs import ReportInputs
 from bodycap_batch.report.result_links import describe_files
-from bodycap_batch.report.verdict import judge
+from bodycap_batch.report.verdict import Verdict
 
 _SHEET_PICTURES = 24
 """Maximum number of pictures of lost frames on the page: six rows of four pictures on a wide screen."""
@@ -51,6 +49,7 @@ _PROGRESS_AT_FAILURE = {
 
 def page_content(
     inputs: ReportInputs,
+    verdict: Verdict,
     scene: DrawnScene,
     losses: Sequence[DiagnosedLoss],
     colours: dict[str, str],
@@ -60,6 +59,7 @@ def page_content(
 
     Args:
         inputs: The results of the job.
+        verdict: The verdict about these results.
         scene: Maps and camera paths of the 3D viewer.
         losses: The lost intervals of all cameras, with their causes.
         colours: Colour ``#rrggbb`` of each camera, by camera name.
@@ -68,7 +68,6 @@ def page_content(
     Returns:
         The value of each template variable, by variable name.
     """
-    verdict = judge(inputs.metrics, inputs.failure)
     return {
         "name": inputs.name,
         "person": None if inputs.merge is None else _person(inputs.merge),
@@ -80,10 +79,7 @@ def page_content(
         "failure": inputs.failure,
         "progress": _progress_at_failure(inputs),
         "figures": list(headline_figures(inputs.metrics)) if inputs.metrics is not None else [],
-        # A good result needs no change.
-        "recommendations": recommend_changes(inputs, count_frames_by_cause(losses))
-        if verdict.grade > Grade.GOOD
-        else [],
+        "recommendations": recommend_changes(inputs, verdict) if _needs_change(verdict) else [],
         "tables": make_tables(inputs),
         "scene": scene,
         "places": {name: place.replace("_", " ") for name, place in inputs.places_from_motion.items()},
@@ -93,7 +89,7 @@ def page_content(
         "has_body": inputs.merge is not None,
         "cameras": _cameras(inputs, losses, colours, budget),
         "missing": _missing(inputs, losses, colours),
-        "causes": {cause.value: criterion for cause, criterion in _CAUSE_CRITERIA.items()},
+        "causes": {cause.value: rule for cause, (rule, _) in CAUSES.items()},
         "lost_pictures": _lost_pictures(losses, budget.scaled(_SHEET_PICTURES)),
         "loss_count": len(losses),
         "matrix": draw_camera_landmark_matrix(inputs, colours, budget.share),
@@ -102,6 +98,12 @@ def page_content(
         "before": _distances_before_optimisation(inputs),
         "thinned": budget.thinned_lines(),
     }
+
+
+def _needs_change(verdict: Verdict) -> bool:
+    """Return True if the grade or the coverage can be better. A good and complete result needs no change."""
+    coverage = verdict.coverage
+    return verdict.grade > Grade.GOOD or coverage is None or bool(coverage.advice)
 
 
 def _person(merge: MergeResult) -> dict[str, Any]:
@@ -141,25 +143,6 @@ def _motion_curves(inputs: ReportInputs, budget: PageBudget) -> str:
     take = Take(name=inputs.name, motion=merge.motion, start_s=merge.motion.start_ns / 1e9)
     times = take.times_s()
     return draw_motion_curves([take], (float(times[0]), float(times[-1])), budget.share)
-
-
-_CAUSE_CRITERIA = {
-    LossCause.DARK: f"the mean brightness of the lost frame is below {DARK_BRIGHTNESS:.0f} of 255",
-    LossCause.FAST: f"just before or after the lost frames, the camera turned more than {FAST_DEG:.0f}° per "
-    "frame",
-    LossCause.BLUR: f"the sharpness is below {BLUR_SHARPNESS_RATIO * 100:.0f} % of the sharpness of the "
-    "registered frames",
-    LossCause.PLAIN: f"the frame has under {PLAIN_RATIO * 100:.0f} % of the corners of the camera's "
-    "registered frames",
-    LossCause.SHALLOW: "the visible points did not determine the position",
-    LossCause.UNKNOWN_PLACE: "the frame is sharp and textured, but it does not match the map",
-    LossCause.CONTRADICTED: "two or more successive keyframes near the frame contradict the rest of the map",
-    LossCause.NO_MAP: "there is no map for this camera",
-    LossCause.OTHER_MAP: "the frame has a pose in another map, whose place in the room is not known",
-    LossCause.DAMAGED: "the decoder reports damaged data, or gives no picture for the frame",
-    LossCause.FROZEN: "the video repeats one picture, although the camera moves before or after it",
-}
-"""Rule by which each cause of a loss is found. The limits are those of `frame_losses`."""
 
 
 def _progress_at_failure(inputs: ReportInputs) -> str:

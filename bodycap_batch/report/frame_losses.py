@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
@@ -15,39 +14,14 @@ from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.report.drawn_scene import common_times_s
 from bodycap_batch.report.frame_pictures import FrameAppearance
+from bodycap_batch.report.loss_causes import FAST_DEG, PLAIN_RATIO, LossCause
 from bodycap_batch.report.report_inputs import ReportInputs
 
-FAST_DEG = 8.0
-"""Maximum rotation (degrees) between successive frames that is not treated as a fast turn.
-
-Optical flow loses most tracks above 20 degrees. Motion blur starts at much smaller angles.
-"""
-PLAIN_RATIO = 0.3
-"""Minimum ratio of a lost frame's number of corners to the usual number in the camera's registered frames.
-
-A frame with fewer corners shows plain surfaces. Evidence: none.
-"""
 _NEIGHBOURS = 3
 """Number of frame pairs on each side of a lost interval in which the rotation is measured.
 
 Evidence: none.
 """
-
-
-class LossCause(StrEnum):
-    """The likely cause of a lost interval, derived from measurements."""
-
-    DARK = "too dark"
-    FAST = "fast turn"
-    BLUR = "motion blur"
-    PLAIN = "plain surfaces"
-    SHALLOW = "points too far away or too close together"
-    UNKNOWN_PLACE = "place not in the map"
-    CONTRADICTED = "part that contradicts the map"
-    NO_MAP = "no map for this camera"
-    OTHER_MAP = "part in another map"
-    DAMAGED = "damaged video"
-    FROZEN = "frozen recording"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

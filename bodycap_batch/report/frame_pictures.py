@@ -13,6 +13,7 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import FloatArray, IntArray, evenly_spaced
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.report.loss_causes import DARK_BRIGHTNESS
 
 SERIES_BUDGET = 6_000_000
 """Maximum number of characters of all picture series together, including their overlays.
@@ -48,11 +49,6 @@ _MAX_SHIFT_S = 1.0
 
 If half the time between two pictures is longer than this value, half the time between two pictures is the
 maximum. Keyframes are at most half a second apart.
-"""
-DARK_BRIGHTNESS = 30.0
-"""Minimum mean brightness (grey levels, 0 to 255) of a frame that is not dark.
-
-If a frame is darker, hardly any light reached the camera. Evidence: none.
 """
 MAX_CORNERS = 300
 """Maximum number of corners that are counted in a frame. Evidence: none."""

@@ -10,8 +10,9 @@ import numpy as np
 
 from bodycap_batch.core.arrays import evenly_spaced
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.report.frame_losses import FrameLoss, LossCause, find_frame_losses, likely_cause
+from bodycap_batch.report.frame_losses import FrameLoss, find_frame_losses, likely_cause
 from bodycap_batch.report.frame_pictures import FrameAppearance, measure_appearance
+from bodycap_batch.report.loss_causes import LossCause, LostSpan
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _REFERENCE_FRAMES = 5
@@ -81,6 +82,20 @@ def _measure_frames(
     appearances = measure_appearance(inputs.capture.camera(camera), indices, context)
     corners = [appearances[index].corners for index in reference if index in appearances]
     return appearances, float(np.median(corners)) if corners else None
+
+
+def spans_of(losses: Sequence[DiagnosedLoss]) -> tuple[LostSpan, ...]:
+    """Return the lost intervals in the form that the verdict uses."""
+    return tuple(
+        LostSpan(
+            camera=diagnosed.loss.camera,
+            from_s=diagnosed.loss.start_s,
+            to_s=diagnosed.loss.end_s,
+            frames=diagnosed.loss.frame_count,
+            cause=diagnosed.cause,
+        )
+        for diagnosed in losses
+    )
 
 
 def count_frames_by_cause(losses: Sequence[DiagnosedLoss]) -> dict[str, Counter[LossCause]]:

@@ -1,7 +1,8 @@
-"""Write ``report.html``, the report page of a job."""
+"""Write ``report.html``, the report page of a job, and ``verdict.json`` beside it."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,11 @@ from bodycap_batch.report.content import page_content
 from bodycap_batch.report.drawn_scene import common_times_s, make_drawn_scene
 from bodycap_batch.report.frame_overlays import FrameOverlays
 from bodycap_batch.report.frame_pictures import SERIES_BUDGET, picture_series
-from bodycap_batch.report.loss_diagnosis import diagnose_losses
+from bodycap_batch.report.loss_diagnosis import diagnose_losses, spans_of
 from bodycap_batch.report.packing import PageBudget
 from bodycap_batch.report.page import render_page
 from bodycap_batch.report.report_inputs import ReportInputs
+from bodycap_batch.report.verdict import VERDICT_FILE, judge
 from bodycap_batch.report.viewer_data import make_viewer_data
 
 REPORT_FILE = "report.html"
@@ -31,8 +33,9 @@ With the last factor, little more than text and tables remains.
 
 
 def write_report(inputs: ReportInputs, path: Path, context: StageContext) -> None:
-    """Write the report page as one file of at most 15 MB, however long the capture is.
+    """Write the report page as one file of at most 15 MB, however long the capture is, and the verdict.
 
+    The verdict is written to `VERDICT_FILE` in the folder of the page.
     If the page is too large, it is rendered again with smaller budgets until it is small enough. The page
     then states how many items of each thinned kind are shown, for example pictures or points.
 
@@ -48,6 +51,10 @@ def write_report(inputs: ReportInputs, path: Path, context: StageContext) -> Non
     colours = {name: hex_from_colour(colour) for name, colour in camera_colours(inputs.cameras).items()}
     context.progress(0, 3, "pictures")
     losses = diagnose_losses(inputs, context)
+    verdict = judge(inputs.metrics, inputs.failure, spans_of(losses))
+    write_text(
+        path.with_name(VERDICT_FILE), json.dumps(verdict.to_dict(), indent=1, ensure_ascii=False) + "\n"
+    )
     all_series = make_picture_series(inputs, context) if scene.has_content else []
     context.progress(1, 3, "figures")
     for share in _BUDGET_SHARES:
@@ -59,7 +66,7 @@ def write_report(inputs: ReportInputs, path: Path, context: StageContext) -> Non
             "solid": make_viewer_data(inputs, scene, budget),
             "pictures": [_thin_series(series, budget) for series in all_series],
         }
-        content = page_content(inputs, scene, losses, colours, budget)
+        content = page_content(inputs, verdict, scene, losses, colours, budget)
         text = render_page(content, {**data, "shown": budget.to_dict()})
         if len(text.encode("utf-8")) <= MAX_BYTES:
             break

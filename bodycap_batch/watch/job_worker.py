@@ -126,6 +126,8 @@ class JobWorker:
                 hint="run `bodycap retry` for this job",
             )
         job = read_job(job_dir, self._options.permissions)
+        if job.require is None:
+            job = job.model_copy(update={"require": self._options.require})
         settings = Settings(
             store=self._store,
             threads=max(1, self._options.threads // self._options.jobs),
@@ -140,6 +142,8 @@ class JobWorker:
             summary = run_job(job, out_dir=job_dir.result, settings=settings)
             if summary.verdict is not None:
                 status.update(verdict=summary.verdict.to_dict())
+            if summary.unmet is not None:
+                raise summary.unmet
         finally:
             if not self._is_deleted(job_dir):
                 make_result_paths_relative(job_dir, job)

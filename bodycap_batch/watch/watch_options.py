@@ -23,6 +23,7 @@ class WatchOptions:
         unchanged_s: Time (seconds) for which an entry must not change before it is treated as complete.
         retry_s: Time (seconds) until a job or an entry that a disk failure stopped is tried again. With
             `once`, also the maximum time for which the watcher waits for a missing disk.
+        require: What the results of jobs that state no requirement must reach, such as ``good,0.9``.
         once: True: stop when nothing is left to do.
         command: Command line that starts the child process of a job.
     """
@@ -34,5 +35,6 @@ class WatchOptions:
     memory_mb: int | None = None
     unchanged_s: float = 10.0
     retry_s: float = 60.0
+    require: str | None = None
     once: bool = False
     command: Sequence[str] = CHILD_COMMAND

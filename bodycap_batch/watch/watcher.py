@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from bodycap_batch.core.errors import BodycapError, StoreError, one_line
+from bodycap_batch.core.errors import BodycapError, StoreError, one_line, worst_exit_code
 from bodycap_batch.watch.access_failures import AccessFailures
 from bodycap_batch.watch.inbox_claim import (
     claim_entry,
@@ -97,7 +97,7 @@ class Watcher:
         for at most `retry_s` seconds.
 
         Returns:
-            The highest exit code of the jobs that ended and of the watcher's own disk failures.
+            The worst exit code of the jobs that ended and of the watcher's own disk failures.
         """
         with ThreadPoolExecutor(max_workers=self._options.jobs, thread_name_prefix="job") as pool:
             try:
@@ -116,6 +116,9 @@ class Watcher:
         self._status_file.remove()
         return self._worst_exit_code
 
+    def _note_exit_code(self, code: int) -> None:
+        self._worst_exit_code = worst_exit_code((self._worst_exit_code, code))
+
     def _step(self, pool: ThreadPoolExecutor) -> float | None:
         """Start the jobs that can start. Return the time (seconds) until the next scan, or None to end."""
         try:
@@ -126,7 +129,7 @@ class Watcher:
             pause_s = self.access_failures.record(error)
             if not self._options.once or self.access_failures.duration_s < self._options.retry_s:
                 return pause_s
-            self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
+            self._note_exit_code(StoreError.exit_code)
             return None
         self.access_failures.clear()
         return None if is_finished else _POLL_S
@@ -140,7 +143,7 @@ class Watcher:
             try:
                 finish(self.spool)
             except (OSError, StoreError) as error:
-                self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
+                self._note_exit_code(StoreError.exit_code)
                 self._report_once(f"an interrupted move in {folder} cannot be completed: {one_line(error)}")
 
     def _report_once(self, line: str) -> None:
@@ -164,7 +167,7 @@ class Watcher:
                 self._stuck_until[job_dir.name] = time.monotonic() + self._options.retry_s
             self._has_stopped_jobs |= outcome.state == "stopped"
             if outcome.state != "stopped":
-                self._worst_exit_code = max(self._worst_exit_code, outcome.exit_code)
+                self._note_exit_code(outcome.exit_code)
             self._report_end(outcome)
 
     def _report_end(self, outcome: JobOutcome) -> None:
@@ -219,7 +222,7 @@ class Watcher:
             if self._reported.get(path) == reason:
                 continue
             if path in tracker.unreadable:
-                self._worst_exit_code = max(self._worst_exit_code, StoreError.exit_code)
+                self._note_exit_code(StoreError.exit_code)
                 self._write_line(f"{path.name}: cannot be read: {reason}")
             elif not self._options.once:  # otherwise the reasons are reported at the end
                 self._write_line(f"{path.name} waits: {reason}")
@@ -247,7 +250,7 @@ class Watcher:
             return claim_entry(self.spool, entry, snapshot, self._options.permissions)
         except StoreError as error:
             self._unmovable[str(entry.path)] = (snapshot.digest, time.monotonic() + self._options.retry_s)
-            self._worst_exit_code = max(self._worst_exit_code, error.exit_code)
+            self._note_exit_code(error.exit_code)
             if digest != snapshot.digest:
                 self._write_line(f"{entry.name}: cannot be moved out of the inbox: {error.one_line}")
             return None

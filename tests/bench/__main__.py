@@ -44,6 +44,7 @@ from tests.bench import (
     synth,
     uncertainty,
     upright,
+    verdict,
     viewer,
     violent,
 )
@@ -75,6 +76,7 @@ _WITH_OPTIONS = {
     "paired": paired.main,
     "real": real.main,
     "measure": measure.main,
+    "verdict": verdict.main,
 }
 """Benchmarks with options of their own: of a single stage, and of a capture of ten minutes."""
 
@@ -98,7 +100,7 @@ def main() -> int:
         "plain surfaces), `shutter` (drawn readout times against global shutters), `mappers` (the "
         "incremental and the global mapper), `paired` (two versions on perturbed captures), `real` (the "
         "table of the real captures), `measure` (how well the pictures judge poses), `synth` (seconds of a "
-        "rendered frame), `drawn` (renders the drawn captures), "
+        "rendered frame), `verdict` (grades of stored results), `drawn` (renders the drawn captures), "
         "`lens` (the lens from tracks), and `long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")

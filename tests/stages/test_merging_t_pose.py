@@ -8,7 +8,7 @@ import pytest
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.merging import merge_trajectories
-from bodycap_batch.report.body_doubts import body_doubt_criteria
+from bodycap_batch.report.criteria import BODY_RULES, judge_rules
 from bodycap_batch.report.grades import Grade
 from bodycap_batch.synthetic import synthesise
 from tests.bench import simulation
@@ -67,6 +67,6 @@ def test_every_constant_has_its_sentence_and_its_sources(merged):
 def test_the_t_pose_is_no_rare_posture(merged):
     """The walker stands with its arms stretched out for a fifth of the time, as the guides ask for."""
     _, result = merged
-    doubts = body_doubt_criteria(result.report.to_dict())
+    doubts = judge_rules("body", BODY_RULES, {"merge": result.report.to_dict()})
     (postures,) = (item for item in doubts if item.name == "Postures")
     assert postures.grade is Grade.GOOD

@@ -30,7 +30,7 @@ from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import Trajectory
-from bodycap_batch.report.body_doubts import body_doubt_criteria
+from bodycap_batch.report.criteria import BODY_RULES, judge_rules
 from bodycap_batch.report.grades import Grade
 from tests.stages.walker import FPS, ROLES, Walk, make_inputs, make_walk, record
 
@@ -78,9 +78,19 @@ def _contradicted_clocks(trajectories: list[Trajectory]) -> set[str]:
     return {name for name, clock in clocks.cameras.items() if clock.is_contradicted}
 
 
+CONTRADICTIONS = (
+    "Postures",
+    "Sources of the scale",
+    "Scales of the limbs",
+    "Cameras in their usual places",
+)
+"""Criteria that a wrong fact violates; scale and mounts can be uncertain without any wrong fact."""
+
+
 def _doubts(result: MergeResult) -> list[str]:
-    """Return the findings about the body that lower the grade of the motion."""
-    found = body_doubt_criteria(result.report.to_dict())
+    """Return the findings about contradictions in the body that lower the grade of the motion."""
+    rules = [rule for rule in BODY_RULES if rule.name in CONTRADICTIONS]
+    found = judge_rules("body", rules, {"merge": result.report.to_dict()})
     return [item.finding for item in found if item.grade is not Grade.GOOD]
 
 

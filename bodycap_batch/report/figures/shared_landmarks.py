@@ -5,8 +5,8 @@ from __future__ import annotations
 import html
 
 from bodycap_batch.core.percent import format_percent
+from bodycap_batch.report.advice import count_shared_points
 from bodycap_batch.report.figures.svg import element, svg_image, text
-from bodycap_batch.report.recommendations import count_shared_points
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _CELL, _LEFT, _TOP = 74.0, 130.0, 26.0

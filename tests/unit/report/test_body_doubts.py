@@ -11,13 +11,14 @@ from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.graph.motion_graph import posture_deviations
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.skeleton_presets import load_skeleton
-from bodycap_batch.report.body_doubts import body_doubt_criteria
+from bodycap_batch.report.criteria import BODY_RULES, judge_rules
 from bodycap_batch.report.grades import Criterion, Grade
 from bodycap_batch.report.verdict import judge
 
 
 def _criterion(merge: dict[str, Any], name: str) -> Criterion:
-    return next(item for item in body_doubt_criteria(merge) if item.name == name)
+    rules = [rule for rule in BODY_RULES if rule.name == name]
+    return next(judge_rules("body", rules, {"merge": merge}))
 
 
 @pytest.mark.parametrize(("left", "grade"), [(0.2, Grade.GOOD), (0.6, Grade.FAIR), (1.3, Grade.POOR)])
@@ -63,10 +64,11 @@ def test_a_camera_in_an_odd_place_is_named(turn_deg: float, grade: Grade) -> Non
 
 
 def test_without_figures_there_is_no_criterion() -> None:
-    assert not [*body_doubt_criteria({"scale": {"chi2": 0.0, "degrees_of_freedom": 0}})]
+    merge = {"scale": {"chi2": 0.0, "degrees_of_freedom": 0}}
+    assert not [*judge_rules("body", BODY_RULES, {"merge": merge})]
 
 
-@pytest.mark.parametrize(("frozen", "grade"), [(0, Grade.GOOD), (8, Grade.FAIR), (90, Grade.POOR)])
+@pytest.mark.parametrize(("frozen", "grade"), [(0, Grade.GOOD), (8, Grade.FAIR), (90, Grade.FAIR)])
 def test_a_frozen_part_lowers_the_grade(frozen: int, grade: Grade) -> None:
     camera = {"coverage": 1.0, "frames": 300, "frames_registered": 300, "frame": "map-0", "keyframes": 90}
     metrics = {

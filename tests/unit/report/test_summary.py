@@ -23,7 +23,7 @@ def joints(*observed: str) -> dict[str, dict[str, object]]:
     }
 
 
-def metrics(gap_s: float, scale: float) -> dict[str, object]:
+def metrics(gap_s: float = 0.0, scale: float = 0.01, residual_m: float = 0.001) -> dict[str, object]:
     return {
         "frame": "world",
         "total": {
@@ -32,7 +32,7 @@ def metrics(gap_s: float, scale: float) -> dict[str, object]:
         "cameras": {"torso": {"coverage": 1.0, "frames": 10, "frames_registered": 10, "frame": "world"}},
         "merge": {
             "scale": {"relative_sigma": scale},
-            "cameras": {"torso": {"longest_gap_s": gap_s, "residual_m": {"p95": 0.02}}},
+            "cameras": {"torso": {"longest_gap_s": gap_s, "residual_m": {"p95": residual_m}}},
         },
         "motion": {"joints": {}},
     }  # fmt: skip
@@ -47,48 +47,81 @@ def test_parts_of_the_body_are_named_in_words() -> None:
 
 
 def test_the_worst_two_criteria_are_named_the_worst_first() -> None:
-    summary = summarise(metrics(gap_s=5.0, scale=0.05))
+    summary = summarise(metrics(residual_m=0.05, scale=0.05))
     assert summary.grade == Grade.POOR
     assert [doubt.split(":")[:2] for doubt in summary.doubts] == [
-        ["poor", " Longest gap"],
+        ["poor", " Distance between cameras and body"],
         ["usable with care", " Metric scale"],
     ]
     assert summary.lines()[0] == f"verdict: poor. {summary.headline}"
     assert "the motion is poor" in summary.headline
 
 
+def test_the_headline_names_the_size_and_what_makes_it_known() -> None:
+    values = metrics(scale=0.06)
+    sources = [{"name": "mean stature", "used": True}]
+    values["merge"]["scale"] |= {"sources": sources}  # type: ignore[index]
+    values["merge"]["mounts"] = {  # type: ignore[index]
+        name: {"role": role, "sigma_deg": 2.0, "sigma_m": 0.01}
+        for name, role in (("torso", "Spine1"), ("left_palm", "LeftHand"))
+    }
+    headline = summarise(values).headline
+    assert headline.startswith(
+        "The cameras are good (100.0% of the frames), but the motion is usable with care."
+    )
+    assert "Sizes are known to about ± 10 cm of body height (6.0%): give the height of the person" in headline
+
+
+def test_what_is_missing_costs_coverage_and_no_grade() -> None:
+    values = metrics(gap_s=5.0)
+    values["cameras"]["left_palm"] = {  # type: ignore[index]
+        **values["cameras"]["torso"], "frames_registered": 4, "coverage": 0.4, "seconds": 2.0,  # type: ignore[index]
+    }  # fmt: skip
+    verdict = judge(values, None)
+    assert (verdict.cameras, verdict.body) == (Grade.GOOD, Grade.GOOD)
+    assert verdict.coverage is not None
+    found = verdict.coverage.to_dict()
+    assert (found["share"], found["frames"], found["frames_delivered"]) == (0.7, 20, 14)
+    assert found["cameras"]["left_palm"]["seconds_delivered"] == 0.8
+    assert found["seconds"] is None, "the duration of one video is not known"
+    assert "(70.0% of the frames; left_palm 40.0%)" in verdict.headline
+
+
 @pytest.mark.parametrize(
-    ("frame", "advice", "place"),
+    ("frame", "advice"),
     [
-        ("a1b2", "check that the video is of this recording", "not in the main map: left_palm"),
-        ("main", "clap once", "not part of the body"),
+        ("a1b2", "check that the video is of this recording"),
+        ("main", "clap once"),
     ],
     ids=["another room", "the same room"],
 )
-def test_the_advice_about_an_unknown_clock_depends_on_the_map(frame: str, advice: str, place: str) -> None:
+def test_the_advice_about_an_unknown_clock_depends_on_the_map(frame: str, advice: str) -> None:
     """A clap alone does not help if the video shows another room."""
-    values = metrics(gap_s=0.0, scale=0.01)
+    values = metrics()
     values["cameras"]["left_palm"] = {**values["cameras"]["torso"], "frame": frame}  # type: ignore[index]
     values["models"] = [{"frame": "world"}, {"frame": "a1b2"}]
     values["clocks"] = {"torso": {"source": "common"}, "left_palm": {"source": "none"}}
     verdict = judge(values, None)
     assert advice in verdict.headline
     assert ("is of this recording" in verdict.headline) == (frame != "main")
-    (room,) = (item for item in verdict.criteria if item.name == "One room")
-    assert room.grade is Grade.POOR
-    assert place in room.finding
+    assert verdict.coverage is not None
+    assert verdict.coverage.cameras["left_palm"].delivered == 0
+    assert verdict.coverage.cameras["left_palm"].reason
+    assert verdict.coverage.share == 0.5
 
 
-def test_a_camera_that_fell_off_is_named_before_the_gap_that_it_leaves() -> None:
-    values = metrics(gap_s=2.5, scale=0.01)
-    values["merge"]["still_cameras"] = {"left_palm": {"from_s": 2.5, "to_s": 5.0}}  # type: ignore[index]
-    summary = summarise(values)
-    assert summary.grade is Grade.POOR
-    assert "left_palm stands still in the room between 2.5 s and 5.0 s" in summary.doubts[0]
+def test_a_camera_that_fell_off_is_named_in_the_coverage() -> None:
+    values = metrics(gap_s=2.5)
+    values["merge"]["still_cameras"] = {"torso": {"from_s": 2.5, "to_s": 5.0}}  # type: ignore[index]
+    verdict = judge(values, None)
+    assert verdict.grade is Grade.GOOD
+    assert verdict.coverage is not None
+    assert "stands still in the room between 2.5 s and 5.0 s" in verdict.coverage.cameras["torso"].reason
+    assert any(each.action.startswith("Fasten torso") for each in verdict.coverage.advice)
 
 
 def test_warnings_about_the_skeleton_file_are_doubts() -> None:
-    values = metrics(gap_s=0.0, scale=0.01)
+    values = metrics()
     skeleton: dict[str, list[str]] = {"notes": ["up is +Z"], "warnings": []}
     values["merge"]["skeleton"] = skeleton  # type: ignore[index]
     assert not any("up is +Z" in doubt for doubt in summarise(values).doubts)
@@ -97,9 +130,7 @@ def test_warnings_about_the_skeleton_file_are_doubts() -> None:
 
 
 def test_a_good_result_names_no_criterion() -> None:
-    values = metrics(gap_s=0.0, scale=0.01)
-    values["merge"]["cameras"]["torso"]["residual_m"]["p95"] = 0.001  # type: ignore[index]
-    assert summarise(values).doubts == ()
+    assert summarise(metrics()).doubts == ()
 
 
 def test_a_folder_without_metrics_has_no_summary(tmp_path: Path) -> None:
