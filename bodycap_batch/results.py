@@ -27,6 +27,7 @@ _KINDS = {
     "motion": ("motion.*", "joints.*", "fill.json"),
     "map": ("map*.ply", "colmap/*"),
     "trajectories": ("trajectories/*",),
+    "cameras": ("cameras.*", "cameras/*"),
     "frames": ("frames.csv",),
     "figures": (METRICS_FILE, VERDICT_FILE),
     "report": ("report.html",),
@@ -258,8 +259,8 @@ class Result:
     def files(self) -> dict[str, tuple[Path, ...]]:
         """Return the paths of all files that are in the folder, sorted, by kind.
 
-        The kinds are ``motion``, ``map``, ``trajectories``, ``frames``, ``figures``, ``report``, ``preview``,
-        ``scene``, ``record`` and ``logs``. A kind without a file has an empty list.
+        The kinds are ``motion``, ``map``, ``trajectories``, ``cameras``, ``frames``, ``figures``, ``report``,
+        ``preview``, ``scene``, ``record`` and ``logs``. A kind without a file has an empty list.
         """
         return {
             kind: tuple(

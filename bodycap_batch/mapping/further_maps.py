@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from bodycap_batch.capture import Capture
@@ -17,7 +18,7 @@ from bodycap_batch.mapping.intrinsics.readout_time import map_with_readouts
 from bodycap_batch.mapping.intrinsics.shutters import readouts_of_maps
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import (
-    ImageRef,
+    count_features,
     read_camera_ids,
     update_camera,
 )
@@ -27,13 +28,13 @@ from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, mod
 from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
 from bodycap_batch.mapping.results import finalise_models
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment
-from bodycap_batch.model.scene import Map, MapResult, Registration
+from bodycap_batch.model.scene import Map, MapResult, Trajectory
 
 
 def map_lost_keyframes(
     capture: Capture,
     previous: MapResult,
-    registrations: Iterable[Registration],
+    paths: Sequence[Trajectory],
     options: MapOptions,
     context: StageContext,
 ) -> MapResult:
@@ -45,7 +46,7 @@ def map_lost_keyframes(
     Args:
         capture: All cameras.
         previous: The maps to which the paths refer. The workspace is not changed.
-        registrations: The registration of each camera.
+        paths: The trajectory of each camera.
         options: The options of the stage `map`.
         context: Work folder, threads, progress.
 
@@ -54,12 +55,9 @@ def map_lost_keyframes(
         further maps has a gauge of its own, and no keyframe is in two of them. The workspace is empty:
         these maps are final.
     """
-    used, left = set[str](), set[str]()
-    for found in registrations:
-        used.add(found.trajectory.gauge)
-        left |= _lost_keyframes(found)
+    used = {path.gauge for path in paths}
     kept = [item for number, item in enumerate(previous.maps) if number == 0 or item.gauge in used]
-    further = _further_maps(capture, previous, left, options, context)
+    further = _further_maps(capture, previous, paths, options, context)
     final = context.work_dir / "final"
     final.mkdir()
     sizes = [len(item.keyframe_frame) for item in further]
@@ -74,15 +72,15 @@ def map_lost_keyframes(
 def _further_maps(
     capture: Capture,
     previous: MapResult,
-    left: set[str],
+    paths: Sequence[Trajectory],
     options: MapOptions,
     context: StageContext,
 ) -> list[Map]:
-    """Return the further maps; `left` are the image names of the keyframes without a pose."""
-    if len(left) < LEAST_MAPPED:
-        return []
+    """Return the further maps, the largest first."""
     workspace = context.work_dir / "workspace"
+    # SQLite may write to a database that it only reads, and a stored workspace must not change.
     shutil.copytree(previous.workspace, workspace)
+    left = _lost_keyframes(workspace, paths)
     ids = read_camera_ids(workspace)
     capture = with_lenses_of_maps(capture, previous)
     for name, number in ids.items():
@@ -104,11 +102,11 @@ def _further_maps(
     ]
 
 
-def _lost_keyframes(found: Registration) -> set[str]:
-    """Return the image names of the keyframes of a camera whose frames have no pose."""
-    path = found.trajectory
-    frames = found.tried_keyframes[~path.localised[found.tried_keyframes]]
-    return {ImageRef(path.camera, int(frame)).name for frame in frames}
+def _lost_keyframes(workspace: Path, paths: Sequence[Trajectory]) -> set[str]:
+    """Return the image names of the keyframes in a database whose frames have no pose."""
+    lost = {path.camera: ~path.localised for path in paths}
+    refs = count_features(workspace)
+    return {ref.name for ref in refs if ref.camera in lost and lost[ref.camera][ref.frame]}
 
 
 def _consistent_models(names: set[str], mapping: MappingContext) -> Sequence[Any]:

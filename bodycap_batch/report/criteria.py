@@ -75,11 +75,11 @@ CAMERA_RULES = (
     Rule(
         name="Uncertainty of the paths",
         read=readings.read_path_uncertainty,
-        bounds=Bounds(good=0.2, fair=0.5, more_is_better=False),
+        bounds=Bounds(good=0.2, fair=0.25, more_is_better=False),
         finding="the positions of {camera} are uncertain by {percent} of the extent of the longest path",
         rationale="Compared are root mean squares, the position's standard deviation and its distance from "
-        "the mean position. Up to a fifth, the shape of the path is clear. Above a half, it is mostly "
-        "noise: a head that moved by 2 cm had positions without relation to the true ones.",
+        "the mean position. Up to a fifth, the shape of the path is clear. Above a quarter, it may be "
+        "noise: a head that moved by 2 cm had positions without relation to the true ones, at 30 to 48 %.",
         action="Walk at least some steps, with more than plain surfaces in view: a camera that only turns "
         "shows no position.",
         priority=1.6,

@@ -61,9 +61,9 @@ def run_further_maps(task: FurtherMapsTask, context: StageContext, files: Path) 
 
     previous = load_map(task.map.path)
     # A generator loads one registration at a time: the tracks of a long video need much memory.
-    registrations = (load_registration(artefact.path) for artefact in task.registrations.values())
+    paths = (load_registration(artefact.path).trajectory for artefact in task.registrations.values())
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
-    result = map_lost_keyframes(capture, previous, registrations, task.options, context)
+    result = map_lost_keyframes(capture, previous, list(paths), task.options, context)
     record_act(Mechanism.FURTHER_MAPS, len(result.log["further_maps"]))
     save_map(result, files)
 

@@ -278,8 +278,8 @@ def test_an_adjustment_weights_readout_times_from_elsewhere() -> None:
 def test_a_camera_without_a_trajectory_tells_no_readout_time() -> None:
     film = Film(0.02)
     model, cameras = the_map(film, range(1, FRAMES, 5)), {"head": camera_of(film)}
-    assert RollingShutterModel(model, {"head": film.trajectory()}, cameras)._silent_cameras() == set()
-    assert RollingShutterModel(model, {}, cameras)._silent_cameras() == {"head"}
+    assert RollingShutterModel(model, {"head": film.trajectory()}, cameras)._uninformative_cameras() == set()
+    assert RollingShutterModel(model, {}, cameras)._uninformative_cameras() == {"head"}
 
 
 def test_velocities_of_a_smooth_path_are_exact_enough() -> None:
