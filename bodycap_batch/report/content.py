@@ -23,7 +23,7 @@ from bodycap_batch.report.figures.motion_curves import Take, draw_motion_curves
 from bodycap_batch.report.figures.pictogram import draw_pictogram
 from bodycap_batch.report.figures.shared_landmarks import draw_shared_landmarks
 from bodycap_batch.report.grades import Grade
-from bodycap_batch.report.loss_causes import CAUSES
+from bodycap_batch.report.loss_causes import CAUSES, LossCause
 from bodycap_batch.report.loss_diagnosis import DiagnosedLoss, count_frames_by_cause
 from bodycap_batch.report.metric_tables import headline_figures, make_tables
 from bodycap_batch.report.packing import PageBudget
@@ -211,6 +211,7 @@ def _missing(
         "start": _clock_text(span[0]),
         "end": _clock_text(span[1]),
         "more": len(losses) - len(longest),
+        "other": any(each.cause is LossCause.OTHER_MAP for each in losses),
         "intervals": [
             {
                 "time": f"{_clock_text(each.loss.start_s)} to {_clock_text(each.loss.end_s)}",

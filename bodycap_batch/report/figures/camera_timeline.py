@@ -59,7 +59,7 @@ class _StatusBar:
     """A bar that represents an interval of frames, or several intervals that a screen cannot separate.
 
     Attributes:
-        kind: Kind of the interval: "reg" (registered), "bridged" or "lost".
+        kind: Kind of the interval: "reg" (registered), "bridged", "other" (in another map) or "lost".
         start_s: Common time of the bar's start, seconds.
         end_s: Common time of the bar's end, seconds.
         frames: Number of lost frames.
@@ -284,6 +284,7 @@ def _lost_bar(loss: FrameLoss, times: FloatArray, bridged_s: float) -> _StatusBa
     is_between = loss.first > 0 and loss.last < len(times) - 1
     gap_s = float(times[loss.last + 1] - times[loss.first - 1]) if is_between else np.inf
     kind = "bridged" if gap_s <= bridged_s else "lost"
+    kind = "other" if loss.reason is FrameStatus.OTHER_MAP else kind
     end_s = loss.end_s + _frame_interval_s(times)
     return _StatusBar(kind, loss.start_s, end_s, loss.frame_count, (loss.reason.value,))
 

@@ -78,9 +78,9 @@ class Solid {
   }
 
   // Return the points that the first view must show: the body at all times, and the camera paths without their
-  // distant parts.
+  // distant parts; without a body, the near points of the room, too.
   pointsInFirstView() {
-    const { body, paths, solid } = this.data;
+    const { body, paths, points, solid } = this.data;
     const out = [];
     if (body) {
       const ticks = body.centres.length / (3 * body.count);
@@ -96,6 +96,11 @@ class Solid {
         const place = [...path.centre.subarray(3 * i, 3 * i + 3)];
         if (Math.hypot(...place.map((value, axis) => value - centre[axis])) < 2 * radius) out.push(...place);
       }
+    }
+    // The points are in random order.
+    for (let i = 0; !body && i < Math.min(points.length, 3 * 500); i += 3) {
+      const place = [...points.subarray(i, i + 3)];
+      if (Math.hypot(...place.map((value, axis) => value - centre[axis])) < 1.5 * radius) out.push(...place);
     }
     return out;
   }
