@@ -174,6 +174,24 @@ class Result:
             camera: path for camera, path in self.trajectories().items() if path.frame_of_reference == main
         }
 
+    def other_trajectories(self) -> dict[int, dict[str, TimedPoses]]:
+        """Return the poses of frames that are in another map than the path of their camera.
+
+        The place of these maps in the room is unknown, and each has its own scale and axes.
+
+        Returns:
+            By number n of the map, as in ``map_<n>.ply``, and name of the camera, times and poses
+            map_from_camera. Empty if the job has no such frames.
+
+        Raises:
+            JobError: A file is malformed.
+        """
+        files = sorted((self.folder / "trajectories").glob("map_*/*.tum"))
+        out: dict[int, dict[str, TimedPoses]] = {}
+        for file in files:
+            out.setdefault(int(file.parent.name.removeprefix("map_")), {})[file.stem] = read_tum(file)
+        return out
+
     def _path(self, table: FrameTable, frame_of_reference: str) -> CameraPath:
         folder, name = self.folder / "trajectories", f"{table.camera}.tum"
         unplaced = folder / _UNPLACED / name

@@ -124,7 +124,7 @@ def _consistent_models(names: set[str], mapping: MappingContext) -> Sequence[Any
         try:
             finalise_models([kept], mapping, [None])
         except EstimationError:
-            continue
+            continue  # No point is left: the model consisted of things that move by themselves.
         if kept.num_reg_images() >= LEAST_MAPPED:
             taken |= keyframe_names(kept)
             out.append(kept)

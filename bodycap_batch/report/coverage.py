@@ -26,6 +26,7 @@ class CameraCoverage:
     Attributes:
         frames: Number of frames of the video.
         delivered: Number of frames with a pose from their own picture.
+        other_maps: Number of further frames with a pose in another map than that of the camera's path.
         seconds: Duration of the video; None if the metrics do not state it.
         reason: Why the camera, or a part of its video, is left out; "" if it is not.
         lost: The lost spans; empty if they were not looked at.
@@ -33,6 +34,7 @@ class CameraCoverage:
 
     frames: int
     delivered: int
+    other_maps: int
     seconds: float | None
     reason: str
     lost: tuple[LostSpan, ...]
@@ -46,6 +48,7 @@ class CameraCoverage:
         """Return the coverage as plain JSON values."""
         return {
             **_amounts(self.frames, self.delivered, self.seconds),
+            "frames_in_other_maps": self.other_maps,
             "reason": self.reason,
             "lost": [span.to_dict() for span in self.lost],
         }
@@ -101,6 +104,11 @@ class Coverage:
         return sum(camera.frames for camera in self.cameras.values())
 
     @property
+    def other_maps(self) -> int:
+        """Number of further frames of all cameras with a pose in another map than that of the path."""
+        return sum(camera.other_maps for camera in self.cameras.values())
+
+    @property
     def share(self) -> float:
         """Share of the frames of all cameras that are delivered."""
         delivered = sum(camera.delivered for camera in self.cameras.values())
@@ -126,6 +134,7 @@ class Coverage:
         seconds = sum(known) if known and len(known) == len(self.cameras) else None
         return {
             **_amounts(self.frames, delivered, seconds),
+            "frames_in_other_maps": self.other_maps,
             "cameras": {name: camera.to_dict() for name, camera in self.cameras.items()},
             "body": None if self.body is None else self.body.to_dict(),
             "advice": [each.to_dict() for each in self.advice],
@@ -155,6 +164,7 @@ def measure_coverage(metrics: Metrics, lost: Sequence[LostSpan] = ()) -> Coverag
         name: CameraCoverage(
             frames=int(camera["frames"]),
             delivered=int(camera["frames_registered"]) if name in inside else 0,
+            other_maps=int(camera.get("frames_in_other_maps", 0)),
             seconds=camera.get("seconds"),
             reason=reasons.get(name, ""),
             lost=tuple(span for span in lost if span.camera == name),

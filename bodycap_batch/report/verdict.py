@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,8 @@ class Verdict:
     """The judgement of a job's result.
 
     Attributes:
-        headline: The judgement in some sentences.
+        judgement: The judgement of cameras and motion in one sentence, after those about unknown clocks.
+        sigmas: Sentences about the scale and the mounts, if they are not good, with their advice.
         grade: The worse of the two grades `cameras` and `body`.
         cameras: Grade of the camera paths and the map.
         body: Grade of the body's motion; None if the job asks for no body.
@@ -34,12 +35,18 @@ class Verdict:
         criteria: All graded criteria.
     """
 
-    headline: str
+    judgement: str
+    sigmas: tuple[str, ...]
     grade: Grade
     cameras: Grade
     body: Grade | None
     coverage: Coverage | None
     criteria: tuple[Criterion, ...]
+
+    @property
+    def headline(self) -> str:
+        """The judgement in some sentences."""
+        return " ".join((self.judgement, *self.sigmas))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as plain JSON values, the content of ``verdict.json``."""
@@ -82,7 +89,8 @@ def judge(
         body = Grade.NONE
     coverage = None if metrics is None else measure_coverage(metrics, lost)
     return Verdict(
-        headline=_headline(cameras, body, metrics, failure, coverage, criteria),
+        judgement=_judgement(cameras, body, metrics, failure, coverage),
+        sigmas=() if body is None or failure is not None else tuple(_named_sigmas(criteria)),
         grade=max(cameras, Grade.GOOD if body is None else body),
         cameras=cameras,
         body=body,
@@ -96,13 +104,12 @@ def _worst_grade(criteria: Sequence[Criterion], subject: str) -> Grade:
     return max((each.grade for each in criteria if each.subject == subject), default=Grade.GOOD)
 
 
-def _headline(
+def _judgement(
     cameras: Grade,
     body: Grade | None,
     metrics: Mapping[str, Any] | None,
     failure: Mapping[str, Any] | None,
     coverage: Coverage | None,
-    criteria: Sequence[Criterion],
 ) -> str:
     if metrics is None or coverage is None:
         return "The job stopped before there was a result."
@@ -114,12 +121,16 @@ def _headline(
         return f"{first}. The job asked for no body."
     conjunction = "and" if (body == Grade.GOOD) == (cameras == Grade.GOOD) else "but"
     phrases = ("is good", "is usable with care", "is poor", "is missing")
-    named = [each for each in criteria if each.name in _NAMED_SIGMAS and each.grade > Grade.GOOD]
-    sentences = [f"{first}, {conjunction} the motion {phrases[body]}."]
-    for each in named:
-        action = "" if each.advice is None else f": {each.advice.action[:1].lower()}{each.advice.action[1:]}"
-        sentences.append(f"{each.finding[:1].upper()}{each.finding[1:]}{action or '.'}")
-    return " ".join(sentences)
+    return f"{first}, {conjunction} the motion {phrases[body]}."
+
+
+def _named_sigmas(criteria: Sequence[Criterion]) -> Iterator[str]:
+    """Yield a sentence about each uncertainty that the headline names."""
+    for each in criteria:
+        if each.name in _NAMED_SIGMAS and each.grade > Grade.GOOD:
+            advice = each.advice
+            action = "." if advice is None else f": {advice.action[:1].lower()}{advice.action[1:]}"
+            yield f"{each.finding[:1].upper()}{each.finding[1:]}{action}"
 
 
 def _left_out(metrics: Mapping[str, Any]) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bodycap_batch import Result
 from bodycap_batch.cli import main
 from bodycap_batch.evaluate import evaluate_trajectories
 from bodycap_batch.formats.tum import TimedPoses, read_tum, write_tum
@@ -69,6 +70,9 @@ def test_the_frame_table_names_the_map_of_each_frame(results: Path) -> None:
     camera = json.loads((results.parent / "out" / "metrics.json").read_text())["cameras"]["torso"]
     assert camera["frames_in_other_maps"] == sum(row["map"] == "1" for row in rows)
     assert camera["frames_registered"] == sum(row["map"] == "0" for row in rows)
+    result = Result(results.parent / "out")
+    assert len(result.other_trajectories()[1]["torso"].times_ns) == camera["frames_in_other_maps"]
+    assert result.verdict()["coverage"]["frames_in_other_maps"] == camera["frames_in_other_maps"]
 
 
 def test_the_pictures_are_compared_with_the_frames_of_both_maps(
