@@ -21,6 +21,9 @@ _SCALE_SIGMAS = 5.0
 jumps of some hundred times exceeds 4."""
 _MAX_LOG_SIGMA = 0.3
 """Maximum standard deviation of the logarithm of a ratio of legs that is used."""
+_POSITION_SIGMA_DEG = 0.15
+"""Standard deviation of a delivered position, as a parallax (degrees): 5 mm at a distance of 2 m. A short leg
+is longer or shorter by it, which is no jump of the scale."""
 _MIN_PARALLAX_DEG = 1.0
 """Minimum parallax (degrees) of both legs of a ratio that is used. With less, errors of corners, which hands
 and pyramid levels give in common, are a large part of a leg, and have one sign."""
@@ -89,7 +92,7 @@ def scale_jumps(
         if is_seen and deviation < _MAX_LOG_SIGMA and not spanned:
             frames.append(triple)
             difference.append(np.log(lengths[1] / lengths[0]) - value)
-            sigma.append(deviation)
+            sigma.append(float(np.hypot(deviation, _ratio_sigma(parallax))))
     if not frames:
         return []
     spread = np.array(sigma)
@@ -99,6 +102,12 @@ def scale_jumps(
         normalised = np.abs(np.array(difference)[gaps == gap]) / spread[gaps == gap]
         spread[gaps == gap] *= max(1.0, 1.48 * float(np.median(normalised)))
     return _jumps(np.array(frames), np.array(difference), spread, way)
+
+
+def _ratio_sigma(parallax: FloatArray) -> float:
+    """Return the deviation of the logarithm of a ratio of two legs (2,) through delivered positions."""
+    ends, middle = 1.0 / parallax, np.sum(1.0 / parallax)
+    return float(np.deg2rad(_POSITION_SIGMA_DEG) * np.sqrt(np.sum(ends**2) + middle**2))
 
 
 def _jumps(frames: IntArray, difference: FloatArray, sigma: FloatArray, way: FloatArray) -> list[int]:

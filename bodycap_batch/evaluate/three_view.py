@@ -139,20 +139,21 @@ def judge_legs(
         legs: (2,3) delivered legs in the frame of the middle camera: middle − first, last − middle.
 
     Returns:
-        The outcome, and the legs that the pictures confirm.
+        The outcome, and the legs that the pictures confirm: of several with nearly equal support, as a camera
+        that moves towards a wall has them, those next to the delivered ones.
     """
     if measured is None:
         return Outcome.UNMEASURABLE, None
     outcome = _compare(measured, legs)
-    if outcome is not Outcome.WRONG:
-        return outcome, measured
     delivered = _translations(rotations, legs)
-    if _support(common, rotations, delivered) >= _NOT_EXCLUDED * measured.support:
-        return Outcome.UNMEASURABLE, measured
     nearest = _usable(_refined(common, rotations, delivered))
-    if nearest is not None and nearest.support >= _EQUAL_SUPPORT * measured.support:
-        return _compare(nearest, legs), nearest
-    return Outcome.WRONG, measured
+    if nearest is not None and nearest.support < _EQUAL_SUPPORT * measured.support:
+        nearest = None
+    if outcome is not Outcome.WRONG:
+        return outcome, nearest or measured
+    if _support(common, rotations, delivered) >= _NOT_EXCLUDED * measured.support:
+        return Outcome.UNMEASURABLE, nearest or measured
+    return (_compare(nearest, legs), nearest) if nearest is not None else (Outcome.WRONG, measured)
 
 
 def _support(common: CommonRays, rotations: FloatArray, translations: FloatArray) -> int:

@@ -20,6 +20,7 @@ from bodycap_batch.evaluate.right_frames import (
     find_right_frames,
     measure_pictures,
 )
+from bodycap_batch.evaluate.three_view import judge_legs
 from bodycap_batch.evaluate.two_view import Outcome
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import (
@@ -266,3 +267,37 @@ def test_ratios_that_show_a_small_part_of_a_jump_do_not_measure_it() -> None:
     legs += [((at, at + gap, at + 2 * gap), leg(0.0)) for gap in gaps for at in range(400, 2000, 320)]
     centres = np.column_stack([np.arange(2400.0), np.zeros((2400, 2))])
     assert scale_jumps(legs, centres, []) == []
+
+
+def test_of_legs_that_pictures_confirm_equally_those_next_to_the_path_are_taken(
+    seen: Pictures, path: FloatArray
+) -> None:
+    """A camera that moves towards a wall sees several legs with equal support; here a search found others."""
+    frames = (10, 40, 70)
+    triple = seen.triple(frames)
+    assert triple is not None
+    assert triple.measured is not None
+    poses = path[list(frames)]
+    rotations = np.swapaxes(poses[1, :3, :3].T @ poses[[0, 2], :3, :3], 1, 2)
+    legs = np.diff(poses[:, :3, 3], axis=0) @ poses[1, :3, :3]
+    true_ratio = float(np.log(np.linalg.norm(legs[1]) / np.linalg.norm(legs[0])))
+    other = triple.measured.translations * np.array([[1.0], [1.3]])
+    search = replace(triple.measured, translations=other / np.linalg.norm(other))
+    _, confirmed = judge_legs(triple.common, search, rotations, legs)
+    assert confirmed is not None
+    # Legs of 6 degrees with a noise of half a pixel (0.06 degrees) of a hundred points.
+    assert confirmed.log_ratio[0] == pytest.approx(true_ratio, abs=0.05)
+
+
+@pytest.mark.parametrize(("parallax_deg", "found"), [(1.5, 0), (15.0, 1)])
+def test_short_legs_change_their_ratio_by_errors_of_positions(parallax_deg: float, found: int) -> None:
+    """Legs of 1.5 degrees have an error of 40 % through positions that are right to 0.15 degrees."""
+    parallax = np.deg2rad(parallax_deg) * np.sqrt(2)
+
+    def leg(error: float) -> Any:
+        translations = np.eye(2, 3) / np.sqrt(2)
+        return SimpleNamespace(log_ratio=(-error, 0.02), parallax=parallax, translations=translations)
+
+    legs = [((at - 5, at, at + 5), leg(0.15 if 46 <= at <= 53 else 0.0)) for at in range(10, 90)]
+    centres = np.column_stack([np.arange(100.0), np.zeros((100, 2))])
+    assert len(scale_jumps(legs, centres, [])) == found
