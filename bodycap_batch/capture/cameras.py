@@ -25,6 +25,7 @@ from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.copied_frames import Pictures
+from bodycap_batch.model.rotation_chain import RotationChain
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
@@ -73,6 +74,7 @@ class CaptureCamera:
             OMP_NUM_THREADS. If this variable is not set, all processors are used.
         lens_sigma: Relative standard deviation of the focal length, if `camera` was estimated from the tracks
             of the video. The lens is constant until the last adjustment of the map. 0 for another lens.
+        turns: How the camera turns, by the tracks of its video; None if it is unknown.
         given: Intrinsics that were given, if the map contradicted them and `camera` replaces them; else None.
     """
 
@@ -96,6 +98,7 @@ class CaptureCamera:
     threads: int = 0
     given: Camera | None = None
     lens_sigma: float = 0.0
+    turns: RotationChain | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         count = len(self.frame_numbers)

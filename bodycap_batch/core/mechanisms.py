@@ -56,6 +56,7 @@ class Mechanism(StrEnum):
     GAP_FILLING = "gap_filling"
     SENSOR_PATH = "sensor_path"
     FURTHER_MAPS = "further_maps"
+    CONTINUITY = "continuity"
     LYING = "lying"
 
 

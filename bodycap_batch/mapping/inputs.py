@@ -53,6 +53,7 @@ def make_mapping_context(
             for name, number in read_camera_ids(workspace).items()
             if capture.camera(name).lens_sigma
         },
+        turns={camera.name: camera.turns for camera in capture.cameras},
     )
 
 

@@ -12,6 +12,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.mechanisms import Mechanism, is_on
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
+from bodycap_batch.model.rotation_chain import RotationChain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +31,7 @@ class MappingContext:
         times_ns: Times of all frames of each camera, nanoseconds, by camera name.
         lens_sigma: By database id, the relative standard deviation of the focal length of those calibrated
             cameras whose lens was estimated from tracks. The last adjustment refines it.
+        turns: How each camera turns, by the tracks of its video, by camera name.
     """
 
     workspace: Path
@@ -41,6 +43,7 @@ class MappingContext:
     skeletal_above: int = SKELETAL_ABOVE
     times_ns: Mapping[str, IntArray] = field(default_factory=dict)
     lens_sigma: Mapping[int, float] = field(default_factory=dict)
+    turns: Mapping[str, RotationChain | None] = field(default_factory=dict)
 
     @property
     def given_ids(self) -> frozenset[int]:

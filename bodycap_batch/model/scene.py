@@ -21,6 +21,7 @@ from bodycap_batch.model.frame_matches import FrameMatches
 from bodycap_batch.model.gyro_rates import GyroRates
 from bodycap_batch.model.lens_estimate import LensEstimate
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
+from bodycap_batch.model.rotation_chain import RotationChain
 
 _FEATURE_STRIDE = 1 << 24
 """Factor of the frame index in a key that combines frame and feature: key = frame · factor + feature.
@@ -100,6 +101,7 @@ class KeyframeSelection:
             example a hand. An empty array means that nothing does.
         lens: The lens as the tracks of the video determine it; None for a given lens, or with too little
             motion.
+        turns: How the camera turns, by the tracks of the video; None without a lens.
     """
 
     camera: str
@@ -116,6 +118,7 @@ class KeyframeSelection:
     fixed_regions: BoolArray = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
     moving_regions: BoolArray = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=bool))
     lens: LensEstimate | None = None
+    turns: RotationChain | None = None
 
     def __post_init__(self) -> None:
         set_array(self, "fixed_regions", (None, None), np.bool_)

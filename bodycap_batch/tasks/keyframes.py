@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from bodycap_batch.capture import CaptureCamera
     from bodycap_batch.core.arrays import BoolArray
     from bodycap_batch.model.lens_estimate import LensEstimate
+    from bodycap_batch.model.point_tracks import PointTracks
+    from bodycap_batch.model.rotation_chain import RotationChain
+    from bodycap_batch.model.scene import KeyframeSelection
     from bodycap_batch.telemetry.streams import CameraTelemetry
 
 
@@ -59,7 +62,8 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     camera = load_capture(task.capture, threads=context.threads).cameras[0]
     size = camera.camera
     telemetry, telemetry_notes = _telemetry(camera, task)
-    regions, moving, lens = regions_and_lens(camera, context)
+    shown = regions_and_lens(camera, context)
+    regions, moving, lens = shown.fixed, shown.moving, shown.lens
     in_room = without_regions(camera.mask, regions, (size.width_px, size.height_px))
     camera = replace(camera, mask=in_room)
     with FrameKeeper(files, size.width_px, size.height_px, camera.should_keep_all) as keeper:
@@ -69,6 +73,7 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
         moving = moving[selection.pictures.frames]
     selection = replace(selection, fixed_regions=regions, moving_regions=moving, lens=lens)
     copies = copied_notes(camera.times_ns, selection.pictures)
+    selection = replace(selection, turns=_turns(camera, shown, selection))
     camera = camera.only(selection.pictures)
     if telemetry is not None:
         assert selection.matches is not None
@@ -82,17 +87,25 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     write_summary(files, frames=selection.frame_count, keyframes=len(selection.frames), notes=notes)
 
 
-def regions_and_lens(
-    camera: CaptureCamera, context: StageContext
-) -> tuple[BoolArray, BoolArray, LensEstimate | None]:
-    """Return what the tracks of a video show: what is not the room, and the lens of a camera that needs one.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shown:
+    """What the tracks of a video show.
 
-    A video of fewer than two frames shows nothing.
-
-    Returns:
-        (R,C) mask of the regions that are fixed to the camera; (N,R,C) mask of those that move by themselves
-            in each frame, empty if nothing does; the lens.
+    Attributes:
+        fixed: (R,C) mask of the regions that are fixed to the camera.
+        moving: (N,R,C) mask of those that move by themselves in each frame; empty if nothing does.
+        lens: The lens of a camera that needs one; None if it is given, or if the tracks do not determine it.
+        tracks: The tracks in the room; None if there are none.
     """
+
+    fixed: BoolArray
+    moving: BoolArray
+    lens: LensEstimate | None
+    tracks: PointTracks | None
+
+
+def regions_and_lens(camera: CaptureCamera, context: StageContext) -> Shown:
+    """Return what the tracks of a video show. A video of fewer than two frames shows nothing."""
     import numpy as np
 
     from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
@@ -108,7 +121,7 @@ def regions_and_lens(
     wants_lens = camera.camera.refine and is_on(Mechanism.LENS_FROM_TRACKS)
     used = (Mechanism.FIXED_REGIONS, Mechanism.MOVING_REGIONS)
     if len(camera.times_ns) < 2 or not (wants_lens or any(map(is_on, used))):
-        return regions, moving, None
+        return Shown(fixed=regions, moving=moving, lens=None, tracks=None)
 
     def show(done: int, total: int) -> None:
         context.check_cancelled()
@@ -129,9 +142,25 @@ def regions_and_lens(
         is_enough = bool(found.mean() >= _MIN_MOVING_SHARE)
         record_act(Mechanism.MOVING_REGIONS, int(is_enough))
         moving = found if is_enough else moving
+        tracks = tracks.outside(found) if is_enough else tracks
         if lens is not None and is_enough:
-            lens = estimate_lens(tracks.outside(found), camera.times_ns)
-    return regions, moving, lens
+            lens = estimate_lens(tracks, camera.times_ns)
+    return Shown(fixed=regions, moving=moving, lens=lens, tracks=tracks)
+
+
+def _turns(camera: CaptureCamera, shown: Shown, selection: KeyframeSelection) -> RotationChain | None:
+    """Return how the camera turns; None if its lens or its tracks are unknown."""
+    import numpy as np
+
+    from bodycap_batch.core.mechanisms import Mechanism, is_on
+    from bodycap_batch.tracks import measure_rotation_chain
+
+    known = not camera.camera.refine or (shown.lens is not None and shown.lens.is_determined)
+    if shown.tracks is None or not known or not is_on(Mechanism.CONTINUITY):
+        return None
+    lens, sigma = (camera.camera, 0.0) if shown.lens is None else (shown.lens.lens, shown.lens.focal_sigma)
+    frames = np.arange(len(camera.times_ns)) if selection.pictures is None else selection.pictures.frames
+    return measure_rotation_chain(shown.tracks, lens, sigma, frames, selection.frames)
 
 
 def _telemetry(camera: CaptureCamera, task: KeyframesTask) -> tuple[CameraTelemetry | None, list[str]]:

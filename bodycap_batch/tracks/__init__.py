@@ -3,6 +3,7 @@
 from bodycap_batch.tracks.fixed_regions import find_fixed_regions, fixed_notes
 from bodycap_batch.tracks.lens import estimate_lens
 from bodycap_batch.tracks.moving_regions import find_moving_regions, find_moving_tracks
+from bodycap_batch.tracks.rotation_chain import measure_rotation_chain
 from bodycap_batch.tracks.tracker import PointTracker
 from bodycap_batch.tracks.video import track_video
 
@@ -13,5 +14,6 @@ __all__ = [
     "find_moving_regions",
     "find_moving_tracks",
     "fixed_notes",
+    "measure_rotation_chain",
     "track_video",
 ]

@@ -62,7 +62,7 @@ def find_moving_tracks(tracks: PointTracks, lens: Camera, times_ns: IntArray) ->
     off, compared = np.zeros((2, count), dtype=np.int64)
     for one, other in _pairs(times_ns):
         numbers, start, end = tracks.between(one, other)
-        matches, seen = _ray_matches(start, end, lens)
+        matches, seen = ray_matches(start, end, lens)
         is_off = _off_camera_motion(matches)
         if is_off is not None:
             off[numbers[seen][is_off]] += 1
@@ -120,7 +120,7 @@ def _pairs(times_ns: IntArray) -> list[tuple[int, int]]:
     return out
 
 
-def _ray_matches(start: Pixels, end: Pixels, lens: Camera) -> tuple[RayMatches, BoolArray]:
+def ray_matches(start: Pixels, end: Pixels, lens: Camera) -> tuple[RayMatches, BoolArray]:
     """Return the lines of sight of points (K,2) in two frames, and which points have them (K,)."""
     first, second = (unit_directions(lens.unproject(px.astype(np.float64))) for px in (start, end))
     seen = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)

@@ -33,7 +33,8 @@ def main(arguments: Sequence[str]) -> int:
     for folder in folders:
         for camera in open_capture(load_job(folder.resolve()).capture).cameras:
             unknown = replace(camera, camera=replace(camera.camera, refine=True))
-            regions, moving, found = regions_and_lens(unknown, StageContext(work_dir=Path()))
+            shown = regions_and_lens(unknown, StageContext(work_dir=Path()))
+            regions, moving, found = shown.fixed, shown.moving, shown.lens
             share = f"fixed {regions.mean():4.0%}, moving {moving.mean() if moving.size else 0:4.0%}"
             sys.stdout.write(f"{folder.name:16} {camera.name:16} {share} {_line(camera.camera, found)}\n")
             sys.stdout.flush()

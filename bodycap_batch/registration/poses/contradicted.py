@@ -1,4 +1,4 @@
-"""Withdraw the poses of frames around keyframes that contradict the map."""
+"""Find poses that the keyframes around them, or the rotation of the video, contradict, and withdraw them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
+from bodycap_batch.model.rotation_chain import RotationChain, find_folded
 from bodycap_batch.model.scene import FrameStatus, Map, Registration, Trajectory
 
 _MIN_MISPLACED = 2
@@ -78,3 +79,18 @@ def _frames_in_blocks(count: int, kept: IntArray, misplaced: IntArray) -> BoolAr
         if ((misplaced > before) & (misplaced < after)).sum() >= _MIN_MISPLACED:
             inside[before + 1 : after] = True
     return inside
+
+
+def find_folded_poses(turns: RotationChain | None, gauge_from_cam: FloatArray) -> BoolArray:
+    """Return for each frame (N,) whether the rotation of the video contradicts its pose.
+
+    Args:
+        turns: How the camera turns, by the tracks of its video; None if it is unknown.
+        gauge_from_cam: (N,4,4) poses; NaN for frames without a pose.
+    """
+    out = np.zeros(len(gauge_from_cam), dtype=bool)
+    if is_on(Mechanism.CONTINUITY):
+        posed = np.flatnonzero(np.isfinite(gauge_from_cam[:, 0, 0]))
+        out[posed] = find_folded(turns, posed, gauge_from_cam[posed, :3, :3])
+        record_act(Mechanism.CONTINUITY, int(out.sum()))
+    return out

@@ -15,6 +15,7 @@ from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.rotation_path import RotationPath
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Trajectory
 from bodycap_batch.registration.poses.batched_pnp import find_inliers
+from bodycap_batch.registration.poses.contradicted import find_folded_poses
 from bodycap_batch.registration.poses.observations import CameraObservations, PointReliability
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria, FramePose, solve_poses
 from bodycap_batch.registration.poses.pose_outliers import (
@@ -101,7 +102,7 @@ def solve_camera(
         path = poses if is_rolling else None
         solution = _solve(seen, start, criteria, threads, solution.reliability, path)
     accepted = _require_static_inliers(solution.poses, solution.static)
-    return _reject_outliers(_with_keyframe_status(accepted, scene_map, rows), camera.times_ns, criteria)
+    return _reject_outliers(_with_keyframe_status(accepted, scene_map, rows), camera, criteria)
 
 
 @dataclass(slots=True)
@@ -254,16 +255,18 @@ def _require_static_inliers(poses: list[FramePose], static_inliers: IntArray) ->
 
 
 def _reject_outliers(
-    poses: list[FramePose], times_ns: IntArray, criteria: AcceptanceCriteria
+    poses: list[FramePose], camera: CaptureCamera, criteria: AcceptanceCriteria
 ) -> list[FramePose]:
-    """Reject poses that deviate from the poses around them, and isolated poses with few inliers."""
+    """Reject poses that the video or their neighbours contradict, and isolated poses with few inliers."""
+    folded = find_folded_poses(camera.turns, pose_array(poses))
+    poses = _reject(poses, folded, FrameStatus.CONTRADICTED)
     centres = np.full((len(poses), 3), np.nan)
     sigma = np.full(len(poses), np.nan)
     for frame, pose in enumerate(poses):
         if pose.gauge_from_cam is not None:
             centres[frame] = pose.gauge_from_cam[:3, 3]
             sigma[frame] = pose.scatter
-    accepted = _reject(poses, find_outlier_poses(centres, sigma, times_ns), FrameStatus.POSE_JUMP)
+    accepted = _reject(poses, find_outlier_poses(centres, sigma, camera.times_ns), FrameStatus.POSE_JUMP)
     localised = np.array([pose.gauge_from_cam is not None for pose in accepted], dtype=bool)
     inliers = np.array([pose.inliers for pose in accepted], dtype=np.int64)
     isolated = isolated_poses(localised, inliers, ISOLATED_INLIER_FACTOR * criteria.min_inliers)

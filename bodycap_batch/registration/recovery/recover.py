@@ -16,7 +16,11 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.rotation_path import RotationPath, TurningShutter
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Map, Registration, Trajectory
-from bodycap_batch.registration.poses.contradicted import contradicted_frames, withdraw_contradicted_poses
+from bodycap_batch.registration.poses.contradicted import (
+    contradicted_frames,
+    find_folded_poses,
+    withdraw_contradicted_poses,
+)
 from bodycap_batch.registration.poses.keyframe_requests import lost_intervals
 from bodycap_batch.registration.poses.map_error import with_map_error, without_map_error
 from bodycap_batch.registration.poses.pnp import AcceptanceCriteria
@@ -201,6 +205,7 @@ def find_lost_poses(
                 poses |= found
             before, path = path.localised, _merge_into(path, poses, localiser.criteria)
             intervals = _extended_intervals(path.localised, before, frozen)
+    path = path.without(find_folded_poses(camera.turns, path.gauge_from_cam), FrameStatus.CONTRADICTED)
     return replace(registration, trajectory=smooth_weak_centres(path, ~lost))
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.rotation_chain import RotationChain
 from bodycap_batch.model.scene import FrameStatus, Registration, Trajectory
 from bodycap_batch.registration import withdraw_contradicted_poses
-from bodycap_batch.registration.poses.contradicted import _frames_in_blocks
+from bodycap_batch.registration.poses.contradicted import _frames_in_blocks, find_folded_poses
 from tests.scenes import small_map
 
 
@@ -70,3 +72,14 @@ def test_frames_in_a_block_lose_their_poses_and_say_why() -> None:
 def test_other_registrations_are_not_changed(gauge: str, misplaced: tuple[int, ...]) -> None:
     registration = _registration(gauge)
     assert withdraw_contradicted_poses(registration, [small_map()], misplaced) is registration
+
+
+def test_poses_after_a_turn_that_the_video_does_not_show_are_contradicted() -> None:
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[8:, :3, :3] = so3_exp([0.0, np.pi / 2, 0.0])
+    poses[5] = np.nan
+    still = RotationChain(
+        frames=np.arange(12), turns=np.zeros((11, 3)), sigma_rad=np.full(11, 1e-3), turn_sigma=0.05
+    )
+    assert np.flatnonzero(find_folded_poses(still, poses)).tolist() == [8, 9, 10, 11]
+    assert not find_folded_poses(None, poses).any()

@@ -15,10 +15,15 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp
 from bodycap_batch.model.point_tracks import PointTracks
 from bodycap_batch.tasks.keyframes import regions_and_lens
-from bodycap_batch.tracks import estimate_lens, find_moving_regions, find_moving_tracks
+from bodycap_batch.tracks import (
+    estimate_lens,
+    find_moving_regions,
+    find_moving_tracks,
+    measure_rotation_chain,
+)
 from tests.unit.tracks.simulated import project, tracks_of_views
 
 WIDTH, HEIGHT, FRAMES, FPS = 640, 480, 60, 30
@@ -51,6 +56,31 @@ def tracks_with_hand(hand_m: float, motion: float = 1.0, half_side_m: float = 0.
         seen[HAND:] &= ~((px[HAND:] > low) & (px[HAND:] < high)).all(axis=1)
         views.append((px, seen))
     return tracks_of_views(LENS, views, rng)
+
+
+def test_a_chain_of_tracks_turns_as_the_camera_does() -> None:
+    tracks = tracks_with_hand(0.1)
+    time = np.arange(FRAMES) / FPS
+    true = so3_exp(np.column_stack([0.1 * np.sin(3 * time), 0.2 * np.sin(2 * time), 0 * time]))
+    chain = measure_rotation_chain(tracks, LENS, 0.01, np.arange(FRAMES), np.array([13, 40]))
+    assert {0, 13, 40, FRAMES - 1} <= set(chain.frames.tolist())
+    found = chain.between(0, FRAMES - 1)
+    assert found is not None
+    error = float(rotation_angle_rad(found[0] @ (true[-1].T @ true[0]).T))
+    assert error < min(3 * found[1], np.deg2rad(2.0))
+    # Without the frames from 20 to 40, which are copies of frame 20 for example, their numbers count others.
+    frames = np.array([*range(21), *range(41, FRAMES)])
+    rest = measure_rotation_chain(tracks, LENS, 0.01, frames, np.zeros(0, dtype=np.int64))
+    assert rest.frames[-1] == len(frames) - 1
+
+
+def test_without_tracks_no_rotation_is_claimed() -> None:
+    tracks = tracks_with_hand(0.1)
+    blank = np.zeros((FRAMES, 1, 1), dtype=bool)
+    blank[30] = True
+    chain = measure_rotation_chain(tracks.outside(blank), LENS, 0.01, np.arange(FRAMES), np.arange(FRAMES))
+    assert chain.between(29, 31) is None
+    assert chain.between(0, 29) is not None
 
 
 def seen_often(tracks: PointTracks) -> BoolArray:
@@ -113,7 +143,8 @@ def test_only_a_thing_of_some_size_is_left_out(
     found = tracks_with_hand(0.08, half_side_m=half_side_m)
     monkeypatch.setattr(bodycap_batch.tracks, "track_video", lambda camera, progress: found)
     camera = cast(CaptureCamera, SimpleNamespace(camera=LENS, times_ns=TIMES_NS))
-    fixed, moving, lens = regions_and_lens(camera, StageContext(work_dir=tmp_path))
+    shown = regions_and_lens(camera, StageContext(work_dir=tmp_path))
+    fixed, moving, lens = shown.fixed, shown.moving, shown.lens
     assert not fixed.any()
     assert lens is None, "the lens is given"
     assert (moving.mean() > 0.02) if is_left_out else (moving.size == 0)

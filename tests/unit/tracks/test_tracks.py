@@ -159,7 +159,8 @@ def wrist_camera(count: int, read: list[int]) -> CaptureCamera:
 
 def test_the_hand_of_a_wrist_camera_is_found_in_the_whole_video(tmp_path: Path) -> None:
     read: list[int] = []
-    regions, _, lens = regions_and_lens(wrist_camera(90, read), StageContext(work_dir=tmp_path))
+    shown = regions_and_lens(wrist_camera(90, read), StageContext(work_dir=tmp_path))
+    regions, lens = shown.fixed, shown.lens
     assert lens is None, "the lens is given"
     assert read == list(range(90))
     assert regions[regions.shape[0] // 2 + 3 : -1, 1 : regions.shape[1] // 2 - 6].mean() > 0.9
@@ -171,7 +172,8 @@ def test_a_video_of_fewer_than_two_frames_shows_neither_regions_nor_a_lens(
 ) -> None:
     camera = wrist_camera(count, [])
     camera.camera = replace(camera.camera, refine=True)  # type: ignore[misc]
-    regions, moving, lens = regions_and_lens(camera, StageContext(work_dir=tmp_path))
+    shown = regions_and_lens(camera, StageContext(work_dir=tmp_path))
+    regions, moving, lens = shown.fixed, shown.moving, shown.lens
     assert not regions.any()
     assert not moving.size
     assert lens is None
@@ -181,7 +183,8 @@ def test_nothing_is_read_if_the_mechanisms_are_switched_off(tmp_path: Path) -> N
     read: list[int] = []
     mechanisms.begin_task({mechanisms.KEY_OPTION: ["fixed_regions", "moving_regions"]})
     try:
-        regions, moving, lens = regions_and_lens(wrist_camera(90, read), StageContext(work_dir=tmp_path))
+        shown = regions_and_lens(wrist_camera(90, read), StageContext(work_dir=tmp_path))
+        regions, moving, lens = shown.fixed, shown.moving, shown.lens
         assert not regions.any()
         assert not moving.size
         assert lens is None

@@ -1,0 +1,36 @@
+"""Find the keyframes of a model that the rotation of their video contradicts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
+from bodycap_batch.mapping.matching.database import ImageRef
+from bodycap_batch.mapping.validation.track_agreement import image_sequences
+from bodycap_batch.model.rotation_chain import RotationChain, find_folded
+
+
+def find_folded_images(model: Any, turns: Mapping[str, RotationChain | None]) -> set[int]:
+    """Return the ids of the keyframes that look-alike places have put into another place of the model.
+
+    Places that look alike, the bays of a room for example, agree with each other in number, so no vote of
+    matches shows the error. The rotation of the video from keyframe to keyframe does.
+
+    Args:
+        model: The model, a `pycolmap.Reconstruction`.
+        turns: How each camera turns, by camera name.
+    """
+    folded = set[int]()
+    for sequence in image_sequences(model) if is_on(Mechanism.CONTINUITY) else ():
+        images = [model.image(number) for number in sequence]
+        refs = [ImageRef.parse(image.name) for image in images]
+        world_from_cam = [image.cam_from_world().inverse().rotation.matrix() for image in images]
+        found = find_folded(
+            turns.get(refs[0].camera), np.array([ref.frame for ref in refs]), np.array(world_from_cam)
+        )
+        folded |= set(np.array(sequence)[found].tolist())
+    record_act(Mechanism.CONTINUITY, len(folded))
+    return folded
