@@ -122,6 +122,7 @@ class Flow:
         self.runner.report_notes(artefact, "check")
         if len(self._capture.cameras) > 1:
             self._sound = self._start_sound()
+            self._sound.add_done_callback(self._note_clocks_from_motion)
         if self._capture.start_s is not None or self._capture.end_s is not None:
             self._apply_sound_offsets()
 
@@ -557,6 +558,16 @@ class Flow:
             # As in another thread, the stages that do not use the sound go on.
             done.set_exception(error)
         return done
+
+    def _note_clocks_from_motion(self, sound: Future[Artefact]) -> None:
+        """Report which clocks only the motion can determine, and what is missing if it does not."""
+        from bodycap_batch.clocks import clocks_from_motion_notes
+
+        if sound.cancelled() or sound.exception() is not None:
+            return
+        capture = known_from_sound(self._job.capture, sound.result().path)
+        for note in clocks_from_motion_notes(capture, with_body=has_body(self._job)):
+            self.runner.note(note, "clocks")
 
     @property
     def sound(self) -> Future[Artefact] | None:

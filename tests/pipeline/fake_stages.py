@@ -132,6 +132,21 @@ def registered(options: Json, arguments: Json, files: Path) -> None:
     (files / "summary.json").write_text(json.dumps(values))
 
 
+def heard(options: Json, arguments: Json, files: Path) -> None:
+    """No camera has sound, so the sound gives no clock."""
+    summary(options, arguments, files)
+    start = {"first_frame_s": 0.0, "created_s": None, "timecode_s": None, "frame_s": 0.0, "gps_s": None}
+    recordings = [
+        {
+            "camera": camera["name"], "sound_start_s": None, "problem": "the video has no sound", "notes": [],
+            "recorder": None, "start": start, "first_frame_s": 0.0, "end_s": 1.0, "frames": 20,
+        }
+        for camera in arguments["capture"]["config"]["cameras"]
+    ]  # fmt: skip
+    document = {"type": "SoundEvidence", "value": {"recordings": recordings, "pairs": []}}
+    (files / "sound.json").write_text(json.dumps(document))
+
+
 def placed(options: Json, arguments: Json, files: Path) -> None:
     found = orders().get("places", {})
     values = {"notes": [], "places": found, "reason": "" if found else "the arms do not move"}
@@ -211,6 +226,7 @@ EXTRA = {
     "registration": registered,
     "refine": refined,
     "recover": recovered,
+    "sound": heard,
     "further_maps": further_mapped,
     "merge": merged,
     "export": exported,
