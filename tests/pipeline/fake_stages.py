@@ -20,7 +20,7 @@ ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
  "unused": {camera: reason}, "rolling": true, "late": number of maps,
- "corrected" | "corrected_before" | "distorted": [cameras] in refined maps,
+ "unknown_clocks": [cameras], "corrected" | "corrected_before" | "distorted": [cameras] in refined maps,
  "fail_rebuilt": true, "telemetry": [cameras],
  "real": [stages that are no stand-ins]}.
  "fail" may be a list of stages."""
@@ -98,7 +98,8 @@ def videos(arguments: Json) -> list[str]:
 
 
 def summary(options: Json, arguments: Json, files: Path) -> None:
-    (files / "summary.json").write_text(json.dumps({"notes": ["a note"], "frames": 20}))
+    unknown = orders().get("unknown_clocks", [])
+    (files / "summary.json").write_text(json.dumps({"notes": ["a note"], "frames": 20, "unknown": unknown}))
 
 
 def with_sensor(options: Json, arguments: Json, files: Path) -> None:

@@ -254,6 +254,9 @@ def test_an_unknown_clock_is_in_the_first_line_and_costs_coverage(
     metrics["clock_notes"] = {"left_palm": [note]}
     verdict = judge(metrics, None)
     assert verdict.headline.startswith("The clock of left_palm is unknown, so the body is solved without it")
+    failed = judge(metrics, {"stage": "merge", "message": "no two cameras determine the size"}).headline
+    assert failed.startswith("The clock of left_palm is unknown: clap once")
+    assert failed.endswith("the body could not be solved.")
     assert verdict.coverage is not None
     assert verdict.coverage.cameras["left_palm"].reason == note
     clocks = {**inputs.clocks, "left_palm": replace(inputs.clocks["left_palm"], source="none", notes=(note,))}
