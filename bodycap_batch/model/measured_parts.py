@@ -64,7 +64,7 @@ class JointSource(StrEnum):
 
 def joint_sources(motion: Motion) -> tuple[JointSource, ...]:
     """Return the source of each joint (J): measured if a camera measured it at any tick, else filled."""
-    measured = motion.observed.any(axis=0).tolist()
+    measured = np.any(motion.observed, axis=0).tolist()
     return tuple(JointSource.MEASURED if each else JointSource.FILLED for each in measured)
 
 
@@ -73,7 +73,7 @@ def filled_branches(motion: Motion) -> BoolArray:
 
     Their poses can change without any change of a measured joint.
     """
-    carries = np.array(motion.observed.any(axis=0))
+    carries = np.array(np.any(motion.observed, axis=0))
     parents = motion.skeleton.parents.tolist()
     for joint in range(len(parents) - 1, 0, -1):
         carries[parents[joint]] |= carries[joint]

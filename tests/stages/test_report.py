@@ -843,6 +843,7 @@ def test_the_page_leads_with_the_verdict_and_links_the_files(inputs: ReportInput
     ]
     assert places == sorted(places)
     assert "No camera measured: head, pelvis, left leg, right leg." in text
+    assert "without a camera on the hips, the trunk is one block" in text
     assert '<a href="motion.bvh">' in text
     assert 'class="strip motion"' in text
     without = written(ReportInputs(name="x"), tmp_path)
