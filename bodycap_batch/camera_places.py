@@ -9,7 +9,9 @@ import numpy as np
 
 from bodycap_batch.config.mounts import MOTION_PLACES
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.geometry import poses_at, rotation_angle_rad
+from bodycap_batch.model.scene import Trajectory
 
 _RATE_HZ = 15.0
 """Rate, Hz, of the common instants. A hand swings at 1 to 3 Hz. Evidence: none."""
@@ -107,6 +109,52 @@ class _TrunkHypothesis:
             ),
         )
         return [reason for passed, reason in tests if not passed]
+
+
+def find_places_with(
+    clocks: Mapping[str, Mapping[str, ClockRelation]],
+    paths: Sequence[Trajectory],
+    stated: Mapping[str, str],
+) -> FoundPlaces:
+    """Find the places with the clocks that follow from each hypothesis about the camera on the trunk.
+
+    A hypothesis is accepted if the places found with its clocks agree with it. One only may be accepted.
+
+    Args:
+        clocks: The clock of each camera, by camera name. One such mapping for each hypothesis, by name of the
+            camera that is taken for the one on the trunk; "" for clocks that hold without a hypothesis.
+        paths: The paths of the three cameras in one map, each on its own clock.
+        stated: The known places, by camera name.
+    """
+    found = {trunk: _places_with(known, paths, stated) for trunk, known in clocks.items()}
+    accepted = [
+        each
+        for trunk, each in found.items()
+        if each.by_camera and (not trunk or each.by_camera[trunk] == MOTION_PLACES[0])
+    ]
+    if len(accepted) == 1:
+        return accepted[0]
+    if accepted:
+        return _unknown("two answers are possible")
+    reasons = [each.reason for each in found.values() if each.reason]
+    return _unknown("; ".join(dict.fromkeys(reasons)) or "no answer agrees with the clocks that it needs")
+
+
+def _places_with(
+    clocks: Mapping[str, ClockRelation], paths: Sequence[Trajectory], stated: Mapping[str, str]
+) -> FoundPlaces:
+    """Find the places with known clocks, or say which clock is unknown."""
+    unknown = [path.camera for path in paths if not clocks[path.camera].is_known]
+    if unknown:
+        return _unknown(f"the clock of {', '.join(unknown)} is unknown")
+    poses = {
+        path.camera: TimedPoses(
+            common_ns=clocks[path.camera].common_ns(path.times_ns[path.localised]),
+            map_from_cam=path.gauge_from_cam[path.localised],
+        )
+        for path in paths
+    }
+    return find_places(poses, stated)
 
 
 def find_places(cameras: Mapping[str, TimedPoses], stated: Mapping[str, str]) -> FoundPlaces:

@@ -44,12 +44,13 @@ def check(  # noqa: PLR0913, PLR0917 - the flags a user types
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.check import check_path
     from bodycap_batch.clocks import describe_clocks
+    from bodycap_batch.config.models import NO_SKELETON
     from bodycap_batch.telemetry import telemetry_notes
 
     report = check_path(find_job(job).file, make_overrides(out, skeleton, height, camera, activity, places))
     if report.ready and report.job is not None:
         capture = report.job.capture
-        clocks = describe_clocks(capture)
+        clocks = describe_clocks(capture, with_body=report.job.skeleton != NO_SKELETON)
         notes = (*report.notes, *clocks, *telemetry_notes(capture))
         report = replace(report, notes=notes)
     if as_json:

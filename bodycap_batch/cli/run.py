@@ -80,7 +80,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap run single_camera/ --skeleton none
       bodycap run jobs/cpl_lab.yaml
       bodycap run my_walk/ --from merge
-      bodycap run my_walk/ --require good,0.9   exit code 6 if the result is not good enough
+      bodycap run my_walk/ --require good,0.9   exit code 6 if it is not reached
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.api import Execution, execute_job, prepare_job
     from bodycap_batch.config.body_height import describe_height

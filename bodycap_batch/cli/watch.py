@@ -108,7 +108,7 @@ def watch(  # noqa: PLR0913, PLR0917 - the flags a user types
     Examples:
       bodycap watch jobs/inbox
       bodycap watch /mnt/nas/jobs/inbox --root /mnt/nas/footage --jobs 2
-      bodycap watch jobs/inbox --once          run the jobs that are there, then stop
+      bodycap watch jobs/inbox --once      run the jobs that are there, then stop
       bodycap watch jobs/inbox --web 127.0.0.1:8080
       bodycap status jobs                      list the jobs
     """  # noqa: D301 - \b keeps lines as they are

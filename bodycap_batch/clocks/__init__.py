@@ -2,6 +2,7 @@
 
 from bodycap_batch.clocks.capture_clocks import (
     clock_notes,
+    clocks_from_motion_notes,
     decide_clocks,
     describe_clock,
     describe_clocks,
@@ -28,6 +29,7 @@ __all__ = [
     "SoundEvidence",
     "add_motion",
     "clock_notes",
+    "clocks_from_motion_notes",
     "clocks_from_paths",
     "combine_evidence",
     "decide_clocks",

@@ -14,7 +14,7 @@ from bodycap_batch.export.target_frames import WORLD, trajectories_in_target_fra
 from bodycap_batch.formats.bvh.axes import UNITS_PER_METRE
 from bodycap_batch.model.bone_axes import bone_ends_m
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.measured_parts import part_spans
+from bodycap_batch.model.measured_parts import filled_branches, joint_sources, part_spans
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Motion, rest_pose
 
@@ -49,16 +49,19 @@ def collect_blender_scene(inputs: ExportInputs, motion: Motion, options: ExportO
 
 
 def _bones(motion: Motion) -> dict[str, Mapping[str, Any]]:
-    """Return the length, the freedom to move and the measured share of each bone, by joint name."""
+    """Return the length, the freedom to move and the source of the motion of each bone, by joint name."""
     skeleton = motion.skeleton
     lengths = np.linalg.norm(bone_ends_m(skeleton) - rest_pose(skeleton)[:, :3, 3], axis=1)
     share = motion.observed.mean(axis=0)
     free = 0 if motion.hips_in_root_m is None else 1
+    sources, removable = joint_sources(motion), filled_branches(motion)
     return {
         name: {
             "length_m": round(float(lengths[joint]), 6),
             "moves_freely": joint <= free,
             "measured_share": round(float(share[joint]), 4),
+            "source": sources[joint].value,
+            "in_filled_layer": bool(removable[joint]),
         }
         for joint, name in enumerate(skeleton.joints)
     }

@@ -13,6 +13,7 @@ from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.formats.mannequin import Mannequin, make_mannequin
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, rotation_from_quat_xyzw
+from bodycap_batch.model.measured_parts import joint_sources
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 from bodycap_batch.model.take import Take
 
@@ -39,8 +40,9 @@ def write_usd(
     The time codes are frame numbers, counted from 0. The mesh is bound to the joints in the T-pose. The joint
     tokens are paths of names that USD allows (``mixamorig_Hips``). The original names are stored in
     ``jointNames``. The custom data ``unobservedJoints`` of the skeleton lists the joints that no camera
-    measured. Translations, rotations and scales are written for every frame. So are the primvars ``measured``
-    and ``sigmaMetres`` of the skeleton, with a value for each joint.
+    measured, and the primvar ``motionSource`` has ``measured`` or ``filled`` for each joint. Translations,
+    rotations and scales are written for every frame. So are the primvars ``measured`` and ``sigmaMetres`` of
+    the skeleton, with a value for each joint.
 
     Args:
         path: Path of the file (``.usd``, ``.usda``, ``.usdc``), which is replaced atomically.
@@ -177,6 +179,8 @@ def _add_validity(skeleton: Any, motion: Motion, sigma_m: FloatArray | None) -> 
     from pxr import Sdf, UsdGeom, Vt
 
     variables = UsdGeom.PrimvarsAPI(skeleton)
+    source = variables.CreatePrimvar("motionSource", Sdf.ValueTypeNames.TokenArray)
+    source.Set(Vt.TokenArray([each.value for each in joint_sources(motion)]))
     measured = variables.CreatePrimvar("measured", Sdf.ValueTypeNames.BoolArray)
     for frame, row in enumerate(motion.observed.tolist()):
         measured.Set(Vt.BoolArray(row), float(frame))

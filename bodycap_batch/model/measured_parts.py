@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bodycap_batch.core.arrays import IntArray
+from bodycap_batch.core.arrays import BoolArray, IntArray
 from bodycap_batch.model.skeleton import Motion
 
 BODY_PARTS: dict[str, tuple[str, ...]] = {
@@ -53,6 +53,31 @@ class PartSpan:
     state: PartState
     first: int
     last: int
+
+
+class JointSource(StrEnum):
+    """Where the motion of a joint comes from."""
+
+    MEASURED = "measured"
+    FILLED = "filled"
+
+
+def joint_sources(motion: Motion) -> tuple[JointSource, ...]:
+    """Return the source of each joint (J): measured if a camera measured it at any tick, else filled."""
+    measured = np.any(motion.observed, axis=0).tolist()
+    return tuple(JointSource.MEASURED if each else JointSource.FILLED for each in measured)
+
+
+def filled_branches(motion: Motion) -> BoolArray:
+    """Return which joints (J,) are filled and carry no measured joint: legs, neck and head without cameras.
+
+    Their poses can change without any change of a measured joint.
+    """
+    carries = np.array(np.any(motion.observed, axis=0))
+    parents = motion.skeleton.parents.tolist()
+    for joint in range(len(parents) - 1, 0, -1):
+        carries[parents[joint]] |= carries[joint]
+    return np.asarray(~carries)
 
 
 def part_states(motion: Motion) -> dict[str, IntArray]:

@@ -12,7 +12,7 @@ from typing import Any
 
 from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_MAPPED, LEAST_POSED
 from bodycap_batch.config.models import CameraConfig, Job
-from bodycap_batch.config.mounts import MOTION_PLACES, mount_of
+from bodycap_batch.config.mounts import MOTION_PLACES, TRUNK_ROLES, mount_of
 from bodycap_batch.core.errors import BodycapError, CaptureError, EstimationError, JobError
 from bodycap_batch.core.mechanisms import Mechanism, is_on
 from bodycap_batch.core.progress import RECONSTRUCTION, Event
@@ -122,6 +122,7 @@ class Flow:
         self.runner.report_notes(artefact, "check")
         if len(self._capture.cameras) > 1:
             self._sound = self._start_sound()
+            self._sound.add_done_callback(self._note_clocks_from_motion)
         if self._capture.start_s is not None or self._capture.end_s is not None:
             self._apply_sound_offsets()
 
@@ -332,11 +333,16 @@ class Flow:
         unplaced = self._job.capture.unplaced()
         if not unplaced or not has_body(self._job):
             return self._job
-        clocks = self._decide_clocks(scene_map, registrations)
+        clocks = {"": self._decide_clocks(scene_map, registrations)}
+        if read_summary(clocks[""].path)["unknown"]:
+            clocks = {
+                camera.name: self._decide_clocks(scene_map, registrations, trunk=camera.name)
+                for camera in unplaced
+            }
         stated = [(camera.name, mount_of(camera.mount or camera.name)) for camera in self._capture.cameras]
         task = PlacesTask(
             stated={name: found[0] for name, found in stated if found is not None},
-            clocks=artefact_ref(clocks),
+            clocks=refs_by_camera(clocks),
             registrations=refs_by_camera(registrations),
         )
         artefact = self.runner.run(make_task(PLACES, task))
@@ -522,13 +528,22 @@ class Flow:
         task = report_task(self._job, results, self._cameras, digests, failure)
         return self.runner.run(make_task(REPORT, task))
 
-    def _decide_clocks(self, scene_map: Artefact, registrations: ByCamera) -> Artefact:
-        """Decide which clock each camera has, and return the artefact of the clocks."""
+    def _decide_clocks(self, scene_map: Artefact, registrations: ByCamera, trunk: str = "") -> Artefact:
+        """Decide which clock each camera has, and return the artefact of the clocks.
+
+        Args:
+            scene_map: The artefact of the map.
+            registrations: The registration of each camera, by camera name.
+            trunk: Name of the camera that is taken for the one on the trunk; "" for the places of the job.
+        """
         distances = [] if self._body is None else camera_distances(self._body)
         capture = self._job.capture
+        stated = stated_clocks(capture)
+        if trunk:
+            stated[trunk] = replace(stated[trunk], role=TRUNK_ROLES[0])
         task = ClocksTask(
             capture=capture_ref(capture, self._cameras),
-            stated=stated_clocks(capture),
+            stated=stated,
             common=capture.clocks,
             rig=capture.rig,
             sound=optional_ref(None if self._sound is None else self._sound.result()),
@@ -557,6 +572,16 @@ class Flow:
             # As in another thread, the stages that do not use the sound go on.
             done.set_exception(error)
         return done
+
+    def _note_clocks_from_motion(self, sound: Future[Artefact]) -> None:
+        """Report which clocks only the motion can determine, and what is missing if it does not."""
+        from bodycap_batch.clocks import clocks_from_motion_notes
+
+        if sound.cancelled() or sound.exception() is not None:
+            return
+        capture = known_from_sound(self._job.capture, sound.result().path)
+        for note in clocks_from_motion_notes(capture, with_body=has_body(self._job)):
+            self.runner.note(note, "clocks")
 
     @property
     def sound(self) -> Future[Artefact] | None:

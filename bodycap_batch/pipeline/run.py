@@ -131,13 +131,17 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     scene_map, found = flow.extend_map(scene_map, found, keyframes)
     results.map, found = flow.refine_map(scene_map, found, keyframes)
     results.registrations = flow.recover(results.map, found, keyframes)
-    results.job = job = flow.find_places(results.map, results.registrations)
+    try:
+        results.job = job = flow.find_places(results.map, results.registrations)
+    except EstimationError as error:  # only the body needs the places
+        results.failure = error
     results.clocks = flow.clocks(results.map, results.registrations)
     found = flow.use_sensors(results.registrations)
     results.map, results.registrations = flow.map_lost_parts(results.map, found, keyframes)
     yield "registration"
     results.stage = "merge"
-    results.merged, results.failure = _merge(job, flow, results)
+    if results.failure is None:
+        results.merged, results.failure = _merge(job, flow, results)
     yield "merge"
     if results.merged is not None:
         results.stage = "fill"

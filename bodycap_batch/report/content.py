@@ -118,12 +118,15 @@ def _person(merge: MergeResult) -> dict[str, Any]:
             is_filled = filled[[role in BODY_PARTS[name] for role in motion.skeleton.roles]].all()
             state = PartState.FILLED if is_filled else PartState.UNMEASURED
         parts.append({"name": name, "measured": measured, "partly": partly, "state": state})
+    states = {part["name"]: part["state"] for part in parts}
+    seen = (PartState.MEASURED, PartState.PARTLY)
     return {
         "pictogram": draw_pictogram(motion, filled),
         "parts": parts,
         "filled": [part["name"] for part in parts if part["state"] == PartState.FILLED],
         "unmeasured": [part["name"] for part in parts if part["state"] == PartState.UNMEASURED],
         "sure_steps": _share_of_sure_steps(merge),
+        "one_block": states.get("chest") in seen and states.get("pelvis") not in seen,
     }
 
 

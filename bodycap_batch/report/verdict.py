@@ -114,7 +114,8 @@ def _judgement(
     if metrics is None or coverage is None:
         return "The job stopped before there was a result."
     phrases = ("are good", "are usable with care", "are poor", "have no path")
-    first = f"{_left_out(metrics)}The cameras {phrases[cameras]} ({coverage.text})"
+    left_out = _left_out(metrics, is_solved=failure is None and body is not None)
+    first = f"{left_out}The cameras {phrases[cameras]} ({coverage.text})"
     if failure is not None:
         return f"{first}; the body could not be solved."
     if body is None:
@@ -133,21 +134,32 @@ def _named_sigmas(criteria: Sequence[Criterion]) -> Iterator[str]:
             yield f"{each.finding[:1].upper()}{each.finding[1:]}{action}"
 
 
-def _left_out(metrics: Mapping[str, Any]) -> str:
-    """Return the sentences about cameras with an unknown clock; "" if there are none."""
+def _left_out(metrics: Mapping[str, Any], *, is_solved: bool) -> str:
+    """Return the sentences about cameras with an unknown clock; "" if there are none.
+
+    Args:
+        metrics: The content of ``metrics.json``.
+        is_solved: True if there is a body, which is then solved without these cameras.
+    """
     unknown, elsewhere = unknown_clocks(metrics), cameras_in_own_maps(metrics)
     sentences = []
     if names := [name for name in unknown if name not in elsewhere]:
-        clocks, them = ("clock", "it") if len(names) == 1 else ("clocks", "them")
+        clocks, are = ("clock", "is") if len(names) == 1 else ("clocks", "are")
         sentences.append(
-            f"The {clocks} of {' and '.join(names)} {'is' if len(names) == 1 else 'are'} unknown, so the "
-            f"body is solved without {them}: clap once, or hop once, while all cameras record. "
+            f"The {clocks} of {' and '.join(names)} {are} unknown{_consequence(len(names), is_solved)}: clap "
+            "once, or hop once, while all cameras record. "
         )
     if names := [name for name in unknown if name in elsewhere]:
-        videos, them = ("the video is", "it") if len(names) == 1 else ("the videos are", "them")
+        videos = "the video is" if len(names) == 1 else "the videos are"
         sentences.append(
             f"The map of {' and '.join(names)} has no place in common with the other cameras, and the clock "
-            f"is unknown, so the body is solved without {them}: check that {videos} of this recording, let "
-            "all cameras see the same places, and clap once while they record. "
+            f"is unknown{_consequence(len(names), is_solved)}: check that {videos} of this recording, "
+            "let all cameras see the same places, and clap once while they record. "
         )
     return "".join(sentences)
+
+
+def _consequence(count: int, is_solved: bool) -> str:
+    """Return what follows for the body from `count` cameras that are left out; "" without a body."""
+    them = "it" if count == 1 else "them"
+    return f", so the body is solved without {them}" if is_solved else ""

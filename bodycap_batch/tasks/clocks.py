@@ -87,7 +87,8 @@ def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
         known = {name: clock for name, clock in clocks.cameras.items() if clock.is_known}
         common_ns = {name: clock.common_ns(times_ns[name]) for name, clock in known.items()}
         distances = check_distances(load_map(task.map.path).maps[0], common_ns, reach).to_log()
-    write_summary(files, notes=clock_notes(clocks), distances=distances)
+    unknown = [name for name, clock in clocks.cameras.items() if not clock.is_known]
+    write_summary(files, notes=clock_notes(clocks), distances=distances, unknown=unknown)
 
 
 CLOCKS = Stage(

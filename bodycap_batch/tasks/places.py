@@ -16,40 +16,34 @@ from bodycap_batch.tasks.stage import Stage, write_summary
 class PlacesTask:
     """Find from the motion which camera was at which place on the body.
 
+    The motion often gives the clocks only if it is known which camera was on the trunk. If a clock is
+    unknown, there is therefore one hypothesis for each camera.
+
     The summary holds ``places``, the place of each camera, and ``reason``, why they are not known.
 
     Attributes:
         stated: The place of each camera whose place is known, by camera name.
-        clocks: The clocks of all cameras.
+        clocks: The clocks of all cameras, by name of the camera that is taken for the one on the trunk; "" if
+            the clocks need no such hypothesis.
         registrations: The registration of each camera, by camera name.
     """
 
     stated: Mapping[str, str]
-    clocks: ArtefactRef
+    clocks: Mapping[str, ArtefactRef]
     registrations: Mapping[str, ArtefactRef]
 
 
 def run_places(task: PlacesTask, context: StageContext, files: Path) -> None:
     """Find the places, and store them in the summary."""
-    from bodycap_batch.camera_places import FoundPlaces, TimedPoses, find_places
+    from bodycap_batch.camera_places import FoundPlaces, find_places_with
 
     context.check_cancelled()
-    clocks = load_clocks(task.clocks).cameras
     paths = [load_registration(artefact.path).trajectory for artefact in task.registrations.values()]
-    unknown = [path.camera for path in paths if not clocks[path.camera].is_known]
-    if unknown:
-        found = FoundPlaces(by_camera={}, reason=f"the clock of {', '.join(unknown)} is unknown")
-    elif len({path.gauge for path in paths}) > 1:
+    if len({path.gauge for path in paths}) > 1:
         found = FoundPlaces(by_camera={}, reason="the cameras are not in one map")
     else:
-        poses = {
-            path.camera: TimedPoses(
-                common_ns=clocks[path.camera].common_ns(path.times_ns[path.localised]),
-                map_from_cam=path.gauge_from_cam[path.localised],
-            )
-            for path in paths
-        }
-        found = find_places(poses, task.stated)
+        clocks = {trunk: load_clocks(artefact).cameras for trunk, artefact in task.clocks.items()}
+        found = find_places_with(clocks, paths, task.stated)
     text = ", ".join(f"{name} on {place}" for name, place in found.by_camera.items())
     notes = [f"places found from the motion: {text}"] if text else []
     write_summary(files, places=dict(found.by_camera), reason=found.reason, notes=notes)

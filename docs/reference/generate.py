@@ -18,7 +18,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from bodycap_batch import cli
-from bodycap_batch.cli.application import app
+from bodycap_batch.cli.application import COMMAND_GROUPS, app
 from bodycap_batch.config.models import Job
 from bodycap_batch.formats.frame_table import COLUMNS as FRAME_COLUMNS
 from bodycap_batch.formats.joint_table import COLUMNS as JOINT_COLUMNS
@@ -121,19 +121,23 @@ def command_line() -> str:
     """Return the page of the commands, from their definitions."""
     assert cli.main  # importing the package registers the commands
     parts = ["# Commands\n\nEvery command prints this with `--help`.\n"]
-    for name, command in sorted(commands().items()):
+    title_of = {names[0]: title for title, names in COMMAND_GROUPS.items()}
+    for name, command in commands().items():
+        if name in title_of:
+            parts.append(f"\n## {title_of[name]}\n")
         arguments = [p for p in command.params if p.param_type_name == "argument"]
         words = " ".join(str(p.metavar or p.name.upper()) for p in arguments)
         text = "\n".join(_help_lines(command.help or ""))
-        parts.append(f"\n## bodycap {name}\n\n```text\nbodycap {name} [OPTIONS] {words}\n```\n\n{text}\n")
+        parts.append(f"\n### bodycap {name}\n\n```text\nbodycap {name} [OPTIONS] {words}\n```\n\n{text}\n")
         rows = [(_flags(p), str(getattr(p, "help", "") or "")) for p in command.params if p.name != "help"]
         parts.append("\n" + _table(("argument or option", "meaning"), rows))
     return "".join(parts)
 
 
 def commands() -> dict[str, Any]:
-    """Return the commands by name."""
-    return dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
+    """Return the commands by name, in the order of the help."""
+    known = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    return {name: known[name] for names in COMMAND_GROUPS.values() for name in names}
 
 
 def _help_lines(text: str) -> Iterator[str]:

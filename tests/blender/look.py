@@ -76,6 +76,7 @@ def report() -> dict[str, Any]:
     out["armature"] = rows(body.matrix_world)
     out["joints"] = [bone.name for bone in body.data.bones]
     out["parents"] = {bone.name: bone.parent.name if bone.parent else None for bone in body.data.bones}
+    out["sources"] = {bone.name: bone.get("motion_source") for bone in body.pose.bones}
     out["objects"] = sorted(
         f"{item.type} {item.name}"
         for item in bpy.data.objects

@@ -27,6 +27,7 @@ from bodycap_batch.formats.fbx import find_blender, write_fbx
 from bodycap_batch.formats.palette import CAMERA_COLOURS
 from bodycap_batch.model.bone_axes import align_axes_with_bones, main_children
 from bodycap_batch.model.geometry import Similarity, invert, rotation_angle_rad
+from bodycap_batch.model.measured_parts import JointSource, filled_branches, joint_sources
 from bodycap_batch.model.skeleton import Motion, rest_pose
 from tests.bodies import merged, reaching
 from tests.figures import skinned
@@ -138,6 +139,13 @@ def test_all_joints_and_no_other_bones(case: Case, name: str) -> None:
         for joint, parent in zip(body.joints, body.parents, strict=True)
     }
     assert report["parents"] == parents
+
+
+def test_each_bone_has_the_source_of_its_motion_as_a_property(case: Case, name: str) -> None:
+    if name not in ("glb", "fbx"):
+        pytest.skip("BVH has no place for it, and Blender does not import the primvars of a USD skeleton")
+    sources = (source.value for source in joint_sources(case.motion))
+    assert case.seen[name].report["sources"] == dict(zip(case.motion.skeleton.joints, sources, strict=True))
 
 
 def test_it_stands_upright_faces_minus_y_and_has_its_size(case: Case, name: str) -> None:
@@ -348,6 +356,25 @@ def test_the_script_builds_the_scene(case: Case, blender: Path, tmp_path: Path) 
         np.testing.assert_allclose(pose[:, :3, :3], turned[:, :3, :3], atol=2e-3)
     assert seen["videos"] == {"torso": "torso.mp4"}
     assert seen["connected"] > 10
+    sources = dict(zip(motion.skeleton.joints, joint_sources(motion), strict=True))
+    for source in JointSource:
+        names = sorted(name for name, each in sources.items() if each == source)
+        assert seen["collections"][source]["bones"] == names
+        assert len(seen["collections"][source]["colours"]) == 1
+    assert seen["collections"]["measured"]["colours"] != seen["collections"]["filled"]["colours"]
+    assert seen["properties"] == {name: source.value for name, source in sources.items()}
+    # The filled limbs can be muted: nothing that carries a measured joint is among them.
+    assert seen["tracks"] == ["filled"]
+    limbs = {name for name, each in zip(motion.skeleton.joints, filled_branches(motion), strict=True) if each}
+    assert set(seen["filled_actions"]) == limbs
+    assert any("Leg" in name for name in limbs)
+    before, muted = ({n: np.array(p) for n, p in seen[key].items()} for key in ("poses", "muted"))
+    for name in motion.skeleton.joints:
+        off = np.linalg.norm(muted[name][:, :3, 3] - before[name][:, :3, 3], axis=1).max()
+        assert off < 1e-3 or name in limbs, f"{name} moves by {off} m"
+    assert max(np.ptp(muted[name][:, :3, :3], axis=0).max() for name in limbs) > 0.0, (
+        "they follow their parent"
+    )
     (frame, text), *_ = seen["markers"]
     assert frame == 1
     assert text.startswith("not measured: ")

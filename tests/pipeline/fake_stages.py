@@ -20,7 +20,7 @@ ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
  "unused": {camera: reason}, "rolling": true, "late": number of maps,
- "corrected" | "corrected_before" | "distorted": [cameras] in refined maps,
+ "unknown_clocks": [cameras], "corrected" | "corrected_before" | "distorted": [cameras] in refined maps,
  "fail_rebuilt": true, "telemetry": [cameras],
  "real": [stages that are no stand-ins]}.
  "fail" may be a list of stages."""
@@ -98,7 +98,8 @@ def videos(arguments: Json) -> list[str]:
 
 
 def summary(options: Json, arguments: Json, files: Path) -> None:
-    (files / "summary.json").write_text(json.dumps({"notes": ["a note"], "frames": 20}))
+    unknown = orders().get("unknown_clocks", [])
+    (files / "summary.json").write_text(json.dumps({"notes": ["a note"], "frames": 20, "unknown": unknown}))
 
 
 def with_sensor(options: Json, arguments: Json, files: Path) -> None:
@@ -130,6 +131,21 @@ def registered(options: Json, arguments: Json, files: Path) -> None:
         "rolling": rolling,
     }
     (files / "summary.json").write_text(json.dumps(values))
+
+
+def heard(options: Json, arguments: Json, files: Path) -> None:
+    """No camera has sound, so the sound gives no clock."""
+    summary(options, arguments, files)
+    start = {"first_frame_s": 0.0, "created_s": None, "timecode_s": None, "frame_s": 0.0, "gps_s": None}
+    recordings = [
+        {
+            "camera": camera["name"], "sound_start_s": None, "problem": "the video has no sound", "notes": [],
+            "recorder": None, "start": start, "first_frame_s": 0.0, "end_s": 1.0, "frames": 20,
+        }
+        for camera in arguments["capture"]["config"]["cameras"]
+    ]  # fmt: skip
+    document = {"type": "SoundEvidence", "value": {"recordings": recordings, "pairs": []}}
+    (files / "sound.json").write_text(json.dumps(document))
 
 
 def placed(options: Json, arguments: Json, files: Path) -> None:
@@ -211,6 +227,7 @@ EXTRA = {
     "registration": registered,
     "refine": refined,
     "recover": recovered,
+    "sound": heard,
     "further_maps": further_mapped,
     "merge": merged,
     "export": exported,

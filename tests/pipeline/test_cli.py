@@ -16,10 +16,12 @@ from unittest import mock
 
 import numpy as np
 import pytest
+import typer
 import yaml
 
 import bodycap_batch
 from bodycap_batch.cli import main
+from bodycap_batch.cli.application import COMMAND_GROUPS, app
 from bodycap_batch.formats.frame_table import COLUMNS
 from bodycap_batch.runner import Children
 from bodycap_batch.tasks.check import CHECK
@@ -359,11 +361,19 @@ def test_an_unwritable_results_folder_is_named(bench: Bench) -> None:
     assert "hint:" in err
 
 
-def test_the_list_of_commands_has_whole_sentences(capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_help_lists_every_command_once_in_its_group(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     assert main(["--help"]) == 0
-    listed = capfd.readouterr().out.partition("Commands:")[2]
-    assert "gc " in listed
+    text = capfd.readouterr().out
+    assert [line for line in text.splitlines() if len(line) > 80] == []
+    listed = text.partition("Record and solve:")[2]
     assert "..." not in listed
+    words = [line.split()[0] for line in listed.splitlines() if line.startswith("  ") and line[2] != " "]
+    assert sorted(words) == sorted(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
+    titles = [line.rstrip(":") for line in listed.splitlines() if line and not line.startswith(" ")]
+    assert titles == list(COMMAND_GROUPS)[1:]
 
 
 def test_a_disk_that_does_not_answer_is_not_a_bug(

@@ -628,12 +628,38 @@ def test_places_found_from_the_motion_are_used_and_written_into_the_job_file(ben
     assert computed == set(), "a job with the found places gives the same results"
 
 
+def test_without_clocks_each_camera_is_taken_for_the_one_on_the_trunk(bench: Bench) -> None:
+    bench.order(places=FOUND)
+    known = run_job(unplaced_job(bench), out_dir=bench.out, settings=bench.settings())
+    assert sum(stage.stage == "clocks" for stage in known.stages) == 2, "before and after the places"
+    shutil.rmtree(bench.folder / "store")
+    bench.order(places=FOUND, unknown_clocks=["b"])
+    summary = run_job(unplaced_job(bench), out_dir=bench.out, settings=bench.settings())
+    assert sum(stage.stage == "clocks" for stage in summary.stages) == 2 + len(FOUND)
+    (places,) = (bench.folder / "store").glob("artefacts/places/*/made_of.txt")
+    clocks = json.loads(places.read_text())[2]["clocks"]
+    assert set(clocks) == set(FOUND)
+    assert len(set(clocks.values())) == len(FOUND)
+
+
+def test_what_is_missing_without_a_clock_is_said_before_the_map(bench: Bench) -> None:
+    bench.run(left_palm={"offset_s": None})
+    texts = [(event.kind, event.what) for event in bench.events]
+    (said,) = [index for index, (_, text) in enumerate(texts) if "there is no motion of the body" in text]
+    assert said < next(index for index, event in enumerate(bench.events) if event.stage == "map")
+    bench.events.clear()
+    bench.run()
+    assert not any("there is no motion of the body" in event.what for event in bench.events)
+
+
 def test_places_that_the_motion_does_not_show_are_asked_for(bench: Bench) -> None:
     job = unplaced_job(bench)
     with pytest.raises(EstimationError, match="the arms do not move") as caught:
         run_job(job, out_dir=bench.out, settings=bench.settings())
     assert "--camera a=PLACE --camera b=PLACE" in str(caught.value.hint)
-    assert (bench.out / "partial" / "report.html").is_file()
+    partial = bench.out / "partial"
+    assert {"metrics.json", "result.ply", "report.html", "preview.mp4"} <= set(os.listdir(partial))
+    assert "the arms do not move" in (partial / "report.html").read_text()
     cameras = [each.model_copy(update={"mount": FOUND[each.name]}) for each in job.capture.cameras]
     capture = job.capture.model_copy(update={"cameras": tuple(cameras), "places": ()})
     summary = run_job(

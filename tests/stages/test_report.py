@@ -254,6 +254,9 @@ def test_an_unknown_clock_is_in_the_first_line_and_costs_coverage(
     metrics["clock_notes"] = {"left_palm": [note]}
     verdict = judge(metrics, None)
     assert verdict.headline.startswith("The clock of left_palm is unknown, so the body is solved without it")
+    failed = judge(metrics, {"stage": "merge", "message": "no two cameras determine the size"}).headline
+    assert failed.startswith("The clock of left_palm is unknown: clap once")
+    assert failed.endswith("the body could not be solved.")
     assert verdict.coverage is not None
     assert verdict.coverage.cameras["left_palm"].reason == note
     clocks = {**inputs.clocks, "left_palm": replace(inputs.clocks["left_palm"], source="none", notes=(note,))}
@@ -840,6 +843,7 @@ def test_the_page_leads_with_the_verdict_and_links_the_files(inputs: ReportInput
     ]
     assert places == sorted(places)
     assert "No camera measured: head, pelvis, left leg, right leg." in text
+    assert "without a camera on the hips, the trunk is one block" in text
     assert '<a href="motion.bvh">' in text
     assert 'class="strip motion"' in text
     without = written(ReportInputs(name="x"), tmp_path)

@@ -44,6 +44,13 @@ _MARKER_LENGTH = 63
 _CAMERA_SIZE_M = 0.15
 """Size of the drawn cameras, metres."""
 
+_SOURCE_COLOURS = {"measured": (0.10, 0.65, 0.60), "filled": (0.95, 0.50, 0.10)}
+"""Colours of the bones, RGB, 0 to 1, by the source of their motion, which is also the name of their
+collection. Teal and orange differ for people with any colour vision deficiency."""
+
+FILLED_TRACK = "filled"
+"""Name of the NLA track with the filled bones that carry no measured bone."""
+
 _RATE_TOLERANCE = 1e-3
 """Relative difference of the rates of video and motion above which the video's frame is keyed."""
 
@@ -144,23 +151,66 @@ def _add_body(folder: Path, data: dict[str, Any], collection: Any) -> str:
     for bone in body.pose.bones:
         if bone.name in data["bones"]:
             bone["measured_share"] = data["bones"][bone.name]["measured_share"]
-    return f"body: {len(body.data.bones)} bones, {data['frames']} frames at {data['fps']:g} per second"
+    _sort_bones(body, data["bones"])
+    layer = {name for name, fact in data["bones"].items() if fact.get("in_filled_layer")}
+    _separate_layer(body, layer)
+    bones = f"{len(body.data.bones)} bones, {len(layer)} of them in the NLA track {FILLED_TRACK!r}"
+    return f"body: {bones}, {data['frames']} frames at {data['fps']:g} per second"
+
+
+def _sort_bones(body: Any, bones: dict[str, Any]) -> None:
+    """Put the bones into a collection for each source of their motion, and give each its colour."""
+    collections: dict[str, Any] = {}
+    for bone in body.data.bones:
+        source = bones.get(bone.name, {}).get("source")
+        if source is None:
+            continue
+        if source not in collections:
+            collections[source] = body.data.collections.new(source)
+        collections[source].assign(bone)
+        body.pose.bones[bone.name]["motion_source"] = source
+        normal = _SOURCE_COLOURS[source]
+        bone.color.palette = "CUSTOM"
+        bone.color.custom.normal = normal
+        bone.color.custom.select = [min(1.0, 0.5 + 0.5 * value) for value in normal]
+        bone.color.custom.active = (1.0, 1.0, 1.0)
+
+
+def _separate_layer(body: Any, names: set[str]) -> None:
+    """Move the curves of these bones from the body's action into an NLA track, which can be muted."""
+    action = body.animation_data.action if body.animation_data is not None else None
+    if action is None or not names:
+        return
+    paths = tuple(f'pose.bones["{name}"].' for name in names)
+    filled = action.copy()
+    filled.name = f"{action.name} {FILLED_TRACK}"
+    for each, is_layer in ((action, False), (filled, True)):
+        for curves in _curve_collections(each):
+            for curve in list(curves):
+                if curve.data_path.startswith(paths) != is_layer:
+                    curves.remove(curve)
+    tracks = body.animation_data.nla_tracks
+    for track in list(tracks):  # the glTF importer adds the body's action as a muted track
+        tracks.remove(track)
+    track = tracks.new()
+    track.name = FILLED_TRACK
+    strip = track.strips.new(FILLED_TRACK, FIRST_FRAME, filled)
+    if hasattr(filled, "slots"):
+        strip.action_slot = filled.slots[0]
 
 
 def curves_of(item: Any) -> Iterable[Any]:
     """Return the animation curves of an object, in every version of Blender."""
     if item.animation_data is None or item.animation_data.action is None:
         return []
-    action = item.animation_data.action
+    return [curve for curves in _curve_collections(item.animation_data.action) for curve in curves]
+
+
+def _curve_collections(action: Any) -> list[Any]:
+    """Return the collections of curves of an action, in every version of Blender."""
     if not hasattr(action, "slots"):  # before Blender 4.4
-        return list(action.fcurves)
-    return [
-        curve
-        for layer in action.layers
-        for strip in layer.strips
-        for bag in strip.channelbags
-        for curve in bag.fcurves
-    ]
+        return [action.fcurves]
+    return [bag.fcurves for layer in action.layers for strip in layer.strips for bag in strip.channelbags]
 
 
 def _new_curves(owner: Any, name: str) -> Any:

@@ -21,6 +21,7 @@ from bodycap_batch.formats.gltf.axes import (
 from bodycap_batch.formats.gltf.binary_buffer import BinaryBuffer
 from bodycap_batch.formats.mannequin import make_mannequin
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, make_transform, quat_xyzw_from_rotation
+from bodycap_batch.model.measured_parts import JointSource
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 from bodycap_batch.model.take import Take
 
@@ -141,12 +142,15 @@ def _joint_nodes(motion: Motion, rest: FloatArray, sigma_m: FloatArray | None) -
 def _properties(motion: Motion, joint: int, sigma_m: FloatArray | None) -> dict[str, Any]:
     """Return the custom properties of a joint.
 
-    They are its role, ``observed: false`` if it was never measured, and, with a standard deviation, the first
-    and the last frame of each span in which it was measured, and the standard deviation of each frame.
+    They are its role, ``motion_source`` (measured or filled), ``observed: false`` if it was never measured,
+    and, with a standard deviation, the first and the last frame of each span in which it was measured, and
+    the standard deviation of each frame.
     """
     role = motion.skeleton.roles[joint]
     out: dict[str, Any] = {"role": role} if role else {}
-    if not motion.observed[:, joint].any():
+    is_measured = bool(motion.observed[:, joint].any())
+    out["motion_source"] = (JointSource.MEASURED if is_measured else JointSource.FILLED).value
+    if not is_measured:
         out["observed"] = False
     elif sigma_m is not None:
         out["measured_frames"] = true_spans(motion.observed[:, joint])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.cli import main
-from bodycap_batch.clocks import decide_clocks, describe_clocks, estimate_clocks
+from bodycap_batch.clocks import clocks_from_motion_notes, decide_clocks, describe_clocks, estimate_clocks
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.config.sample_files import samples_beside
 from tests.sounds import heard, scene, write_video_with_sound
@@ -251,14 +251,37 @@ def test_cameras_with_one_trigger_share_a_clock(folder):
 
 
 def test_each_camera_has_a_line_about_its_clock(folder):
-    lines = describe_clocks(capture(folder, *NAMES, head=-HEAD_S))
+    lines = describe_clocks(capture(folder, *NAMES, head=-HEAD_S), with_body=True)
     by_name = {line.partition(":")[0]: line for line in lines}
     assert "reference clock" in by_name["torso"]
     assert "+0.73" in by_name["left_palm"]
     assert "(sound)" in by_name["left_palm"]
-    assert "the run estimates the offset from the motion" in by_name["left_thigh"]
+    assert "the sound does not give the clock offset (" in by_name["left_thigh"]
     assert "with the sign turned the sound agrees" in by_name["head"]
-    assert describe_clocks(capture(folder, "torso")) == []
+    assert "the motion of the body is solved without right_palm, left_thigh" in lines[-1]
+    assert describe_clocks(capture(folder, "torso"), with_body=True) == []
+
+
+PLACES = ("torso", "left_palm", "right_palm")
+
+
+@pytest.mark.parametrize(
+    ("names", "heard_names", "places", "with_body", "missing"),
+    [
+        (("torso", "left_palm"), ("torso",), (), True, "there is no motion of the body"),
+        (("a", "b", "c"), ("a", "b"), PLACES, True, "the places of the cameras are not found and"),
+        (PLACES, PLACES[:2], (), True, "the motion of the body is solved without right_palm"),
+        (("torso", "left_palm"), ("torso",), (), False, "the times of left_palm are not those of"),
+    ],
+)
+def test_what_is_missing_without_a_clock_is_said_before_the_run(
+    tmp_path, names, heard_names, places, with_body, missing
+):
+    known = capture(tmp_path, *names, **dict.fromkeys(heard_names, 0.0)).model_copy(update={"places": places})
+    (note,) = clocks_from_motion_notes(known, with_body=with_body)
+    assert f"If the motion does not show it, {missing}" in note
+    complete = capture(tmp_path, *names, **dict.fromkeys(names, 0.0))
+    assert clocks_from_motion_notes(complete, with_body=with_body) == []
 
 
 def test_check_prints_the_clock_of_each_camera(folder, tmp_path, capfd):

@@ -108,6 +108,15 @@ def test_glb_and_usd_name_the_unmeasured_joints(tmp_path: Path) -> None:
         if prim.GetCustomDataByKey("unobservedJoints")
     ]
     assert set(listed) == expected
+    sources = {name: "filled" if name in expected else "measured" for name in result.skeleton.joints}
+    properties = {node.name: (node.extras or {}).get("motion_source") for node in document.nodes}
+    assert {name: properties[name] for name in sources} == sources
+    (values,) = [
+        list(prim.GetAttribute("primvars:motionSource").Get())
+        for prim in stage.Traverse()
+        if prim.HasAttribute("primvars:motionSource")
+    ]
+    assert values == [sources[name] for name in result.skeleton.joints]
 
 
 def test_fill_json_lists_joints_and_steps(tmp_path: Path) -> None:

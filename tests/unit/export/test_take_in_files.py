@@ -72,7 +72,8 @@ def test_glb(inputs: ExportInputs) -> None:
     extras = {node.name: node.extras for node in document.nodes}
     assert extras["Spine1"]["measured_frames"] == [[1, 10], [16, 40]]
     assert extras["Spine1"]["sigma_m"][:2] == [None, pytest.approx(SIGMA_M)]
-    assert extras["LeftUpLeg"] == {"role": "LeftUpLeg", "observed": False}
+    expected = {"role": "LeftUpLeg", "motion_source": "filled", "observed": False}
+    assert extras["LeftUpLeg"] == expected
 
 
 def test_usd(inputs: ExportInputs) -> None:

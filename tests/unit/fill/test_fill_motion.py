@@ -15,7 +15,7 @@ from bodycap_batch.fill.foot_paths import foot_path
 from bodycap_batch.fill.leg_geometry import leg_geometry
 from bodycap_batch.fill.standing_height import HeightSigmas
 from bodycap_batch.model.fill_data import FillMode, FillResult, Footsteps
-from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp
 from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.model.skeleton_presets import load_skeleton
 from tests.bench.body import drawn_body, score, with_errors
@@ -255,6 +255,22 @@ def test_every_filled_joint_moves_without_jumps() -> None:
     poses = fill(motion, solved).motion.world_from_joint()[..., :3, 3]
     # A swinging foot moves at 4 m/s or less.
     assert np.linalg.norm(np.diff(poses, axis=0), axis=-1).max() * motion.fps < 5.0
+
+
+def test_the_joints_of_the_spine_share_its_bend_without_a_step_at_a_gap() -> None:
+    motion, solved = walking()
+    gap = slice(60, 110)
+    observed = np.array(motion.observed)
+    observed[gap] = False
+    filled = fill(replace(motion, observed=observed), solved).motion
+    spine = [filled.skeleton.roles.index(role) for role in ("Spine", "Spine1")]
+    turns = filled.local_rotation[:, spine]
+    angles = rotation_angle_rad(turns)
+    assert np.degrees(angles.max()) > 1.0
+    np.testing.assert_allclose(angles[:, 0], angles[:, 1], atol=1e-6)
+    steps = rotation_angle_rad(np.swapaxes(turns[:-1], -1, -2) @ turns[1:])
+    edges = steps[[gap.start - 1, gap.stop - 1]]
+    assert edges.max() <= np.delete(steps, [gap.start - 1, gap.stop - 1], axis=0).max()
 
 
 def test_a_standing_person_takes_no_step() -> None:

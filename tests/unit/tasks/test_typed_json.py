@@ -136,7 +136,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             registrations=stored,
             reach=(CameraDistance(first="head", second="torso", least_m=0.1, most_m=0.9),),
         ),
-        "places": PlacesTask(stated={"a": "torso"}, clocks=scene_map, registrations=stored),
+        "places": PlacesTask(stated={"a": "torso"}, clocks={"": scene_map}, registrations=stored),
         "merge": MergeTask(
             options=MergeOptions(known_distance=("torso:1", "head:2", 1.5)),
             map=scene_map,
