@@ -28,7 +28,13 @@ from bodycap_batch.evaluate.right_frames import (
 from bodycap_batch.evaluate.two_view import Outcome
 from bodycap_batch.formats.tum import TimedPoses, read_tum
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.tracks import find_fixed_regions, find_moving_regions, find_moving_tracks, track_video
+from bodycap_batch.tracks import (
+    find_fixed_regions,
+    find_moving_regions,
+    find_moving_tracks,
+    measure_rotation_chain,
+    track_video,
+)
 
 _TIME_TOLERANCE = 0.25
 """Maximum difference between the times of a pose and its frame, as a fraction of the frame interval."""
@@ -175,18 +181,17 @@ def read_pictures(
     tracks = track_video(camera, lambda done, _: progress(done // 2))
     fixed = find_fixed_regions(tracks, camera.times_ns)
     tracks = tracks.outside(fixed)
-    moving = find_moving_tracks(tracks, lens.scaled(*size), camera.times_ns)
-    camera = replace(
-        camera,
-        mask=without_regions(camera.mask, fixed, size),
-        moving_regions=find_moving_regions(tracks, moving),
-    )
+    lens_here = lens.scaled(*size)
+    moving = find_moving_regions(tracks, find_moving_tracks(tracks, lens_here, camera.times_ns))
+    every = np.arange(count)
+    turns = measure_rotation_chain(tracks.outside(moving), lens_here, 0.0, every, every[:0])
+    camera = replace(camera, mask=without_regions(camera.mask, fixed, size), moving_regions=moving)
     features: list[FrameFeatures | None] = [None] * count
     for index, image in camera.read_decodable(np.arange(count)):
         in_picture = lens.scaled(image.shape[1], image.shape[0])
         features[index] = detect_features(image, in_picture, partial(camera.is_unmasked, frame=index))
         progress((count + index) // 2)
-    return Pictures(features, np.asarray(camera.times_ns * 1e-9), readout_s)
+    return Pictures(features, np.asarray(camera.times_ns * 1e-9), readout_s, turns)
 
 
 def poses_of_frames(poses: TimedPoses, camera: CaptureCamera) -> FloatArray:

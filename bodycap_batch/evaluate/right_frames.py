@@ -21,6 +21,7 @@ from bodycap_batch.evaluate.fresh_features import FrameFeatures, match_features
 from bodycap_batch.evaluate.three_view import CommonRays, Legs, judge_legs, measure_legs
 from bodycap_batch.evaluate.two_view import WRONG_DEG, Outcome, differs, judge_rotation
 from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp, so3_log
+from bodycap_batch.model.rotation_chain import RotationChain
 from bodycap_batch.tracks.relative_motion import Motion, RayMatches, measure_rotation
 
 GAPS = {1: 1, 5: 1, 15: 3, 45: 3}
@@ -94,15 +95,24 @@ class Pictures:
     show between neighbouring frames.
     """
 
-    def __init__(self, features: Features, times_s: FloatArray | None = None, readout_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        features: Features,
+        times_s: FloatArray | None = None,
+        readout_s: float = 0.0,
+        turns: RotationChain | None = None,
+    ) -> None:
         """Take the features of all N frames.
 
         Args:
             features: The features of each frame.
             times_s: (N,) times of the frames; needed only for a rolling shutter.
             readout_s: Time from the exposure of the first row to that of the last row.
+            turns: How the camera turns, by tracks. It finds folds across pictures that are too blurred for
+                features.
         """
         self.features = features
+        self.turns = turns
         self._times_s = np.arange(float(len(features))) if times_s is None else times_s
         self._readout_s = readout_s
         self._pairs: dict[tuple[int, int], MeasuredPair] = {}
@@ -322,8 +332,11 @@ def find_right_frames(evidence: PictureEvidence, world_from_cam: FloatArray) -> 
         outcomes[first, second] = _judge_pair(features, (first, second), pair, world_from_cam)
     for (first, last), chain in evidence.chains.items():
         expected = world_from_cam[last, :3, :3].T @ world_from_cam[first, :3, :3]
+        turns, ends = evidence.pictures.turns, np.array([first, last])
         if chain is not None:
             outcomes[first, last] = Outcome.WRONG if differs(*chain, expected) else Outcome.RIGHT
+        elif turns is not None and turns.confirms(ends, world_from_cam[ends, :3, :3]) is False:
+            outcomes[first, last] = Outcome.WRONG
         else:
             outcomes[first, last] = Outcome.UNMEASURABLE
     outcomes |= _revisits(evidence.pictures, world_from_cam, posed)

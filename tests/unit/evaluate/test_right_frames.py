@@ -29,8 +29,10 @@ from bodycap_batch.model.geometry import (
     make_transform,
     rotation_angle_rad,
     so3_exp,
+    so3_log,
     transform_points,
 )
+from bodycap_batch.model.rotation_chain import RotationChain
 from bodycap_batch.tracks.relative_motion import RayMatches, refine_motion
 
 FRAMES = 100
@@ -174,6 +176,24 @@ def test_a_fold_across_lost_frames_is_found_from_the_rotations_between(
     assert (found[:25] == "right").all()
     assert (found[25:75] == "None").all()
     assert (found[75:] == "wrong").all()
+
+
+def test_tracks_find_a_fold_where_lost_frames_have_no_features(path: FloatArray) -> None:
+    posed = np.ones(FRAMES, dtype=bool)
+    posed[40:60] = False
+    blurred = [None if 40 <= frame < 60 else each for frame, each in enumerate(pictures(path))]
+    turns = RotationChain(
+        frames=np.arange(FRAMES),
+        turns=so3_log(np.swapaxes(path[1:, :3, :3], 1, 2) @ path[:-1, :3, :3]),
+        sigma_rad=np.full(FRAMES - 1, 1e-4),
+        turn_sigma=0.05,
+    )
+    evidence = measure_pictures(Pictures(blurred, turns=turns), posed)
+    delivered = np.where(posed[:, None, None], path, np.nan)
+    assert find_right_frames(evidence, delivered).count(Outcome.WRONG) == 0
+    folded = delivered.copy()
+    folded[60:] = fold(path)[60:]
+    assert find_right_frames(evidence, folded).count(Outcome.WRONG) == 40
 
 
 def test_one_wrong_measurement_among_right_ones_is_no_break() -> None:
