@@ -183,8 +183,7 @@ def read_pictures(
     tracks = tracks.outside(fixed)
     lens_here = lens.scaled(*size)
     moving = find_moving_regions(tracks, find_moving_tracks(tracks, lens_here, camera.times_ns))
-    every = np.arange(count)
-    turns = measure_rotation_chain(tracks.outside(moving), lens_here, 0.0, every, every[:0])
+    turns = measure_rotation_chain(tracks.outside(moving), lens_here, 0.0, np.arange(count))
     camera = replace(camera, mask=without_regions(camera.mask, fixed, size), moving_regions=moving)
     features: list[FrameFeatures | None] = [None] * count
     for index, image in camera.read_decodable(np.arange(count)):

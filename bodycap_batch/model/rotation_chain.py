@@ -10,12 +10,11 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.geometry import so3_exp, so3_log
 
-_MIN_ANGLE_RAD = float(np.deg2rad(8.0))
-"""Minimum angle between two rotations that contradict each other. A bare table has two planar solutions, with
-which a chain of ten frames is 5 degrees off. Evidence: docs/decisions/tracks.md."""
-_MIN_SIGMAS = 10.0
-"""Minimum angle between two rotations that contradict each other, in standard deviations of the chain. Its
-links have larger errors than stated, through blur, hands and shutters, and they have them in common.
+_MIN_ANGLE_RAD = float(np.deg2rad(45.0))
+"""Minimum angle between two rotations that contradict each other. Origin: rooms repeat themselves at right
+angles; half of one separates a place from the next one that looks alike."""
+_MIN_SIGMAS = 5.0
+"""Minimum angle between two rotations that contradict each other, in standard deviations of the chain.
 Evidence: docs/decisions/tracks.md."""
 
 

@@ -160,7 +160,7 @@ def _turns(camera: CaptureCamera, shown: Shown, selection: KeyframeSelection) ->
         return None
     lens, sigma = (camera.camera, 0.0) if shown.lens is None else (shown.lens.lens, shown.lens.focal_sigma)
     frames = np.arange(len(camera.times_ns)) if selection.pictures is None else selection.pictures.frames
-    return measure_rotation_chain(shown.tracks, lens, sigma, frames, selection.frames)
+    return measure_rotation_chain(shown.tracks, lens, sigma, frames)
 
 
 def _telemetry(camera: CaptureCamera, task: KeyframesTask) -> tuple[CameraTelemetry | None, list[str]]:

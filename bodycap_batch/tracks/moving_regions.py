@@ -12,7 +12,7 @@ from bodycap_batch.core.arrays import BoolArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.optical_flow import Pixels, pixel_scale, unit_directions
 from bodycap_batch.model.point_tracks import PointTracks
-from bodycap_batch.tracks.relative_motion import RayMatches, measure_rotation, residuals
+from bodycap_batch.tracks.relative_motion import Motion, RayMatches, measure_rotation, residuals
 
 _SPANS_S = (0.2, 0.4)
 """Times, seconds, over which the motion of points is compared with that of the camera. Evidence:
@@ -70,10 +70,17 @@ def find_moving_tracks(tracks: PointTracks, lens: Camera, times_ns: IntArray) ->
     return np.asarray((off >= _MIN_OFF) & (off > _MIN_OFF_SHARE * compared))
 
 
+def camera_motion(matches: RayMatches) -> Motion | None:
+    """Return the motion of the camera; None if matches of less than `_MIN_SUPPORT` of the cells follow it."""
+    motion = measure_rotation(matches)
+    is_known = motion is not None and motion.support >= _MIN_SUPPORT * len(np.unique(matches.cells))
+    return motion if is_known else None
+
+
 def _off_camera_motion(matches: RayMatches) -> BoolArray | None:
     """Return which matches (M,) do not follow the motion of the camera; None if that motion is not known."""
-    motion = measure_rotation(matches)
-    if motion is None or motion.support < _MIN_SUPPORT * len(np.unique(matches.cells)):
+    motion = camera_motion(matches)
+    if motion is None:
         return None
     residual, in_front = residuals(matches, motion)
     return np.asarray((np.abs(residual) > _OFF_ERRORS) | ~in_front)

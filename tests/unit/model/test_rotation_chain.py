@@ -84,7 +84,7 @@ def test_a_part_that_is_folded_is_found(start: int, stop: int, lost: int) -> Non
 
 def test_an_inexact_chain_contradicts_nothing() -> None:
     rotations = path()
-    chain = chain_of(rotations, np.arange(0, FRAMES, 5), sigma_deg=10.0)
+    chain = chain_of(rotations, np.arange(0, FRAMES, 5), sigma_deg=20.0)
     assert not find_folded(chain, np.arange(FRAMES), folded(rotations, 60, FRAMES, 90.0)).any()
     assert not find_folded(None, np.arange(FRAMES), folded(rotations, 60, FRAMES, 90.0)).any()
 
