@@ -26,12 +26,13 @@ _FRAME_S = 1.0 / 30.0
 strap takes some hundredths of a second to slip."""
 _HALF_FRAMES = 6
 """Number of frames before and after the instant. Evidence: docs/decisions/merging.md."""
-_MAX_SPAN_S = 0.6
-"""Maximum time (seconds) from the first to the last of these frames. Longer windows have lost frames."""
+_MIN_SPAN_S, _MAX_SPAN_S = 0.5 * (2 * _HALF_FRAMES - 1) * _FRAME_S, 0.6
+"""Limits of the time (seconds) from the first to the last of these frames. Longer windows have lost frames;
+shorter ones have wrong timestamps. Derivation: half of the usual time; 20 frames a second."""
 _STEP_SIGMAS = float(np.radians(10.0)), 0.03
 """Sigma of the step of a slip per axis: radians, metres. Derivation: turns of about 15°, moves of about 3
 cm and more."""
-_LOG_EVIDENCE = 7.0
+_LOG_EVIDENCE = 9.0
 """Minimum logarithm of the ratio of the likelihoods of a slip and of no slip. Evidence:
 docs/decisions/merging.md."""
 _MISSING_INTERVALS = 0.5, 3.5
@@ -223,7 +224,7 @@ def _windows(track: CameraTrack, frames: IntArray) -> _Windows:
     first = np.arange(_HALF_FRAMES, len(frames) - _HALF_FRAMES + 1)
     index = frames[first[:, None] + np.arange(-_HALF_FRAMES, _HALF_FRAMES)]
     times_s = 1e-9 * (track.times_ns[index] - track.times_ns[index[:, :1]])
-    kept = (times_s[:, -1] >= _FRAME_S) & (times_s[:, -1] <= _MAX_SPAN_S)
+    kept = (times_s[:, -1] >= _MIN_SPAN_S) & (times_s[:, -1] <= _MAX_SPAN_S)
     index, times_s = index[kept], times_s[kept]
     poses = track.map_from_cam[index]
     last = poses[:, _HALF_FRAMES - 1, None]
