@@ -32,7 +32,10 @@ shorter ones have wrong timestamps. Derivation: half of the usual time; 20 frame
 _STEP_SIGMAS = float(np.radians(10.0)), 0.03
 """Sigma of the step of a slip per axis: radians, metres. Derivation: turns of about 15°, moves of about 3
 cm and more."""
-_LOG_EVIDENCE = 9.0
+_MAX_TRANSITION_FRAMES = 2
+"""Maximum number of frames at which the camera is under way from its old to its new place. Evidence:
+docs/decisions/merging.md."""
+_LOG_EVIDENCE = 7.5
 """Minimum logarithm of the ratio of the likelihoods of a slip and of no slip. Evidence:
 docs/decisions/merging.md."""
 _MISSING_INTERVALS = 0.5, 3.5
@@ -182,13 +185,18 @@ def _steps(track: CameraTrack) -> list[_Step]:
     windows = _windows(replace(track, map_from_cam=track.map_from_cam @ pivot_in_cam), frames)
     if not len(windows.first_after):
         return []
-    found = [_likelihoods(windows, part, move) for part, move in zip(_PARTS, windows.moves, strict=True)]
-    weights = [_motion_weights(each.smooth) for each in found]
-    evidence = _slip_evidence(found, weights)
+    durations = [
+        [_likelihoods(windows, part, move, wrong) for part, move in zip(_PARTS, windows.moves, strict=True)]
+        for wrong in _transitions()
+    ]
+    weights = [_motion_weights(each.smooth) for each in durations[0]]
+    all_evidence = np.array([_slip_evidence(durations[0], each, weights) for each in durations])
+    evidence = np.asarray(logsumexp(all_evidence, axis=0) - np.log(len(durations)))
     out: list[_Step] = []
     for index in _peaks(evidence):
         if evidence[index] - _wrong_frames_evidence(windows.at(index), weights) < _LOG_EVIDENCE:
             continue
+        found = durations[int(np.argmax(all_evidence[:, index]))]
         step = _mean_step(
             int(windows.first_after[index]), [_only(each, index) for each in found], weights, pivot_in_cam
         )
@@ -217,6 +225,12 @@ def _pivot_m(track: CameraTrack, frames: IntArray) -> FloatArray:
         off = np.linalg.norm(move + turn @ pivot, axis=1)
         weight = 1.0 / (1.0 + (off / max(float(np.median(off)), 1e-9)) ** 2)
     return pivot
+
+
+def _transitions() -> list[BoolArray]:
+    """Return, for each possible duration of a slip, the frames (2K,) at which the camera is under way."""
+    frames = np.arange(2 * _HALF_FRAMES) - _HALF_FRAMES
+    return [(frames >= 0) & (frames < length) for length in range(_MAX_TRANSITION_FRAMES + 1)]
 
 
 def _windows(track: CameraTrack, frames: IntArray) -> _Windows:
@@ -308,14 +322,27 @@ def _motion_weights(smooth: FloatArray) -> FloatArray:
     return weights
 
 
-def _slip_evidence(found: Sequence[_Likelihoods], weights: Sequence[FloatArray]) -> FloatArray:
-    """Return the log of the ratio (W,) of the likelihoods of a slip and of a smooth motion."""
-    turned, moved = (
-        logsumexp(each.slipped + weight, axis=1) - logsumexp(each.smooth + weight, axis=1)
-        for each, weight in zip(found, weights, strict=True)
+def _slip_evidence(
+    usual: Sequence[_Likelihoods], found: Sequence[_Likelihoods], weights: Sequence[FloatArray]
+) -> FloatArray:
+    """Return the log of the ratio (W,) of the likelihoods of a slip and of a smooth motion.
+
+    Args:
+        usual: Likelihoods of rotation and translation, without a frame under way.
+        found: Likelihoods for the duration of the slip.
+        weights: Log of the shares of the motions, for rotation and translation.
+    """
+    smooth = [logsumexp(each.smooth + weight, axis=1) for each, weight in zip(usual, weights, strict=True)]
+    slipped, still = (
+        [
+            logsumexp(values + weight, axis=1) - base
+            for values, weight, base in zip(part, weights, smooth, strict=True)
+        ]
+        for part in ([each.slipped for each in found], [each.smooth for each in found])
     )
     # A slip turns the camera, or moves it, or both.
-    return np.asarray(logsumexp([turned + moved, turned, moved], axis=0) - np.log(3.0))
+    either = [slipped[0] + slipped[1], slipped[0] + still[1], still[0] + slipped[1]]
+    return np.asarray(logsumexp(either, axis=0) - np.log(3.0))
 
 
 def _wrong_frames_evidence(window: _Windows, weights: Sequence[FloatArray]) -> float:

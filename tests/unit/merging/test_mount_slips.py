@@ -65,6 +65,15 @@ def test_a_slip_is_found_with_its_instant_and_step(step: FloatArray, fps: float)
     assert slip.sigma_m < 0.005
 
 
+def test_a_slip_that_lasts_two_frames_is_found() -> None:
+    half = make_transform(so3_exp(np.radians(7.5) * AXIS), np.zeros(3))
+    slip = find_slip(_with_step(_with_step(_arm(), half, SLIP_S - 0.001), half, SLIP_S + 0.03))
+    assert slip is not None
+    assert abs(1e-9 * slip.time_ns - SLIP_S) <= 2.0 / 30.0
+    # 4 sigma per axis bound the length of an error with three axes in 99.9 % of the cases.
+    assert rotation_angle_rad(TURN[:3, :3].T @ slip.before_from_after[:3, :3]) < 4.0 * slip.sigma_rad
+
+
 def test_a_smooth_path_has_no_slip() -> None:
     assert find_slip(_arm()) is None
 
