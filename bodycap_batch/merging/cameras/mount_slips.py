@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import logsumexp
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.model.geometry import invert, make_transform, rotation_angle_rad, so3_exp, so3_log
 from bodycap_batch.model.skeleton import MountSlip
@@ -41,6 +41,8 @@ docs/decisions/merging.md."""
 _MISSING_INTERVALS = 0.5, 3.5
 """Limits of the number of frame intervals that a recording lacks at one instant. Evidence:
 docs/decisions/merging.md."""
+_USUAL_WINDOWS = 300
+"""Number of windows of a take of 10 s, as those that determined the minimum evidence."""
 _MIN_STEP = float(np.radians(5.0)), 0.015
 """Minimum step of a slip: radians, or metres. A smaller step is within the uncertainty of a mount."""
 
@@ -48,6 +50,9 @@ _NEXT_FRAME = 1.5
 """Maximum step between successive frames without a lost frame between them, in frame intervals."""
 _PIVOT_ITERATIONS = 10
 """Number of iterations of the robust fit of the pivot. Evidence: none."""
+_WINDOWS_AT_ONCE = 1000
+"""Number of windows that are compared at once, and that show how often each motion occurs. Derivation: they
+need 140 MB."""
 _EM_ITERATIONS = 15
 """Number of iterations that fit the shares of the motions. Evidence: none."""
 _FREE_SHARE = 0.002
@@ -104,11 +109,10 @@ class _Windows(NamedTuple):
     rotation: FloatArray
     moves: tuple[FloatArray, FloatArray]
 
-    def at(self, index: int) -> _Windows:
-        """Return one of the windows."""
-        one = slice(index, index + 1)
-        moves = (self.moves[0][one], self.moves[1][one])
-        return _Windows(self.first_after[one], self.times_s[one], self.rotation[one], moves)
+    def take(self, index: IntArray | slice) -> _Windows:
+        """Return some of the windows."""
+        moves = (self.moves[0][index], self.moves[1][index])
+        return _Windows(self.first_after[index], self.times_s[index], self.rotation[index], moves)
 
 
 class _Likelihoods(NamedTuple):
@@ -185,21 +189,24 @@ def _steps(track: CameraTrack) -> list[_Step]:
     windows = _windows(replace(track, map_from_cam=track.map_from_cam @ pivot_in_cam), frames)
     if not len(windows.first_after):
         return []
-    durations = [
-        [_likelihoods(windows, part, move, wrong) for part, move in zip(_PARTS, windows.moves, strict=True)]
-        for wrong in _transitions()
-    ]
-    weights = [_motion_weights(each.smooth) for each in durations[0]]
-    all_evidence = np.array([_slip_evidence(durations[0], each, weights) for each in durations])
-    evidence = np.asarray(logsumexp(all_evidence, axis=0) - np.log(len(durations)))
+    sample = windows.take(evenly_spaced(len(windows.first_after), _WINDOWS_AT_ONCE))
+    weights = [_motion_weights(each.smooth) for each in _both_parts(sample)]
+    by_duration = np.hstack(
+        [
+            _slip_evidence(windows.take(slice(start, start + _WINDOWS_AT_ONCE)), weights)
+            for start in range(0, len(windows.first_after), _WINDOWS_AT_ONCE)
+        ]
+    )
+    evidence = np.asarray(logsumexp(by_duration, axis=0) - np.log(len(by_duration)))
+    # A slip is as likely in a long take as in a short one, but a long take has more instants.
+    evidence -= np.log(max(1.0, len(evidence) / _USUAL_WINDOWS))
     out: list[_Step] = []
     for index in _peaks(evidence):
-        if evidence[index] - _wrong_frames_evidence(windows.at(index), weights) < _LOG_EVIDENCE:
+        window = windows.take(slice(index, index + 1))
+        if evidence[index] - _wrong_frames_evidence(window, weights) < _LOG_EVIDENCE:
             continue
-        found = durations[int(np.argmax(all_evidence[:, index]))]
-        step = _mean_step(
-            int(windows.first_after[index]), [_only(each, index) for each in found], weights, pivot_in_cam
-        )
+        under_way = _transitions()[int(np.argmax(by_duration[:, index]))]
+        step = _mean_step(int(window.first_after[0]), _both_parts(window, under_way), weights, pivot_in_cam)
         if out and _undoes(step.before_from_after, out[-1].before_from_after):
             out.pop()
         elif _is_slip(step.before_from_after) and not _is_along_path(track, step, stride):
@@ -322,27 +329,41 @@ def _motion_weights(smooth: FloatArray) -> FloatArray:
     return weights
 
 
-def _slip_evidence(
-    usual: Sequence[_Likelihoods], found: Sequence[_Likelihoods], weights: Sequence[FloatArray]
-) -> FloatArray:
-    """Return the log of the ratio (W,) of the likelihoods of a slip and of a smooth motion.
+def _both_parts(windows: _Windows, wrong: BoolArray | None = None) -> list[_Likelihoods]:
+    """Return the likelihoods of the rotation and of the translation, with frames (2K,) that may be wrong."""
+    return [
+        _likelihoods(windows, part, move, wrong) for part, move in zip(_PARTS, windows.moves, strict=True)
+    ]
+
+
+def _slip_evidence(windows: _Windows, weights: Sequence[FloatArray]) -> FloatArray:
+    """Return the log of the ratio (D,W) of the likelihoods of a slip and of a smooth motion.
 
     Args:
-        usual: Likelihoods of rotation and translation, without a frame under way.
-        found: Likelihoods for the duration of the slip.
+        windows: The windows.
         weights: Log of the shares of the motions, for rotation and translation.
+
+    Returns:
+        The ratios for D durations of the slip, see `_transitions`.
     """
-    smooth = [logsumexp(each.smooth + weight, axis=1) for each, weight in zip(usual, weights, strict=True)]
-    slipped, still = (
-        [
-            logsumexp(values + weight, axis=1) - base
-            for values, weight, base in zip(part, weights, smooth, strict=True)
-        ]
-        for part in ([each.slipped for each in found], [each.smooth for each in found])
-    )
-    # A slip turns the camera, or moves it, or both.
-    either = [slipped[0] + slipped[1], slipped[0] + still[1], still[0] + slipped[1]]
-    return np.asarray(logsumexp(either, axis=0) - np.log(3.0))
+    usual = [
+        logsumexp(each.smooth + weight, axis=1)
+        for each, weight in zip(_both_parts(windows), weights, strict=True)
+    ]
+    out = []
+    for wrong in _transitions():
+        found = _both_parts(windows, wrong)
+        slipped, still = (
+            [
+                logsumexp(values + weight, axis=1) - base
+                for values, weight, base in zip(part, weights, usual, strict=True)
+            ]
+            for part in ([each.slipped for each in found], [each.smooth for each in found])
+        )
+        # A slip turns the camera, or moves it, or both.
+        either = [slipped[0] + slipped[1], slipped[0] + still[1], still[0] + slipped[1]]
+        out.append(logsumexp(either, axis=0) - np.log(3.0))
+    return np.array(out)
 
 
 def _wrong_frames_evidence(window: _Windows, weights: Sequence[FloatArray]) -> float:
@@ -354,8 +375,8 @@ def _wrong_frames_evidence(window: _Windows, weights: Sequence[FloatArray]) -> f
         blocks.append((frames < _HALF_FRAMES) & (frames >= _HALF_FRAMES - length))
     total = [
         sum(
-            float(logsumexp(_likelihoods(window, part, move, block).smooth + weight))
-            for part, move, weight in zip(_PARTS, window.moves, weights, strict=True)
+            float(logsumexp(each.smooth + weight))
+            for each, weight in zip(_both_parts(window, block), weights, strict=True)
         )
         for block in blocks
     ]
@@ -395,10 +416,6 @@ def _peaks(evidence: FloatArray) -> list[int]:
     return sorted(out)
 
 
-def _only(found: _Likelihoods, index: int) -> _Likelihoods:
-    return _Likelihoods(*(each[index] for each in found))
-
-
 def _mean_step(
     first_after: int,
     found: Sequence[_Likelihoods],
@@ -409,17 +426,18 @@ def _mean_step(
 
     Args:
         first_after: Index of the first frame after the step.
-        found: Likelihoods of rotation and translation in the window; the translation is the pivot's.
+        found: Likelihoods of rotation and translation in this one window; the translation is the pivot's.
         weights: Log of the shares of the motions, for rotation and translation.
         pivot_in_cam: (4,4) axes of the camera at the pivot, in the camera's frame.
     """
     means, sigmas = [], []
     for each, weight in zip(found, weights, strict=True):
-        share = np.exp(each.slipped + weight - logsumexp(each.slipped + weight))
-        mean = share @ each.step
-        spread = ((each.step - mean) ** 2).mean(axis=1)
+        slipped, steps = each.slipped[0] + weight, each.step[0]
+        share = np.exp(slipped - logsumexp(slipped))
+        mean = share @ steps
+        spread = ((steps - mean) ** 2).mean(axis=1)
         means.append(mean)
-        sigmas.append(float(np.sqrt(share @ (each.variance + spread))))
+        sigmas.append(float(np.sqrt(share @ (each.variance[0] + spread))))
     turn = so3_exp(means[0])
     # The translation was fitted in the axes of the camera after the step.
     step = pivot_in_cam @ make_transform(turn, turn @ means[1]) @ invert(pivot_in_cam)
