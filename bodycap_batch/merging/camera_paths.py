@@ -55,7 +55,7 @@ def with_solved_centres(
 
     Args:
         trajectory: The measured trajectory of the camera in the world.
-        track: The measured poses of the camera in the motion graph.
+        track: The measured poses of the camera in the motion graph: those at its place before a slip.
         mount: The solved mount of the camera.
         solution: The solved motion.
         world_from_solved: Rigid transform from the solved frame of reference to the world.
@@ -66,6 +66,8 @@ def with_solved_centres(
     if is_uncalibrated(mount):
         return trajectory
     solved = world_from_solved.apply_to_poses(solution.world_from_cam[track.camera])
+    if mount.slip is not None:
+        solved = mount.slip.as_moved(solved, track.times_ns)
     poses = np.array(trajectory.gauge_from_cam)
     poses[track.frames] = _blend_centres(poses[track.frames], solved, solution.weights[track.camera])
     return replace(trajectory, gauge_from_cam=poses)

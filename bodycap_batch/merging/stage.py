@@ -23,6 +23,7 @@ from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSi
 from bodycap_batch.merging.camera_paths import trajectory_in_world, with_solved_centres
 from bodycap_batch.merging.camera_selection import select_cameras
 from bodycap_batch.merging.cameras.excluded_cameras import MIN_LOCALISED_FRAMES
+from bodycap_batch.merging.cameras.mount_slips import find_slip, without_slip
 from bodycap_batch.merging.cameras.still_parts import still_parts
 from bodycap_batch.merging.cameras.track import CameraTrack, inflate_sigmas, make_track
 from bodycap_batch.merging.cameras.track_outliers import remove_outliers
@@ -65,7 +66,7 @@ from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs, MergeResult, SolvedBody
 from bodycap_batch.model.merge_report import AlignedCameraReport
 from bodycap_batch.model.scene import Trajectory
-from bodycap_batch.model.skeleton import Mount, SkeletonModel
+from bodycap_batch.model.skeleton import Mount, MountSlip, SkeletonModel
 
 _EXPECTED_ITERATIONS = 80
 """Expected number of optimiser iterations in the whole stage. Evidence: none.
@@ -145,13 +146,15 @@ def _solve_body(
         CalibrationInput(
             tracks,
             prepared.provisional,
-            {camera: PoseSigma(*sigmas) for camera, sigmas in aligned.sigmas.items()},
+            _pose_sigmas(aligned.sigmas, prepared.slips),
             aligned.main_from_gauge,
         ),
         step,
     )
     step.what = "solving"
     scale = calibration.scale.metres_per_unit
+    slips = {camera: slip.scaled(scale / prepared.provisional) for camera, slip in prepared.slips.items()}
+    solved_mounts = tuple(replace(mount, slip=slips.get(mount.camera)) for mount in calibration.mounts)
     tracks = [within_ticks(track, tick_times) for track in tracks]
     metric = [track.scaled(scale) for track in tracks]
     rules = soft_limits(inputs.skeleton, bones, inputs.activity)
@@ -186,9 +189,9 @@ def _solve_body(
     paths = tuple(trajectory_in_world(each, world_from_map, prepared.dropped[each.camera]) for each in used)
     if options.camera_paths == "joint":
         own = {track.camera: track for track in metric}
-        solved_mounts = {mount.camera: mount for mount in calibration.mounts}
+        by_camera = {mount.camera: mount for mount in solved_mounts}
         paths = tuple(
-            with_solved_centres(path, own[path.camera], solved_mounts[path.camera], solution, to_world)
+            with_solved_centres(path, own[path.camera], by_camera[path.camera], solution, to_world)
             for path in paths
         )
     observed = observed_joints(inputs.skeleton, bones, tracks, tick_times, options.max_gap_s)
@@ -202,7 +205,7 @@ def _solve_body(
         solved=placed.solved,
         observed=observed,
         trajectories=paths,
-        mounts=calibration.mounts,
+        mounts=solved_mounts,
         standing=standing_joints(contacts, len(tick_times), len(placed.solved)),
     )
     step("projecting")
@@ -233,6 +236,7 @@ def _solve_body(
                 dropped=prepared.dropped,
                 floor=placed.floor,
                 still_ns=prepared.still_ns,
+                slips=slips,
                 unused=aligned.unused,
                 aligned={name: AlignedCameraReport(**sigmas) for name, sigmas in aligned.report().items()},
                 joint_sigma_m=sigma_percentiles(inputs.skeleton.roles, covariance, observed),
@@ -328,12 +332,15 @@ class _PreparedTracks:
         dropped: By camera, (N,) numbers of the frames with gross errors.
         still_ns: By camera that stands still in the room for some time while the trunk moves, the first and
             the last common time of the frames that are not used therefore.
+        slips: By camera whose mount slips, the slip, in metres at the provisional scale. The poses in
+            `tracks` are those at the place before the slip.
     """
 
     tracks: list[CameraTrack]
     provisional: float
     dropped: dict[str, IntArray]
     still_ns: dict[str, tuple[int, int]]
+    slips: dict[str, MountSlip]
 
 
 def _prepare_tracks(
@@ -354,12 +361,29 @@ def _prepare_tracks(
         tracks[position] = tracks[position].keep(~still)
     if still_ns:
         provisional = provisional_scale(bones, tracks, mounts)
-    cleaned, dropped = [], {}
+    cleaned, dropped, slips = [], {}, {}
     for track in tracks:
         kept = remove_outliers(track, provisional, inputs.clocks[track.camera].nominal_fps)
         dropped[track.camera] = np.setdiff1d(track.frames, kept.frames)
+        if slip := find_slip(kept.scaled(provisional)):
+            slips[track.camera] = slip
+            kept = without_slip(kept, slip, provisional)
         cleaned.append(kept)
-    return _PreparedTracks(cleaned, provisional_scale(bones, cleaned, mounts), dropped, still_ns)
+    scale = provisional_scale(bones, cleaned, mounts)
+    slips = {camera: slip.scaled(scale / provisional) for camera, slip in slips.items()}
+    return _PreparedTracks(cleaned, scale, dropped, still_ns, slips)
+
+
+def _pose_sigmas(
+    aligned: Mapping[str, tuple[float, float]], slips: Mapping[str, MountSlip]
+) -> dict[str, PoseSigma]:
+    """Return the uncertainty of the pose of a camera's map, or of a camera after a slip, by camera."""
+    slipped = {camera: (slip.sigma_rad, slip.sigma_m) for camera, slip in slips.items()}
+    none = (0.0, 0.0)
+    return {
+        camera: PoseSigma(*np.hypot(aligned.get(camera, none), slipped.get(camera, none)).tolist())
+        for camera in sorted({*aligned, *slipped})
+    }
 
 
 def _usable_still_parts(

@@ -284,6 +284,40 @@ class InvertedCamerasReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MountSlipReport:
+    """A slip of a camera's mount: after it, the camera has another pose on its bone.
+
+    Attributes:
+        at_s: Time of the slip, seconds after tick 0.
+        turned_deg: Angle by which the camera turned, degrees.
+        moved_m: Distance by which the camera moved, metres.
+        sigma_deg: Sigma of the turn, degrees per axis.
+        sigma_m: Sigma of the move, metres per axis.
+        joint_from_cam: (4,4) pose of the camera in the frame of the joint after the slip, metres.
+    """
+
+    at_s: float
+    turned_deg: float
+    moved_m: float
+    sigma_deg: float
+    sigma_m: float
+    joint_from_cam: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlippedMountsReport:
+    """The cameras whose mounts slipped.
+
+    Attributes:
+        cameras: By camera name, the slip of its mount.
+        says: Sentence about these cameras for the user.
+    """
+
+    cameras: Mapping[str, MountSlipReport]
+    says: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AlignedCameraReport:
     """The sigmas of the pose of a map that was aligned with another map: degrees and metres, per axis.
 
@@ -357,6 +391,7 @@ class MergeReport:
         cameras: By camera name, the measurements of the camera.
         exchanged_sides: Cameras that seem to be on the wrong side of the body; None if there are none.
         inverted_cameras: Cameras that are mounted upside down; None if there are none.
+        slipped_mounts: Cameras whose mounts slipped; None if there are none.
         still_cameras: By name of a camera on a limb that stands still in the room for some time while the
             trunk moves, the time in which its frames are not used for the body.
         unused_cameras: By camera name, the reason why the camera's map could not be linked to the body. Only
@@ -388,6 +423,7 @@ class MergeReport:
     cameras: Mapping[str, CameraReport]
     exchanged_sides: SwappedSidesReport | None = field(metadata=_EMPTY_IF_NONE)
     inverted_cameras: InvertedCamerasReport | None = field(default=None, metadata=_OMIT_NONE)
+    slipped_mounts: SlippedMountsReport | None = field(default=None, metadata=_OMIT_NONE)
     still_cameras: Mapping[str, StillPartReport]
     unused_cameras: Mapping[str, str]
     joined_cameras: Mapping[str, AlignedCameraReport]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
-from bodycap_batch.model.geometry import make_transform
+from bodycap_batch.model.geometry import invert, make_transform
 
 _MAX_SOLE_M = 0.15
 """Maximum height, metres, of the lowest joint of the feet above or below the floor. Derivation: the ankles of
@@ -76,6 +76,58 @@ class SkeletonModel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MountSlip:
+    """A step of a camera on its bone: the strap slipped, and the camera stays at its new place.
+
+    Attributes:
+        time_ns: Common time of the first frame after the slip, nanoseconds.
+        before_from_after: (4,4) pose of the camera after the slip, in its axes before the slip, metres.
+        sigma_rad: Standard deviation of the rotation, radians per axis.
+        sigma_m: Standard deviation of the translation, metres per axis.
+    """
+
+    time_ns: int
+    before_from_after: FloatArray
+    sigma_rad: float
+    sigma_m: float
+
+    def __post_init__(self) -> None:
+        set_array(self, "before_from_after", (4, 4))
+
+    def scaled(self, ratio: float) -> MountSlip:
+        """Return the slip at another metric scale: all lengths multiplied by `ratio`."""
+        step = self.before_from_after.copy()
+        step[:3, 3] *= ratio
+        return replace(self, before_from_after=step, sigma_m=ratio * self.sigma_m)
+
+    def as_before(self, poses: FloatArray, times_ns: IntArray) -> FloatArray:
+        """Return the poses that the camera would have at its place before the slip.
+
+        Args:
+            poses: (N,4,4) poses of the camera, metres.
+            times_ns: (N,) common times of the poses.
+
+        Returns:
+            (N,4,4) poses; those before the slip remain unchanged.
+        """
+        after = (times_ns >= self.time_ns)[:, None, None]
+        return np.asarray(np.where(after, poses @ invert(self.before_from_after), poses))
+
+    def as_moved(self, poses: FloatArray, times_ns: IntArray) -> FloatArray:
+        """Return the inverse of `as_before`: from the place before the slip to the actual place.
+
+        Args:
+            poses: (N,4,4) poses at the place before the slip, metres.
+            times_ns: (N,) common times of the poses.
+
+        Returns:
+            (N,4,4) poses of the camera.
+        """
+        after = (times_ns >= self.time_ns)[:, None, None]
+        return np.asarray(np.where(after, poses @ self.before_from_after, poses))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Mount:
     """The pose of a camera in the frame of its bone.
 
@@ -87,6 +139,7 @@ class Mount:
         sigma_m: Standard deviation of the position, metres per axis.
         by_name: True if the rotation and its standard deviation were chosen only from the name of the camera,
             because the job does not give a rotation.
+        slip: The slip after which the camera has another pose on the bone; None without one.
     """
 
     camera: str
@@ -95,6 +148,7 @@ class Mount:
     sigma_rad: float
     sigma_m: float
     by_name: bool = False
+    slip: MountSlip | None = None
 
     def __post_init__(self) -> None:
         set_array(self, "joint_from_cam", (4, 4))

@@ -253,6 +253,17 @@ BODY_RULES = (
         "poses are wrong.",
     ),
     Rule(
+        name="Straps",
+        read=readings.read_slips,
+        grade=Grade.FAIR,
+        finding="{says}",
+        rationale="The camera jumped to another place on the body from one frame to the next and stayed "
+        "there; a limb moves smoothly. A strap that slides slowly, or that slips while the limb is thrown "
+        "about or while frames are lost, is not found.",
+        action="Tighten the strap of {names}, and check it during the take.",
+        priority=2.6,
+    ),
+    Rule(
         name="Cameras on one bone",
         read=readings.read_shared_segment,
         bounds=Bounds(good=2.0, fair=6.0),

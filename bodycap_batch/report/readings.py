@@ -103,6 +103,14 @@ def says(path: str) -> Reader:
     return read
 
 
+def read_slips(metrics: Metrics) -> Reading | None:
+    """Read which mounts slipped."""
+    found = metric_at(metrics, "merge.slipped_mounts")
+    if not found:
+        return None
+    return Reading(words={"says": str(found["says"]), "names": " and ".join(sorted(found["cameras"]))})
+
+
 def chance(path: str, sources: str) -> Reader:
     """Return a function that reads how probable a disagreement between scales is, if all scales are correct.
 

@@ -73,6 +73,7 @@ def run_merge(task: MergeTask, context: StageContext, files: Path) -> None:
     notes = [f"camera {name} is not used for the body: {why}" for name, why in result.unused_cameras.items()]
     notes += [result.report.exchanged_sides.says] if result.report.exchanged_sides is not None else []
     notes += [result.report.inverted_cameras.says] if result.report.inverted_cameras is not None else []
+    notes += [result.report.slipped_mounts.says] if result.report.slipped_mounts is not None else []
     write_summary(files, unused_cameras=dict(result.unused_cameras), notes=notes)
 
 

@@ -38,6 +38,7 @@ from tests.bench import (
     seeds,
     shutter,
     simulation,
+    slips,
     solving,
     spool,
     sync,
@@ -66,6 +67,7 @@ _WITH_OPTIONS = {
     "drawn": drawn.main,
     "elbows": elbows.main,
     "scale": scale.main,
+    "slips": slips.main,
     "bare": bare.main,
     "inertial": inertial.main,
     "shutter": shutter.main,
@@ -96,12 +98,12 @@ def main() -> int:
         "with several seeds), `clocks` (from generated sound and motion), `sync` (ten minutes of sound), "
         "`inertial` (gaps filled from a sensor), `violent` (whole jobs with and without sensors), "
         "`lenses` (named profiles in the adjustment), `body` (joints without cameras), `elbows` (their "
-        "flexion with a height alone), `scale` (the metric scale with a height alone), `bare` (a camera at "
-        "plain surfaces), `shutter` (drawn readout times against global shutters), `mappers` (the "
-        "incremental and the global mapper), `paired` (two versions on perturbed captures), `real` (the "
-        "table of the real captures), `measure` (how well the pictures judge poses), `synth` (seconds of a "
-        "rendered frame), `verdict` (grades of stored results), `drawn` (renders the drawn captures), "
-        "`lens` (the lens from tracks), and `long` (ten minutes of three cameras)",
+        "flexion with a height alone), `scale` (the metric scale with a height alone), `slips` (mounts that "
+        "slip), `bare` (a camera at plain surfaces), `shutter` (drawn readout times against global "
+        "shutters), `mappers` (the incremental and the global mapper), `paired` (two versions on perturbed "
+        "captures), `real` (the table of the real captures), `measure` (how well the pictures judge poses), "
+        "`synth` (seconds of a rendered frame), `verdict` (grades of stored results), `drawn` (renders the "
+        "drawn captures), `lens` (the lens from tracks), and `long` (ten minutes of three cameras)",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures with ground truth")
     parser.add_argument("--lab", type=Path, default=LAB)

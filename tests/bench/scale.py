@@ -53,7 +53,7 @@ class Outcome:
 
 def drawn_options(number: int, seed: int, motions: Path) -> Iterator[tuple[str, SynthOptions]]:
     """Yield the name and the options of each capture; a capture does not depend on their number."""
-    lengths = {path: _length_s(path) for path in sorted(motions.glob("*.bvh"))}
+    lengths = {path: length_s(path) for path in sorted(motions.glob("*.bvh"))}
     kinds: list[str | Path] = [*_WALKS, *lengths]
     for index in range(number):
         rng = np.random.default_rng([seed, index])
@@ -136,6 +136,7 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _length_s(path: Path) -> float:
+def length_s(path: Path) -> float:
+    """Return the usable duration of a recorded motion, seconds."""
     motion = read_bvh(path)[1]
     return 0.0 if motion is None else (len(motion.root_in_world_m) - 2) / motion.fps - 0.1

@@ -21,6 +21,7 @@ from bodycap_batch.model.geometry import interpolate_pose
 from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Trajectory
+from bodycap_batch.model.skeleton import MountSlip
 from bodycap_batch.pipeline.stage_results import StageResults, report_task
 from bodycap_batch.report import ReportInputs
 from bodycap_batch.report.advice import count_shared_points, recommend_changes
@@ -243,6 +244,23 @@ def test_contradictions_of_the_body_are_recommended_first(
     contradicted = replace(inputs, metrics=metrics)
     assert action in advice(contradicted)[0].action
     assert "0.5 s behind" in written(contradicted, tmp_path)
+
+
+def test_a_slip_is_in_the_timeline_of_its_camera(inputs: ReportInputs, tmp_path: Path) -> None:
+    assert inputs.merge is not None
+    assert 'class="slip"' not in written(inputs, tmp_path)
+    path = inputs.merge.trajectories[1]
+    middle = int(path.times_ns[len(path.times_ns) // 2])
+    slip = MountSlip(time_ns=middle, before_from_after=np.eye(4), sigma_rad=0.01, sigma_m=0.01)
+    mounts = tuple(
+        replace(mount, slip=slip if mount.camera == path.camera else None) for mount in inputs.merge.mounts
+    )
+    slipped = replace(inputs, merge=replace(inputs.merge, mounts=mounts))
+    span = (1e-9 * float(path.times_ns[0]), 1e-9 * float(path.times_ns[-1]))
+    drawn = draw_camera_timeline(slipped, path.camera, span, [], 0.0)
+    x = float(x_from_time(1e-9 * middle, span))
+    assert f'class="slip" d="M{x:.1f}'.removesuffix(".0") in drawn
+    assert written(slipped, tmp_path).count('class="slip"') == 1
 
 
 def test_an_unknown_clock_is_in_the_first_line_and_costs_coverage(

@@ -166,10 +166,13 @@ def _camera_targets(
             trajectory.times_ns[localised], None if rows is None else rows[localised]
         )
         order = np.argsort(times, kind="stable")
+        own_poses = trajectory.gauge_from_cam[localised[order]]
+        if mount.slip is not None:
+            own_poses = mount.slip.as_before(own_poses, times[order])
         interval = np.median(np.diff(trajectory.times_ns)) if len(trajectory.times_ns) > 1 else 0.0
         poses, found = poses_at(
             times[order],
-            trajectory.gauge_from_cam[localised[order]],
+            own_poses,
             body.times_ns(),
             max_gap_ns=round(_MAX_GAP_INTERVALS * float(interval)),
             snap_ns=_SNAP_NS,

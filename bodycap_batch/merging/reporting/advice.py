@@ -11,6 +11,7 @@ import numpy as np
 
 from bodycap_batch.merging.body_calibration.calibrate_body import BodyCalibration
 from bodycap_batch.merging.world.vertical import Vertical
+from bodycap_batch.model.merge_report import MountSlipReport
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import split_side
 
@@ -81,6 +82,23 @@ def describe_inverted_cameras(rolls_deg: Mapping[str, float], cameras: int) -> s
         f"from the position of the limbs, the roll from the usual mount is {measured}; the body is solved "
         "with this roll, so if they are mounted upright, give their mounts (joint_from_cam)"
     )
+
+
+def describe_slips(slips: Mapping[str, MountSlipReport]) -> str:
+    """Describe mounts that slipped.
+
+    Args:
+        slips: By camera, the slip of its mount.
+
+    Returns:
+        A sentence for the report.
+    """
+    parts = [
+        f"the mount of {name} slipped {slip.at_s:.1f} s after the start of the motion: the camera turned by "
+        f"{slip.turned_deg:.0f}° and moved by {100.0 * slip.moved_m:.1f} cm"
+        for name, slip in sorted(slips.items())
+    ]
+    return f"{'; '.join(parts)}; from then on, the body is solved with the new place of the camera"
 
 
 def describe_unknown_way_up(camera: str) -> str:

@@ -24,6 +24,7 @@ from bodycap_batch.merging.reporting.advice import (
     describe_inverted_cameras,
     describe_mount,
     describe_scale,
+    describe_slips,
     describe_swapped_sides,
     describe_unknown_way_up,
     describe_vertical,
@@ -43,18 +44,20 @@ from bodycap_batch.model.merge_report import (
     LimbScalesReport,
     MergeReport,
     MountReport,
+    MountSlipReport,
     OtherVerticalReport,
     Percentiles,
     RunnerUpRollReport,
     ScaleReport,
     ScaleSourceReport,
+    SlippedMountsReport,
     SolverReport,
     StillPartReport,
     SwappedSidesReport,
     TPoseReport,
     VerticalReport,
 )
-from bodycap_batch.model.skeleton import Mount
+from bodycap_batch.model.skeleton import Mount, MountSlip
 from bodycap_batch.model.skeleton_presets import split_side
 
 _DOWN_WEIGHTED = 0.25
@@ -78,6 +81,7 @@ class MotionFacts:
         floor: The floor.
         still_ns: By camera that stands still in the room for some time while the trunk moves, the first and
             the last common time of the frames that are not used therefore.
+        slips: By camera whose mount slips, the slip.
         unused: By name of an unused camera, the reason why the camera is not used.
         aligned: By camera, uncertainty of the pose of this camera's map in the main map. The mapping contains
             only cameras whose map was aligned to the main map.
@@ -98,6 +102,7 @@ class MotionFacts:
     dropped: Mapping[str, IntArray]
     floor: Floor
     still_ns: Mapping[str, tuple[int, int]]
+    slips: Mapping[str, MountSlip]
     unused: Mapping[str, str]
     aligned: Mapping[str, AlignedCameraReport]
     joint_sigma_m: Mapping[str, Mapping[str, Mapping[str, float]]]
@@ -141,6 +146,7 @@ def build_report(
         cameras={track.camera: _camera_report(track, solution, facts) for track in tracks},
         exchanged_sides=_sides_report(inputs.mounts, calibration, main_tracks),
         inverted_cameras=_inverted_cameras_report(inputs.mounts, calibration),
+        slipped_mounts=_slips_report(calibration.mounts, facts),
         still_cameras={
             camera: StillPartReport(
                 from_s=round(1e-9 * (first_ns - facts.start_ns), 3),
@@ -319,6 +325,27 @@ def _mount_report(prior: Mount, solved: Mount, calibration: BodyCalibration) -> 
         if has_unknown_roll(prior)
         else None,
         known_to=describe_mount(solved, t_pose=calibration.t_pose_ns is not None),
+    )
+
+
+def _slips_report(mounts: Sequence[Mount], facts: MotionFacts) -> SlippedMountsReport | None:
+    slips = {
+        mount.camera: _slip_report(mount, facts.slips[mount.camera], facts.start_ns)
+        for mount in mounts
+        if mount.camera in facts.slips
+    }
+    return SlippedMountsReport(cameras=slips, says=describe_slips(slips)) if slips else None
+
+
+def _slip_report(mount: Mount, slip: MountSlip, start_ns: int) -> MountSlipReport:
+    step = slip.before_from_after
+    return MountSlipReport(
+        at_s=round(1e-9 * (slip.time_ns - start_ns), 3),
+        turned_deg=round(float(np.degrees(rotation_angle_rad(step[:3, :3]))), 3),
+        moved_m=round(float(np.linalg.norm(step[:3, 3])), 5),
+        sigma_deg=round(float(np.degrees(slip.sigma_rad)), 3),
+        sigma_m=round(slip.sigma_m, 5),
+        joint_from_cam=tuple(tuple(row) for row in (mount.joint_from_cam @ step).tolist()),
     )
 
 

@@ -110,6 +110,7 @@ def draw_camera_timeline(
     if path is not None:
         lost_bars = [_lost_bar(loss, times, bridged_s) for loss in losses]
         parts.append(_draw_status(path, times, span_s, lost_bars, columns))
+        parts.append(_draw_slip(inputs, camera, span_s))
         top += _STATUS_HEIGHT + _MARGIN
     for curve in curves:
         parts.append(_draw_curve(curve, times, span_s, top, columns))
@@ -246,6 +247,17 @@ def _draw_status(
         lines = "".join(f"M{number(x)} 4V{number(4.0 + _STATUS_HEIGHT / 3)}" for x in positions)
         parts.append(element("path", class_="key", d=lines))
     return _draw_bars(path, times, span_s, lost_bars, columns) + "".join(parts)
+
+
+def _draw_slip(inputs: ReportInputs, camera: str, span_s: tuple[float, float]) -> str:
+    """Draw a line at the time at which the mount of a camera slips; "" if it does not slip."""
+    mounts = () if inputs.merge is None else inputs.merge.mounts
+    slip = next((mount.slip for mount in mounts if mount.camera == camera), None)
+    if slip is None:
+        return ""
+    x = float(x_from_time(1e-9 * slip.time_ns, span_s))
+    title = element("title", "the mount slips")
+    return element("path", title, class_="slip", d=f"M{number(x)} 0V{number(8.0 + _STATUS_HEIGHT)}")
 
 
 def _draw_bars(

@@ -120,6 +120,17 @@ def test_a_camera_that_fell_off_is_named_in_the_coverage() -> None:
     assert any(each.action.startswith("Fasten torso") for each in verdict.coverage.advice)
 
 
+def test_a_strap_that_slipped_is_named_with_advice() -> None:
+    values = metrics()
+    assert not any(each.name == "Straps" for each in judge(values, None).criteria)
+    says = "the mount of left_palm slipped 4.2 s after the start of the motion"
+    values["merge"]["slipped_mounts"] = {"cameras": {"left_palm": {}}, "says": says}  # type: ignore[index]
+    (found,) = (each for each in judge(values, None).criteria if each.name == "Straps")
+    assert (found.grade, found.finding) == (Grade.FAIR, says)
+    assert found.advice is not None
+    assert found.advice.action.startswith("Tighten the strap of left_palm")
+
+
 def test_warnings_about_the_skeleton_file_are_doubts() -> None:
     values = metrics()
     skeleton: dict[str, list[str]] = {"notes": ["up is +Z"], "warnings": []}
