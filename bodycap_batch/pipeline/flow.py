@@ -358,7 +358,8 @@ class Flow:
     def use_sensors(self, registrations: ByCamera) -> ByCamera:
         """Use the inertial sensors of the cameras that have telemetry, and report notes to the user.
 
-        Without telemetry, or if all uses are switched off, the registrations are returned unchanged.
+        Without telemetry, the registrations are returned unchanged. Telemetry also shows how stabilised
+        pictures are turned, so it is read if all uses of the sensors are switched off.
         """
         off = {
             field: False
@@ -366,9 +367,11 @@ class Flow:
             if not is_on(mechanism)
         }
         options = self._job.telemetry.model_copy(update=off)
-        if not (options.gravity or options.smoothing or options.gaps or options.gps):
-            return registrations
-        cameras = [camera for camera in self._capture.cameras if camera.name in self._with_telemetry]
+        cameras = [
+            camera
+            for camera in self._capture.cameras
+            if camera.name in self._with_telemetry or camera.stabilised
+        ]
         tasks = []
         for own in cameras:
             ordered = [own, *(camera for camera in cameras if camera.name != own.name)]
@@ -379,6 +382,7 @@ class Flow:
                 capture=self._footage(ordered),
                 registrations=refs_by_camera({name: registrations[name] for name in names}),
                 samples={name: self._samples[name] for name in names if name in self._samples},
+                stabilised=own.stabilised,
             )
             tasks.append(make_task(INERTIAL, task, camera=own.name))
         used = self.runner.run_all(tasks)
