@@ -46,11 +46,16 @@ Evidence: none.
 """
 
 
-def setting_notes(camera: CaptureCamera) -> list[str]:
-    """Return notes on a camera's settings, found in the first chapter's metadata and in the frame times."""
+def setting_notes(camera: CaptureCamera, *, stabilised: bool | None = None) -> list[str]:
+    """Return notes on a camera's settings, found in the first chapter's metadata and in the frame times.
+
+    Args:
+        camera: The camera.
+        stabilised: Whether the job states that the camera stabilised the video; None if it does not state it.
+    """
     path = camera.chapters[0]
     return [
-        *_stabilisation_notes(path),
+        *([] if stabilised is False else _stabilisation_notes(path)),
         *_gopro_notes(gopro_settings(path)),
         *_phone_notes(path),
         *_rate_notes(camera.times_ns),

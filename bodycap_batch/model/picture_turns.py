@@ -106,6 +106,5 @@ def stabilisation_note(mode: str, *, recorded: bool, missing: str = "") -> str:
     )
     return (
         f"the camera stabilised the video{level}; the turned and cropped pictures are used as they are, and "
-        f"{used}. A calibration without stabilisation does not fit: use `calibration: auto`. Next time, "
-        "switch the stabilisation (HyperSmooth) off"
+        f"{used}. Next time, switch the stabilisation (HyperSmooth) off"
     )

@@ -87,6 +87,7 @@ class Flow:
         self._map_round = 0
         self._with_telemetry = frozenset[str]()
         self._with_gyro = frozenset[str]()
+        self._stabilised = frozenset[str]()
         self._samples: Mapping[str, FileRef] = {}
 
     def __enter__(self) -> Flow:
@@ -117,6 +118,7 @@ class Flow:
         }
         self._samples = {name: samples for name, samples in found.items() if samples is not None}
         self._with_telemetry = frozenset(summary.get("telemetry", ())) | self._samples.keys()
+        self._stabilised = frozenset(summary.get("stabilised", ()))
         if self._job.telemetry.tracking:
             self._with_gyro = self._with_telemetry
         self.runner.report_notes(artefact, "check")
@@ -358,8 +360,8 @@ class Flow:
     def use_sensors(self, registrations: ByCamera) -> ByCamera:
         """Use the inertial sensors of the cameras that have telemetry, and report notes to the user.
 
-        Without telemetry, the registrations are returned unchanged. Telemetry also shows how stabilised
-        pictures are turned, so it is read if all uses of the sensors are switched off.
+        Without telemetry, or if all uses are switched off, the registrations are returned unchanged. The
+        telemetry of cameras that stabilised their pictures is always read: it shows how they are turned.
         """
         off = {
             field: False
@@ -367,11 +369,9 @@ class Flow:
             if not is_on(mechanism)
         }
         options = self._job.telemetry.model_copy(update=off)
-        cameras = [
-            camera
-            for camera in self._capture.cameras
-            if camera.name in self._with_telemetry or camera.stabilised
-        ]
+        is_used = options.gravity or options.smoothing or options.gaps or options.gps
+        named = self._stabilised | (self._with_telemetry if is_used else frozenset())
+        cameras = [camera for camera in self._capture.cameras if camera.stabilised or camera.name in named]
         tasks = []
         for own in cameras:
             ordered = [own, *(camera for camera in cameras if camera.name != own.name)]

@@ -464,6 +464,8 @@ class SynthOptions(Options):
             raise ValueError(
                 "sound: poses_only writes no videos, which contain the sound; leave out one of them"
             )
+        if self.stabilised != "no" and self.poses_only:
+            raise ValueError("stabilised: poses_only writes no videos; leave out one of them")
         if self.sound and self.seconds > _MAX_SOUND_S:
             raise ValueError(
                 f"seconds: a video with sound can last {_MAX_SOUND_S:g} s at most; lower seconds, or set "

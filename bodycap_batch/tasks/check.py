@@ -51,12 +51,12 @@ def run_check(task: CheckTask, context: StageContext, files: Path) -> None:
     frames = sum(camera.used_frames for camera in report.cameras)
     large = sum(camera.large_frames for camera in report.cameras)
     notes += report.notes
-    telemetry = [
-        camera.name
-        for camera in task.job.capture.cameras
-        if any(has_telemetry_track(path) or states_stabilisation(path) for path in camera.video)
-    ]
-    write_summary(files, notes=notes, frames=frames, large_frames=large, telemetry=telemetry)
+    cameras = task.job.capture.cameras
+    telemetry = [camera.name for camera in cameras if any(map(has_telemetry_track, camera.video))]
+    stabilised = [camera.name for camera in cameras if any(map(states_stabilisation, camera.video))]
+    write_summary(
+        files, notes=notes, frames=frames, large_frames=large, telemetry=telemetry, stabilised=stabilised
+    )
 
 
 CHECK = Stage(

@@ -146,3 +146,11 @@ def test_a_calibration_that_contradicts_the_video_is_named(tmp_path, change, wor
     notes = _notes(tmp_path, settings={"MINF": "HERO9 Black", "VFOV": "W", "EISE": "N"})
     assert len(notes) == bool(words)
     assert not notes or words in notes[0]
+
+
+def test_the_job_can_contradict_the_settings(tmp_path):
+    append_settings(write_video(tmp_path / "torso.mp4", FRAMES), {"EISE": "Y"})
+    cameras = "capture:\n  cameras: [{name: torso, video: torso.mp4, stabilised: false}]\n"
+    (tmp_path / "job.yaml").write_text(cameras)
+    (camera,) = check_path(tmp_path).cameras
+    assert camera.notes == ()
