@@ -98,9 +98,7 @@ def _aligned(
         if _explained(aligned) >= _explained(plain):
             return path, turns, aligned
     unused = plain.comparison
-    if (
-        unused.verdict == "agrees"
-    ):  # the pictures move so much that their turns relative to the lens hardly count
+    if unused.verdict == "agrees":  # fast movements hide the turns of the pictures relative to the lens
         reason = "the camera stabilised the video without a usable record of how it turned the pictures"
         unused = PictureGyroComparison(verdict="stabilised", reason=reason)
     return pictures, unrecorded_turns(telemetry, len(pictures.status)), SensorAlignment(comparison=unused)
