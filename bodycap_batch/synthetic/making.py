@@ -184,7 +184,7 @@ def _write_camera_truth(
     times_ns = frame_times_ns(options, camera)[kept]
     clock = true_clocks(options)[camera]
     common_s = clock.common_s(seconds_from_ns(times_ns))
-    poses = picture_poses_at(subject.motion, mount, common_s, stabilised=options.stabilised != "no")
+    poses = picture_poses_at(subject.motion, mount, common_s, stabilised=options.stabilised != "none")
     write_path(folder / "gt" / f"{camera}.tum", times_ns, poses, "world_from_camera, the camera's own clock")
     if options.exposure_s:
 
@@ -194,7 +194,7 @@ def _write_camera_truth(
         mean = mean_poses(pose_at, seconds_from_ns(times_ns), options.exposure_s)
         note = "world_from_camera, mean over the exposure, the camera's own clock"
         write_path(folder / "gt" / "exposure" / f"{camera}.tum", times_ns, mean, note)
-    if options.stabilised != "no":
+    if options.stabilised != "none":
         lens = camera_poses_at(subject.motion, mount, common_s)
         note = "world_from_lens of the camera that stabilises its pictures, the camera's own clock"
         write_path(folder / "gt" / "lens" / f"{camera}.tum", times_ns, lens, note)
@@ -278,7 +278,7 @@ def _write_videos(
                     video.add(image)
                     done += 1
                     context.progress(done, total, camera)
-            if options.stabilised != "no":
+            if options.stabilised != "none":
                 append_settings(folder / f"{camera}.mp4", GOPRO_SETTINGS)
 
 
@@ -344,7 +344,7 @@ def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRende
             wearer=wearer.visible_from(mount, subject.motion.skeleton) if wearer else None,
             exposure_s=options.exposure_s,
             rolling_shutter_s=options.rolling_shutter_s,
-            stabilised=options.stabilised != "no",
+            stabilised=options.stabilised != "none",
         )
         for mount in subject.mounts
     ]

@@ -231,8 +231,8 @@ class SynthOptions(Options):
             "up to this value, in seconds"
         ),
     )
-    stabilised: Literal["no", "recorded", "unrecorded"] = Field(
-        "no",
+    stabilised: Literal["none", "recorded", "unrecorded"] = Field(
+        "none",
         description=(
             "the cameras stabilise their pictures by rotation, and crop them; recorded: the videos hold the "
             "orientations of the pictures, as those of GoPro cameras do; unrecorded: they only state the "
@@ -464,7 +464,7 @@ class SynthOptions(Options):
             raise ValueError(
                 "sound: poses_only writes no videos, which contain the sound; leave out one of them"
             )
-        if self.stabilised != "no" and self.poses_only:
+        if self.stabilised != "none" and self.poses_only:
             raise ValueError("stabilised: poses_only writes no videos; leave out one of them")
         if self.sound and self.seconds > _MAX_SOUND_S:
             raise ValueError(
@@ -527,7 +527,7 @@ class SynthOptions(Options):
         params = self.lens_params
         if params is None:
             params = _default_lens_params(self.lens, self.width, self.height)
-        if self.stabilised != "no":
+        if self.stabilised != "none":
             focals = 1 if self.lens in SINGLE_FOCAL else 2
             params = (*(_CROP_ZOOM * focal for focal in params[:focals]), *params[focals:])
         return Camera(model=self.lens, width_px=self.width, height_px=self.height, params=list(params))  # type: ignore[arg-type]

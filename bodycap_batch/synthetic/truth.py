@@ -93,7 +93,7 @@ def write_calibration(folder: Path, options: SynthOptions) -> None:
         "pixel_origin": "COLMAP (centre of first pixel = 0.5)",
     }
     # The lens of a crop is unknown to users: a calibration without stabilisation does not fit it.
-    _write_json(folder / ("calib.json" if options.stabilised == "no" else "gt/calib.json"), content)
+    _write_json(folder / ("calib.json" if options.stabilised == "none" else "gt/calib.json"), content)
 
 
 def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts: tuple[Mount, ...]) -> None:
@@ -127,7 +127,7 @@ def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts:
         _write_clocks(truth / "clocks.json", options)
     readme = _README + (_CLOCKS_README if own_clocks else "")
     hidden = set() if own_clocks else set(_CLOCK_OPTIONS)
-    if options.stabilised == "no":
+    if options.stabilised == "none":
         hidden.add("stabilised")
     if isinstance(motion, StanceWalk):
         _write_contacts(truth / "contacts.json", motion, seconds_from_ns(ticks))

@@ -52,15 +52,17 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
     from bodycap_batch.model.camera_clock import FrameTiming
     from bodycap_batch.telemetry import read_telemetry
     from bodycap_batch.telemetry.comparison import all_times_ns
-    from bodycap_batch.telemetry.streams import CameraTelemetry
 
     context.check_cancelled()
     capture, configs = open_capture(task.capture.config, context.threads), task.capture.config.cameras
     camera = capture.cameras[0]
+    times_ns = all_times_ns(camera, configs[0])
     try:
-        telemetry = read_telemetry(camera.videos, all_times_ns(camera, configs[0]), configs[0].samples)
+        telemetry = read_telemetry(camera.videos, times_ns, configs[0].samples)
     except CaptureError as error:
-        telemetry = CameraTelemetry(notes=(f"{error.one_line}; its samples are not used",))
+        telemetry = read_telemetry(camera.videos, times_ns)
+        note = f"{error.one_line}; its samples are not used"
+        telemetry = replace(telemetry, notes=(*telemetry.notes, note))
     before = task.registrations[camera.name].path
     registration = load_registration(before)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,3 +57,14 @@ def test_without_a_record_only_the_setting_is_stated(tmp_path):
     telemetry = read_telemetry([video], video.times_ns())
     assert telemetry.is_stabilised
     assert not telemetry.streams
+
+
+def test_a_video_that_players_turn_has_turned_orientations(recorded):
+    video = index_video(recorded / "left_palm.mp4")
+    quarter = replace(video, orientation=((0, -1), (1, 0)))
+    times_s = video.times_ns() * 1e-9
+    plain, turned = (
+        recorded_turns(read_telemetry([each], video.times_ns()), times_s)[0] for each in (video, quarter)
+    )
+    shown_from_stored = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(turned, shown_from_stored @ plain @ shown_from_stored.T, atol=1e-12)

@@ -29,9 +29,12 @@ from tests.videos import textured_frame, write_video
 def test_poses_are_kept_if_the_samples_cannot_be_read(tmp_path: Path) -> None:
     samples = tmp_path / "left_palm.gcsv"
     samples.write_text("<html>")
-    (note,) = read_summary(_run(tmp_path, samples=samples))["notes"]
+    after = _run(tmp_path, samples=samples, settings={"EISE": "Y"})
+    (note,) = read_summary(after)["notes"]
     assert "does not start with GYROFLOW IMU LOG" in note
     assert note.endswith("its samples are not used")
+    # What the video states is still known.
+    assert read_dataclass(InertialCamera, after, INERTIAL_CAMERA).turns is not None
 
 
 def test_a_stabilised_video_without_a_record_has_slack_and_is_not_refused(tmp_path: Path) -> None:
