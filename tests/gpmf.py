@@ -11,31 +11,8 @@ from pathlib import Path
 import av
 import numpy as np
 
+from bodycap_batch.formats.gpmf_writer import header, item, nested
 from tests.videos import Image
-
-FORMATS = {"b": "b", "B": "B", "s": "h", "S": "H", "l": "i", "L": "I", "j": "q", "J": "Q", "f": "f", "d": "d"}
-
-
-def item(key: str, kind: str, values: object, columns: int = 1) -> bytes:
-    """Return an item with numbers of one type, or with text (kind "c")."""
-    if kind == "c":
-        content, size, count = str(values).encode("latin-1"), 1, len(str(values))
-    else:
-        flat = np.asarray(values).ravel().tolist()
-        content = struct.pack(f">{len(flat)}{FORMATS[kind]}", *flat)
-        size, count = struct.calcsize(">" + FORMATS[kind]) * columns, len(flat) // columns
-    return header(key, ord(kind), size, count) + content + b"\0" * (-len(content) % 4)
-
-
-def header(key: str, kind: int, size: int, count: int) -> bytes:
-    """Return the header of an item."""
-    return struct.pack(">4sBBH", key.encode("latin-1"), kind, size, count)
-
-
-def nested(key: str, *items: bytes) -> bytes:
-    """Return an item that contains other items."""
-    content = b"".join(items)
-    return header(key, 0, 1, len(content)) + content + b"\0" * (-len(content) % 4)
 
 
 def raw(key: str, kind: str, size: int, count: int, content: bytes) -> bytes:

@@ -14,7 +14,9 @@ from bodycap_batch.capture.lens_choice import video_mode
 from bodycap_batch.capture.video import open_container
 from bodycap_batch.config.calibration import NOTED_RMS_RATIO, CalibratedWith, Calibration, max_rms_px
 from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.formats.gpmf import gopro_settings
+from bodycap_batch.formats.gpmf import gopro_settings, gopro_stabilisation
+from bodycap_batch.model.picture_turns import stabilisation_note
+from bodycap_batch.telemetry.gopro import gyroflow_original, has_picture_orientations
 
 _OFF_VALUES = ("", "N", "N/A", "NA", "OFF", "NONE")
 """Values that mean that a setting is switched off."""
@@ -44,10 +46,20 @@ Evidence: none.
 """
 
 
-def setting_notes(camera: CaptureCamera) -> list[str]:
-    """Return notes on a camera's settings, found in the first chapter's metadata and in the frame times."""
+def setting_notes(camera: CaptureCamera, *, stabilised: bool | None = None) -> list[str]:
+    """Return notes on a camera's settings, found in the first chapter's metadata and in the frame times.
+
+    Args:
+        camera: The camera.
+        stabilised: Whether the job states that the camera stabilised the video; None if it does not state it.
+    """
     path = camera.chapters[0]
-    return [*_gopro_notes(gopro_settings(path)), *_phone_notes(path), *_rate_notes(camera.times_ns)]
+    return [
+        *([] if stabilised is False else _stabilisation_notes(path)),
+        *_gopro_notes(gopro_settings(path)),
+        *_phone_notes(path),
+        *_rate_notes(camera.times_ns),
+    ]
 
 
 def calibration_notes(calibration: Calibration, camera: CaptureCamera) -> list[str]:
@@ -90,15 +102,22 @@ def _letters(text: str) -> str:
     return "".join(letter for letter in text.lower() if letter.isalnum())
 
 
+def _stabilisation_notes(path: Path) -> list[str]:
+    original = gyroflow_original(path)
+    if original is not None:
+        named = f" ({original})" if original else ""
+        return [
+            f"the program Gyroflow stabilised this video: use the camera's original file{named} instead, "
+            "because Gyroflow turns and zooms the pictures without a record"
+        ]
+    mode = gopro_stabilisation(gopro_settings(path))
+    if mode in {"", "off"}:
+        return []
+    return [stabilisation_note(mode, recorded=has_picture_orientations(path))]
+
+
 def _gopro_notes(settings: dict[str, str]) -> list[str]:
     notes = []
-    mode = settings.get("EISA", "")
-    if settings.get("EISE", mode).upper() not in _OFF_VALUES:
-        level = f" ({mode})" if mode.upper() not in (*_OFF_VALUES, "Y") else ""
-        notes.append(
-            f"the camera stabilised the video{level}: the picture moves relative to the lens, so no "
-            "calibration fits; film again with HyperSmooth off"
-        )
     if settings.get("DZOM", "N").upper() not in _OFF_VALUES:
         notes.append(
             "the video was filmed with digital zoom: film without zoom, or calibrate the camera at the "
@@ -116,7 +135,7 @@ def _phone_notes(path: Path) -> list[str]:
             return [
                 f"the video was filmed with a phone ({name}), and the camera app of the phone stabilises "
                 "the picture and changes the focus; film with an app that can switch off stabilisation "
-                "and lock the focus and the zoom"
+                "and lock the focus and the zoom. If it was on, state `stabilised: true` for this camera"
             ]
     return []
 

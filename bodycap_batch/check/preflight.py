@@ -197,7 +197,7 @@ def _summarise_camera(camera: CaptureCamera, config: CameraConfig, quality: Pict
             *camera.notes,
             *quality.notes,
             *_dropped_frame_notes(camera, median_ns),
-            *setting_notes(camera),
+            *setting_notes(camera, stabilised=config.stabilised),
             *(
                 calibration_notes(config.calibration, camera)
                 if isinstance(config.calibration, Calibration)

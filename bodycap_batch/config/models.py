@@ -180,6 +180,11 @@ class CameraConfig(_Block):
         description="PNG picture with the aspect ratio of the video: white where the room is visible, "
         "black where the wearer is visible",
     )
+    stabilised: bool | None = Field(
+        None,
+        description="true: the camera stabilised the video by turning its pictures; false: it did not; "
+        "default: what the file and its telemetry show",
+    )
     offset_s: Annotated[Seconds | None, BeforeValidator(_none_if_auto)] = Field(
         None,
         description="offset of the camera's clock in seconds: common time = camera time · (1 + drift_ppm · "

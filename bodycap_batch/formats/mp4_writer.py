@@ -23,6 +23,9 @@ TIME_BASE_HZ = 15360
 """Number of timestamp units per second. Derivation: the number is a multiple of the usual frame rates 24, 30,
 60 and 120 Hz. It is also FFmpeg's default for 30 Hz."""
 
+_DATA_HZ = 1000
+"""Number of timestamp units per second of a data track, as in GoPro's files."""
+
 _FAST_X264_PARAMS = "bframes=0:rc-lookahead=0:weightp=0:8x8dct=0"
 """Options of x264 for fast encoding: no look-ahead, no weighted prediction, no large transforms. Evidence:
 docs/decisions/formats.md."""
@@ -59,6 +62,19 @@ class Sound:
     rate_hz: int
 
 
+@dataclass(frozen=True, slots=True)
+class DataTrack:
+    """A track of data, such as the telemetry of a camera.
+
+    Attributes:
+        handler: Name of the track's handler.
+        payloads: Content, time in the file (seconds) and duration (seconds) of each payload.
+    """
+
+    handler: str
+    payloads: tuple[tuple[bytes, float, float], ...]
+
+
 class VideoWriter:
     """Writer of an MP4 file with H.264 video.
 
@@ -77,6 +93,7 @@ class VideoWriter:
         bit_rate_mbps: Mean bit rate, megabits per second, instead of a constant quality. None: `quality`
             decides.
         timecode: Timecode of the first image, for a timecode track; "" for none.
+        data: Track of data. None for none.
 
     Raises:
         StoreError: The file cannot be written.
@@ -92,6 +109,7 @@ class VideoWriter:
         sound: Sound | None = None,
         bit_rate_mbps: float | None = None,
         timecode: str = "",
+        data: DataTrack | None = None,
     ) -> None:
         import av
 
@@ -105,8 +123,13 @@ class VideoWriter:
             self._sound_stream = sound and self._container.add_stream(
                 "aac", rate=sound.rate_hz, layout="mono"
             )
+            if data is not None:
+                self._data_stream = self._container.add_data_stream("bin_data")
+                self._data_stream.metadata["handler_name"] = data.handler
+                self._data_stream.time_base = Fraction(1, _DATA_HZ)
         except (OSError, av.error.FFmpegError) as error:
             raise self._failure(error) from error
+        self._payloads = () if data is None else data.payloads
         self._sound = iter(()) if sound is None else sound_frames(sound.samples, sound.rate_hz)
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
@@ -159,6 +182,18 @@ class VideoWriter:
             self._sound_s += frame.samples / frame.sample_rate
             self._send(self._sound_stream, frame)
 
+    def _send_data(self) -> None:
+        """Write the payloads of the data track."""
+        for content, time_s, duration_s in self._payloads:
+            packet = self._av.Packet(content)
+            packet.stream, packet.time_base = self._data_stream, Fraction(1, _DATA_HZ)
+            packet.pts = packet.dts = round(_DATA_HZ * time_s)
+            packet.duration = round(_DATA_HZ * duration_s)
+            try:
+                self._container.mux(packet)
+            except (OSError, self._av.error.FFmpegError) as error:
+                raise self._failure(error) from error
+
     def _send(self, stream: Any, frame: object) -> None:
         try:
             for packet in stream.encode(frame):
@@ -185,6 +220,7 @@ class VideoWriter:
             self._send_sound(float("inf"))
             if self._sound_stream is not None:
                 self._send(self._sound_stream, None)
+            self._send_data()
         try:
             self._container.close()
         except (OSError, self._av.error.FFmpegError) as problem:

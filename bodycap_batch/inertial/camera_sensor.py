@@ -17,8 +17,11 @@ from bodycap_batch.inertial.path_solving import solve_path
 from bodycap_batch.model.earth import GpsFixes
 from bodycap_batch.model.gravity import fit_gravity
 from bodycap_batch.model.inertial_camera import ForceWindows, InertialCamera, SensorRelation
+from bodycap_batch.model.picture_turns import PictureTurns
 from bodycap_batch.model.scene import Trajectory
+from bodycap_batch.telemetry.comparison import PictureGyroComparison
 from bodycap_batch.telemetry.gyro_fit import GyroFit
+from bodycap_batch.telemetry.picture_orientation import turns_of_pictures, unrecorded_turns
 from bodycap_batch.telemetry.streams import CameraTelemetry, GpsTrack
 
 _MAX_DILUTION = 10.0
@@ -34,7 +37,7 @@ class UsedSensor:
 
     Attributes:
         camera: Its relation to the camera, and what it measures.
-        trajectory: The poses of the camera, with the frames that the sensor added.
+        trajectory: The poses of the pictures, with the frames that the sensor added.
     """
 
     camera: InertialCamera
@@ -43,19 +46,23 @@ class UsedSensor:
 
 @dataclass(frozen=True, slots=True)
 class _Prepared:
-    """The path of a camera, the relation of its sensor to it, and the means of the specific force."""
+    """The path of a camera, the relation of its sensor to it, and the means of the specific force.
+
+    The path has the axes of the camera. They differ from those of stabilised pictures by `turns`.
+    """
 
     trajectory: Trajectory
+    turns: PictureTurns | None
     aligned: SensorAlignment
     windows: ForceWindows | None
 
     @staticmethod
-    def of(trajectory: Trajectory, telemetry: CameraTelemetry) -> _Prepared:
-        aligned = align_sensor(trajectory, telemetry)
+    def of(pictures: Trajectory, telemetry: CameraTelemetry) -> _Prepared:
+        trajectory, turns, aligned = _aligned(pictures, telemetry)
         if aligned.fit is None or aligned.samples is None:
-            return _Prepared(trajectory, aligned, None)
+            return _Prepared(trajectory, turns, aligned, None)
         windows = force_windows(trajectory, aligned.samples, aligned.fit.rotation_sigma_rad)
-        return _Prepared(trajectory, aligned, windows)
+        return _Prepared(trajectory, turns, aligned, windows)
 
     def solver(self, others: Sequence[_Prepared]) -> ClipSolver | None:
         """Return the solver of the clip; None if vertical and scale are too uncertain.
@@ -72,8 +79,39 @@ class _Prepared:
         return None if constants is None else ClipSolver(self.trajectory, samples, constants)
 
 
+def _aligned(
+    pictures: Trajectory, telemetry: CameraTelemetry
+) -> tuple[Trajectory, PictureTurns | None, SensorAlignment]:
+    """Return the path of a camera, the turns of its pictures, and the comparison of its sensor with the path.
+
+    The sensor turns with the camera, not with stabilised pictures. If it agrees less with poses that the
+    record turned back, the pictures were turned in another way, for example by another program: the record is
+    not used.
+    """
+    plain = align_sensor(pictures, telemetry)
+    turns = turns_of_pictures(telemetry, pictures.seconds)
+    if turns is None and plain.comparison.verdict != "stabilised":
+        return pictures, None, plain
+    if turns is not None and turns.recorded.any():
+        path = turns.exact().camera_path(pictures)
+        aligned = align_sensor(path, telemetry)
+        if _explained(aligned) >= _explained(plain):
+            return path, turns, aligned
+    unused = plain.comparison
+    if unused.verdict == "agrees":  # fast movements hide the turns of the pictures relative to the lens
+        reason = "the camera stabilised the video without a usable record of how it turned the pictures"
+        unused = PictureGyroComparison(verdict="stabilised", reason=reason)
+    return pictures, unrecorded_turns(telemetry, len(pictures.status)), SensorAlignment(comparison=unused)
+
+
+def _explained(aligned: SensorAlignment) -> float:
+    """Return the share of the variance that the sensor explains; 0 without a fit."""
+    fit = aligned.comparison.fit
+    return 0.0 if fit is None else fit.r_squared
+
+
 def use_sensor(
-    trajectory: Trajectory,
+    pictures: Trajectory,
     telemetry: CameraTelemetry,
     options: TelemetryOptions,
     others: Iterable[tuple[Trajectory, CameraTelemetry]] = (),
@@ -81,13 +119,13 @@ def use_sensor(
     """Estimate how the sensor of a camera relates to its solved poses, and use what it measures.
 
     Args:
-        trajectory: The poses of the camera's frames.
+        pictures: The poses of the camera's frames, in the axes of the pictures.
         telemetry: The telemetry of the camera.
         options: Which uses of the telemetry are on.
         others: Poses and telemetry of other cameras. They help to find the vertical and the scale of the map.
     """
-    own = _Prepared.of(trajectory, telemetry)
-    aligned, windows = own.aligned, own.windows
+    own = _Prepared.of(pictures, telemetry)
+    trajectory, aligned, windows = own.trajectory, own.aligned, own.windows
     used = _UsedPath(trajectory)
     if windows is not None and (options.gaps or options.smoothing):
         prepared = [_Prepared.of(*other) for other in others if other[0].gauge == trajectory.gauge]
@@ -112,8 +150,13 @@ def use_sensor(
         solved=used.solved,
         replaced=used.replaced,
         gps=_gps_fixes(telemetry.gps) if options.gps and telemetry.gps is not None else None,
+        turns=own.turns,
     )
-    return UsedSensor(camera=camera, trajectory=used.trajectory)
+    if used.trajectory is trajectory:
+        return UsedSensor(camera=camera, trajectory=pictures)
+    exact = None if own.turns is None else own.turns.exact()
+    solved = used.trajectory if exact is None else exact.picture_path(used.trajectory)
+    return UsedSensor(camera=camera, trajectory=solved)
 
 
 @dataclass(frozen=True, slots=True)

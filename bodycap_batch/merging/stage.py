@@ -22,6 +22,7 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
 from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSigma
 from bodycap_batch.merging.camera_paths import trajectory_in_world, with_solved_centres
 from bodycap_batch.merging.camera_selection import select_cameras
+from bodycap_batch.merging.cameras.camera_axes import with_axes_of_cameras
 from bodycap_batch.merging.cameras.excluded_cameras import MIN_LOCALISED_FRAMES
 from bodycap_batch.merging.cameras.mount_slips import find_slip, without_slip
 from bodycap_batch.merging.cameras.still_parts import still_parts
@@ -108,13 +109,22 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
 
     If the distances between the cameras fit no person, the body is solved without the camera that does not
     fit (`merge_without_unfit_camera`).
+
+    The body is solved with the axes of the cameras, and the paths of the result have those of the pictures.
+    The two differ in stabilised videos.
     """
-    step = _Progress(context)
+    step, turns = _Progress(context), inputs.picture_turns
+    of_cameras = with_axes_of_cameras(inputs)
 
     def solve(left_out: Mapping[str, str]) -> MergeResult:
-        return _solve_body(inputs, options, step, left_out)
+        return _solve_body(of_cameras, options, step, left_out)
 
-    return merge_without_unfit_camera([each.camera for each in inputs.trajectories], solve)
+    result = merge_without_unfit_camera([each.camera for each in inputs.trajectories], solve)
+    paths = [
+        turns[path.camera].picture_path(path) if path.camera in turns else path
+        for path in result.trajectories
+    ]
+    return replace(result, trajectories=tuple(paths))
 
 
 def _solve_body(

@@ -11,6 +11,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, set_array
 from bodycap_batch.model.earth import GpsFixes
 from bodycap_batch.model.geometry import Similarity, rotation_angle_rad
+from bodycap_batch.model.picture_turns import PictureTurns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,6 +128,7 @@ class InertialCamera:
         solved: Number of localised frames whose poses were solved again together with the sensor.
         replaced: Number of localised frames whose pose contradicted the sensor, and was replaced.
         gps: GPS positions of the camera; None if there are none, or if they are not used.
+        turns: How the camera turned its pictures relative to its lens; None if nothing shows that it did.
     """
 
     camera: str
@@ -141,6 +143,7 @@ class InertialCamera:
     solved: int = 0
     replaced: int = 0
     gps: GpsFixes | None = None
+    turns: PictureTurns | None = None
 
     def figures(self) -> dict[str, Any]:
         """Return verdict and relation as plain JSON values for ``metrics.json``."""
@@ -154,4 +157,5 @@ class InertialCamera:
             "frames_refused": self.refused,
             "frames_solved_again": self.solved,
             "frames_replaced": self.replaced,
+            **({} if self.turns is None else {"stabilisation": self.turns.figures()}),
         }

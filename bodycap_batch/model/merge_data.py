@@ -15,6 +15,7 @@ from bodycap_batch.model.fill_data import FillReport
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.inertial_camera import ForceWindows
 from bodycap_batch.model.merge_report import MergeReport
+from bodycap_batch.model.picture_turns import PictureTurns
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 
@@ -89,6 +90,9 @@ class MergeInputs:
         board_views: Observations of the job's marker board in keyframes.
         force_windows: By camera name, what the camera's accelerometer measures along the trajectory, in the
             gauge of the trajectory. Only cameras with a usable accelerometer have an entry.
+        picture_turns: By camera name, how the camera turned its pictures relative to its lens. Only cameras
+            with stabilised pictures have an entry. Trajectories and observations of the board have the axes
+            of the pictures; mounts have those of the lens.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -102,6 +106,7 @@ class MergeInputs:
     row_fraction: Mapping[str, FloatArray] = field(default_factory=dict)
     board_views: tuple[BoardView, ...] = ()
     force_windows: Mapping[str, ForceWindows] = field(default_factory=dict)
+    picture_turns: Mapping[str, PictureTurns] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         cameras = [trajectory.camera for trajectory in self.trajectories]

@@ -87,6 +87,7 @@ class Flow:
         self._map_round = 0
         self._with_telemetry = frozenset[str]()
         self._with_gyro = frozenset[str]()
+        self._stabilised = frozenset[str]()
         self._samples: Mapping[str, FileRef] = {}
 
     def __enter__(self) -> Flow:
@@ -117,6 +118,7 @@ class Flow:
         }
         self._samples = {name: samples for name, samples in found.items() if samples is not None}
         self._with_telemetry = frozenset(summary.get("telemetry", ())) | self._samples.keys()
+        self._stabilised = frozenset(summary.get("stabilised", ()))
         if self._job.telemetry.tracking:
             self._with_gyro = self._with_telemetry
         self.runner.report_notes(artefact, "check")
@@ -358,7 +360,8 @@ class Flow:
     def use_sensors(self, registrations: ByCamera) -> ByCamera:
         """Use the inertial sensors of the cameras that have telemetry, and report notes to the user.
 
-        Without telemetry, or if all uses are switched off, the registrations are returned unchanged.
+        Without telemetry, or if all uses are switched off, the registrations are returned unchanged. The
+        telemetry of cameras that stabilised their pictures is always read: it shows how they are turned.
         """
         off = {
             field: False
@@ -366,9 +369,9 @@ class Flow:
             if not is_on(mechanism)
         }
         options = self._job.telemetry.model_copy(update=off)
-        if not (options.gravity or options.smoothing or options.gaps or options.gps):
-            return registrations
-        cameras = [camera for camera in self._capture.cameras if camera.name in self._with_telemetry]
+        is_used = options.gravity or options.smoothing or options.gaps or options.gps
+        named = self._stabilised | (self._with_telemetry if is_used else frozenset())
+        cameras = [camera for camera in self._capture.cameras if camera.stabilised or camera.name in named]
         tasks = []
         for own in cameras:
             ordered = [own, *(camera for camera in cameras if camera.name != own.name)]
@@ -379,6 +382,7 @@ class Flow:
                 capture=self._footage(ordered),
                 registrations=refs_by_camera({name: registrations[name] for name in names}),
                 samples={name: self._samples[name] for name in names if name in self._samples},
+                stabilised=own.stabilised,
             )
             tasks.append(make_task(INERTIAL, task, camera=own.name))
         used = self.runner.run_all(tasks)

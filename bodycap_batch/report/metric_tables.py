@@ -220,6 +220,8 @@ def _sensors_table(metrics: Mapping[str, Any]) -> Table:
         path = metric_path("telemetry", name)
         if sensor["verdict"] != "agrees":
             reasons.append(f"{name}: {sensor['reason']}.")
+        if "stabilisation" in sensor:
+            reasons.append(f"{name}: {sensor['stabilisation']['reason']}.")
         rows.append(
             (
                 Cell(text=name),

@@ -13,6 +13,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.skeleton import Mount, SkeletonModel, forward_kinematics
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.lens import RayGrid
+from bodycap_batch.synthetic.stabilisation import turn_of_pictures, turned_poses
 from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, Triangles, concatenate_triangles
 from bodycap_batch.synthetic.wearer import Wearer
 
@@ -59,6 +60,18 @@ def camera_poses_at(motion: MovingBody, mount: Mount, t_s: FloatArray) -> FloatA
     return np.asarray(joint_poses_at(motion, t_s)[:, joint] @ mount.joint_from_cam)
 
 
+def picture_poses_at(motion: MovingBody, mount: Mount, t_s: FloatArray, *, stabilised: bool) -> FloatArray:
+    """Return the poses world_from_picture (T,4,4) of a camera's pictures at common times (T,) in seconds.
+
+    Pictures that are not stabilised have the pose of the camera.
+    """
+    poses = camera_poses_at(motion, mount, t_s)
+    if not stabilised:
+        return poses
+    turns = turn_of_pictures(lambda times_s: camera_poses_at(motion, mount, times_s), t_s)
+    return turned_poses(poses, turns)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraRenderer:
     """Renderer of the frames of a camera on a moving body in a room.
@@ -73,6 +86,7 @@ class CameraRenderer:
         wearer: Surface of the body; None if the body is not rendered.
         exposure_s: Exposure time, seconds.
         rolling_shutter_s: Time (seconds) between the exposures of the first and the last row.
+        stabilised: Whether the camera stabilises its pictures.
     """
 
     motion: MovingBody
@@ -84,6 +98,11 @@ class CameraRenderer:
     wearer: Wearer | None
     exposure_s: float
     rolling_shutter_s: float
+    stabilised: bool = False
+
+    def poses_at(self, t_s: FloatArray) -> FloatArray:
+        """Return the poses world_from_picture (T,4,4) of pictures at common times (T,) in seconds."""
+        return picture_poses_at(self.motion, self.mount, t_s, stabilised=self.stabilised)
 
     def render(self, t_s: float) -> Bytes:
         """Return the image (H,W,3) without noise. The exposure is centred on a common time (seconds)."""
@@ -100,10 +119,10 @@ class CameraRenderer:
         """Return the image (H,W,3) at a common time (seconds) without motion blur."""
         height = self.grid.in_cam.shape[0]
         if self.rolling_shutter_s == 0.0:
-            pose = camera_poses_at(self.motion, self.mount, np.array([t_s]))
+            pose = self.poses_at(np.array([t_s]))
             return self._scene_at(t_s).image(self.grid, pose[0], slice(0, height))
         rows_s = t_s + ((np.arange(height) + 0.5) / height - 0.5) * self.rolling_shutter_s
-        poses = camera_poses_at(self.motion, self.mount, rows_s)
+        poses = self.poses_at(rows_s)
         edges = np.linspace(0, height, min(_SHUTTER_BANDS, height) + 1).astype(int)
         bands = [slice(low, high) for low, high in pairwise(edges.tolist())]
         scenes = [self._scene_at(float(rows_s[band].mean())) for band in bands]
@@ -122,7 +141,7 @@ class CameraRenderer:
         if self.exposure_s == 0.0:
             return 1
         half = self.exposure_s / 2
-        start, end = camera_poses_at(self.motion, self.mount, np.array([t_s - half, t_s + half]))
+        start, end = self.poses_at(np.array([t_s - half, t_s + half]))
         px_per_rad = 1.0 / float(np.linalg.norm(self.grid.per_px_x, axis=-1).max())
         cosine = (np.trace(start[:3, :3].T @ end[:3, :3]) - 1) / 2
         shift_m = np.linalg.norm(end[:3, 3] - start[:3, 3])

@@ -27,7 +27,7 @@ _BRANCH_SAMPLES = 8
 only if the Jacobian of the distortion has a positive determinant at all test points."""
 _BLOCK = 1 << 13
 """Number of points that are inverted together. A block of this size fits into the processor's cache."""
-_SINGLE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+SINGLE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 """Names of the camera models with one focal length for both axes."""
 
 Distortion = Callable[[FloatArray], FloatArray]
@@ -125,7 +125,7 @@ def _enhanced_unified(plane: FloatArray, alpha: float, beta: float) -> FloatArra
 
 def distortion_of(camera: Camera) -> Distortion:
     """Return the distortion function of a camera."""
-    extra = camera.params[(3 if camera.model in _SINGLE_FOCAL else 4) :]
+    extra = camera.params[(3 if camera.model in SINGLE_FOCAL else 4) :]
     if camera.model == "FOV":
         return lambda plane: _field_of_view(plane, float(extra[0]))
     if camera.model == "EUCM":
@@ -146,7 +146,7 @@ def distortion_of(camera: Camera) -> Distortion:
 
 def focal_and_centre(camera: Camera) -> tuple[FloatArray, FloatArray]:
     """Return the focal lengths (2,) and the principal point (2,) of a camera in pixels."""
-    if camera.model in _SINGLE_FOCAL:
+    if camera.model in SINGLE_FOCAL:
         return np.repeat(camera.params[:1], 2), np.asarray(camera.params[1:3])
     return np.asarray(camera.params[:2]), np.asarray(camera.params[2:4])
 

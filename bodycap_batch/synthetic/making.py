@@ -18,7 +18,8 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.atomic_files import store_error_from_os_error
-from bodycap_batch.formats.mp4_writer import VideoWriter
+from bodycap_batch.formats.gpmf_writer import append_settings
+from bodycap_batch.formats.mp4_writer import DataTrack, VideoWriter
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
@@ -28,6 +29,7 @@ from bodycap_batch.synthetic.camera_renderer import (
     MovingBody,
     Sensor,
     camera_poses_at,
+    picture_poses_at,
 )
 from bodycap_batch.synthetic.camera_sounds import CameraSounds
 from bodycap_batch.synthetic.clip import load_clip
@@ -42,6 +44,7 @@ from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
 from bodycap_batch.synthetic.pressing import carrying, find_press
 from bodycap_batch.synthetic.room import BareSurfaces, RoomLayout, build_room
+from bodycap_batch.synthetic.stabilisation import GOPRO_SETTINGS, orientation_track
 from bodycap_batch.synthetic.stance_walk import StanceWalk
 from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, triangles_from_surfaces
 from bodycap_batch.synthetic.truth import (
@@ -180,7 +183,8 @@ def _write_camera_truth(
     camera = mount.camera
     times_ns = frame_times_ns(options, camera)[kept]
     clock = true_clocks(options)[camera]
-    poses = camera_poses_at(subject.motion, mount, clock.common_s(seconds_from_ns(times_ns)))
+    common_s = clock.common_s(seconds_from_ns(times_ns))
+    poses = picture_poses_at(subject.motion, mount, common_s, stabilised=options.stabilised != "none")
     write_path(folder / "gt" / f"{camera}.tum", times_ns, poses, "world_from_camera, the camera's own clock")
     if options.exposure_s:
 
@@ -190,6 +194,10 @@ def _write_camera_truth(
         mean = mean_poses(pose_at, seconds_from_ns(times_ns), options.exposure_s)
         note = "world_from_camera, mean over the exposure, the camera's own clock"
         write_path(folder / "gt" / "exposure" / f"{camera}.tum", times_ns, mean, note)
+    if options.stabilised != "none":
+        lens = camera_poses_at(subject.motion, mount, common_s)
+        note = "world_from_lens of the camera that stabilises its pictures, the camera's own clock"
+        write_path(folder / "gt" / "lens" / f"{camera}.tum", times_ns, lens, note)
     if not kept.all():
         write_timestamps(folder / f"{camera}.timestamps.txt", times_ns)
     if options.poses_only:
@@ -262,6 +270,7 @@ def _write_videos(
                 options.quality,
                 sound=heard,
                 bit_rate_mbps=options.bit_rate_mbps,
+                data=_orientations(options, renderer, recorder.times_s[frames]),
             ) as video:
                 for frame, image in zip(frames, _render_in_order(pool, render, frames, context), strict=True):
                     if options.auto_exposure:
@@ -269,6 +278,24 @@ def _write_videos(
                     video.add(image)
                     done += 1
                     context.progress(done, total, camera)
+            if options.stabilised != "none":
+                append_settings(folder / f"{camera}.mp4", GOPRO_SETTINGS)
+
+
+def _orientations(options: SynthOptions, renderer: CameraRenderer, common_s: FloatArray) -> DataTrack | None:
+    """Return the record of the orientations of stabilised pictures; None without one.
+
+    Args:
+        options: The options of the capture.
+        renderer: The camera.
+        common_s: (T,) common times of the pictures, seconds.
+    """
+    if options.stabilised != "recorded":
+        return None
+    cameras = camera_poses_at(renderer.motion, renderer.mount, common_s)
+    turns = np.swapaxes(cameras[:, :3, :3], 1, 2) @ renderer.poses_at(common_s)[:, :3, :3]
+    in_file_ns = np.round(np.arange(len(common_s)) * (1e9 / options.fps)).astype(np.int64)
+    return orientation_track(in_file_ns, cameras, turns)
 
 
 def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRenderer]:
@@ -317,6 +344,7 @@ def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRende
             wearer=wearer.visible_from(mount, subject.motion.skeleton) if wearer else None,
             exposure_s=options.exposure_s,
             rolling_shutter_s=options.rolling_shutter_s,
+            stabilised=options.stabilised != "none",
         )
         for mount in subject.mounts
     ]

@@ -91,7 +91,7 @@ class MovingCamera:
     """
 
     def __init__(self, renderer: CameraRenderer, camera: Camera) -> None:
-        self._motion, self._mount, self._camera = renderer.motion, renderer.mount, camera
+        self._motion, self._camera, self._poses_at = renderer.motion, camera, renderer.poses_at
         self._exposure_s, self._rolling_s = renderer.exposure_s, renderer.rolling_shutter_s
         limbs = renderer.wearer.parts if renderer.wearer else []
         parts = [MovingPart(ROOM, renderer.room), *(MovingPart(joint, shape) for joint, shape in limbs)]
@@ -130,8 +130,7 @@ class MovingCamera:
         count = int(np.ceil((row_s[-1] - row_s[0] + 2 * half) / _NODE_S)) + 2
         node_s = np.linspace(row_s[0] - half, row_s[-1] + half, count)
         joints = joint_poses_at(self._motion, node_s)
-        role = self._motion.skeleton.index_of_role(self._mount.role)
-        world_from_cam = joints[:, role] @ self._mount.joint_from_cam
+        world_from_cam = self._poses_at(node_s)
         poses = [
             world_from_cam if part.joint == ROOM else invert(joints[:, part.joint]) @ world_from_cam
             for part in self._scene.parts

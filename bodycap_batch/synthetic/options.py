@@ -23,6 +23,7 @@ from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.config.options import Options
 from bodycap_batch.model.camera import CAMERA_MODELS, Camera, parameter_count
 from bodycap_batch.synthetic.imu_options import ImuOptions, imu_from_word
+from bodycap_batch.synthetic.lens import SINGLE_FOCAL
 
 _EARLIEST_S = 3.0
 """Maximum time (seconds) from the start of a camera to time 0 of the common clock. The built-in walk starts
@@ -47,6 +48,9 @@ _MAX_SOUND_S = 1200.0
 _DEFAULT_FOCAL_PX = 420.0
 """Focal length (px) of the default lens at an image width of 640 px. The horizontal angle of view is 75
 degrees."""
+_CROP_ZOOM = 1.25
+"""Focal length of stabilised pictures divided by that of the lens: a tenth of the picture is cut off on each
+side, as GoPro states of HyperSmooth."""
 _DEFAULT_FOV_OMEGA_RAD = 0.8
 """Distortion parameter (radians) of the default lens for the camera model FOV. Evidence: none."""
 
@@ -225,6 +229,14 @@ class SynthOptions(Options):
         description=(
             "with sound: the sound of each camera is late or early against its pictures by a random time of "
             "up to this value, in seconds"
+        ),
+    )
+    stabilised: Literal["none", "recorded", "unrecorded"] = Field(
+        "none",
+        description=(
+            "the cameras stabilise their pictures by rotation, and crop them; recorded: the videos hold the "
+            "orientations of the pictures, as those of GoPro cameras do; unrecorded: they only state the "
+            "setting. The lens of the crop is written to gt/calib.json, and no calib.json is written"
         ),
     )
     drop_frames: float = Field(
@@ -452,6 +464,8 @@ class SynthOptions(Options):
             raise ValueError(
                 "sound: poses_only writes no videos, which contain the sound; leave out one of them"
             )
+        if self.stabilised != "none" and self.poses_only:
+            raise ValueError("stabilised: poses_only writes no videos; leave out one of them")
         if self.sound and self.seconds > _MAX_SOUND_S:
             raise ValueError(
                 f"seconds: a video with sound can last {_MAX_SOUND_S:g} s at most; lower seconds, or set "
@@ -509,10 +523,13 @@ class SynthOptions(Options):
         return self.rates_fps.get(camera, self.fps)
 
     def camera(self) -> Camera:
-        """Return the intrinsics of all cameras of the capture."""
+        """Return the intrinsics of all cameras of the capture. Stabilised pictures are a crop."""
         params = self.lens_params
         if params is None:
             params = _default_lens_params(self.lens, self.width, self.height)
+        if self.stabilised != "none":
+            focals = 1 if self.lens in SINGLE_FOCAL else 2
+            params = (*(_CROP_ZOOM * focal for focal in params[:focals]), *params[focals:])
         return Camera(model=self.lens, width_px=self.width, height_px=self.height, params=list(params))  # type: ignore[arg-type]
 
 
@@ -522,14 +539,7 @@ def _default_lens_params(model: str, width: int, height: int) -> tuple[float, ..
     The lens has a usual angle of view. It has no distortion, except for the model FOV.
     """
     focal = width * _DEFAULT_FOCAL_PX / 640.0
-    has_one_focal = model in (
-        "SIMPLE_PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "SIMPLE_RADIAL_FISHEYE",
-        "RADIAL_FISHEYE",
-    )
-    head = [focal] if has_one_focal else [focal, focal]
+    head = [focal] if model in SINGLE_FOCAL else [focal, focal]
     head += [width / 2.0, height / 2.0]
     rest = [0.0] * (parameter_count(model) - len(head))
     if model == "FOV":

@@ -39,6 +39,8 @@ _README = """Ground truth of a synthetic capture. Metres, Z up, floor at z = 0.
                motion blur, it is the pose at the middle of the exposure.
 exposure/<camera>.tum  with motion blur, the mean pose over the exposure, which the picture shows. A recorded
                motion shakes within an exposure, so it differs from the pose at the middle.
+lens/<camera>.tum  with stabilisation, the poses with the axes of the lens, which mounts.json refers to.
+               <camera>.tum holds those of the pictures, which the camera turned relative to its lens.
 joints.npz     names (J,), t (T,) s on the common clock, world (T,J,3) m: joint centres.
 motion.bvh     the motion on the common clock, at the cameras' rate; frame 0 is the earliest frame.
 mounts.json    joint_from_cam of each camera: the true mount, which differs from the nominal mount.
@@ -72,6 +74,8 @@ MARKER = Path("gt", "synth.json")
 def write_calibration(folder: Path, options: SynthOptions) -> None:
     """Write ``calib.json``: the intrinsics, the timing and the clock offsets of all cameras.
 
+    It is written to ``gt/`` if the pictures are stabilised.
+
     The offsets of free clocks are left out: a user does not know them.
     """
     stated = {name: options.offsets_s.get(name, 0.0) for name in options.cameras}
@@ -88,7 +92,8 @@ def write_calibration(folder: Path, options: SynthOptions) -> None:
         "timestamp": "middle of the exposure",
         "pixel_origin": "COLMAP (centre of first pixel = 0.5)",
     }
-    _write_json(folder / "calib.json", content)
+    # The lens of a crop is unknown to users: a calibration without stabilisation does not fit it.
+    _write_json(folder / ("calib.json" if options.stabilised == "none" else "gt/calib.json"), content)
 
 
 def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts: tuple[Mount, ...]) -> None:
@@ -122,6 +127,8 @@ def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts:
         _write_clocks(truth / "clocks.json", options)
     readme = _README + (_CLOCKS_README if own_clocks else "")
     hidden = set() if own_clocks else set(_CLOCK_OPTIONS)
+    if options.stabilised == "none":
+        hidden.add("stabilised")
     if isinstance(motion, StanceWalk):
         _write_contacts(truth / "contacts.json", motion, seconds_from_ns(ticks))
         readme += _CONTACTS_README

@@ -41,7 +41,7 @@ class CheckTask:
 def run_check(task: CheckTask, context: StageContext, files: Path) -> None:
     """Check the job; store the notes for the user and the numbers of frames."""
     from bodycap_batch.check import require_ready, require_within_limits
-    from bodycap_batch.telemetry.gopro import has_telemetry_track
+    from bodycap_batch.telemetry.gopro import has_telemetry_track, states_stabilisation
 
     context.check_cancelled()
     if task.limits is not None:
@@ -51,10 +51,12 @@ def run_check(task: CheckTask, context: StageContext, files: Path) -> None:
     frames = sum(camera.used_frames for camera in report.cameras)
     large = sum(camera.large_frames for camera in report.cameras)
     notes += report.notes
-    telemetry = [
-        camera.name for camera in task.job.capture.cameras if any(map(has_telemetry_track, camera.video))
-    ]
-    write_summary(files, notes=notes, frames=frames, large_frames=large, telemetry=telemetry)
+    cameras = task.job.capture.cameras
+    telemetry = [camera.name for camera in cameras if any(map(has_telemetry_track, camera.video))]
+    stabilised = [camera.name for camera in cameras if any(map(states_stabilisation, camera.video))]
+    write_summary(
+        files, notes=notes, frames=frames, large_frames=large, telemetry=telemetry, stabilised=stabilised
+    )
 
 
 CHECK = Stage(

@@ -33,6 +33,7 @@ class InertialTask:
         registrations: The registration of each camera, by name.
         samples: The files with inertial samples beside the videos, by name. A camera without a file has its
             samples in the video.
+        stabilised: Whether the first camera stabilised its video; None if the job does not state it.
     """
 
     options: TelemetryOptions
@@ -40,6 +41,7 @@ class InertialTask:
     capture: CaptureRef
     registrations: Mapping[str, ArtefactRef]
     samples: Mapping[str, FileRef]
+    stabilised: bool | None = None
 
 
 def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None:
@@ -50,15 +52,17 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
     from bodycap_batch.model.camera_clock import FrameTiming
     from bodycap_batch.telemetry import read_telemetry
     from bodycap_batch.telemetry.comparison import all_times_ns
-    from bodycap_batch.telemetry.streams import CameraTelemetry
 
     context.check_cancelled()
     capture, configs = open_capture(task.capture.config, context.threads), task.capture.config.cameras
     camera = capture.cameras[0]
+    times_ns = all_times_ns(camera, configs[0])
     try:
-        telemetry = read_telemetry(camera.videos, all_times_ns(camera, configs[0]), configs[0].samples)
+        telemetry = read_telemetry(camera.videos, times_ns, configs[0].samples)
     except CaptureError as error:
-        telemetry = CameraTelemetry(notes=(f"{error.one_line}; its samples are not used",))
+        telemetry = read_telemetry(camera.videos, times_ns)
+        note = f"{error.one_line}; its samples are not used"
+        telemetry = replace(telemetry, notes=(*telemetry.notes, note))
     before = task.registrations[camera.name].path
     registration = load_registration(before)
 
@@ -71,10 +75,14 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
                 continue
             yield load_registration(task.registrations[other.name].path).trajectory, read
 
-    found = use_sensor(registration.trajectory, telemetry, task.options, others())
+    stated = telemetry.with_statement(stabilised=task.stabilised)
+    found = use_sensor(registration.trajectory, stated, task.options, others())
     notes = [f"{camera.name}: {note}" for note in telemetry.notes]
     if telemetry.gyro is not None and found.camera.relation is None:
         notes.append(f"{camera.name}: the inertial sensor is not used: {found.camera.reason}")
+    turns = found.camera.turns
+    if turns is not None and turns.says() != telemetry.stabilisation_note():  # the check said this already
+        notes.append(f"{camera.name}: {turns.says()}")
     registration = replace(registration, trajectory=found.trajectory)
     camera = replace(camera, nominal_fps=read_dataclass(FrameTiming, before, "timing").nominal_fps)
     save_registration(registration, camera, files, rolling=read_summary(before)["rolling"], notes=notes)

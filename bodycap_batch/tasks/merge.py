@@ -98,6 +98,7 @@ def _merge_inputs(task: MergeTask) -> MergeInputs:
         force_windows={
             name: item.windows for name, item in found.inertial.items() if item.windows is not None
         },
+        picture_turns={name: item.turns for name, item in found.inertial.items() if item.turns is not None},
     )
 
 

@@ -97,13 +97,18 @@ class RegisteredCameras:
         """
         from bodycap_batch.model.relative_pose import estimate_relative_pose
 
-        trajectory_of = {trajectory.camera: trajectory for trajectory in self.trajectories}
+        trajectory_of = {path.camera: self._camera_path(path) for path in self.trajectories}
         out = []
         for pair in (pair for names in segments for pair in combinations(sorted(names), 2)):
             if all(self.clocks[name].is_known for name in pair):
                 first, second = (self._on_common_clock(trajectory_of[name]) for name in pair)
                 out.append(estimate_relative_pose(first, second, 0))
         return tuple(out)
+
+    def _camera_path(self, trajectory: Trajectory) -> Trajectory:
+        """Return a trajectory in the axes of the camera instead of those of stabilised pictures."""
+        sensor = self.inertial.get(trajectory.camera)
+        return trajectory if sensor is None or sensor.turns is None else sensor.turns.camera_path(trajectory)
 
     def _on_common_clock(self, trajectory: Trajectory) -> Trajectory:
         """Return a trajectory with common times instead of the camera's times."""

@@ -10,9 +10,12 @@ import numpy as np
 from bodycap_batch.capture import CaptureCamera, open_camera
 from bodycap_batch.capture.timeline import join_chapters
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.model.geometry import so3_exp, so3_log
+from bodycap_batch.model.picture_turns import stabilisation_note
 from bodycap_batch.telemetry.gyro_fit import GyroFit, fit_gyro
+from bodycap_batch.telemetry.picture_orientation import recorded_turns
 from bodycap_batch.telemetry.picture_rotation import WORK_PX, PictureRotation, measure_picture_rotation
 from bodycap_batch.telemetry.reading import read_telemetry
 from bodycap_batch.telemetry.streams import IMAGE_ORIENTATION, CameraTelemetry, Stream
@@ -33,8 +36,6 @@ frame, at 30 frames per second and 500 pixels of focal length, is 0.006 rad/s.""
 _MAX_SHAKE_RATIO = 0.6
 """Maximum ratio of the fast changes of the pictures to those of the gyroscope, of a stabilised video.
 Evidence: docs/decisions/telemetry.md."""
-_MAX_DISTANCE = 0.6
-"""Maximum distance of an orientation from its frame, in intervals of its stream: half, and some rounding."""
 _UNDO_ROUNDS = 3
 """Number of times that a stabilisation is undone, each time with a better focal ratio."""
 
@@ -142,12 +143,11 @@ def _undone_fit(
     picture: PictureRotation, gyro: Stream, telemetry: CameraTelemetry, *, focal_known: bool
 ) -> GyroFit | None:
     """Return the fit after the orientations of the image undid the stabilisation; None without them."""
-    orientations = telemetry.streams.get(IMAGE_ORIENTATION)
-    if orientations is None:
+    if IMAGE_ORIENTATION not in telemetry.streams:
         return None
     ratio, best = 1.0, None
     for _ in range(_UNDO_ROUNDS):
-        undone = undo_stabilisation(picture, orientations, ratio)
+        undone = undo_stabilisation(picture, telemetry, ratio)
         fit = fit_gyro(undone, gyro, axes_known=telemetry.axes_known, focal_known=focal_known)
         if fit is None:
             break
@@ -157,41 +157,24 @@ def _undone_fit(
 
 
 def undo_stabilisation(
-    picture: PictureRotation, orientations: Stream, focal_ratio: float = 1.0
+    picture: PictureRotation, telemetry: CameraTelemetry, focal_ratio: float = 1.0
 ) -> PictureRotation:
     """Return the rotations of the camera instead of those of the stabilised image.
 
-    The camera records how it turned the image of each frame relative to the lens. A pair of frames without
-    such an orientation is left out.
+    A pair of frames without a recorded orientation is left out.
 
     Args:
         picture: Rotations that the stabilised pictures show.
-        orientations: The stream of these orientations (IORI): w, x, y, z of the conjugate quaternion, in
-            OpenCV's axes.
+        telemetry: The telemetry with the recorded orientations.
         focal_ratio: True focal length divided by the assumed one.
     """
-    from scipy.spatial.transform import Rotation
-
-    first, has_first = _nearest(orientations, picture.start_s)
-    second, has_second = _nearest(orientations, picture.end_s)
+    first, has_first = recorded_turns(telemetry, picture.start_s)
+    second, has_second = recorded_turns(telemetry, picture.end_s)
     keep = np.flatnonzero(has_first & has_second)
     picture = picture.chosen(keep)
-    quat_xyzw = orientations.values[:, [1, 2, 3, 0]] * [-1.0, -1.0, -1.0, 1.0]
-    norm = np.linalg.norm(quat_xyzw, axis=1, keepdims=True)
-    cam_from_image = Rotation.from_quat(np.where(norm > 0.5, quat_xyzw, [0.0, 0.0, 0.0, 1.0]))
-    second_from_first = Rotation.from_rotvec(-picture.turn_rad / focal_ratio)
-    turned = cam_from_image[second[keep]] * second_from_first * cam_from_image[first[keep]].inv()
-    return replace(picture, turn_rad=-turned.as_rotvec())
-
-
-def _nearest(stream: Stream, times_s: FloatArray) -> tuple[IntArray, BoolArray]:
-    """Return the index (N,) of the sample nearest to each time, and whether it is within half an interval."""
-    after = np.clip(np.searchsorted(stream.times_s, times_s), 1, max(len(stream.times_s) - 1, 1))
-    after = np.minimum(after, len(stream.times_s) - 1)
-    before = np.maximum(after - 1, 0)
-    nearer = np.abs(stream.times_s[before] - times_s) <= np.abs(stream.times_s[after] - times_s)
-    index = np.asarray(np.where(nearer, before, after), dtype=np.int64)
-    return index, np.asarray(np.abs(stream.times_s[index] - times_s) <= _MAX_DISTANCE / stream.rate_hz)
+    first_from_second = so3_exp(picture.turn_rad / focal_ratio)
+    turned = first[keep] @ first_from_second @ np.swapaxes(second[keep], 1, 2)
+    return replace(picture, turn_rad=so3_log(turned).reshape(-1, 3))
 
 
 def all_times_ns(camera: CaptureCamera, config: CameraConfig) -> IntArray:
@@ -222,6 +205,8 @@ def telemetry_notes(spec: CaptureConfig, threads: int = 1) -> list[str]:
             if error.path is not None and error.path.endswith((".csv", ".gcsv")):
                 notes.append(f"{config.name}: {error.one_line}; its samples are not used")
             continue
-        if compared.verdict == "stabilised":
-            notes.append(f"{config.name}: {compared.reason}")
+        note = stabilisation_note(telemetry.stabilisation, recorded=compared.best is not None)
+        # The check of the settings reports what the file states.
+        if compared.verdict == "stabilised" and note != telemetry.stabilisation_note():
+            notes.append(f"{config.name}: {note}")
     return notes

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -101,6 +101,8 @@ gives the time of its own clock, which may be years wrong."""
 _MAX_OTHER = 500
 """Maximum number of streams that are listed although they are not read. Real files have some twenty."""
 _HANDLER = "GoPro MET"
+_GYROFLOW_COMMENT, _GYROFLOW_SUFFIX = "Original filename: ", "_stabilized"
+"""Start of the comment in a file that Gyroflow wrote, and end of the name that it proposes."""
 
 
 @dataclass(slots=True)
@@ -311,6 +313,43 @@ def has_telemetry_track(path: Path) -> bool:
         return any(_HANDLER in each.metadata.get("handler_name", "") for each in container.streams.data)
 
 
+def has_picture_orientations(path: Path) -> bool:
+    """Return True if a video records how the camera turned its pictures.
+
+    Raises:
+        CaptureError: The file cannot be opened.
+    """
+    first = next(gpmf_payloads(path), None)
+    return first is not None and IMAGE_ORIENTATION in read_gpmf_payloads([first]).streams
+
+
+def gyroflow_original(path: Path) -> str | None:
+    """Return the name of the file from which the program Gyroflow made a stabilised video; None otherwise.
+
+    Gyroflow names the original file in the comment, and adds a suffix to the name of its file. The result is
+    "" if only the suffix is there.
+
+    Source: the program's public code (``render_queue.rs``).
+
+    Raises:
+        CaptureError: The file cannot be opened.
+    """
+    with open_container(path) as container:
+        comment = str(container.metadata.get("comment", ""))
+    if comment.startswith(_GYROFLOW_COMMENT):
+        return comment.removeprefix(_GYROFLOW_COMMENT).splitlines()[0].strip()
+    return "" if path.stem.endswith(_GYROFLOW_SUFFIX) else None
+
+
+def states_stabilisation(path: Path) -> bool:
+    """Return whether a video states that it is stabilised, by the camera or by Gyroflow.
+
+    Raises:
+        CaptureError: The file cannot be opened.
+    """
+    return gopro_stabilisation(gopro_settings(path)) not in {"", "off"} or gyroflow_original(path) is not None
+
+
 def gopro_telemetry(
     track: GpmfTrack, settings: Mapping[str, str], firmware: str, frame_rate_hz: float
 ) -> CameraTelemetry:
@@ -381,7 +420,12 @@ def read_gopro_file(path: Path, frame_rate_hz: float) -> CameraTelemetry:
     with open_container(path) as container:
         firmware = str(container.metadata.get("firmware", ""))
     track = read_gpmf_payloads(gpmf_payloads(path))
-    return gopro_telemetry(track, gopro_settings(path), firmware, frame_rate_hz)
+    telemetry = gopro_telemetry(track, gopro_settings(path), firmware, frame_rate_hz)
+    if gyroflow_original(path) is None:
+        return telemetry
+    # The record, if there is one, is that of the camera, and Gyroflow turned the pictures once more.
+    streams = {key: stream for key, stream in telemetry.streams.items() if key != IMAGE_ORIENTATION}
+    return replace(telemetry, stabilisation="Gyroflow", streams=streams)
 
 
 def gps_time_s(telemetry: CameraTelemetry, at_s: float) -> float | None:

@@ -15,8 +15,10 @@ from bodycap_batch.telemetry.gopro import gaps_of, read_gopro_file
 from bodycap_batch.telemetry.saturation import saturated_stretches
 from bodycap_batch.telemetry.streams import (
     ACCELEROMETER,
+    CAMERA_ORIENTATION,
     GRAVITY,
     GYROSCOPE,
+    IMAGE_ORIENTATION,
     CameraTelemetry,
     GpsTrack,
     Stream,
@@ -24,6 +26,7 @@ from bodycap_batch.telemetry.streams import (
 from bodycap_batch.telemetry.text_files import read_imu_file
 
 _TURNED = (GYROSCOPE, ACCELEROMETER, GRAVITY)
+_ORIENTATIONS = (CAMERA_ORIENTATION, IMAGE_ORIENTATION)
 
 
 def read_telemetry(
@@ -101,10 +104,16 @@ def _turned(telemetry: CameraTelemetry, video: VideoFile) -> CameraTelemetry:
     if (a, b, c, d) == (1, 0, 0, 1) or a * d - b * c != 1:
         return telemetry
     rotation = np.array([[a, b, 0.0], [c, d, 0.0], [0.0, 0.0, 1.0]])
-    streams = {
-        key: replace(stream, values=stream.values @ rotation.T) if key in _TURNED else stream
-        for key, stream in telemetry.streams.items()
-    }
+
+    def turned(stream: Stream) -> Stream:
+        if stream.key in _TURNED:
+            return replace(stream, values=stream.values @ rotation.T)
+        if stream.key in _ORIENTATIONS:
+            axis = stream.values[:, 1:] @ rotation.T
+            return replace(stream, values=np.column_stack([stream.values[:, 0], axis]))
+        return stream
+
+    streams = {key: turned(stream) for key, stream in telemetry.streams.items()}
     return replace(telemetry, streams=streams)
 
 

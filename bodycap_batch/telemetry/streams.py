@@ -9,12 +9,13 @@ accelerometer measures the specific force: at rest, 9.8 m/s² upwards.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
+from bodycap_batch.model.picture_turns import stabilisation_note
 
 TelemetrySource = Literal["GPMF", "gcsv file", "imu.csv file", "none"]
 """Where telemetry comes from."""
@@ -120,6 +121,24 @@ class CameraTelemetry:
     axes_known: bool = False
     is_timelapse: bool = False
     notes: tuple[str, ...] = ()
+
+    @property
+    def is_stabilised(self) -> bool:
+        """Whether the file states that the camera stabilised the video."""
+        return self.stabilisation not in {"", "off"}
+
+    def stabilisation_note(self) -> str:
+        """Return the note for the user on a stabilisation that the file states; "" if it states none."""
+        if not self.is_stabilised:
+            return ""
+        return stabilisation_note(self.stabilisation, recorded=IMAGE_ORIENTATION in self.streams)
+
+    def with_statement(self, *, stabilised: bool | None) -> CameraTelemetry:
+        """Return the telemetry with what the user states about the stabilisation; None: nothing."""
+        if stabilised is None or (stabilised and self.is_stabilised):
+            return self
+        kept = {key: each for key, each in self.streams.items() if stabilised or key != IMAGE_ORIENTATION}
+        return replace(self, stabilisation="on" if stabilised else "off", streams=kept)
 
     @property
     def gyro(self) -> Stream | None:

@@ -10,8 +10,10 @@ from bodycap_batch.capture import open_camera
 from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.config.sample_files import samples_beside
+from bodycap_batch.model.geometry import rotation_angle_rad, rotation_from_quat_xyzw
 from bodycap_batch.telemetry import compare_picture_and_gyro, read_telemetry
 from bodycap_batch.telemetry.gopro import gopro_telemetry, read_gpmf_payloads
+from bodycap_batch.telemetry.picture_orientation import recorded_turns
 from bodycap_batch.telemetry.picture_rotation import WORK_PX
 
 pytestmark = pytest.mark.data
@@ -67,14 +69,7 @@ def test_a_walk_with_horizon_lock(data_root):
     ],
 )
 def test_raw_tracks_of_other_models(data_root, name, model, streams, gps):
-    data = (data_root / "gopro" / f"{name}.raw").read_bytes()
-    track, offset = [], 0
-    while offset + 8 <= len(data):
-        size, count = struct.unpack_from(">BH", data, offset + 5)
-        end = offset + 8 + (size * count + 3) // 4 * 4
-        track.append((data[offset:end], 1.001 * len(track), 1.001))
-        offset = end
-    telemetry = gopro_telemetry(read_gpmf_payloads(track), {}, "", 30000 / 1001)
+    telemetry = _read_raw(data_root / "gopro" / f"{name}.raw")
     assert telemetry.model == model
     assert telemetry.axes_known
     assert telemetry.notes == ()
@@ -82,6 +77,35 @@ def test_raw_tracks_of_other_models(data_root, name, model, streams, gps):
     assert len(telemetry.gps.times_s) == gps
     # People walk: on the average, the specific force is that of gravity.
     assert np.linalg.norm(telemetry.accelerometer.values, axis=1).mean() == pytest.approx(9.8, abs=2.5)
+
+
+def _read_raw(path: Path):
+    data, track, offset = path.read_bytes(), [], 0
+    while offset + 8 <= len(data):
+        size, count = struct.unpack_from(">BH", data, offset + 5)
+        end = offset + 8 + (size * count + 3) // 4 * 4
+        track.append((data[offset:end], 1.001 * len(track), 1.001))
+        offset = end
+    return gopro_telemetry(read_gpmf_payloads(track), {}, "", 30000 / 1001)
+
+
+@pytest.mark.parametrize("name", ["hero11.raw", "max-heromode.mp4"])
+def test_recorded_orientations_have_the_same_axes_and_direction(data_root, name):
+    path = data_root / "gopro" / name
+    telemetry = _read_raw(path) if path.suffix == ".raw" else _read(path)
+    times_s = telemetry.streams["IORI"].times_s
+    turns, known = recorded_turns(telemetry, times_s)
+    assert known.all()
+    quat_wxyz = telemetry.streams["CORI"].values * [1.0, -1.0, -1.0, -1.0]
+    camera = rotation_from_quat_xyzw(quat_wxyz[:, [1, 2, 3, 0]])
+
+    def step_deg(rotations):
+        steps = np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]
+        return np.degrees(rotation_angle_rad(steps)).mean()
+
+    # Pictures turn less from frame to frame than their camera. Any other direction adds to its turns.
+    assert step_deg(camera @ turns) < 0.6 * step_deg(camera)
+    assert step_deg(camera @ np.swapaxes(turns, 1, 2)) > 1.5 * step_deg(camera)
 
 
 def _compare(path: Path):

@@ -21,7 +21,7 @@ ORDERS = "BODYCAP_FAKE_ORDERS"
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
  "unused": {camera: reason}, "rolling": true, "late": number of maps,
  "unknown_clocks": [cameras], "corrected" | "corrected_before" | "distorted": [cameras] in refined maps,
- "fail_rebuilt": true, "telemetry": [cameras],
+ "fail_rebuilt": true, "telemetry": [cameras], "stabilised": [cameras],
  "real": [stages that are no stand-ins]}.
  "fail" may be a list of stages."""
 
@@ -110,7 +110,14 @@ def with_sensor(options: Json, arguments: Json, files: Path) -> None:
 def checked(options: Json, arguments: Json, files: Path) -> None:
     telemetry = orders().get("telemetry", [])
     (files / "summary.json").write_text(
-        json.dumps({"notes": ["a note"], "frames": 20, "telemetry": telemetry})
+        json.dumps(
+            {
+                "notes": ["a note"],
+                "frames": 20,
+                "telemetry": telemetry,
+                "stabilised": orders().get("stabilised", []),
+            }
+        )
     )
 
 

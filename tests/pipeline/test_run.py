@@ -420,6 +420,12 @@ def test_telemetry_that_is_switched_off_changes_nothing(bench: Bench) -> None:
     assert {name: data for name, data in bench.results().items() if name != "job.yaml"} == before
 
 
+def test_stabilised_cameras_are_turned_back_if_all_sensors_are_switched_off(bench: Bench) -> None:
+    off = {"telemetry": dict.fromkeys(("gravity", "tracking", "gps", "smoothing", "gaps"), False)}
+    bench.order(telemetry=["torso", "left_palm"], stabilised=["left_palm"])
+    assert [name for name in bench.executed(**off) if name.startswith("inertial")] == ["inertial left_palm"]
+
+
 def test_rounds_limit_the_extensions(bench: Bench) -> None:
     bench.order(wanted=[[5]] * 5, localised=[1, 2, 3, 4, 5, 6])
     assert bench.executed(registration={"rounds": 1}).count("extend") == 1

@@ -15,15 +15,20 @@ from bodycap_batch.core.errors import Cancelled, EstimationError
 from bodycap_batch.inertial import align_sensor, force_windows
 from bodycap_batch.merging import merge_trajectories
 from bodycap_batch.merging.body.bones import kinematic_chain
+from bodycap_batch.merging.cameras.camera_axes import with_axes_of_cameras
 from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
 from bodycap_batch.merging.graph.windows import solve_windows, split_timeline
 from bodycap_batch.model.camera_clock import CameraClock
-from bodycap_batch.model.geometry import Similarity, align_points, make_transform, so3_exp
+from bodycap_batch.model.geometry import Similarity, align_points, make_transform, so3_exp, transform_points
 from bodycap_batch.model.inertial_camera import ForceWindows
-from bodycap_batch.model.merge_data import MergeResult
+from bodycap_batch.model.merge_data import BoardView, MergeResult
+from bodycap_batch.model.picture_turns import PictureTurns
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.synthetic import SynthOptions
+from bodycap_batch.synthetic.stabilisation import turn_of_pictures
+from bodycap_batch.telemetry.picture_orientation import unrecorded_turns
+from bodycap_batch.telemetry.streams import CameraTelemetry
 from tests.bench.posed import posed
 from tests.inertial import Sensor
 from tests.stages.walker import FPS, ROLES, Walk, make_inputs, make_walk, record
@@ -447,3 +452,69 @@ def test_windows_of_a_long_capture_join_without_a_discontinuity(walk):
         assert_allclose(pieces.residual_m[camera], residual, atol=1e-3)
     assert split_timeline(ticks, tracks, 70) == [(0, 70), (70, 140), (140, 210)]
     assert split_timeline(ticks, [tracks[0].keep(np.arange(210) < 20)], 70) == [(0, 210)]
+
+
+def _turned(walk: Walk, path: Trajectory, *, recorded: bool) -> tuple[Trajectory, PictureTurns]:
+    """Return the path of a camera that stabilises its pictures, and what is known about their turns."""
+    turns = turn_of_pictures(lambda seconds: walk.camera(path.camera, seconds), path.seconds)
+    exact = PictureTurns(mode="", cam_from_picture=turns, sigma_rad=np.zeros(len(turns)))
+    unknown = unrecorded_turns(CameraTelemetry(stabilisation="on"), len(turns))
+    return exact.picture_path(path), exact if recorded else unknown
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_stabilised_pictures(walk, base, context, recorded):
+    found = [_turned(walk, path, recorded=recorded) for path in _recorded(walk)]
+    turns = {path.camera: each for path, each in found}
+    inputs = make_inputs(walk, [path for path, _ in found], picture_turns=turns)
+    result = merge_trajectories(inputs, MergeOptions(), context)
+    # The paths of the result have the axes of the pictures, as the inputs.
+    for path, before in zip(result.trajectories, inputs.trajectories, strict=True):
+        to_world = result.world_from_map[before.gauge].rotation
+        assert_allclose(
+            path.gauge_from_cam[:, :3, :3], to_world @ before.gauge_from_cam[:, :3, :3], atol=1e-9
+        )
+        assert_allclose(path.covariance[:, :3, :3], before.covariance[:, :3, :3], atol=1e-9)
+    sigma, usual = (
+        np.nanmedian(each.joint_sigma_m()[:, each.observed.any(axis=0)], axis=0) for each in (result, base)
+    )
+    if recorded:
+        assert_allclose(result.graph_world_from_joint, base.graph_world_from_joint, atol=1e-4)
+        assert_allclose(sigma, usual, atol=1e-4)
+        return
+    # The mounts have slack: joints are less certain. Nominal mounts and the scale give most of their sigma.
+    moving = usual > 0.0
+    assert (sigma[moving] > usual[moving]).all()
+    assert (sigma[moving] / usual[moving]).max() > 1.03
+    # The sigma covers the error.
+    for camera in ("left_palm", "right_palm"):
+        palm = result.skeleton.roles.index(ROLES[camera])
+        # Three sigmas over three axes.
+        assert _palm_error_m(walk, result, camera).mean() < 3.0 * np.sqrt(3.0) * np.nanmedian(
+            result.joint_sigma_m()[:, palm]
+        )
+
+
+def test_a_board_in_a_turned_picture_is_where_it_was():
+    rng = np.random.default_rng(4)
+    board = rng.uniform(-0.3, 0.3, (20, 3)) * [1.0, 1.0, 0.0]
+    cam_from_board = make_transform(so3_exp([0.2, -0.1, 0.3]), np.array([0.1, -0.2, 1.5]))
+    cam_from_picture = so3_exp([0.05, -0.08, 0.06])
+    picture_from_board = make_transform(cam_from_picture.T, np.zeros(3)) @ cam_from_board
+    in_cam, in_picture = (transform_points(pose, board) for pose in (cam_from_board, picture_from_board))
+    path = record(make_walk(rng), "torso", rng)
+    count = len(path.status)
+    view = BoardView(
+        camera="torso",
+        frame=7,
+        board_m=board,
+        rays=in_picture[:, :2] / in_picture[:, 2:],
+        cam_from_board=picture_from_board,
+    )
+    turns = PictureTurns(
+        mode="", cam_from_picture=np.tile(cam_from_picture, (count, 1, 1)), sigma_rad=np.zeros(count)
+    )
+    inputs = make_inputs(make_walk(rng), [path], board_views=(view,), picture_turns={"torso": turns})
+    (turned,) = with_axes_of_cameras(inputs).board_views
+    assert_allclose(turned.cam_from_board, cam_from_board, atol=1e-12)
+    assert_allclose(turned.rays, in_cam[:, :2] / in_cam[:, 2:], atol=1e-12)

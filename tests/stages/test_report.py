@@ -316,7 +316,12 @@ def test_sensors_are_listed_and_a_stabilised_video_is_named(inputs: ReportInputs
     metrics = json.loads(json.dumps(inputs.metrics))
     reason = "the camera stabilised the video: the pictures show 8 % of the shaking"
     metrics["telemetry"] = {
-        "torso": {"verdict": "stabilised", "reason": reason, "frames_filled": 0},
+        "torso": {
+            "verdict": "stabilised",
+            "reason": reason,
+            "frames_filled": 0,
+            "stabilisation": {"reason": "the pictures are used as they are"},
+        },
         "left_palm": {
             "verdict": "agrees",
             "reason": "",
@@ -330,6 +335,7 @@ def test_sensors_are_listed_and_a_stabilised_video_is_named(inputs: ReportInputs
     page = written(replace(inputs, metrics=metrics), tmp_path)
     assert "Inertial sensors" in page
     assert reason in page
+    assert "torso: the pictures are used as they are." in page
     for text in ("+8.1 ms", "2.1°", "not used: the camera stabilised the video"):
         assert text in page
 

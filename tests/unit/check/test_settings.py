@@ -9,34 +9,18 @@ import pytest
 
 from bodycap_batch.check import check_path
 from bodycap_batch.formats.gpmf import gopro_settings
+from bodycap_batch.formats.gpmf_writer import append_settings, item, nested
+from bodycap_batch.telemetry.gopro import read_gopro_file
+from tests.gpmf import Sensor, payloads, write_gopro
 from tests.videos import textured_frame, write_video
 
 FRAMES = [textured_frame(index % 40) for index in range(75)]
 
 
-def _item(key, text):
-    data = text.encode("latin-1")
-    return struct.pack(">4sBBH", key.encode(), ord("c"), 1, len(data)) + data + b"\0" * (-len(data) % 4)
-
-
-def _with_gopro_box(path, settings):
-    """Return a settings box as in a GoPro's MP4: moov/udta/GPMF, here in a moov box of its own."""
-    items = b"".join(_item(key, text) for key, text in settings.items())
-    nested = struct.pack(">4sBBH", b"DEVC", 0, 1, len(items)) + items
-    box = struct.pack(">I4s", 8 + len(nested), b"GPMF") + nested
-    for kind in (b"udta", b"moov"):
-        box = struct.pack(">I4s", 8 + len(box), kind) + box
-    return box
-
-
 def _notes(folder, frames=FRAMES, settings=None, **values):
     path = write_video(folder / "torso.mp4", frames, **values)
     if settings is not None:
-        # A second moov box at the end: the file's own moov must not change, because it holds offsets.
-        content = path.read_bytes()
-        size = struct.unpack(">I", content[:4])[0]
-        box = _with_gopro_box(path, settings)
-        path.write_bytes(content[:size] + content[size:] + box)
+        append_settings(path, settings)
     (camera,) = check_path(folder).cameras
     return camera.notes
 
@@ -50,7 +34,8 @@ def test_a_plain_file_gives_no_note(tmp_path):
     ("settings", "words"),
     [
         ({"EISE": "Y", "EISA": "HS High"}, "the camera stabilised the video (HS High)"),
-        ({"EISA": "Y"}, "the camera stabilised the video:"),
+        ({"EISE": "Y", "EISA": "HS High"}, "without a record of their orientations"),
+        ({"EISA": "Y"}, "the camera stabilised the video;"),
         ({"FMWR": "HD9.01.01", "DZOM": "Y"}, "digital zoom"),
     ],
 )
@@ -70,16 +55,52 @@ def test_a_damaged_box_is_ignored(tmp_path):
     assert gopro_settings(path) == {}
     path.write_bytes(struct.pack(">I4s", 60, b"moov") + struct.pack(">I4s", 500, b"udta") + b"GP")
     assert gopro_settings(path) == {}
-    box = _with_gopro_box(path, {"EISE": "Y"})
-    path.write_bytes(box[:-3])
+    path.write_bytes(b"")
+    append_settings(path, {"EISE": "Y"})
+    path.write_bytes(path.read_bytes()[:-3])
     assert set(gopro_settings(path)) <= {"EISE"}
+
+
+def test_a_record_of_the_orientations_is_named(tmp_path):
+    record = item("IORI", "s", [32767, 0, 0, 0] * 30, 4)
+    stream = nested("STRM", item("SCAL", "s", [32767]), record)
+    write_gopro(tmp_path / "torso.mp4", FRAMES, payloads(Sensor(), 3, extra=[stream]))
+    append_settings(tmp_path / "torso.mp4", {"EISE": "Y"})
+    (camera,) = check_path(tmp_path).cameras
+    (note,) = camera.notes
+    assert "their recorded orientations turn the poses back" in note
+    assert "HyperSmooth" in note
+
+
+@pytest.mark.parametrize(
+    ("name", "comment", "words"),
+    [
+        ("torso.mp4", "Original filename: GX010017.MP4\n", "original file (GX010017.MP4)"),
+        ("torso_stabilized.mp4", "", "original file instead"),
+    ],
+)
+def test_a_video_from_gyroflow_is_named(tmp_path, name, comment, words):
+    plain = write_video(tmp_path / "plain" / "torso.mp4", FRAMES)
+    _with_metadata(plain, tmp_path / "made" / name, {"comment": comment} if comment else {})
+    (camera,) = check_path(tmp_path / "made").cameras
+    (note,) = camera.notes
+    assert "Gyroflow" in note
+    assert words in note
+    assert read_gopro_file(tmp_path / "made" / name, 30.0).is_stabilised
 
 
 def test_a_phone_gives_a_note_on_stabilisation(tmp_path):
     plain = write_video(tmp_path / "plain" / "torso.mp4", FRAMES)
     metadata = {"com.apple.quicktime.make": "Apple", "com.apple.quicktime.model": "iPhone 13"}
-    (tmp_path / "phone").mkdir()
     named = tmp_path / "phone" / "torso.mov"
+    _with_metadata(plain, named, metadata)
+    (camera,) = check_path(named.parent).cameras
+    assert any("phone (Apple iPhone 13)" in note for note in camera.notes)
+
+
+def _with_metadata(plain, named, metadata):
+    """Write a copy of a video with metadata."""
+    named.parent.mkdir()
     tags = {"movflags": "use_metadata_tags"}
     with av.open(str(plain)) as source, av.open(str(named), "w", options=tags) as target:
         target.metadata.update(metadata)
@@ -88,8 +109,6 @@ def test_a_phone_gives_a_note_on_stabilisation(tmp_path):
             if packet.dts is not None:
                 packet.stream = stream
                 target.mux(packet)
-    (camera,) = check_path(named.parent).cameras
-    assert any("phone (Apple iPhone 13)" in note for note in camera.notes)
     assert check_path(plain.parent).cameras[0].notes == ()
 
 
@@ -127,3 +146,11 @@ def test_a_calibration_that_contradicts_the_video_is_named(tmp_path, change, wor
     notes = _notes(tmp_path, settings={"MINF": "HERO9 Black", "VFOV": "W", "EISE": "N"})
     assert len(notes) == bool(words)
     assert not notes or words in notes[0]
+
+
+def test_the_job_can_contradict_the_settings(tmp_path):
+    append_settings(write_video(tmp_path / "torso.mp4", FRAMES), {"EISE": "Y"})
+    cameras = "capture:\n  cameras: [{name: torso, video: torso.mp4, stabilised: false}]\n"
+    (tmp_path / "job.yaml").write_text(cameras)
+    (camera,) = check_path(tmp_path).cameras
+    assert camera.notes == ()

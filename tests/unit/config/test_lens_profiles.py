@@ -1,7 +1,6 @@
 """Lenses by name: the table, search, choice by name, and choice by the model in a file."""
 
 import json
-import struct
 
 import numpy as np
 import pytest
@@ -13,8 +12,8 @@ from bodycap_batch.config import lens_profiles as lenses
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.lens_profiles import LensChoice, LensProfile, choose_for_file, choose_named
 from bodycap_batch.core.errors import CaptureError, JobError
+from bodycap_batch.formats.gpmf_writer import append_settings
 from bodycap_batch.model.camera import Camera
-from tests.gpmf import item, nested
 from tests.lens_table import TABLE, row
 from tests.videos import textured_frame, write_video
 
@@ -146,11 +145,7 @@ def test_a_lens_that_two_terms_do_not_describe_keeps_its_four_terms(turning):
 def _gopro(folder, settings, size=(1920, 1080)):
     frames = [textured_frame(index % 40, *size) for index in range(20)]
     path = write_video(folder / "torso.mp4", frames)
-    items = b"".join(item(key, "c", text) for key, text in settings.items())
-    box = nested("DEVC", items)
-    for kind in (b"GPMF", b"udta", b"moov"):
-        box = struct.pack(">I4s", 8 + len(box), kind) + box
-    path.write_bytes(path.read_bytes() + box)
+    append_settings(path, settings)
     return path
 
 

@@ -39,6 +39,7 @@ def test_every_camera_model_has_default_parameters(model):
         ({"sound_skews_s": {"torso": 0.02}}, "sound_skews_s has no effect without sound"),
         ({"sound_skew_range_s": 0.02}, "sound_skew_range_s has no effect without sound"),
         ({"sound": True, "poses_only": True}, "sound: poses_only writes no videos"),
+        ({"stabilised": "recorded", "poses_only": True}, "stabilised: poses_only writes no videos"),
         ({"sound": True, "seconds": 1300}, "can last 1200 s at most"),
         ({"width": 641}, "multiple of 2"),
     ],

@@ -114,6 +114,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             capture=capture,
             registrations=stored,
             samples={"torso": FileRef(path=folder / "torso.imu.csv", digest="of the samples")},
+            stabilised=True,
         ),
         "further_maps": FurtherMapsTask(**together, options=MapOptions()),
         "further_poses": FurtherPosesTask(
