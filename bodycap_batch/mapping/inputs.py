@@ -106,14 +106,14 @@ def with_estimated_lenses(capture: Capture, selections: Sequence[KeyframeSelecti
 
 
 def with_map_lenses(capture: Capture, previous: MapResult) -> Capture:
-    """Return the capture with the lenses of an earlier map, for the cameras whose lens tracks determined.
+    """Return the capture with the lenses of an earlier map, for the cameras with a lens before that map.
 
-    A lens that nothing but the map determines is refined again with each extension: in a small map it may be
-    far off.
+    The map may have refined a lens that was given or that tracks determined. A lens that nothing but the map
+    determines is refined again with each extension: in a small map it may be far off.
     """
     mapped = {name: camera for item in reversed(previous.maps) for name, camera in item.cameras.items()}
-    unknown = {item.name for item in capture.cameras if item.lens_sigma}
-    return _with_lenses(capture, {name: (mapped[name], 0.0) for name in sorted(unknown & mapped.keys())})
+    known = {item.name for item in capture.cameras if item.calibrated}
+    return _with_lenses(capture, {name: (mapped[name], 0.0) for name in sorted(known & mapped.keys())})
 
 
 def with_lenses_of_maps(capture: Capture, previous: MapResult) -> Capture:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
+from bodycap_batch.mapping.intrinsics.intrinsics_check import contradicts
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robustly
@@ -20,18 +23,24 @@ from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wear
 from bodycap_batch.model.scene import MapResult
 
 
-def finalise_models(models: list[Any], context: MappingContext, resected: Sequence[set[int] | None]) -> int:
+def finalise_models(
+    models: list[Any],
+    context: MappingContext,
+    resected: Sequence[set[int] | None],
+    given: Collection[int] = (),
+) -> int:
     """Remove transient points, points on the wearer and dominant points, and adjust robustly, in place.
 
     A model that is left without points is removed from the list: its keyframes saw nothing but transient
     points, or contradict each other. The last adjustment of the largest model refines the lenses that tracks
-    determined (`_adjust`). The other models keep these lenses.
+    determined, and the given lenses that it contradicts (`_adjust`). The other models keep these lenses.
 
     Args:
         models: Reconstructions, the largest first. The list and the reconstructions are changed in place.
         context: Workspace, mapper options.
         resected: For each model, the ids of the images to adjust: the images that were resected after the
             model's last robust adjustment. None: all images of the model are adjusted.
+        given: Ids of the cameras whose given lens is compared with the one that the model determines.
 
     Returns:
         Number of points removed from all models.
@@ -48,7 +57,7 @@ def finalise_models(models: list[Any], context: MappingContext, resected: Sequen
             continue
         only = None if image_ids is None else image_ids & registered_ids(model)
         if only is None or only:
-            _adjust(model, context, lenses, only)
+            _adjust(model, context, lenses, only, given)
         kept.append(model)
         lenses |= {
             number: kept[-1].camera(number).params for number in kept[-1].cameras if number not in lenses
@@ -63,21 +72,43 @@ def finalise_models(models: list[Any], context: MappingContext, resected: Sequen
 
 
 def _adjust(
-    model: Any, context: MappingContext, known: Mapping[int, Any], only: Collection[int] | None
+    model: Any,
+    context: MappingContext,
+    known: Mapping[int, Any],
+    only: Collection[int] | None,
+    given: Collection[int],
 ) -> None:
     """Adjust a model robustly for the last time, in place.
+
+    A given lens is a measurement, and so is the lens that the model determines. The given one is far more
+    exact if it is right, so it stays if both agree (`contradicts`); else the model refines it.
 
     Args:
         model: A reconstruction. It is changed in place.
         context: Mapper options, and the cameras whose lens tracks determined.
         known: Parameters of the lenses that a larger model determined, by camera id.
         only: Ids of the images to adjust; None: all images.
+        given: Ids of the cameras whose given lens is compared.
     """
-    estimated = context.lens_sigma.keys() & set(model.cameras)
-    for number in estimated & known.keys():
+    settings, own = context.mapper_options(), set(model.cameras)
+    estimated, compared = context.lens_sigma.keys() & own, set(given) & own
+    for number in (estimated | compared) & known.keys():
         model.camera(number).params = known[number]
     held = set(context.calibrated_ids) - (estimated - known.keys())
-    adjust_robustly(model, context.mapper_options(), sorted(held), only)
+    adjust_robustly(model, settings, sorted(held), only)
+    compared -= known.keys()
+    if only is not None or not compared or not is_on(Mechanism.RECALIBRATION):
+        return
+    free = copy.deepcopy(model)
+    adjust_robustly(free, settings, sorted(held - compared))
+    wrong = {
+        number
+        for number in compared
+        if contradicts(free.camera(number).mean_focal_length() / model.camera(number).mean_focal_length())
+    }
+    record_act(Mechanism.RECALIBRATION, len(wrong))
+    if wrong:
+        adjust_robustly(model, settings, sorted(held - wrong))
 
 
 def misplaced_frames(names: Collection[str], models: Sequence[Any]) -> dict[str, tuple[int, ...]]:

@@ -351,6 +351,24 @@ def test_the_last_adjustment_refines_a_lens_that_tracks_determined(
     assert _rms(models[0], poses) < 0.02
 
 
+@pytest.mark.parametrize("factor", [1.0, 0.96, 1.04])
+def test_the_last_adjustment_corrects_a_given_lens_only_if_the_map_contradicts_it(
+    factor: float, built: tuple[Any, FloatArray, MappingContext, set[Any]]
+) -> None:
+    model, poses, mapping, _ = built
+    mapping = replace(mapping, times_ns={"cam": np.arange(99) * 10**9})
+    models = [copy.deepcopy(model), copy.deepcopy(model)]
+    for item in models:
+        focal_px, *others = item.camera(1).params
+        item.camera(1).params = [factor * focal_px, *others]
+    finalise_models(models, mapping, [None, None], mapping.given_ids)
+    focal_px = [item.camera(1).params[0] for item in models]
+    assert focal_px[1] == focal_px[0], "a camera has one lens in all models"
+    # A right lens stays as it is. A corrected one is as exact as what the map finds: see `_FOCAL_SIGMA`.
+    assert focal_px[0] == (420.0 if factor == 1.0 else pytest.approx(420.0, rel=0.0075))
+    assert _rms(models[0], poses) < 0.02
+
+
 def test_a_map_without_any_point_is_an_error_that_says_so(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
