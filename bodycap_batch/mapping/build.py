@@ -108,7 +108,7 @@ def build_map(
 ) -> MapResult:
     """Reconstruct the room and the keyframe poses by incremental structure from motion.
 
-    If the map contradicts a given calibration, the map is built again with refined intrinsics. If the matches
+    If a given calibration is far off, the map is built again with refined intrinsics. If the matches
     of one camera contradict the matches of the other cameras, the map is built again without this camera.
 
     Args:
@@ -189,6 +189,8 @@ def build_map_once(
     earlier: EarlierResults = NOTHING_EARLIER,
 ) -> tuple[MapResult, EstimationError | None]:
     """Build a map with the capture's intrinsics: calibrated intrinsics stay constant, others are refined.
+
+    The last adjustment corrects the given lenses that it contradicts (`finalise_models`).
 
     The arguments are the same as in `build_map`; `earlier` is what earlier maps give.
 

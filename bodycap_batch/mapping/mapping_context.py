@@ -24,7 +24,8 @@ class MappingContext:
         intrinsics: Intrinsics by camera name.
         mapper_options: Function that returns a new copy of the options of COLMAP's mapper. A caller may
             change its copy.
-        calibrated_ids: Database ids of the calibrated cameras. The intrinsics of these cameras stay constant.
+        calibrated_ids: Database ids of the calibrated cameras. The intrinsics of these cameras stay constant
+            until the last adjustment.
         stage: Threads, progress, cancellation.
         frame_numbers: `CaptureCamera.frame_numbers` of each camera, by camera name.
         skeletal_above: Maximum number of keyframes of a map that is not large (`is_large`).

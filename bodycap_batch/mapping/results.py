@@ -7,16 +7,23 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.mapping.intrinsics.intrinsics_check import contradicts
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import ImageRef
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robustly
+from bodycap_batch.mapping.reconstruction.bundle_adjustment import (
+    adjust_robustly,
+    bundle_adjust,
+    loss_width_px,
+)
 from bodycap_batch.mapping.reconstruction.camera_motion import CameraMotion
 from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction
 from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, registered_ids
+from bodycap_batch.mapping.reconstruction.reprojection import residuals_px
 from bodycap_batch.mapping.validation.dominant_points import remove_dominant_points
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
@@ -80,8 +87,8 @@ def _adjust(
 ) -> None:
     """Adjust a model robustly for the last time, in place.
 
-    A given lens is a measurement, and so is the lens that the model determines. The given one is far more
-    exact if it is right, so it stays if both agree (`contradicts`); else the model refines it.
+    A given lens is a measurement, and so is the lens that the model determines. The given one is more exact
+    if it is right, so it stays if both agree, or if the model does not determine the lens.
 
     Args:
         model: A reconstruction. It is changed in place.
@@ -99,16 +106,52 @@ def _adjust(
     compared -= known.keys()
     if only is not None or not compared or not is_on(Mechanism.RECALIBRATION):
         return
-    free = copy.deepcopy(model)
-    adjust_robustly(free, settings, sorted(held - compared))
+    free, width_px = copy.deepcopy(model), loss_width_px(model)
+    bundle_adjust(free, settings, sorted(held - compared), loss_px=width_px)
     wrong = {
         number
         for number in compared
         if contradicts(free.camera(number).mean_focal_length() / model.camera(number).mean_focal_length())
     }
+    if wrong:
+        # Both have the same observations and as many steps, so only the lenses make the difference.
+        constant = copy.deepcopy(model)
+        bundle_adjust(constant, settings, sorted(held), loss_px=width_px)
+        wrong &= _likelier_lenses(free, constant, width_px)
     record_act(Mechanism.RECALIBRATION, len(wrong))
+    for number in wrong:
+        model.camera(number).params = free.camera(number).params
     if wrong:
         adjust_robustly(model, settings, sorted(held - wrong))
+
+
+def _likelier_lenses(free: Any, constant: Any, width_px: float) -> set[int]:
+    """Return the ids of the cameras whose residuals justify a free lens (Bayesian information criterion).
+
+    The residuals have a Cauchy distribution in two dimensions. The points and poses fit its noise in part,
+    so it is wider than the residuals.
+
+    Args:
+        free: A model that was adjusted with free lenses.
+        constant: The same model after the same adjustment with constant lenses.
+        width_px: Width of the residuals.
+
+    Source: Schwarz, "Estimating the dimension of a model", 1978.
+    """
+    after, before = residuals_px(free), residuals_px(constant)
+    count = 2 * sum(map(len, before.values()))
+    redundancy = count - 3 * free.num_points3D() - 6 * free.num_reg_images() + 7
+    variance_px2 = width_px**2 * count / max(redundancy, 1)
+    out = set[int]()
+    for number, residuals in before.items():
+        one, other = (
+            3.0 * np.log1p((item**2).sum(axis=1) / variance_px2).sum() for item in (residuals, after[number])
+        )
+        lens = free.camera(number)
+        parameters = len(lens.focal_length_idxs()) + len(lens.extra_params_idxs())
+        if one - other > parameters * np.log(len(residuals)):
+            out.add(number)
+    return out
 
 
 def misplaced_frames(names: Collection[str], models: Sequence[Any]) -> dict[str, tuple[int, ...]]:

@@ -21,6 +21,7 @@ from bodycap_batch.mapping import initial_models
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.initial_models import reconstruct_with_intrinsics
 from bodycap_batch.mapping.intrinsics import intrinsics_check
+from bodycap_batch.mapping.intrinsics.intrinsics_check import contradicts
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
@@ -367,6 +368,23 @@ def test_the_last_adjustment_corrects_a_given_lens_only_if_the_map_contradicts_i
     # A right lens stays as it is. A corrected one is as exact as what the map finds: see `_FOCAL_SIGMA`.
     assert focal_px[0] == (420.0 if factor == 1.0 else pytest.approx(420.0, rel=0.0075))
     assert _rms(models[0], poses) < 0.02
+
+
+def test_a_right_lens_stays_if_few_keyframes_do_not_determine_it(
+    built: tuple[Any, FloatArray, MappingContext, set[Any]],
+) -> None:
+    model, _, mapping, _ = built
+    models = [sub_model(model, set(sorted(model.reg_image_ids())[:3]))]
+    for point in list(models[0].point3D_ids()):
+        if models[0].point3D(point).track.length() < 2:
+            models[0].delete_point3D(point)
+    mapping = replace(mapping, times_ns={"cam": np.arange(99) * 10**9})
+    finalise_models(models, mapping, [None], mapping.given_ids)
+    assert models[0].camera(1).params[0] == 420.0
+    adjust_robustly(models[0], mapping.mapper_options(), [])
+    assert contradicts(models[0].camera(1).mean_focal_length() / 420.0), (
+        "three keyframes fit another lens as well"
+    )
 
 
 def test_a_map_without_any_point_is_an_error_that_says_so(
