@@ -19,6 +19,7 @@ from bodycap_batch.mapping.reconstruction.bundle_adjustment import (
     adjust_robustly,
     bundle_adjust,
     loss_width_px,
+    restore,
 )
 from bodycap_batch.mapping.reconstruction.camera_motion import CameraMotion
 from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction
@@ -106,7 +107,7 @@ def _adjust(
     compared -= known.keys()
     if only is not None or not compared or not is_on(Mechanism.RECALIBRATION):
         return
-    free, width_px = copy.deepcopy(model), loss_width_px(model)
+    free, constant, width_px = copy.deepcopy(model), copy.deepcopy(model), loss_width_px(model)
     bundle_adjust(free, settings, sorted(held - compared), loss_px=width_px)
     wrong = {
         number
@@ -115,13 +116,13 @@ def _adjust(
     }
     if wrong:
         # Both have the same observations and as many steps, so only the lenses make the difference.
-        constant = copy.deepcopy(model)
         bundle_adjust(constant, settings, sorted(held), loss_px=width_px)
         wrong &= _likelier_lenses(free, constant, width_px)
     record_act(Mechanism.RECALIBRATION, len(wrong))
-    for number in wrong:
-        model.camera(number).params = free.camera(number).params
     if wrong:
+        restore(model, free)
+        for number in compared - wrong:
+            model.camera(number).params = constant.camera(number).params
         adjust_robustly(model, settings, sorted(held - wrong))
 
 

@@ -168,7 +168,7 @@ def bundle_adjust(
         )
     }
     if impossible:
-        _restore(model, before)
+        restore(model, before)
         bundle_adjust(model, settings, {*calibrated_ids, *impossible}, iterations, loss_px, only)
         return
     if not summary.is_solution_usable():
@@ -178,8 +178,8 @@ def bundle_adjust(
         )
 
 
-def _restore(model: Any, before: Any) -> None:
-    """Give a model the poses, points and lenses of an earlier copy of it, in place."""
+def restore(model: Any, before: Any) -> None:
+    """Give a model the poses, points and lenses of a copy of it, in place."""
     for frame_id in before.reg_frame_ids():
         model.frame(frame_id).rig_from_world = before.frame(frame_id).rig_from_world
     for point_id, point in before.points3D.items():

@@ -5,14 +5,17 @@ import pycolmap
 import pytest
 
 from bodycap_batch.config import MapOptions
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.intrinsics.intrinsics_check import (
     find_misfit_intrinsics,
     misfit_note,
     refine_principal_points,
     select_camera_models,
 )
+from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import bundle_adjust
 from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
+from bodycap_batch.mapping.results import _adjust
 from bodycap_batch.model.geometry import so3_exp
 
 
@@ -61,6 +64,25 @@ def test_a_lens_that_the_map_corrected_far_is_a_misfit():
     one, other = _names(model).values()
     corrected = {one: 1.03, other: 1.2}
     assert find_misfit_intrinsics(model, settings, _names(model), corrected) == {other: 1.2}
+
+
+def test_the_last_adjustment_corrects_only_the_camera_whose_lens_is_wrong(tmp_path):
+    model, settings = _model(1.0)
+    right, wrong = sorted(model.cameras)
+    given = {number: np.array(model.camera(number).params) for number in model.cameras}
+    model.camera(wrong).params = given[wrong] * [1.04, 1.0, 1.0, 1.0]
+    mapping = MappingContext(
+        workspace=tmp_path,
+        intrinsics={},
+        mapper_options=lambda: settings,
+        calibrated_ids=[right, wrong],
+        stage=StageContext(work_dir=tmp_path),
+        frame_numbers={},
+    )
+    _adjust(model, mapping, {}, None, mapping.given_ids)
+    assert (model.camera(right).params == given[right]).all()
+    # As in `test_a_wrong_focal_length_is_found_and_measured`.
+    assert model.camera(wrong).mean_focal_length() == pytest.approx(given[wrong][0], rel=0.01)
 
 
 def test_a_wrong_principal_point_is_found():
