@@ -23,7 +23,7 @@ from bodycap_batch.mapping.inputs import (
     make_mapping_context,
     with_estimated_lenses,
 )
-from bodycap_batch.mapping.intrinsics.intrinsics_check import contradicts, find_misfit_intrinsics
+from bodycap_batch.mapping.intrinsics.intrinsics_check import corrected_lenses, find_misfit_intrinsics
 from bodycap_batch.mapping.intrinsics.readout_profile import estimate_from_matches
 from bodycap_batch.mapping.intrinsics.readout_time import Readout, map_with_readouts
 from bodycap_batch.mapping.intrinsics.recalibration import MISFIT_CAMERAS, recalibrate_if_misfit
@@ -36,7 +36,6 @@ from bodycap_batch.mapping.intrinsics.shutters import (
     with_gyroscopes,
     write_shutters,
 )
-from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     add_camera,
@@ -241,7 +240,9 @@ def build_map_once(
     if refused is not None and not models:
         raise refused
     write_models(workspace, models)
-    corrected, misfits = _check_given_lenses(models[0], capture, mapping, ids)
+    given = {number: name for name, number in ids.items() if number in mapping.given_ids}
+    corrected = corrected_lenses(models, capture, given)
+    misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), given, corrected)
     log[MISFIT_CAMERAS] = sorted(misfits)
     removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
@@ -258,34 +259,6 @@ def build_map_once(
     result = make_result(models, workspace, log)
     result = _with_readouts(result, {name: used[name] for name in shutters})
     return result, refused or add_flip_hint(check_consistency(left_contradicted(log["repair"], ratio)), flips)
-
-
-def _check_given_lenses(
-    model: Any, capture: Capture, mapping: MappingContext, ids: Mapping[str, int]
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Compare the given lenses with those of a model, and with those that fit it.
-
-    Args:
-        model: A reconstruction.
-        capture: All cameras, with their given lenses.
-        mapping: Mapper options, calibrated cameras.
-        ids: Database ids by camera name.
-
-    Returns:
-        By camera name, the ratio of the focal length in the model to the given one, for the lenses that the
-        model refined; the ratio of the one that fits, for the lenses with which the map is built again.
-    """
-    given = {
-        number: name
-        for name, number in ids.items()
-        if number in mapping.given_ids and model.exists_camera(number)
-    }
-    ratios = {
-        name: model.camera(number).mean_focal_length() / capture.camera(name).camera.focal_px
-        for number, name in given.items()
-    }
-    corrected = {name: round(ratio, 3) for name, ratio in ratios.items() if contradicts(ratio)}
-    return corrected, find_misfit_intrinsics(model, mapping.mapper_options(), given, corrected)
 
 
 def _with_readouts(result: MapResult, readouts: Mapping[str, Readout]) -> MapResult:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bodycap_batch.capture import Capture
 from bodycap_batch.core.arrays import evenly_spaced
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.matching.database import DATABASE_NAME
@@ -80,6 +81,26 @@ def contradicts(factor: float) -> bool:
         factor: Ratio of the focal length of the map to the given focal length.
     """
     return abs(factor - 1.0) > 2.0 * _FOCAL_SIGMA
+
+
+def corrected_lenses(models: Sequence[Any], capture: Capture, given: Mapping[int, str]) -> dict[str, float]:
+    """Return the focal lengths in models, divided by the given ones, where the models contradict them.
+
+    Args:
+        models: Reconstructions, the largest first.
+        capture: All cameras, with their given lenses.
+        given: Names of the cameras whose lens was given, by database id.
+
+    Returns:
+        The ratios by camera name.
+    """
+    ratios = {
+        name: model.camera(number).mean_focal_length() / capture.camera(name).camera.focal_px
+        for model in reversed(models)
+        for number, name in sorted(given.items())
+        if model.exists_camera(number)
+    }
+    return {name: round(ratio, 3) for name, ratio in ratios.items() if contradicts(ratio)}
 
 
 def find_misfit_intrinsics(
