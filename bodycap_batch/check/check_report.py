@@ -44,6 +44,7 @@ class CameraSummary:
         guessed_lens: True if the camera has no calibration.
         origins: Where the settings of the camera come from; None if it is unknown.
         is_static: True if the inspected pictures stand still throughout the recording.
+        is_worn: False if nobody wears the camera.
     """
 
     name: str
@@ -63,6 +64,7 @@ class CameraSummary:
     guessed_lens: bool = False
     origins: CameraOrigins | None = None
     is_static: bool = False
+    is_worn: bool = True
 
     @property
     def large_frames(self) -> int:
@@ -78,6 +80,7 @@ class CameraSummary:
         if len(self.files) > _MAX_SHOWN_FILES:
             files += f" … ({len(self.files)} chapters)"
         place = "place not known yet" if self.role is None else place_of_role(self.role)
+        place = place if self.is_worn else "not on the body"
         width, height = self.size_px
         size = f"{width}×{height}"
         if self.work_size_px != self.size_px:

@@ -193,6 +193,7 @@ def _summarise_camera(camera: CaptureCamera, config: CameraConfig, quality: Pict
         lens=_intrinsics_text(camera),
         guessed_lens=not camera.calibrated,
         is_static=quality.is_static,
+        is_worn=config.is_worn,
         notes=(
             *camera.notes,
             *quality.notes,
@@ -287,7 +288,7 @@ def _duration_notes(duration_s: float) -> list[str]:
 def _body_notes(job: Job) -> list[str]:
     if job.skeleton == NO_SKELETON:
         return []
-    roles = {camera.role for camera in job.capture.cameras}
+    roles = {camera.role for camera in job.capture.worn()}
     notes = []
     if not roles & set(TRUNK_ROLES) and not job.capture.unplaced():
         notes.append(

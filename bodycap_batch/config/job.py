@@ -391,7 +391,9 @@ def _no_body(job: Job, resolved: Job) -> str:
     """Return why the job computes no body although it does not say so; "" if there is no reason to say it."""
     if resolved.skeleton != NO_SKELETON or job.skeleton is not None:
         return ""
-    cameras = job.capture.cameras
+    cameras = job.capture.worn()
+    if not cameras:
+        return "no body is computed: nobody wears a camera (mount: none)"
     names = ", ".join(camera.name for camera in cameras)
     places = " and ".join(sorted({_place_of(camera) for camera in cameras}))
     roles = {camera.role for camera in cameras}

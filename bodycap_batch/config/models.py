@@ -21,7 +21,7 @@ from bodycap_batch.config.bounds import (
 )
 from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.lens_profiles import NAME_SEPARATOR, profiles_named
-from bodycap_batch.config.mounts import REFERENCE_ROLES, mount_of, role_of_segment
+from bodycap_batch.config.mounts import NOT_WORN, REFERENCE_ROLES, mount_of, role_of_segment
 from bodycap_batch.config.options import (
     ExportOptions,
     KeyframeOptions,
@@ -127,7 +127,8 @@ class CameraConfig(_Block):
     )
     mount: str | None = Field(
         None,
-        description="place of the camera on the body; default: the place that the camera's name contains",
+        description="place of the camera on the body, or none for a camera that nobody wears, for example on "
+        "a tripod; default: the place that the camera's name contains",
     )
     mount_source: Literal["motion"] | None = Field(
         None,
@@ -207,11 +208,16 @@ class CameraConfig(_Block):
 
     @property
     def role(self) -> str | None:
-        """Role of the bone that the camera is mounted on (``LeftHand``); None if the role is unknown."""
+        """Role of the bone that the camera is mounted on (``LeftHand``); None if it is unknown or none."""
         if self.segment is not None:
             return role_of_segment(self.segment)
         found = mount_of(self.mount or self.name)
         return None if found is None else found[1]
+
+    @property
+    def is_worn(self) -> bool:
+        """False for a camera that nobody wears. Its path is solved, and the body never uses it."""
+        return self.mount != NOT_WORN
 
     def mount_matrix(self) -> FloatArray | None:
         """Return `joint_from_cam` as a (4,4) transform, in metres; None if the job does not give it."""
@@ -281,9 +287,13 @@ class CaptureConfig(_Block):
                     return camera
         return self.cameras[0]
 
+    def worn(self) -> tuple[CameraConfig, ...]:
+        """Return the cameras that are on the body."""
+        return tuple(camera for camera in self.cameras if camera.is_worn)
+
     def unplaced(self) -> tuple[CameraConfig, ...]:
         """Return the cameras whose place the run finds from the motion."""
-        return tuple(camera for camera in self.cameras if self.places and camera.role is None)
+        return tuple(camera for camera in self.worn() if self.places and camera.role is None)
 
     def segments(self) -> list[list[CameraConfig]]:
         """Return the cameras of each body segment on which two or more cameras are mounted."""

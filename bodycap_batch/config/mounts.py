@@ -71,6 +71,9 @@ TRUNK_ROLES = ("Hips", "Spine", "Spine1", "Neck", "Head")
 REFERENCE_ROLES = ("Spine1", "Spine", "Hips")
 """Roles of the bones of a torso camera, the preferred one first. The common clock is that of this camera."""
 
+NOT_WORN = "none"
+"""Value of ``mount:`` for a camera that nobody wears, for example on a tripod."""
+
 _NOISE = frozenset((
     "cam", "camera", "webcam", "gopro", "go", "pro", "hero", "insta", "osmo", "action", "dji", "sony",
     "iphone", "phone", "video", "vid", "movie", "clip", "film", "take", "rec", "recording", "footage", "file",

@@ -60,8 +60,9 @@ def skeleton_of(job: Job) -> str:
     """
     if job.skeleton is not None:
         return AUTO_SKELETON if job.skeleton == "upper_body" else job.skeleton
-    roles = {camera.role for camera in job.capture.cameras}
-    alone = len(job.capture.cameras) == 1 or (len(roles) == 1 and None not in roles)
+    worn = job.capture.worn()
+    roles = {camera.role for camera in worn}
+    alone = len(worn) <= 1 or (len(roles) == 1 and None not in roles)
     return NO_SKELETON if alone else AUTO_SKELETON
 
 
@@ -86,14 +87,19 @@ def _camera_names(job: Job, index: int) -> Iterator[Problem]:
 
 
 def _mount(job: Job, camera: CameraConfig) -> Iterator[Problem]:
-    if camera.segment is not None and camera.role is None:
+    if not camera.is_worn:
+        for field in ("segment", "joint_from_cam"):
+            if getattr(camera, field) is not None:
+                message = f"camera {camera.name!r} is not on the body (mount: none), so it is on no bone"
+                yield Problem((field,), message, f"remove {field}, or give the camera's place as `mount:`")
+    elif camera.segment is not None and camera.role is None:
         known = (*ROLES, *MOUNT_NAMES)
         yield Problem(
             ("segment",), f"there is no segment {camera.segment!r}", _nearest(camera.segment, known)
         )
     elif camera.mount == UNKNOWN_MOUNT:
         message = f"the place of camera {camera.name!r} on the body is not filled in"
-        yield Problem(("mount",), message, f"use one of {', '.join(MOUNT_NAMES)}")
+        yield Problem(("mount",), message, f"use one of {', '.join(MOUNT_NAMES)}, or none")
     elif camera.segment is None and camera.mount is not None and camera.role is None:
         yield Problem(("mount",), f"there is no mount {camera.mount!r}", _nearest(camera.mount, MOUNT_NAMES))
     elif camera.role is None and skeleton_of(job) != NO_SKELETON and not job.capture.places:
@@ -179,7 +185,13 @@ def _skeleton(job: Job) -> Iterator[Problem]:
         )
     elif value is not None:
         yield from _unusable("skeleton", Path(value))
-    roles = {camera.role for camera in job.capture.cameras}
+    roles = {camera.role for camera in job.capture.worn()}
+    if skeleton_of(job) != NO_SKELETON and not roles:
+        yield Problem(
+            ("skeleton",),
+            "nobody wears a camera (mount: none), so there is no motion of a body",
+            "give the places of the worn cameras, or set `skeleton: none`",
+        )
     if skeleton_of(job) != NO_SKELETON and len(roles) == 1 and None not in roles:
         yield Problem(
             ("skeleton",),
@@ -194,9 +206,10 @@ def _size(job: Job) -> Iterator[Problem]:
 
     In this case no distance between cameras determines the size of the body.
     """
-    parts = [split_side(camera.role) for camera in job.capture.cameras if camera.role is not None]
+    worn = job.capture.worn()
+    parts = [split_side(camera.role) for camera in worn if camera.role is not None]
     limbs = [(side, _FREE_LIMB.get(part)) for side, part in parts]
-    all_differ = len(limbs) == len(set(limbs)) == len(job.capture.cameras) > 1
+    all_differ = len(limbs) == len(set(limbs)) == len(worn) > 1
     if skeleton_of(job) != NO_SKELETON and all_differ and all(limb is not None for _, limb in limbs):
         yield Problem(
             ("skeleton",),

@@ -30,6 +30,10 @@ from bodycap_batch.mapping.validation.transient_points import remove_transient_p
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.scene import MapResult
 
+_MAX_LENS_SIGMAS = 5.0
+"""Maximum change of a focal length in the last adjustment, in standard deviations of the one from tracks.
+With a larger change, the model does not determine the lens. Evidence: docs/decisions/mapping.md."""
+
 
 def finalise_models(
     models: list[Any],
@@ -88,6 +92,8 @@ def _adjust(
 ) -> None:
     """Adjust a model robustly for the last time, in place.
 
+    A lens that tracks determined is refined, unless the model leads to one that the tracks exclude.
+
     A given lens is a measurement, and so is the lens that the model determines. The given one is more exact
     if it is right, so it stays if both agree, or if the model does not determine the lens.
 
@@ -102,8 +108,18 @@ def _adjust(
     estimated, compared = context.lens_sigma.keys() & own, set(given) & own
     for number in (estimated | compared) & known.keys():
         model.camera(number).params = known[number]
-    held = set(context.calibrated_ids) - (estimated - known.keys())
+    freed = estimated - known.keys()
+    held, before = set(context.calibrated_ids) - freed, copy.deepcopy(model)
     adjust_robustly(model, settings, sorted(held), only)
+    absurd = {
+        number
+        for number in freed
+        if abs(_log_focal_ratio(model, before, number)) > _MAX_LENS_SIGMAS * context.lens_sigma[number]
+    }
+    if absurd:
+        restore(model, before)
+        held |= absurd
+        adjust_robustly(model, settings, sorted(held), only)
     compared -= known.keys()
     if only is not None or not compared or not is_on(Mechanism.RECALIBRATION):
         return
@@ -124,6 +140,12 @@ def _adjust(
         for number in compared - wrong:
             model.camera(number).params = constant.camera(number).params
         adjust_robustly(model, settings, sorted(held - wrong))
+
+
+def _log_focal_ratio(model: Any, before: Any, number: int) -> float:
+    """Return the logarithm of the ratio of a camera's focal lengths in two models."""
+    ratio = model.camera(number).mean_focal_length() / before.camera(number).mean_focal_length()
+    return float(np.log(ratio))
 
 
 def _likelier_lenses(free: Any, constant: Any, width_px: float) -> set[int]:

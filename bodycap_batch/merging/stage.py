@@ -26,7 +26,12 @@ from bodycap_batch.merging.cameras.camera_axes import with_axes_of_cameras
 from bodycap_batch.merging.cameras.excluded_cameras import MIN_LOCALISED_FRAMES
 from bodycap_batch.merging.cameras.mount_slips import find_slip, without_slip
 from bodycap_batch.merging.cameras.still_parts import still_parts
-from bodycap_batch.merging.cameras.track import CameraTrack, inflate_sigmas, make_track
+from bodycap_batch.merging.cameras.track import (
+    CameraTrack,
+    inflate_sigmas,
+    make_track,
+    transform_trajectory,
+)
 from bodycap_batch.merging.cameras.track_outliers import remove_outliers
 from bodycap_batch.merging.graph.adaptive_motion_noise import scale_motion_noise
 from bodycap_batch.merging.graph.foot_contact import (
@@ -124,7 +129,12 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         turns[path.camera].picture_path(path) if path.camera in turns else path
         for path in result.trajectories
     ]
-    return replace(result, trajectories=tuple(paths))
+    unworn = [
+        transform_trajectory(path, result.world_from_map[path.gauge], "world")
+        for path in inputs.unworn
+        if path.gauge in result.world_from_map
+    ]
+    return replace(result, trajectories=(*paths, *unworn))
 
 
 def _solve_body(

@@ -93,6 +93,8 @@ class MergeInputs:
         picture_turns: By camera name, how the camera turned its pictures relative to its lens. Only cameras
             with stabilised pictures have an entry. Trajectories and observations of the board have the axes
             of the pictures; mounts have those of the lens.
+        unworn: The trajectories of the cameras that nobody wears, in the gauges of their maps. They have no
+            mount, and the body never uses them.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -107,6 +109,7 @@ class MergeInputs:
     board_views: tuple[BoardView, ...] = ()
     force_windows: Mapping[str, ForceWindows] = field(default_factory=dict)
     picture_turns: Mapping[str, PictureTurns] = field(default_factory=dict)
+    unworn: tuple[Trajectory, ...] = ()
 
     def __post_init__(self) -> None:
         cameras = [trajectory.camera for trajectory in self.trajectories]
@@ -144,7 +147,7 @@ class SolvedBody:
         trajectories: The trajectories of the cameras in use, in the gauge "world". The camera centres were
             solved together with the body (`MergeOptions.camera_paths`). The covariances describe the
             measurements, not the solution; lengths are in metres. Poses with gross errors are removed and
-            have the status POSE_JUMP.
+            have the status POSE_JUMP. Last come the cameras that nobody wears, if their map is in the world.
         mounts: The solved mounts, with their sigmas.
         standing: (T,J) True if the joint is the ankle of a foot that stands at the tick. None if foot contact
             was not detected.

@@ -155,7 +155,7 @@ def samples_input(camera: CameraConfig, digests: FileDigests) -> FileRef | None:
 def body_input(job: Job, digests: FileDigests) -> BodyInput:
     """Return the body of a job as input of a task: skeleton, stature, activity and mounts.
 
-    Cameras whose place the run finds later have no mount.
+    Cameras that nobody wears, and those whose place the run finds later, have no mount.
 
     Raises:
         JobError: A camera's place on the body is unknown, or the skeleton file cannot be read.
@@ -169,7 +169,7 @@ def body_input(job: Job, digests: FileDigests) -> BodyInput:
         tpose_frame=job.tpose_frame if path else None,
         height_m=job.height_m,
         activity=job.activity,
-        mounts=tuple(_mount_input(camera) for camera in job.capture.cameras if camera not in unplaced),
+        mounts=tuple(_mount_input(camera) for camera in job.capture.worn() if camera not in unplaced),
     )
 
 

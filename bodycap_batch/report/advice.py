@@ -181,7 +181,8 @@ def _about_start_and_end(inputs: ReportInputs) -> Iterator[Advice]:
         return
     start_s, end_s = merge.times_ns()[[0, -1]] * 1e-9
     measured = {}
-    for path in merge.trajectories:
+    mounted = {mount.camera for mount in merge.mounts}
+    for path in (path for path in merge.trajectories if path.camera in mounted):
         times = common_times_s(inputs, path.camera, path.times_ns)[path.localised]
         if len(times):
             measured[path.camera] = (float(times[0]), float(times[-1]))

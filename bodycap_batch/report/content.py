@@ -235,7 +235,7 @@ def _clock_text(time_s: float) -> str:
 
 def _cameras_of_body(inputs: ReportInputs) -> set[str]:
     """Return the names of the cameras whose gaps the motion of the body bridges."""
-    return set() if inputs.merge is None else {path.camera for path in inputs.merge.trajectories}
+    return set() if inputs.merge is None else {mount.camera for mount in inputs.merge.mounts}
 
 
 def _time_span(inputs: ReportInputs) -> tuple[float, float]:

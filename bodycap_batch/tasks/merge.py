@@ -85,8 +85,10 @@ def _merge_inputs(task: MergeTask) -> MergeInputs:
         paths_of(task.registrations.values()), scene.maps, load_clocks(task.clocks)
     )
     skeleton, mounts = load_body(task.body)
+    mounted = {mount.camera for mount in mounts}
     return MergeInputs(
-        trajectories=found.trajectories,
+        trajectories=tuple(path for path in found.trajectories if path.camera in mounted),
+        unworn=tuple(path for path in found.trajectories if path.camera not in mounted),
         clocks=found.clocks,
         skeleton=skeleton,
         mounts=mounts,

@@ -41,10 +41,12 @@ def measure_rotation_chain(
 
     nodes, links = [0], list[tuple[FloatArray, float]]()
     while nodes[-1] < len(frames) - 1:
-        ends = [nodes[-1] + step for step in _STEPS if nodes[-1] + step < len(frames)]
-        tried = ((end, _link(motion, nodes[-1], end)) for end in ends)
-        unknown = (min(nodes[-1] + _STEPS[-1], len(frames) - 1), (np.full(3, np.nan), np.nan))
-        end, link = next((pair for pair in tried if pair[1] is not None), unknown)
+        end, link = min(nodes[-1] + _STEPS[-1], len(frames) - 1), (np.full(3, np.nan), np.nan)
+        for longer in (nodes[-1] + step for step in _STEPS):
+            found = _link(motion, nodes[-1], longer) if longer < len(frames) else None
+            if found is not None:
+                end, link = longer, found
+                break
         links.append(link)
         nodes.append(end)
     return RotationChain(

@@ -179,10 +179,13 @@ def bundle_adjust(
 
 
 def restore(model: Any, before: Any) -> None:
-    """Give a model the poses, points and lenses of a copy of it, in place."""
+    """Give a model the poses, points and lenses of an earlier copy of it, in place.
+
+    Points that were removed since stay removed.
+    """
     for frame_id in before.reg_frame_ids():
         model.frame(frame_id).rig_from_world = before.frame(frame_id).rig_from_world
-    for point_id, point in before.points3D.items():
-        model.point3D(point_id).xyz = point.xyz
+    for point_id in model.point3D_ids():
+        model.point3D(point_id).xyz = before.point3D(point_id).xyz
     for camera_id, camera in before.cameras.items():
         model.camera(camera_id).params = camera.params

@@ -18,6 +18,8 @@ from bodycap_batch.config.job import Overrides, load_job
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.options import MARKER_COUNTS
 from bodycap_batch.core.errors import CaptureError, JobError
+from bodycap_batch.pipeline.inputs import body_input
+from bodycap_batch.store.digests import FileDigests
 
 MINIMAL = """\
 capture:
@@ -398,3 +400,38 @@ def test_a_name_that_no_path_can_hold_is_refused_with_its_field(tmp_path: Path) 
     with pytest.raises(JobError) as caught:
         load_job(job)
     assert caught.value.field == "name"
+
+
+TRIPOD = (
+    MINIMAL
+    + """\
+    - name: left_tripod
+      video: tripod.mp4
+      mount: none
+"""
+)
+
+
+def test_a_camera_that_nobody_wears_is_no_part_of_the_body(tmp_path: Path) -> None:
+    job = load(tmp_path, TRIPOD)
+    tripod = job.capture.cameras[2]
+    assert not tripod.is_worn
+    assert tripod.role is None
+    assert job.skeleton == "auto"
+    assert [mount.camera for mount in body_input(job, FileDigests(tmp_path)).mounts] == ["torso", "left_palm"]
+    # Its place is not looked for either.
+    places = load(tmp_path, TRIPOD.replace("capture:", "capture:\n  places: [torso, left_palm, right_palm]"))
+    assert tripod.name not in [camera.name for camera in places.capture.unplaced()]
+
+
+def test_a_body_needs_cameras_that_somebody_wears(tmp_path: Path) -> None:
+    alone = load(tmp_path, "capture: {cameras: [{name: torso, video: a.mp4, mount: none}]}")
+    assert alone.skeleton == "none"
+    text = "skeleton: auto\ncapture: {cameras: [{name: a, video: a.mp4, mount: none}]}"
+    assert "nobody wears a camera" in refused(tmp_path, text).message
+
+
+def test_a_camera_that_nobody_wears_is_on_no_bone(tmp_path: Path) -> None:
+    error = refused(tmp_path, TRIPOD + "      segment: LeftHand\n")
+    assert error.field == "capture.cameras.2.segment"
+    assert "mount: none" in error.message

@@ -352,6 +352,22 @@ def test_the_last_adjustment_refines_a_lens_that_tracks_determined(
     assert _rms(models[0], poses) < 0.02
 
 
+def test_a_lens_that_the_tracks_exclude_is_no_result_of_the_last_adjustment(
+    built: tuple[Any, FloatArray, MappingContext, set[Any]],
+) -> None:
+    model, poses, mapping, _ = built
+    # The model leads from 10 % less back to 420 px. Tracks with a sigma of 0.1 % exclude that.
+    for sigma, focal_px in [(0.001, 378.0), (0.05, 420.0)]:
+        exact = replace(mapping, times_ns={"cam": np.arange(99) * 10**9}, lens_sigma={1: sigma})
+        models = [copy.deepcopy(model)]
+        models[0].camera(1).params = [378.0, *models[0].camera(1).params[1:]]
+        finalise_models(models, exact, [None])
+        # The model itself determines the focal length to 1 %.
+        assert models[0].camera(1).params[0] == pytest.approx(focal_px, rel=0.01)
+        assert models[0].num_reg_images() == _KEYFRAMES
+    assert _rms(models[0], poses) < 0.02
+
+
 @pytest.mark.parametrize("factor", [1.0, 0.96, 1.04])
 def test_the_last_adjustment_corrects_a_given_lens_only_if_the_map_contradicts_it(
     factor: float, built: tuple[Any, FloatArray, MappingContext, set[Any]]
