@@ -129,12 +129,12 @@ def merge(inputs: MergeInputs, options: MergeOptions, context: StageContext) -> 
         turns[path.camera].picture_path(path) if path.camera in turns else path
         for path in result.trajectories
     ]
-    unworn = [
+    not_worn = [
         transform_trajectory(path, result.world_from_map[path.gauge], "world")
-        for path in inputs.unworn
+        for path in inputs.not_worn
         if path.gauge in result.world_from_map
     ]
-    return replace(result, trajectories=(*paths, *unworn))
+    return replace(result, trajectories=(*paths, *not_worn))
 
 
 def _solve_body(

@@ -93,7 +93,7 @@ class MergeInputs:
         picture_turns: By camera name, how the camera turned its pictures relative to its lens. Only cameras
             with stabilised pictures have an entry. Trajectories and observations of the board have the axes
             of the pictures; mounts have those of the lens.
-        unworn: The trajectories of the cameras that nobody wears, in the gauges of their maps. They have no
+        not_worn: The trajectories of the cameras that nobody wears, in the gauges of their maps. They have no
             mount, and the body never uses them.
     """
 
@@ -109,7 +109,7 @@ class MergeInputs:
     board_views: tuple[BoardView, ...] = ()
     force_windows: Mapping[str, ForceWindows] = field(default_factory=dict)
     picture_turns: Mapping[str, PictureTurns] = field(default_factory=dict)
-    unworn: tuple[Trajectory, ...] = ()
+    not_worn: tuple[Trajectory, ...] = ()
 
     def __post_init__(self) -> None:
         cameras = [trajectory.camera for trajectory in self.trajectories]

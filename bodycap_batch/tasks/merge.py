@@ -88,7 +88,7 @@ def _merge_inputs(task: MergeTask) -> MergeInputs:
     mounted = {mount.camera for mount in mounts}
     return MergeInputs(
         trajectories=tuple(path for path in found.trajectories if path.camera in mounted),
-        unworn=tuple(path for path in found.trajectories if path.camera not in mounted),
+        not_worn=tuple(path for path in found.trajectories if path.camera not in mounted),
         clocks=found.clocks,
         skeleton=skeleton,
         mounts=mounts,

@@ -81,6 +81,7 @@ class _Video:
     pictures: list[np.ndarray]
     name: str = "torso"
     mask: np.ndarray | None = None
+    turns: None = None
 
     @property
     def damaged(self) -> np.ndarray:
