@@ -23,10 +23,10 @@ from bodycap_batch.mapping.inputs import (
     make_mapping_context,
     with_estimated_lenses,
 )
-from bodycap_batch.mapping.intrinsics.intrinsics_check import corrected_lenses, find_misfit_intrinsics
+from bodycap_batch.mapping.intrinsics.intrinsics_check import find_misfit_intrinsics
 from bodycap_batch.mapping.intrinsics.readout_profile import estimate_from_matches
 from bodycap_batch.mapping.intrinsics.readout_time import Readout, map_with_readouts
-from bodycap_batch.mapping.intrinsics.recalibration import MISFIT_CAMERAS, recalibrate_if_misfit
+from bodycap_batch.mapping.intrinsics.recalibration import recalibrate_if_misfit
 from bodycap_batch.mapping.intrinsics.shutters import (
     known_readouts,
     possible_readouts,
@@ -107,7 +107,7 @@ def build_map(
 ) -> MapResult:
     """Reconstruct the room and the keyframe poses by incremental structure from motion.
 
-    If a given calibration is far off, the map is built again with refined intrinsics. If the matches
+    If the map contradicts a given calibration, the map is built again with refined intrinsics. If the matches
     of one camera contradict the matches of the other cameras, the map is built again without this camera.
 
     Args:
@@ -189,8 +189,6 @@ def build_map_once(
 ) -> tuple[MapResult, EstimationError | None]:
     """Build a map with the capture's intrinsics: calibrated intrinsics stay constant, others are refined.
 
-    The last adjustment corrects the given lenses that it contradicts (`finalise_models`).
-
     The arguments are the same as in `build_map`; `earlier` is what earlier maps give.
 
     Returns:
@@ -229,7 +227,7 @@ def build_map_once(
         resected: Sequence[set[int] | None] = [None] * len(models)
         if skeletal is not generator:
             resected, log["placed"] = resect_remaining(models, generator, tried, mapping)
-        log["unconfirmed_points"] = finalise_models(models, mapping, resected, mapping.given_ids)
+        log["unconfirmed_points"] = finalise_models(models, mapping, resected)
         models[0], log["contradicting"], ratio = remove_without_adjustment(models[0], mapping)
         # A removed keyframe may have connected others with the room.
         log["unconfirmed_points"] += sum(map(remove_points_on_wearer, models))
@@ -240,21 +238,15 @@ def build_map_once(
     if refused is not None and not models:
         raise refused
     write_models(workspace, models)
-    given = {number: name for name, number in ids.items() if number in mapping.given_ids}
-    corrected = corrected_lenses(models, capture, given)
-    misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), given, corrected)
-    log[MISFIT_CAMERAS] = sorted(misfits)
+    calibrated = {number: name for name, number in ids.items() if number in mapping.given_ids}
+    misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
     removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
     if readouts:
         log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
     unknown = unknown_shutters(capture, selections, readouts)
     log = MapDiagnostics(
-        misfit_factors=corrected | misfits,
-        recalibrated=tuple(sorted(corrected)),
-        misplaced=misplaced,
-        unknown_shutters=unknown,
-        details=log,
+        misfit_factors=misfits, misplaced=misplaced, unknown_shutters=unknown, details=log
     ).to_log()
     result = make_result(models, workspace, log)
     result = _with_readouts(result, {name: used[name] for name in shutters})

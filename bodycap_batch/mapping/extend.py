@@ -19,7 +19,6 @@ from bodycap_batch.mapping.inputs import (
     make_mapping_context,
     with_map_lenses,
 )
-from bodycap_batch.mapping.intrinsics.intrinsics_check import corrected_lenses
 from bodycap_batch.mapping.intrinsics.readout_time import map_with_readouts
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
 from bodycap_batch.mapping.intrinsics.shutters import read_shutters, readouts_of_maps
@@ -58,8 +57,8 @@ def extend_map(
     """Add keyframes to a map.
 
     First, the new keyframes are registered, and the existing poses do not change. Then misregistered
-    keyframes are removed. Last, all poses are adjusted, and the given lenses that they contradict. In a large
-    map, only the poses of the keyframes in `extra_frames` are adjusted.
+    keyframes are removed. Last, all poses are adjusted. In a large map, only the poses of the keyframes in
+    `extra_frames` are adjusted.
 
     Args:
         capture: All cameras.
@@ -75,7 +74,7 @@ def extend_map(
     """
     import pycolmap
 
-    before, capture = capture, with_map_intrinsics(with_map_lenses(capture, previous), previous)
+    capture = with_map_intrinsics(with_map_lenses(capture, previous), previous)
     workspace = context.work_dir / "workspace"
     shutil.copytree(previous.workspace, workspace)
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
@@ -102,11 +101,6 @@ def extend_map(
     generator = PairGenerator(workspace, new, frame_times_ns(capture), options, context)
     _, match_log = match_keyframes(generator, workspace, intrinsics_of(capture), context)
     calibrated_ids = calibrated_camera_ids(capture, ids)
-    given = {
-        ids[name]: name
-        for name in ids
-        if capture.camera(name).calibrated and not before.camera(name).lens_sigma
-    }
     again = {existing[ref] for ref in _image_refs(extra_frames) if ref in existing}
     mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, skeletal_above)
     models, removed, resected = [], list[str](), list[set[int] | None]()
@@ -119,7 +113,7 @@ def extend_map(
         models.append(model)
         removed += cut
         resected.append(registered_ids(model) - kept if mapping.is_large(len(kept)) else None)
-    transient = finalise_models(models, mapping, resected, given)
+    transient = finalise_models(models, mapping, resected)
     for number, model in enumerate(models):
         models[number], names, _ = remove_without_adjustment(model, mapping)
         removed += names
@@ -135,15 +129,12 @@ def extend_map(
         **match_log,
     }
     diagnostics = previous.diagnostics
-    earlier = [
+    before = [
         ImageRef(name, frame).name for name, frames in diagnostics.misplaced.items() for frame in frames
     ]
-    corrected = corrected_lenses(models, before, given)
     diagnostics = replace(
         diagnostics,
-        misfit_factors={**(diagnostics.misfit_factors or {}), **corrected},
-        recalibrated=tuple(sorted({*diagnostics.recalibrated, *corrected})),
-        misplaced=misplaced_frames([*earlier, *removed], models),
+        misplaced=misplaced_frames([*before, *removed], models),
         extensions=(*diagnostics.extensions, entry),
         details={**diagnostics.details, "keyframes": len(existing) + len(new)},
     )

@@ -86,7 +86,10 @@ def _further_maps(
     for name, number in ids.items():
         update_camera(workspace, number, capture.camera(name))
     calibrated_ids = calibrated_camera_ids(capture, ids)
-    mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, SKELETAL_ABOVE)
+    mapping = replace(
+        make_mapping_context(workspace, capture, options, calibrated_ids, context, SKELETAL_ABOVE),
+        turns={camera.name: camera.turns for camera in capture.cameras},
+    )
     models = list[Any]()
     while len(left) >= LEAST_MAPPED:
         context.check_cancelled()

@@ -53,7 +53,6 @@ def make_mapping_context(
             for name, number in read_camera_ids(workspace).items()
             if capture.camera(name).lens_sigma
         },
-        turns={camera.name: camera.turns for camera in capture.cameras},
     )
 
 
@@ -106,14 +105,14 @@ def with_estimated_lenses(capture: Capture, selections: Sequence[KeyframeSelecti
 
 
 def with_map_lenses(capture: Capture, previous: MapResult) -> Capture:
-    """Return the capture with the lenses of an earlier map, for the cameras with a lens before that map.
+    """Return the capture with the lenses of an earlier map, for the cameras whose lens tracks determined.
 
-    The map may have refined a lens that was given or that tracks determined. A lens that nothing but the map
-    determines is refined again with each extension: in a small map it may be far off.
+    A lens that nothing but the map determines is refined again with each extension: in a small map it may be
+    far off.
     """
     mapped = {name: camera for item in reversed(previous.maps) for name, camera in item.cameras.items()}
-    known = {item.name for item in capture.cameras if item.calibrated}
-    return _with_lenses(capture, {name: (mapped[name], 0.0) for name in sorted(known & mapped.keys())})
+    unknown = {item.name for item in capture.cameras if item.lens_sigma}
+    return _with_lenses(capture, {name: (mapped[name], 0.0) for name in sorted(unknown & mapped.keys())})
 
 
 def with_lenses_of_maps(capture: Capture, previous: MapResult) -> Capture:

@@ -24,15 +24,15 @@ class MappingContext:
         intrinsics: Intrinsics by camera name.
         mapper_options: Function that returns a new copy of the options of COLMAP's mapper. A caller may
             change its copy.
-        calibrated_ids: Database ids of the calibrated cameras. The intrinsics of these cameras stay constant
-            until the last adjustment.
+        calibrated_ids: Database ids of the calibrated cameras. The intrinsics of these cameras stay constant.
         stage: Threads, progress, cancellation.
         frame_numbers: `CaptureCamera.frame_numbers` of each camera, by camera name.
         skeletal_above: Maximum number of keyframes of a map that is not large (`is_large`).
         times_ns: Times of all frames of each camera, nanoseconds, by camera name.
         lens_sigma: By database id, the relative standard deviation of the focal length of those calibrated
             cameras whose lens was estimated from tracks. The last adjustment refines it.
-        turns: How each camera turns, by the tracks of its video, by camera name.
+        turns: How each camera turns, by the tracks of its video, by camera name. Empty for the first map: of
+            a folded room, the rest of a camera would be kept, and the map not be refused.
     """
 
     workspace: Path

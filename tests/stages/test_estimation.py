@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,10 +14,6 @@ from bodycap_batch.config.job import load_job
 from bodycap_batch.core.errors import CaptureError, EstimationError
 from bodycap_batch.keyframes import select_keyframes
 from bodycap_batch.mapping import build_map, extend_map
-from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_robustly
-from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
-from bodycap_batch.mapping.reconstruction.model_files import read_model, write_models
-from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, align_points, rotation_angle_rad, so3_exp
 from bodycap_batch.model.scene import FrameStatus, Map
 from bodycap_batch.registration import register_frames
@@ -143,34 +138,6 @@ def test_an_extended_map_keeps_its_keyframes(estimated: Estimated, tmp_path: Pat
     mine, theirs = after.map_from_cam[rows][:, :3, 3], before.map_from_cam[:, :3, 3]
     change = np.linalg.norm(align_points(mine, theirs).apply(mine) - theirs, axis=1)
     assert change.max() < 0.02 * np.ptp(theirs, axis=0).max()
-
-
-def test_an_extension_corrects_a_given_lens_that_it_contradicts(estimated: Estimated, tmp_path: Path) -> None:
-    true = {item.name: item.camera for item in estimated.capture.cameras}
-    wrong = {name: _longer(lens) for name, lens in true.items()}
-    workspace = tmp_path / "built with the wrong lens"
-    shutil.copytree(estimated.result.workspace, workspace)
-    model = read_model(workspace, 0)
-    for number, lens in model.cameras.items():
-        model.camera(number).params = lens.params * [1.04, 1.04, 1.0, 1.0]
-    adjust_robustly(model, make_mapper_options(MapOptions(), [], 1.0), list(model.cameras))
-    write_models(workspace, [model])
-    scene = replace(estimated.result.maps[0], cameras=wrong)
-    previous = replace(estimated.result, workspace=workspace, maps=(scene,))
-    cameras = tuple(replace(item, camera=wrong[item.name]) for item in estimated.capture.cameras)
-    capture = replace(estimated.capture, cameras=cameras)
-    first = cameras[0].name
-    grown = extend_map(capture, previous, {first: np.array([11])}, MapOptions(), context(tmp_path))
-    for name, lens in grown.maps[0].cameras.items():
-        # Free in the last adjustment of the map, it is less than a percent off.
-        assert lens.focal_px == pytest.approx(true[name].focal_px, rel=0.01)
-    assert grown.maps[0].cameras.keys() == true.keys()
-    assert set(grown.diagnostics.recalibrated) == set(grown.diagnostics.misfit_factors or {}) == set(true)
-
-
-def _longer(lens: Camera) -> Camera:
-    """Return a lens with a focal length that is 4 % longer."""
-    return replace(lens, params=lens.params * [1.04, 1.04, 1.0, 1.0])
 
 
 def test_the_same_capture_gives_the_same_map(estimated: Estimated, tmp_path: Path) -> None:

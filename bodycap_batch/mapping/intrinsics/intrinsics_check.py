@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bodycap_batch.capture import Capture
 from bodycap_batch.core.arrays import evenly_spaced
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.matching.database import DATABASE_NAME
@@ -30,16 +29,17 @@ _TOLERANCE = 1e-4
 """Relative change of the cost at which an adjustment in a check ends. Evidence: none."""
 _LOSS_PX = 1.0
 """Width (px) of the Cauchy loss of an adjustment in a check. Evidence: none."""
-_FOCAL_SIGMA = 0.0075
-"""Relative standard deviation of the difference between the focal length of a right calibration and the one
-that a map determines. Evidence: docs/decisions/mapping.md."""
 _MAX_FOCAL_CHANGE = 0.06
-"""Maximum relative error of the focal length with which a map is built. A map with a larger error is built
-again. Evidence: docs/decisions/mapping.md."""
+"""Maximum relative change from the given focal length to the focal length that fits the map. With a larger
+change, the given calibration is a misfit: it does not fit the images.
+Evidence: docs/decisions/mapping.md."""
 _MAX_CENTRE_CHANGE = 0.03
 """Maximum distance from the given principal point to the principal point that fits the map, as a fraction of
 the image's long side. With a larger distance, the given calibration is a misfit.
 Evidence: docs/decisions/mapping.md."""
+_MIN_REDUCTION_MISFIT = 0.05
+"""Minimum relative reduction of the cost if focal lengths and principal points are free. With a smaller
+reduction, no calibration is treated as a misfit. Evidence: docs/decisions/mapping.md."""
 _FISHEYE, _FISHEYE_TWO_TERMS = "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"
 """The fisheye model with one radial term, and the fisheye model with two radial terms. The model with two
 terms is tried only if the model with one term was selected. Evidence: docs/decisions/mapping.md."""
@@ -62,7 +62,7 @@ _OBSERVATIONS_PER_PARAMETER = 10
 fewer observations, the pixels are treated as square. Evidence: none."""
 _MIN_REDUCTION_CENTRE = 0.05
 """Minimum relative reduction of the cost if the principal point is free. With a smaller reduction, the
-principal point stays where it is. Evidence: docs/decisions/mapping.md."""
+principal point stays in the image's centre. Evidence: docs/decisions/mapping.md."""
 _MIN_REDUCTION_RECENTRED = 0.005
 """Minimum relative reduction of the cost if the principal point is refined a second time. This threshold is
 smaller than `_MIN_REDUCTION_CENTRE`, because the second map determines the principal point better.
@@ -71,83 +71,43 @@ _TANGENT_CUBIC = 1.0 / 3.0
 """Cubic coefficient of the tangent's Taylor series."""
 
 
-def contradicts(factor: float) -> bool:
-    """Return whether the focal length of a map contradicts the given one.
-
-    A given lens is a measurement: what a map finds differs a little from a right one, too. Only beyond two
-    standard deviations the given lens is taken as wrong.
-
-    Args:
-        factor: Ratio of the focal length of the map to the given focal length.
-    """
-    return abs(factor - 1.0) > 2.0 * _FOCAL_SIGMA
-
-
-def corrected_lenses(models: Sequence[Any], capture: Capture, given: Mapping[int, str]) -> dict[str, float]:
-    """Return the focal lengths in models, divided by the given ones, where the models contradict them.
-
-    Args:
-        models: Reconstructions, the largest first.
-        capture: All cameras, with their given lenses.
-        given: Names of the cameras whose lens was given, by database id.
-
-    Returns:
-        The ratios by camera name.
-    """
-    ratios = {
-        name: model.camera(number).mean_focal_length() / capture.camera(name).camera.focal_px
-        for model in reversed(models)
-        for number, name in sorted(given.items())
-        if model.exists_camera(number)
-    }
-    return {name: round(ratio, 3) for name, ratio in ratios.items() if contradicts(ratio)}
-
-
 def find_misfit_intrinsics(
-    model: Any,
-    settings: pycolmap.IncrementalPipelineOptions,
-    calibrated: Mapping[int, str],
-    corrected: Mapping[str, float],
+    model: Any, settings: pycolmap.IncrementalPipelineOptions, calibrated: Mapping[int, str]
 ) -> dict[str, float]:
-    """Find the calibrated cameras whose given intrinsics are so wrong that the map must be built again.
+    """Find the calibrated cameras whose given intrinsics contradict the map.
 
-    The focal length that the last adjustment of the map found differs too much from the given one, or the
-    principal point is elsewhere. For the second, a part of the map is adjusted twice: with constant
-    intrinsics, and with free focal lengths and principal points.
+    A part of the map is adjusted twice: with constant intrinsics, and with free focal lengths and principal
+    points.
 
     Args:
         model: The reconstruction; not changed.
         settings: The mapper's options.
         calibrated: Names of the calibrated cameras by database id.
-        corrected: By camera name, the focal length in the model divided by the given one, for the cameras
-            whose given lens the map contradicted.
 
     Returns:
-        By camera name, the ratio of the focal length that fits the map to the given focal length.
+        By camera name, the ratio of the focal length that fits the map to the given focal length. The result
+        holds only the cameras with a large change of the focal length or of the principal point.
 
     Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999.
     """
-    wrong = {name: factor for name, factor in corrected.items() if abs(factor - 1.0) > _MAX_FOCAL_CHANGE}
     part = _subsample(model)
     calibrated = {number: name for number, name in calibrated.items() if part.exists_camera(number)}
     if not calibrated or part.num_reg_images() < _MIN_KEYFRAMES:
-        return wrong
-    before = {number: copy.deepcopy(part.camera(number)) for number in calibrated}
+        return {}
+    given = {number: copy.deepcopy(part.camera(number)) for number in calibrated}
     held_cost = _adjustment_cost(part, settings, free=False)
     free_cost = _adjustment_cost(part, settings, free=True, centre=True)
-    if held_cost is None or free_cost is None or free_cost > (1.0 - _MIN_REDUCTION_CENTRE) * held_cost:
-        return wrong
+    if held_cost is None or free_cost is None or free_cost > (1.0 - _MIN_REDUCTION_MISFIT) * held_cost:
+        return {}
     factors = {
-        number: corrected.get(name, 1.0)
-        * part.camera(number).mean_focal_length()
-        / before[number].mean_focal_length()
-        for number, name in calibrated.items()
+        number: part.camera(number).mean_focal_length() / given[number].mean_focal_length()
+        for number in calibrated
     }
-    return wrong | {
+    return {
         calibrated[number]: round(factor, 3)
         for number, factor in factors.items()
         if abs(factor - 1.0) > _MAX_FOCAL_CHANGE
-        or _principal_point_distance(before[number], part.camera(number)) > _MAX_CENTRE_CHANGE
+        or _principal_point_distance(given[number], part.camera(number)) > _MAX_CENTRE_CHANGE
     }
 
 
@@ -331,7 +291,7 @@ def misfit_note(camera: str, factor: float, *, freed: bool = False) -> str:
         freed: True if refined intrinsics were used instead of the given intrinsics.
     """
     instead = "; therefore the lens was estimated together with the map" if freed else ""
-    if contradicts(factor):
+    if abs(factor - 1.0) > _MAX_FOCAL_CHANGE:
         longer = "longer" if factor > 1.0 else "shorter"
         fits = f"a focal length {round(100 * abs(factor - 1.0))} % {longer} than"
         cause = (

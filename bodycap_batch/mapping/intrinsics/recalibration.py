@@ -15,8 +15,6 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.map_diagnostics import RefinedIntrinsics
 from bodycap_batch.model.scene import Map, MapResult
 
-MISFIT_CAMERAS = "misfit_cameras"
-"""Entry of a map's log: names of the cameras whose given lens is so wrong that the map is built again."""
 _MIN_KEYFRAME_RATIO = 0.95
 """Minimum ratio of the number of keyframes in a new map to the number of keyframes in the first map. A new
 map with a smaller ratio is not better. The ratio is computed for all cameras together and for each camera.
@@ -34,13 +32,13 @@ def recalibrate_if_misfit(
     build: Callable[[Capture], MapResult],
     refused: EstimationError | None = None,
 ) -> MapResult:
-    """Build the map again with refined intrinsics if the given intrinsics of a camera are far off.
+    """Build the map again with refined intrinsics if the map contradicts the given intrinsics of a camera.
 
     Evidence: docs/decisions/mapping.md.
 
     Args:
-        result: The map that was built with constant calibrated intrinsics. Its log names the cameras whose
-            given intrinsics are misfits (`MISFIT_CAMERAS`).
+        result: The map that was built with constant calibrated intrinsics. Its diagnostics name the cameras
+            whose given intrinsics contradict the map (`misfit_factors`).
         capture: All cameras.
         build: Function that builds a map of a capture with changed intrinsics.
         refused: The reason why `result` is unusable; None if it is usable. Wrong intrinsics may be the cause.
@@ -52,7 +50,7 @@ def recalibrate_if_misfit(
         EstimationError: `refused`, if it is given and there is no better map.
     """
     refined = _recalibrate(result, capture, build, usable=refused is None)
-    if refused is not None and refined.maps is result.maps:
+    if refused is not None and not refined.diagnostics.recalibrated:
         raise refused
     return refined
 
@@ -68,13 +66,11 @@ def _recalibrate(
         result: The given map.
         capture: All cameras.
         build: Function that builds a map of a capture with changed intrinsics.
-        usable: Whether the given map is usable. If it is not, any given lens that it contradicts may be the
-            cause. A better map always contains all cameras whose given
+        usable: Whether the given map is usable. A better map always contains all cameras whose given
             intrinsics contradict the given map. If the given map is usable, a better map also passes
             `_is_better_map`. Its lenses must be possible ones (`_is_possible`).
     """
-    factors = result.diagnostics.misfit_factors or {}
-    misfits = {name: factors[name] for name in (result.log.get(MISFIT_CAMERAS, ()) if usable else factors)}
+    misfits = result.diagnostics.misfit_factors or {}
     if not misfits or not is_on(Mechanism.RECALIBRATION):
         return result
     given = {name: capture.camera(name).camera for name in misfits}
@@ -96,7 +92,7 @@ def _recalibrate(
     diagnostics = replace(
         diagnostics,
         misfit_factors={**(diagnostics.misfit_factors or {}), **factors},
-        recalibrated=(*diagnostics.recalibrated, *cameras),
+        recalibrated=tuple(cameras),
         refined_intrinsics={
             name: RefinedIntrinsics(camera.model, tuple(camera.params.tolist()))
             for name, camera in cameras.items()

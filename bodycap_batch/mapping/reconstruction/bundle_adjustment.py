@@ -66,13 +66,9 @@ def adjust_robustly(
     Source: Zhang, "Parameter estimation techniques: a tutorial with application to conic fitting", 1997, for
         the loss. The width is the maximum-likelihood scale of a Cauchy distribution.
     """
-    bundle_adjust(model, settings, calibrated_ids, loss_px=loss_width_px(model), only=only)
+    width_px = max(_MIN_LOSS_PX, median_residual_px(model))
+    bundle_adjust(model, settings, calibrated_ids, loss_px=width_px, only=only)
     _filter_points(model, settings)
-
-
-def loss_width_px(model: Any) -> float:
-    """Return the width (px) of the robust loss that suits the residuals of a model."""
-    return max(_MIN_LOSS_PX, median_residual_px(model))
 
 
 def _mean_track_length(model: Any) -> float:

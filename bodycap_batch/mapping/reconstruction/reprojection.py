@@ -42,15 +42,10 @@ def median_residual_px(model: pycolmap.Reconstruction) -> float:
 
     The result is 0 for a model without observations.
     """
-    residuals = np.concatenate(list(residuals_px(model).values()) or [np.zeros((0, 2))])
-    return float(np.median(np.abs(residuals))) if len(residuals) else 0.0
-
-
-def residuals_px(model: pycolmap.Reconstruction) -> dict[int, FloatArray]:
-    """Return the residuals (N,2) of all observations of each camera, px, by camera id."""
-    parts: dict[int, list[FloatArray]] = {}
+    parts = [np.zeros((0, 2))]
     for image_id in sorted(model.reg_image_ids()):
         image = model.image(image_id)
         feature = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
-        parts.setdefault(image.camera_id, []).append(image_residuals_px(model, image, feature))
-    return {camera_id: np.concatenate(own) for camera_id, own in parts.items()}
+        parts.append(image_residuals_px(model, image, feature))
+    residuals = np.concatenate(parts)
+    return float(np.median(np.abs(residuals))) if len(residuals) else 0.0

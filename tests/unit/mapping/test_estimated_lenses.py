@@ -64,11 +64,3 @@ def test_an_extension_keeps_the_lens_of_the_map(tmp_path: Path) -> None:
     assert extended.camera("torso").calibrated
     assert extended.camera("head").camera.focal_px == 450.0, "the camera is not in the map"
     assert extended.camera("left_palm").camera.refine, "only the map determines its lens"
-
-
-def test_an_extension_keeps_a_given_lens_as_the_map_corrected_it(tmp_path: Path) -> None:
-    capture = Capture(cameras=(camera("torso", known=True), camera("head", known=True)))
-    extended = with_map_lenses(capture, MapResult(maps=(small_map(),), workspace=tmp_path, log={}))
-    assert extended.camera("torso").camera.focal_px == 500.0, "that of the map"
-    assert extended.camera("torso").calibrated, "it stays constant"
-    assert extended.camera("head").camera.focal_px == 600.0, "the camera is not in the map"

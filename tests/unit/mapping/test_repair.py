@@ -21,7 +21,6 @@ from bodycap_batch.mapping import initial_models
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.initial_models import reconstruct_with_intrinsics
 from bodycap_batch.mapping.intrinsics import intrinsics_check
-from bodycap_batch.mapping.intrinsics.intrinsics_check import contradicts
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
@@ -366,41 +365,6 @@ def test_a_lens_that_the_tracks_exclude_is_no_result_of_the_last_adjustment(
         assert models[0].camera(1).params[0] == pytest.approx(focal_px, rel=0.01)
         assert models[0].num_reg_images() == _KEYFRAMES
     assert _rms(models[0], poses) < 0.02
-
-
-@pytest.mark.parametrize("factor", [1.0, 0.96, 1.04])
-def test_the_last_adjustment_corrects_a_given_lens_only_if_the_map_contradicts_it(
-    factor: float, built: tuple[Any, FloatArray, MappingContext, set[Any]]
-) -> None:
-    model, poses, mapping, _ = built
-    mapping = replace(mapping, times_ns={"cam": np.arange(99) * 10**9})
-    models = [copy.deepcopy(model), copy.deepcopy(model)]
-    for item in models:
-        focal_px, *others = item.camera(1).params
-        item.camera(1).params = [factor * focal_px, *others]
-    finalise_models(models, mapping, [None, None], mapping.given_ids)
-    focal_px = [item.camera(1).params[0] for item in models]
-    assert focal_px[1] == focal_px[0], "a camera has one lens in all models"
-    # A right lens stays as it is. A corrected one is as exact as what the map finds: see `_FOCAL_SIGMA`.
-    assert focal_px[0] == (420.0 if factor == 1.0 else pytest.approx(420.0, rel=0.0075))
-    assert _rms(models[0], poses) < 0.02
-
-
-def test_a_right_lens_stays_if_few_keyframes_do_not_determine_it(
-    built: tuple[Any, FloatArray, MappingContext, set[Any]],
-) -> None:
-    model, _, mapping, _ = built
-    models = [sub_model(model, set(sorted(model.reg_image_ids())[:3]))]
-    for point in list(models[0].point3D_ids()):
-        if models[0].point3D(point).track.length() < 2:
-            models[0].delete_point3D(point)
-    mapping = replace(mapping, times_ns={"cam": np.arange(99) * 10**9})
-    finalise_models(models, mapping, [None], mapping.given_ids)
-    assert models[0].camera(1).params[0] == 420.0
-    adjust_robustly(models[0], mapping.mapper_options(), [])
-    assert contradicts(models[0].camera(1).mean_focal_length() / 420.0), (
-        "three keyframes fit another lens as well"
-    )
 
 
 def test_a_map_without_any_point_is_an_error_that_says_so(
