@@ -232,7 +232,6 @@ CHECKS: dict[str, Callable[[Site, Done], None]] = {
     "bodycap sync my_walk/": are_clocks,
     "bodycap calibrate --print board.pdf": is_board,
     "bodycap calibrate board.mp4": is_calibration,
-    "bodycap calibrate board.mp4 --out my_walk/calib.json": is_calibration,
     "bodycap lenses hero11 wide": says("HERO11", "Wide"),
     "bodycap telemetry GX010123.MP4": says("HERO11 Black"),
     "bodycap synth my_test/ --seconds 10": is_capture,
