@@ -74,7 +74,7 @@ class CaptureCamera:
             OMP_NUM_THREADS. If this variable is not set, all processors are used.
         lens_sigma: Relative standard deviation of the focal length, if `camera` was estimated from the tracks
             of the video. The lens is constant until the last adjustment of the map. 0 for another lens.
-        turns: How the camera turns, by the tracks of its video; None if it is unknown.
+        rotation_chain: How the camera turns, by the tracks of its video; None if it is unknown.
         given: Intrinsics that were given, if the map contradicted them and `camera` replaces them; else None.
     """
 
@@ -98,7 +98,7 @@ class CaptureCamera:
     threads: int = 0
     given: Camera | None = None
     lens_sigma: float = 0.0
-    turns: RotationChain | None = field(default=None, repr=False)
+    rotation_chain: RotationChain | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         count = len(self.frame_numbers)

@@ -23,7 +23,7 @@ _MAX_LOG_SIGMA = 0.3
 """Maximum standard deviation of the logarithm of a ratio of legs that is used."""
 _POSITION_SIGMA_DEG = 0.15
 """Standard deviation of a delivered position, as a parallax (degrees): 5 mm at a distance of 2 m. A short leg
-is longer or shorter by it, which is no jump of the scale."""
+is longer or shorter by it, which is no jump of the scale. Evidence: docs/decisions/tracks.md."""
 _MIN_PARALLAX_DEG = 1.0
 """Minimum parallax (degrees) of both legs of a ratio that is used. With less, errors of corners, which hands
 and pyramid levels give in common, are a large part of a leg, and have one sign."""

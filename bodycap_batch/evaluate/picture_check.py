@@ -183,14 +183,14 @@ def read_pictures(
     tracks = tracks.outside(fixed)
     lens_here = lens.scaled(*size)
     moving = find_moving_regions(tracks, find_moving_tracks(tracks, lens_here, camera.times_ns))
-    turns = measure_rotation_chain(tracks.outside(moving), lens_here, 0.0, np.arange(count))
+    chain = measure_rotation_chain(tracks.outside(moving), lens_here, 0.0, np.arange(count))
     camera = replace(camera, mask=without_regions(camera.mask, fixed, size), moving_regions=moving)
     features: list[FrameFeatures | None] = [None] * count
     for index, image in camera.read_decodable(np.arange(count)):
         in_picture = lens.scaled(image.shape[1], image.shape[0])
         features[index] = detect_features(image, in_picture, partial(camera.is_unmasked, frame=index))
         progress((count + index) // 2)
-    return Pictures(features, np.asarray(camera.times_ns * 1e-9), readout_s, turns)
+    return Pictures(features, np.asarray(camera.times_ns * 1e-9), readout_s, chain)
 
 
 def poses_of_frames(poses: TimedPoses, camera: CaptureCamera) -> FloatArray:

@@ -100,7 +100,7 @@ class Pictures:
         features: Features,
         times_s: FloatArray | None = None,
         readout_s: float = 0.0,
-        turns: RotationChain | None = None,
+        rotation_chain: RotationChain | None = None,
     ) -> None:
         """Take the features of all N frames.
 
@@ -108,11 +108,11 @@ class Pictures:
             features: The features of each frame.
             times_s: (N,) times of the frames; needed only for a rolling shutter.
             readout_s: Time from the exposure of the first row to that of the last row.
-            turns: How the camera turns, by tracks. It finds folds across pictures that are too blurred for
-                features.
+            rotation_chain: How the camera turns, by tracks. It finds folds across pictures that are too
+                blurred for features.
         """
         self.features = features
-        self.turns = turns
+        self.rotation_chain = rotation_chain
         self._times_s = np.arange(float(len(features))) if times_s is None else times_s
         self._readout_s = readout_s
         self._pairs: dict[tuple[int, int], MeasuredPair] = {}
@@ -332,10 +332,10 @@ def find_right_frames(evidence: PictureEvidence, world_from_cam: FloatArray) -> 
         outcomes[first, second] = _judge_pair(features, (first, second), pair, world_from_cam)
     for (first, last), chain in evidence.chains.items():
         expected = world_from_cam[last, :3, :3].T @ world_from_cam[first, :3, :3]
-        turns, ends = evidence.pictures.turns, np.array([first, last])
+        by_tracks, ends = evidence.pictures.rotation_chain, np.array([first, last])
         if chain is not None:
             outcomes[first, last] = Outcome.WRONG if differs(*chain, expected) else Outcome.RIGHT
-        elif turns is not None and turns.confirms(ends, world_from_cam[ends, :3, :3]) is False:
+        elif by_tracks is not None and by_tracks.confirms(ends, world_from_cam[ends, :3, :3]) is False:
             outcomes[first, last] = Outcome.WRONG
         else:
             outcomes[first, last] = Outcome.UNMEASURABLE

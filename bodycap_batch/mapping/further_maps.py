@@ -88,7 +88,7 @@ def _further_maps(
     calibrated_ids = calibrated_camera_ids(capture, ids)
     mapping = replace(
         make_mapping_context(workspace, capture, options, calibrated_ids, context, SKELETAL_ABOVE),
-        turns={camera.name: camera.turns for camera in capture.cameras},
+        rotation_chains={camera.name: camera.rotation_chain for camera in capture.cameras},
     )
     models = list[Any]()
     while len(left) >= LEAST_MAPPED:

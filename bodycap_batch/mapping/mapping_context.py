@@ -31,8 +31,8 @@ class MappingContext:
         times_ns: Times of all frames of each camera, nanoseconds, by camera name.
         lens_sigma: By database id, the relative standard deviation of the focal length of those calibrated
             cameras whose lens was estimated from tracks. The last adjustment refines it.
-        turns: How each camera turns, by the tracks of its video, by camera name. Empty for the first map: of
-            a folded room, the rest of a camera would be kept, and the map not be refused.
+        rotation_chains: How each camera turns, by the tracks of its video, by camera name. Empty for the
+            first map: the contradictions for which a folded map is refused would be removed.
     """
 
     workspace: Path
@@ -44,7 +44,7 @@ class MappingContext:
     skeletal_above: int = SKELETAL_ABOVE
     times_ns: Mapping[str, IntArray] = field(default_factory=dict)
     lens_sigma: Mapping[int, float] = field(default_factory=dict)
-    turns: Mapping[str, RotationChain | None] = field(default_factory=dict)
+    rotation_chains: Mapping[str, RotationChain | None] = field(default_factory=dict)
 
     @property
     def given_ids(self) -> frozenset[int]:

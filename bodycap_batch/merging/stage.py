@@ -10,6 +10,7 @@ import numpy as np
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.merging.body.bones import Bone, kinematic_chain
 from bodycap_batch.merging.body.completion import complete_skeleton, observed_joints
 from bodycap_batch.merging.body.provisional_scale import provisional_scale
@@ -385,7 +386,9 @@ def _prepare_tracks(
     for track in tracks:
         kept = remove_outliers(track, provisional, inputs.clocks[track.camera].nominal_fps)
         dropped[track.camera] = np.setdiff1d(track.frames, kept.frames)
-        if slip := find_slip(kept.scaled(provisional)):
+        slip = find_slip(kept.scaled(provisional)) if is_on(Mechanism.MOUNT_SLIPS) else None
+        if slip is not None:
+            record_act(Mechanism.MOUNT_SLIPS)
             slips[track.camera] = slip
             kept = without_slip(kept, slip, provisional)
         cleaned.append(kept)

@@ -42,7 +42,8 @@ class FrameStatus(StrEnum):
     UNCONSTRAINED: Lost; the observations do not determine the pose well enough.
     POSE_JUMP: Lost; the estimated pose was rejected as an outlier of the trajectory.
     UNCONFIRMED: Lost; few observations support the estimated pose, and no neighbouring frame confirms it.
-    CONTRADICTED: Lost; the pose was withdrawn, because the keyframes around the frame contradict the map.
+    CONTRADICTED: Lost; the pose was withdrawn, because the keyframes around the frame contradict the map, or
+        because the tracks of the video contradict the rotation of the pose.
     NO_MAP: Lost; no map contains this camera.
     OTHER_MAP: Lost in the camera's map; localised in another map, whose place in the camera's map is unknown.
     DAMAGED: Lost; the frame cannot be decoded, or the decoder reports that its data are damaged.
@@ -101,7 +102,7 @@ class KeyframeSelection:
             example a hand. An empty array means that nothing does.
         lens: The lens as the tracks of the video determine it; None for a given lens, or with too little
             motion.
-        turns: How the camera turns, by the tracks of the video; None without a lens.
+        rotation_chain: How the camera turns, by the tracks of the video; None without a lens.
     """
 
     camera: str
@@ -118,7 +119,7 @@ class KeyframeSelection:
     fixed_regions: BoolArray = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
     moving_regions: BoolArray = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=bool))
     lens: LensEstimate | None = None
-    turns: RotationChain | None = None
+    rotation_chain: RotationChain | None = None
 
     def __post_init__(self) -> None:
         set_array(self, "fixed_regions", (None, None), np.bool_)

@@ -88,6 +88,8 @@ def page_content(
         and not all(camera.shows_only_room for camera in inputs.capture.cameras),
         "has_body": inputs.merge is not None,
         "cameras": _cameras(inputs, losses, colours, budget),
+        "has_slips": inputs.merge is not None
+        and any(mount.slip is not None for mount in inputs.merge.mounts),
         "missing": _missing(inputs, losses, colours),
         "causes": {cause.value: rule for cause, (rule, _) in CAUSES.items()},
         "lost_pictures": _lost_pictures(losses, budget.scaled(_SHEET_PICTURES)),

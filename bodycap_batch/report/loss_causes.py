@@ -106,7 +106,7 @@ CAUSES = {
         "and walk past each place more than once.",
     ),
     LossCause.CONTRADICTED: (
-        "two or more successive keyframes near the frame contradict the rest of the map",
+        "keyframes near it contradict the rest of the map, or the video does not turn as the pose does",
         _WALLS,
     ),
     LossCause.NO_MAP: (

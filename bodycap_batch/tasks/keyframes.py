@@ -73,7 +73,7 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
         moving = moving[selection.pictures.frames]
     selection = replace(selection, fixed_regions=regions, moving_regions=moving, lens=lens)
     copies = copied_notes(camera.times_ns, selection.pictures)
-    selection = replace(selection, turns=_turns(camera, shown, selection))
+    selection = replace(selection, rotation_chain=_rotation_chain(camera, shown, selection))
     camera = camera.only(selection.pictures)
     if telemetry is not None:
         assert selection.matches is not None
@@ -88,7 +88,7 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Shown:
+class TrackFindings:
     """What the tracks of a video show.
 
     Attributes:
@@ -104,7 +104,7 @@ class Shown:
     tracks: PointTracks | None
 
 
-def regions_and_lens(camera: CaptureCamera, context: StageContext) -> Shown:
+def regions_and_lens(camera: CaptureCamera, context: StageContext) -> TrackFindings:
     """Return what the tracks of a video show. A video of fewer than two frames shows nothing."""
     import numpy as np
 
@@ -121,7 +121,7 @@ def regions_and_lens(camera: CaptureCamera, context: StageContext) -> Shown:
     wants_lens = camera.camera.refine and is_on(Mechanism.LENS_FROM_TRACKS)
     used = (Mechanism.FIXED_REGIONS, Mechanism.MOVING_REGIONS)
     if len(camera.times_ns) < 2 or not (wants_lens or any(map(is_on, used))):
-        return Shown(fixed=regions, moving=moving, lens=None, tracks=None)
+        return TrackFindings(fixed=regions, moving=moving, lens=None, tracks=None)
 
     def show(done: int, total: int) -> None:
         context.check_cancelled()
@@ -145,10 +145,12 @@ def regions_and_lens(camera: CaptureCamera, context: StageContext) -> Shown:
         tracks = tracks.outside(found) if is_enough else tracks
         if lens is not None and is_enough:
             lens = estimate_lens(tracks, camera.times_ns)
-    return Shown(fixed=regions, moving=moving, lens=lens, tracks=tracks)
+    return TrackFindings(fixed=regions, moving=moving, lens=lens, tracks=tracks)
 
 
-def _turns(camera: CaptureCamera, shown: Shown, selection: KeyframeSelection) -> RotationChain | None:
+def _rotation_chain(
+    camera: CaptureCamera, shown: TrackFindings, selection: KeyframeSelection
+) -> RotationChain | None:
     """Return how the camera turns; None if its lens or its tracks are unknown."""
     import numpy as np
 

@@ -51,7 +51,7 @@ def load_capture(
                 camera.only(selection.pictures),
                 damaged=selection.damaged,
                 mask=without_regions(camera.mask, selection.fixed_regions, size),
-                turns=selection.turns,
+                rotation_chain=selection.rotation_chain,
                 moving_regions=selection.moving_regions if len(selection.moving_regions) else None,
             )
         clock = camera.clock if clocks is None else clocks.cameras.get(camera.name, camera.clock)

@@ -81,7 +81,7 @@ class _Video:
     pictures: list[np.ndarray]
     name: str = "torso"
     mask: np.ndarray | None = None
-    turns: None = None
+    rotation_chain: None = None
 
     @property
     def damaged(self) -> np.ndarray:

@@ -248,7 +248,7 @@ def test_contradictions_of_the_body_are_recommended_first(
 
 def test_a_slip_is_in_the_timeline_of_its_camera(inputs: ReportInputs, tmp_path: Path) -> None:
     assert inputs.merge is not None
-    assert 'class="slip"' not in written(inputs, tmp_path)
+    assert "the mount slips" not in written(inputs, tmp_path)
     path = inputs.merge.trajectories[1]
     middle = int(path.times_ns[len(path.times_ns) // 2])
     slip = MountSlip(time_ns=middle, before_from_after=np.eye(4), sigma_rad=0.01, sigma_m=0.01)
@@ -260,7 +260,9 @@ def test_a_slip_is_in_the_timeline_of_its_camera(inputs: ReportInputs, tmp_path:
     drawn = draw_camera_timeline(slipped, path.camera, span, [], 0.0)
     x = float(x_from_time(1e-9 * middle, span))
     assert f'class="slip" d="M{x:.1f}'.removesuffix(".0") in drawn
-    assert written(slipped, tmp_path).count('class="slip"') == 1
+    page = written(slipped, tmp_path)
+    assert page.count('class="slip"') == 1
+    assert '<span class="swatch slip"></span> the mount slips' in page
 
 
 def test_an_unknown_clock_is_in_the_first_line_and_costs_coverage(

@@ -21,7 +21,7 @@ from bodycap_batch.formats.gltf.axes import (
 from bodycap_batch.formats.gltf.binary_buffer import BinaryBuffer
 from bodycap_batch.formats.mannequin import make_mannequin
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, make_transform, quat_xyzw_from_rotation
-from bodycap_batch.model.measured_parts import JointSource
+from bodycap_batch.model.measured_parts import JointSource, joint_sources
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 from bodycap_batch.model.take import Take
 
@@ -148,9 +148,9 @@ def _properties(motion: Motion, joint: int, sigma_m: FloatArray | None) -> dict[
     """
     role = motion.skeleton.roles[joint]
     out: dict[str, Any] = {"role": role} if role else {}
-    is_measured = bool(motion.observed[:, joint].any())
-    out["motion_source"] = (JointSource.MEASURED if is_measured else JointSource.FILLED).value
-    if not is_measured:
+    source = joint_sources(motion)[joint]
+    out["motion_source"] = source.value
+    if source is JointSource.FILLED:
         out["observed"] = False
     elif sigma_m is not None:
         out["measured_frames"] = true_spans(motion.observed[:, joint])

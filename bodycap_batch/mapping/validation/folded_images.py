@@ -13,15 +13,15 @@ from bodycap_batch.mapping.validation.track_agreement import image_sequences
 from bodycap_batch.model.rotation_chain import RotationChain, find_folded
 
 
-def find_folded_images(model: Any, turns: Mapping[str, RotationChain | None]) -> set[int]:
-    """Return the ids of the keyframes that look-alike places have put into another place of the model.
+def find_folded_images(model: Any, chains: Mapping[str, RotationChain | None]) -> set[int]:
+    """Return the ids of the keyframes whose rotation in the model contradicts that of their video.
 
-    Places that look alike, the bays of a room for example, agree with each other in number, so no vote of
-    matches shows the error. The rotation of the video from keyframe to keyframe does.
+    A part of the video can lie at a wrong place of the model that looks like the right one, for example in
+    another bay of the room. All its matches agree with that place. The rotation of the video does not.
 
     Args:
         model: The model, a `pycolmap.Reconstruction`.
-        turns: How each camera turns, by camera name.
+        chains: How each camera turns, by camera name.
     """
     folded = set[int]()
     for sequence in image_sequences(model) if is_on(Mechanism.CONTINUITY) else ():
@@ -29,7 +29,7 @@ def find_folded_images(model: Any, turns: Mapping[str, RotationChain | None]) ->
         refs = [ImageRef.parse(image.name) for image in images]
         world_from_cam = [image.cam_from_world().inverse().rotation.matrix() for image in images]
         found = find_folded(
-            turns.get(refs[0].camera), np.array([ref.frame for ref in refs]), np.array(world_from_cam)
+            chains.get(refs[0].camera), np.array([ref.frame for ref in refs]), np.array(world_from_cam)
         )
         folded |= set(np.array(sequence)[found].tolist())
     record_act(Mechanism.CONTINUITY, len(folded))

@@ -161,7 +161,7 @@ def find_wrong_images(
         model: The model.
         pairs: The verified pairs of the model (`evaluate_pairs`).
     """
-    wrong = find_misregistered_images(pairs) | find_folded_images(model, context.turns)
+    wrong = find_misregistered_images(pairs) | find_folded_images(model, context.rotation_chains)
     agreement = evaluate_agreement(context.workspace, model, context.times_ns)
     misplaced = find_misplaced_images(agreement, image_sequences(model))
     if model.num_reg_images() - len(wrong | misplaced) < MIN_MODEL_KEYFRAMES:
@@ -189,7 +189,9 @@ def _without_confirmed(
         return set(wrong)
     max_error_px = _CONFIRMED_ERROR_RATIO * context.mapper_options().mapper.filter_max_reproj_error
     confirmed = confirm_images(context.workspace, model, wrong, image_sequences(model), max_error_px)
-    acquitted = confirmed - find_misregistered_images(pairs) - find_folded_images(model, context.turns)
+    acquitted = (
+        confirmed - find_misregistered_images(pairs) - find_folded_images(model, context.rotation_chains)
+    )
     record_act(Mechanism.SECOND_REGISTRATION, len(acquitted))
     return set(wrong) - acquitted
 

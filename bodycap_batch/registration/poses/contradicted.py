@@ -81,16 +81,16 @@ def _frames_in_blocks(count: int, kept: IntArray, misplaced: IntArray) -> BoolAr
     return inside
 
 
-def find_folded_poses(turns: RotationChain | None, gauge_from_cam: FloatArray) -> BoolArray:
+def find_folded_poses(chain: RotationChain | None, gauge_from_cam: FloatArray) -> BoolArray:
     """Return for each frame (N,) whether the rotation of the video contradicts its pose.
 
     Args:
-        turns: How the camera turns, by the tracks of its video; None if it is unknown.
+        chain: How the camera turns, by the tracks of its video; None if it is unknown.
         gauge_from_cam: (N,4,4) poses; NaN for frames without a pose.
     """
     out = np.zeros(len(gauge_from_cam), dtype=bool)
     if is_on(Mechanism.CONTINUITY):
         posed = np.flatnonzero(np.isfinite(gauge_from_cam[:, 0, 0]))
-        out[posed] = find_folded(turns, posed, gauge_from_cam[posed, :3, :3])
+        out[posed] = find_folded(chain, posed, gauge_from_cam[posed, :3, :3])
         record_act(Mechanism.CONTINUITY, int(out.sum()))
     return out

@@ -258,7 +258,7 @@ def _reject_outliers(
     poses: list[FramePose], camera: CaptureCamera, criteria: AcceptanceCriteria
 ) -> list[FramePose]:
     """Reject poses that the video or their neighbours contradict, and isolated poses with few inliers."""
-    folded = find_folded_poses(camera.turns, pose_array(poses))
+    folded = find_folded_poses(camera.rotation_chain, pose_array(poses))
     poses = _reject(poses, folded, FrameStatus.CONTRADICTED)
     centres = np.full((len(poses), 3), np.nan)
     sigma = np.full(len(poses), np.nan)

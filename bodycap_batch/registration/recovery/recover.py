@@ -205,7 +205,9 @@ def find_lost_poses(
                 poses |= found
             before, path = path.localised, _merge_into(path, poses, localiser.criteria)
             intervals = _extended_intervals(path.localised, before, frozen)
-    path = path.without(find_folded_poses(camera.turns, path.gauge_from_cam), FrameStatus.CONTRADICTED)
+    path = path.without(
+        find_folded_poses(camera.rotation_chain, path.gauge_from_cam), FrameStatus.CONTRADICTED
+    )
     return replace(registration, trajectory=smooth_weak_centres(path, ~lost))
 
 

@@ -188,7 +188,7 @@ def test_tracks_find_a_fold_where_lost_frames_have_no_features(path: FloatArray)
         sigma_rad=np.full(FRAMES - 1, 1e-4),
         turn_sigma=0.05,
     )
-    evidence = measure_pictures(Pictures(blurred, turns=turns), posed)
+    evidence = measure_pictures(Pictures(blurred, rotation_chain=turns), posed)
     delivered = np.where(posed[:, None, None], path, np.nan)
     assert find_right_frames(evidence, delivered).count(Outcome.WRONG) == 0
     folded = delivered.copy()

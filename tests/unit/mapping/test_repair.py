@@ -12,7 +12,6 @@ import numpy as np
 import pycolmap
 import pytest
 
-from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
@@ -25,9 +24,7 @@ from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     ImageRef,
-    add_camera,
     read_image_ids,
-    write_image,
 )
 from bodycap_batch.mapping.matching.pair_matching import find_mutual_matches, match_pairs
 from bodycap_batch.mapping.model_joining import common_similarity, join_models
@@ -59,14 +56,13 @@ from bodycap_batch.mapping.validation.track_agreement import (
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.geometry import Similarity, align_points, invert, make_transform, so3_exp, so3_log
+from bodycap_batch.model.geometry import Similarity, align_points, invert, so3_exp, so3_log
 from bodycap_batch.model.rotation_chain import RotationChain
 from tests.misplaced import misplace
+from tests.unit.mapping.wall import KEYFRAMES, LENS, write_wall
 
-_CAMERA = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
-_INTRINSICS = {"cam": CameraIntrinsics(_CAMERA, calibrated=True)}
-_KEYFRAMES = 16
-_NUMBERS = {"cam": np.arange(30, 30 + _KEYFRAMES)}
+_INTRINSICS = {"cam": CameraIntrinsics(LENS, calibrated=True)}
+_NUMBERS = {"cam": np.arange(30, 30 + KEYFRAMES)}
 """Frame numbers of the whole video, also before start_s: users name the frames that they see."""
 _MOVED = (6, 7, 8)
 
@@ -102,52 +98,12 @@ def test_a_block_that_drifts_away_is_misplaced_as_a_whole() -> None:
     assert find_misplaced_images(pairs, [range(40)]) == set(drifting)
 
 
-def _poses() -> FloatArray:
-    """Return cam_from_map of keyframes that move sideways along a wall at a distance of 4."""
-    out = []
-    for step in range(_KEYFRAMES):
-        turn = so3_exp(np.array([0.0, 0.1 * np.sin(step), 0.02 * step]))
-        out.append(invert(make_transform(turn, np.array([0.25 * step, 0.1 * np.cos(step), 0.0]))))
-    return np.array(out)
-
-
-def _workspace(folder: Path) -> FloatArray:
-    """Write keyframes with features of a bumpy wall (half a pixel of noise), and return their true poses."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform((-3, -3, 3), (7, 3, 5), (900, 3))
-    raw = rng.exponential(1.0, (len(points), 128))
-    descriptors = np.round(512 * np.sqrt(raw / raw.sum(axis=1, keepdims=True))).clip(0, 255).astype(np.uint8)
-    camera = CaptureCamera(
-        name="cam",
-        chapters=(),
-        camera=_CAMERA,
-        calibrated=True,
-        frame_numbers=np.arange(99),
-        times_ns=np.arange(99) * 10**8,
-        nominal_fps=10.0,
-        rolling_shutter_s=0.0,
-    )
-    poses = _poses()
-    with pycolmap.Database.open(str(folder / DATABASE_NAME)) as database:
-        camera_id = add_camera(database, camera)
-        for frame, pose in enumerate(poses):
-            pixels = _CAMERA.project(points @ pose[:3, :3].T + pose[:3, 3])
-            seen = np.flatnonzero(((pixels > 0) & (pixels < (640, 480))).all(axis=1))
-            image_id = write_image(database, ImageRef("cam", frame), camera_id)
-            noisy = pixels[seen] + rng.normal(0, 0.5, (len(seen), 2))
-            keypoints = np.column_stack([noisy, np.ones((len(seen), 2))])
-            database.write_keypoints(image_id, keypoints.astype(np.float32))
-            kind = pycolmap.FeatureExtractorType.SIFT
-            database.write_descriptors(image_id, pycolmap.FeatureDescriptors(kind, descriptors[seen]))
-    return poses
-
-
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, FloatArray, MappingContext, set[Any]]:
     folder = tmp_path_factory.mktemp("repair")
-    poses = _workspace(folder)
+    poses = write_wall(folder)
     context = StageContext(work_dir=folder, threads=2)
-    refs = [ImageRef("cam", frame) for frame in range(_KEYFRAMES)]
+    refs = [ImageRef("cam", frame) for frame in range(KEYFRAMES)]
     pairs = [(a, b) for a in refs for b in refs if a < b and b.frame - a.frame <= 5]
     assert len(match_pairs(folder, pairs, _INTRINSICS, context)) > 50
     mapping = MappingContext(
@@ -158,7 +114,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, FloatArray, Ma
         stage=context,
         frame_numbers=_NUMBERS,
     )
-    models, _ = reconstruct(folder, mapping.mapper_options(), context, _KEYFRAMES)
+    models, _ = reconstruct(folder, mapping.mapper_options(), context, KEYFRAMES)
     return models[0], poses, mapping, set(pairs)
 
 
@@ -188,9 +144,9 @@ def test_a_complete_map_is_adjusted_once(
     )[0].ids
     settings.mapper.init_min_tri_angle = 2.0
     assert register_images(mapping.workspace, settings, model, lambda: None)
-    assert model.num_reg_images() == _KEYFRAMES
+    assert model.num_reg_images() == KEYFRAMES
     assert _rms(model, poses) < 0.01
-    assert sizes[-1] == _KEYFRAMES
+    assert sizes[-1] == KEYFRAMES
     # No size occurs twice: nothing is adjusted again if nothing was added.
     assert len(set(sizes)) == len(sizes)
 
@@ -213,7 +169,7 @@ def test_a_block_of_another_scale_or_place_is_found_and_repaired(
     agreement = evaluate_agreement(mapping.workspace, model)
     assert find_misplaced_images(agreement, image_sequences(model)) == set()
     numbers = {ImageRef.parse(model.image(i).name).frame: int(i) for i in model.reg_image_ids()}
-    found = np.array([model.image(numbers[frame]).projection_center() for frame in range(_KEYFRAMES)])
+    found = np.array([model.image(numbers[frame]).projection_center() for frame in range(KEYFRAMES)])
     unit = align_points(found, invert(poses)[:, :3, 3]).scale
     block = [numbers[frame] for frame in _MOVED]
     middle = found[list(_MOVED)].mean(axis=0)
@@ -224,7 +180,7 @@ def test_a_block_of_another_scale_or_place_is_found_and_repaired(
     assert find_misplaced_images(agreement, image_sequences(wrong)) == set(block)
     mended, log = repair_model(wrong, tried, mapping)
     assert _rms(mended, poses) < 0.01
-    assert mended.num_reg_images() == _KEYFRAMES
+    assert mended.num_reg_images() == KEYFRAMES
     assert log["cut"] == []
 
 
@@ -261,7 +217,7 @@ def test_a_misplaced_block_is_not_confirmed(
 ) -> None:
     model, _, mapping, _ = built
     numbers = {ImageRef.parse(model.image(i).name).frame: int(i) for i in model.reg_image_ids()}
-    found = np.array([model.image(numbers[frame]).projection_center() for frame in range(_KEYFRAMES)])
+    found = np.array([model.image(numbers[frame]).projection_center() for frame in range(KEYFRAMES)])
     block = [numbers[frame] for frame in _MOVED]
     # Scaled about the keyframe before the block, each keyframe of the block moves.
     start = found[_MOVED[0] - 1]
@@ -286,14 +242,14 @@ def test_without_points_no_image_is_confirmed(
     assert confirm_images(mapping.workspace, model, sequences[0][:-1], sequences, 8.0) == set()
 
 
-def _turns(poses: FloatArray, folded_from: int = _KEYFRAMES) -> RotationChain:
+def _turns(poses: FloatArray, folded_from: int = KEYFRAMES) -> RotationChain:
     """Return how the camera of some poses cam_from_map turns; the video turns further before one frame."""
     rotations = poses[:, :3, :3].copy()
     rotations[folded_from:] = so3_exp([0.0, np.pi / 2, 0.0]) @ rotations[folded_from:]
     return RotationChain(
-        frames=np.arange(_KEYFRAMES),
+        frames=np.arange(KEYFRAMES),
         turns=so3_log(rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2)),
-        sigma_rad=np.full(_KEYFRAMES - 1, 1e-3),
+        sigma_rad=np.full(KEYFRAMES - 1, 1e-3),
         turn_sigma=0.05,
     )
 
@@ -307,9 +263,9 @@ def test_keyframes_in_a_place_that_looks_alike_contradict_the_rotation_of_the_vi
     assert find_folded_images(model, {"cam": None}) == set()
     # All matches agree, as in a room with identical bays. Only the video turned by 90 degrees between.
     turns = {"cam": _turns(poses, folded_from=10)}
-    assert find_folded_images(model, turns) == {numbers[frame] for frame in range(10, _KEYFRAMES)}
-    kept, removed, _ = remove_without_adjustment(model, replace(mapping, turns=turns))
-    assert len(removed) == _KEYFRAMES - 10
+    assert find_folded_images(model, turns) == {numbers[frame] for frame in range(10, KEYFRAMES)}
+    kept, removed, _ = remove_without_adjustment(model, replace(mapping, rotation_chains=turns))
+    assert len(removed) == KEYFRAMES - 10
     assert kept.num_reg_images() == 10
     assert remove_without_adjustment(model, mapping)[1] == []
 
@@ -330,7 +286,7 @@ def test_a_further_model_without_points_is_dropped(
     mapping = replace(mapping, times_ns={"cam": np.arange(99) * 10**9})
     models = [copy.deepcopy(model), empty]
     finalise_models(models, mapping, [None, None])
-    assert [item.num_reg_images() for item in models] == [_KEYFRAMES]
+    assert [item.num_reg_images() for item in models] == [KEYFRAMES]
     assert _rms(models[0], poses) < 0.01
 
 
@@ -363,7 +319,7 @@ def test_a_lens_that_the_tracks_exclude_is_no_result_of_the_last_adjustment(
         finalise_models(models, exact, [None])
         # The model itself determines the focal length to 1 %.
         assert models[0].camera(1).params[0] == pytest.approx(focal_px, rel=0.01)
-        assert models[0].num_reg_images() == _KEYFRAMES
+        assert models[0].num_reg_images() == KEYFRAMES
     assert _rms(models[0], poses) < 0.02
 
 
@@ -398,7 +354,7 @@ def test_conjugate_gradients_give_the_same_map_as_the_direct_solver(
         assert _rms(adjusted, poses) < 0.01
         found = sorted(adjusted.reg_image_ids())
         centres.append(np.array([adjusted.image(image).projection_center() for image in found]))
-    assert solvers[0] < _KEYFRAMES < solvers[1]
+    assert solvers[0] < KEYFRAMES < solvers[1]
     # Half a pixel makes 5 mm for each point. This is a hundredth of the uncertainty from noise.
     off = align_points(centres[0], centres[1]).apply(centres[0]) - centres[1]
     assert np.linalg.norm(off, axis=1).max() < 1e-4
@@ -406,7 +362,7 @@ def test_conjugate_gradients_give_the_same_map_as_the_direct_solver(
 
 def test_a_right_map_is_not_changed(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
     model, poses, mapping, pairs = built
-    assert model.num_reg_images() == _KEYFRAMES
+    assert model.num_reg_images() == KEYFRAMES
     # Half a pixel at depth 4 and 420 px makes 5 mm for each point; a pose has dozens.
     assert _rms(model, poses) < 0.01
     same, log = repair_model(model, set(pairs), mapping)
@@ -426,7 +382,7 @@ def test_a_misregistered_block_is_found_and_repaired(
     }
     repaired, log = repair_model(wrong, set(pairs), mapping)
     assert log["cut"] == []
-    assert repaired.num_reg_images() == _KEYFRAMES
+    assert repaired.num_reg_images() == KEYFRAMES
     assert _rms(repaired, poses) < 0.01
 
 
@@ -443,12 +399,12 @@ def test_keyframes_that_cannot_be_repaired_are_removed(
     refs = sorted(_ids(mapping))
     alone, names, _ = remove_without_adjustment(wrong, mapping)
     assert names == [f"cam/{frame:07d}" for frame in _MOVED]
-    assert alone.num_reg_images() == _KEYFRAMES - len(_MOVED)
+    assert alone.num_reg_images() == KEYFRAMES - len(_MOVED)
     assert remove_without_adjustment(model, mapping)[1] == []
     cut, log = repair_model(wrong, pairs | {(a, b) for a in refs for b in refs if a < b}, mapping)
     assert len(adjusted) == len(log["rounds"]), "the stage adjusts the model again at its end"
     assert log["cut"] == [f"cam/{frame:07d}" for frame in _MOVED]
-    assert cut.num_reg_images() == _KEYFRAMES - len(_MOVED)
+    assert cut.num_reg_images() == KEYFRAMES - len(_MOVED)
     assert _rms(cut, poses) < 0.01
 
 
@@ -458,8 +414,8 @@ def test_keyframes_are_registered_again_against_the_rest(
     model, poses, mapping, _ = built
     ids = {ref.frame: number for ref, number in _ids(mapping).items()}
     wrong = _with_moved_block(model, ids)
-    placed = re_register_images(wrong, {ids[frame] for frame in _MOVED}, mapping, _KEYFRAMES)
-    assert placed.num_reg_images() == _KEYFRAMES
+    placed = re_register_images(wrong, {ids[frame] for frame in _MOVED}, mapping, KEYFRAMES)
+    assert placed.num_reg_images() == KEYFRAMES
     assert _rms(placed, poses) < 0.01
 
 
@@ -481,10 +437,10 @@ def test_models_with_common_keyframes_become_one(
 ) -> None:
     model, poses, mapping, _ = built
     mapping = replace(mapping, skeletal_above=1 if is_large else 100)
-    main, further = _two_models(built, range(10), range(7, _KEYFRAMES))
+    main, further = _two_models(built, range(10), range(7, KEYFRAMES))
     models, log = join_models([main, further], mapping)
-    assert [each.num_reg_images() for each in models] == [_KEYFRAMES]
-    assert log[0]["joined"] == _KEYFRAMES
+    assert [each.num_reg_images() for each in models] == [KEYFRAMES]
+    assert log[0]["joined"] == KEYFRAMES
     assert main.num_reg_images() == 10
     # The joined model has the same observations as the model of all keyframes.
     assert _rms(models[0], poses) < 1.5 * _rms(model, poses)
@@ -494,7 +450,7 @@ def test_models_with_common_keyframes_become_one(
 def test_models_with_too_few_common_keyframes_stay_apart(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
-    main, further = _two_models(built, range(10), range(8, _KEYFRAMES))
+    main, further = _two_models(built, range(10), range(8, KEYFRAMES))
     models, log = join_models([main, further], built[2])
     assert models == [main, further]
     assert log == []
@@ -504,7 +460,7 @@ def test_models_are_not_joined_by_misplaced_keyframes(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
     mapping = built[2]
-    main, further = _two_models(built, range(10), range(6, _KEYFRAMES))
+    main, further = _two_models(built, range(10), range(6, KEYFRAMES))
     ids = {ref.frame: number for ref, number in _ids(mapping).items()}
     block = {ids[frame] for frame in range(6, 10)}
     # The common keyframes agree with one similarity, but it is not that of the other keyframes.
@@ -523,15 +479,15 @@ def test_progress_counts_the_keyframes_that_the_map_has_already(
     watching = replace(mapping.stage, progress=lambda done, _total, _what: reported.append(done))
     wrong = _with_moved_block(model, {ref.frame: number for ref, number in _ids(mapping).items()})
     moved = {number for ref, number in _ids(mapping).items() if ref.frame in _MOVED}
-    re_register_images(wrong, moved, replace(mapping, stage=watching), _KEYFRAMES)
-    assert reported == [_KEYFRAMES - 2, _KEYFRAMES - 1, _KEYFRAMES]
+    re_register_images(wrong, moved, replace(mapping, stage=watching), KEYFRAMES)
+    assert reported == [KEYFRAMES - 2, KEYFRAMES - 1, KEYFRAMES]
 
 
 @pytest.mark.parametrize(("width", "error_px", "explained"), [(640, 7.0, 1), (640, 9.0, 0), (1280, 14.0, 1)])
 def test_the_limit_of_the_epipolar_error_is_scaled_with_the_image(
     width: int, error_px: float, explained: float, tmp_path: Path
 ) -> None:
-    lens = _CAMERA.scaled(width, 3 * width // 4)
+    lens = LENS.scaled(width, 3 * width // 4)
     camera = pycolmap.Camera(
         model=lens.model, width=lens.width_px, height=lens.height_px, params=lens.params, camera_id=1
     )
@@ -563,7 +519,7 @@ def test_transient_points_are_removed_if_enough_others_remain(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
     model, poses, mapping, _ = built
-    seen_ns = np.arange(_KEYFRAMES) * 300_000_000
+    seen_ns = np.arange(KEYFRAMES) * 300_000_000
     some = pycolmap.Reconstruction(model)
     before = {image: some.image(image).num_points3D for image in some.reg_image_ids()}
     removed = remove_transient_points(some, {"cam": seen_ns})
@@ -590,7 +546,7 @@ def _two_cameras(palm: str, depth: float = 0.6) -> pycolmap.Reconstruction:
     model = pycolmap.Reconstruction()
     for number in (1, 2):
         model.add_camera_with_trivial_rig(
-            pycolmap.Camera(model="PINHOLE", width=640, height=480, params=_CAMERA.params, camera_id=number)
+            pycolmap.Camera(model="PINHOLE", width=640, height=480, params=LENS.params, camera_id=number)
         )
     room = rng.uniform((-1, -1, 3.8), (1, 1, 4.2), (40, 3))
     near = rng.uniform((-0.1, -0.1, 1.0), (0.1, 0.1, 1.1), (60, 3)) * depth
@@ -603,7 +559,7 @@ def _two_cameras(palm: str, depth: float = 0.6) -> pycolmap.Reconstruction:
         shift = np.array([0.02 * number, 0.0, 0.0])
         image = pycolmap.Image(
             name=ImageRef(camera, frame).name,
-            keypoints=_CAMERA.project(points[seen] - shift),
+            keypoints=LENS.project(points[seen] - shift),
             camera_id=1 + (camera == "palm"),
             image_id=number,
         )
@@ -702,15 +658,15 @@ def test_initial_pairs_with_sideways_movement_rank_first(
 
 
 def test_keyframes_that_an_initial_pair_does_not_reach_make_another_model(tmp_path: Path) -> None:
-    poses = _workspace(tmp_path)
+    poses = write_wall(tmp_path)
     context = StageContext(work_dir=tmp_path, threads=1)
-    halves = [[ImageRef("cam", frame) for frame in half] for half in (range(8), range(8, _KEYFRAMES))]
+    halves = [[ImageRef("cam", frame) for frame in half] for half in (range(8), range(8, KEYFRAMES))]
     match_pairs(
         tmp_path, [(a, b) for half in halves for a in half for b in half if a < b], _INTRINSICS, context
     )
     pair = rank_initial_pairs(tmp_path, _INTRINSICS)[0]
     settings = make_mapper_options(MapOptions(), [1], 1.0)
-    models, ladder = reconstruct(tmp_path, settings, context, _KEYFRAMES, [pair])
+    models, ladder = reconstruct(tmp_path, settings, context, KEYFRAMES, [pair])
     assert ladder == [{**ladder[0], "models": [8, 8], "pair": list(pair.names)}]
     held = [{model.image(number).name for number in model.reg_image_ids()} for model in models]
     assert sorted(map(sorted, held)) == [[ref.name for ref in half] for half in halves]
@@ -722,7 +678,7 @@ def _link_one_way(folder: Path) -> None:
     with pycolmap.Database.open(str(folder / DATABASE_NAME)) as database:
         ids = {ref.frame: number for ref, number in read_image_ids(database).items()}
         seen = {frame: np.asarray(database.read_descriptors(number).data) for frame, number in ids.items()}
-        pairs = [(a, b) for a in range(_KEYFRAMES) for b in range(a + 1, min(a + 6, _KEYFRAMES))]
+        pairs = [(a, b) for a in range(KEYFRAMES) for b in range(a + 1, min(a + 6, KEYFRAMES))]
         for a, b in [
             pair for pair in pairs if pair[0] >= 8 or pair[1] < 8 or (pair[0] >= 6 and pair[1] <= 10)
         ]:
@@ -735,21 +691,21 @@ def _link_one_way(folder: Path) -> None:
 
 
 def test_an_initial_pair_in_the_unconnected_half_loses_no_keyframes(tmp_path: Path) -> None:
-    poses = _workspace(tmp_path)
+    poses = write_wall(tmp_path)
     _link_one_way(tmp_path)
     context = StageContext(work_dir=tmp_path, threads=1)
     pair = find_user_pair(tmp_path, ("cam:31", "cam:35"), _INTRINSICS, _NUMBERS)
     assert pair is not None
     settings = make_mapper_options(MapOptions(), [1], 1.0)
-    models, _ = reconstruct(tmp_path, settings, context, _KEYFRAMES, [pair])
-    assert [model.num_reg_images() for model in models] == [_KEYFRAMES]
+    models, _ = reconstruct(tmp_path, settings, context, KEYFRAMES, [pair])
+    assert [model.num_reg_images() for model in models] == [KEYFRAMES]
     assert _rms(models[0], poses) < 0.01
 
 
 def test_a_camera_that_joins_without_points_of_the_map_keeps_its_calibration() -> None:
     model = pycolmap.Reconstruction()
     for number in (1, 2):
-        camera = pycolmap.Camera(model="PINHOLE", params=_CAMERA.params, camera_id=number)
+        camera = pycolmap.Camera(model="PINHOLE", params=LENS.params, camera_id=number)
         model.add_camera_with_trivial_rig(camera)
     _add_unregistered_image(model, camera_id=1, image_id=7)
 
@@ -768,14 +724,14 @@ def test_a_camera_that_joins_without_points_of_the_map_keeps_its_calibration() -
 
     run = _MapperRun(cast("Any", Mapper()), make_mapper_options(MapOptions(), [2], 1.0))
     assert run._register_next() == 7
-    assert model.camera(2).params.tolist() == _CAMERA.params.tolist()
+    assert model.camera(2).params.tolist() == LENS.params.tolist()
     assert model.camera(1).params[0] == 394.0, "an unknown lens is refined"
 
 
 def test_images_of_a_camera_that_is_in_the_map_do_not_join_without_points() -> None:
     model = pycolmap.Reconstruction()
     for number in (1, 2):
-        camera = pycolmap.Camera(model="PINHOLE", params=_CAMERA.params, camera_id=number)
+        camera = pycolmap.Camera(model="PINHOLE", params=LENS.params, camera_id=number)
         model.add_camera_with_trivial_rig(camera)
     tried: list[int] = []
     for image_id in (1, 2):
@@ -830,10 +786,10 @@ def test_the_users_initial_pair_is_used(built: tuple[Any, FloatArray, MappingCon
     assert pair is not None
     assert pair.names == ("cam/0000002", "cam/0000006")
     models, ladder = reconstruct(
-        mapping.workspace, mapping.mapper_options(), mapping.stage, _KEYFRAMES, [pair]
+        mapping.workspace, mapping.mapper_options(), mapping.stage, KEYFRAMES, [pair]
     )
     assert ladder[-1]["pair"] == ["cam/0000002", "cam/0000006"]
-    assert models[0].num_reg_images() == _KEYFRAMES
+    assert models[0].num_reg_images() == KEYFRAMES
     assert _rms(models[0], poses) < 0.01
     assert find_user_pair(mapping.workspace, ("cam:30", "cam:45"), _INTRINSICS, _NUMBERS) is None
     with pytest.raises(JobError, match="same nearest keyframe"):
@@ -843,8 +799,8 @@ def test_the_users_initial_pair_is_used(built: tuple[Any, FloatArray, MappingCon
 
 
 def _uncalibrated_context(workspace: Path) -> MappingContext:
-    """Return a context for the keyframes of `_workspace` with an uncalibrated camera."""
-    _workspace(workspace)
+    """Return a context for the keyframes of `write_wall` with an uncalibrated camera."""
+    write_wall(workspace)
     _link_one_way(workspace)
     return MappingContext(
         workspace=workspace,
@@ -868,7 +824,7 @@ def test_the_users_initial_pair_is_used_again_if_the_camera_model_changes(
     changed.camera_id = 1
     monkeypatch.setattr(intrinsics_check, "select_camera_models", lambda *_: ({1: changed}, frozenset()))
     options = MapOptions(init_frames=("cam:31", "cam:35"))
-    models, log = reconstruct_with_intrinsics(mapping, options, {1: "cam"}, _KEYFRAMES)
+    models, log = reconstruct_with_intrinsics(mapping, options, {1: "cam"}, KEYFRAMES)
     assert log["better_lenses"] == {"cam": "RADIAL"}
     assert models[0].camera(1).model_name == "RADIAL"
     assert log["initial_pair_ladder"][0]["pair"] == ["cam/0000001", "cam/0000005"]
@@ -895,7 +851,7 @@ def test_only_a_principal_point_that_moved_is_refined_again(
 
     monkeypatch.setattr(intrinsics_check, "_adjustment_cost", cost)
     _, log = reconstruct_with_intrinsics(
-        mapping, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam"}, _KEYFRAMES
+        mapping, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam"}, KEYFRAMES
     )
     assert log["better_lenses"] == {"cam": "RADIAL"}
     first_map = [False, False, False, True, False]
@@ -914,6 +870,6 @@ def test_the_log_holds_the_camera_models_of_both_updates(
 
     monkeypatch.setattr(initial_models, "update_camera_models", change)
     _, log = reconstruct_with_intrinsics(
-        mapping, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam", 2: "hat"}, _KEYFRAMES
+        mapping, MapOptions(init_frames=("cam:31", "cam:35")), {1: "cam", 2: "hat"}, KEYFRAMES
     )
     assert log["better_lenses"] == {"cam": "RADIAL", "hat": "RADIAL"}

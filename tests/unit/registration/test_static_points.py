@@ -35,7 +35,8 @@ def _path() -> FloatArray:
 
 def _camera(frame_ns: int = 33_333_333) -> CaptureCamera:
     return cast(
-        "CaptureCamera", SimpleNamespace(name="palm", times_ns=np.arange(_COUNT) * frame_ns, turns=None)
+        "CaptureCamera",
+        SimpleNamespace(name="palm", times_ns=np.arange(_COUNT) * frame_ns, rotation_chain=None),
     )
 
 

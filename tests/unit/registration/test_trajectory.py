@@ -76,7 +76,7 @@ def _capture(worn: int, rng: np.random.Generator) -> tuple[Map, Tracks]:
 def _solve(scene_map: Map, tracks: Tracks) -> list[FramePose]:
     camera = cast(
         "CaptureCamera",
-        SimpleNamespace(name="torso", times_ns=np.arange(COUNT) * 33_333_333, turns=None),
+        SimpleNamespace(name="torso", times_ns=np.arange(COUNT) * 33_333_333, rotation_chain=None),
     )
     return solve_camera(camera, scene_map, tracks, CRITERIA)
 
