@@ -80,9 +80,9 @@ class RotationChain:
 def find_folded(chain: RotationChain | None, frames: IntArray, world_from_cam: FloatArray) -> BoolArray:
     """Find the poses whose rotation the video contradicts.
 
-    A path that jumps to another place that looks alike turns there as the video does not. It is divided at
-    these jumps. The longest part is right; parts before and after it are right if the rotation of the video
-    leads to them.
+    A path can jump to a wrong place that looks like the right one. The path then turns by an angle by which
+    the video does not turn. It is divided at such jumps. The longest part is right. A part before or after it
+    is right, too, if the rotation of the video from one to the other agrees.
 
     Args:
         chain: The rotation of the camera; None if it is unknown. Nothing is found then.

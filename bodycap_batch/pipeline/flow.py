@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -124,7 +124,6 @@ class Flow:
         self.runner.report_notes(artefact, "check")
         if len(self._capture.cameras) > 1:
             self._sound = self._start_sound()
-            self._sound.add_done_callback(self._note_clocks_from_motion)
         if self._capture.start_s is not None or self._capture.end_s is not None:
             self._apply_sound_offsets()
 
@@ -150,6 +149,9 @@ class Flow:
         )
         for artefact in selected.values():
             self.runner.report_notes(artefact, "keyframes")
+        if self._sound is not None:
+            # What the sound leaves open is said before the map. It was compared in much less time.
+            wait([self._sound])
         return selected
 
     def map(self, keyframes: ByCamera) -> Artefact:
@@ -518,7 +520,7 @@ class Flow:
             return None
         assert results.clocks is not None
         task = preview_task(self._job, results, results.map, results.clocks, self._cameras)
-        return self.runner.start(make_task(PREVIEW, task, threads=self._threads))
+        return self.runner.start(partial(self.runner.run, make_task(PREVIEW, task, threads=self._threads)))
 
     def report(self, results: StageResults, stopped_by: BodycapError | None = None) -> Artefact:
         """Write the report of all results and return its artefact.
@@ -566,26 +568,26 @@ class Flow:
 
     def _start_sound(self) -> Future[Artefact]:
         """Compare the sound of the cameras, beside the keyframes if there are threads for both."""
-        task = make_task(SOUND, SoundTask(capture=self._footage()))
+        compare = partial(self._compare_sound, make_task(SOUND, SoundTask(capture=self._footage())))
         if self._threads > 1:
-            return self.runner.start(task)
+            return self.runner.start(compare)
         done = Future[Artefact]()
         try:
-            done.set_result(self.runner.run(task))
+            done.set_result(compare())
         except NotStored as error:
             # As in another thread, the stages that do not use the sound go on.
             done.set_exception(error)
         return done
 
-    def _note_clocks_from_motion(self, sound: Future[Artefact]) -> None:
-        """Report which clocks only the motion can determine, and what is missing if it does not."""
+    def _compare_sound(self, task: Task) -> Artefact:
+        """Compare the sound; report which clocks only the motion can determine, and what may be missing."""
         from bodycap_batch.clocks import clocks_from_motion_notes
 
-        if sound.cancelled() or sound.exception() is not None:
-            return
-        capture = known_from_sound(self._job.capture, sound.result().path)
+        artefact = self.runner.run(task)
+        capture = known_from_sound(self._job.capture, artefact.path)
         for note in clocks_from_motion_notes(capture, with_body=has_body(self._job)):
             self.runner.note(note, "clocks")
+        return artefact
 
     @property
     def sound(self) -> Future[Artefact] | None:

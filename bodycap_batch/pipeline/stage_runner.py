@@ -121,9 +121,9 @@ class StageRunner:
         )
         return artefact
 
-    def start(self, task: Task) -> Future[Artefact]:
-        """Start a task in another thread, and return the future of its artefact."""
-        return self._pool.submit(self.run, task)
+    def start(self, function: Callable[[], Artefact]) -> Future[Artefact]:
+        """Call a function that runs a task in another thread, and return the future of its artefact."""
+        return self._pool.submit(function)
 
     def start_beside(self, function: Callable[[], object]) -> None:
         """Call a function of this process in another thread. Its errors are ignored: it only saves time."""

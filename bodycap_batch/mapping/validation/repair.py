@@ -152,7 +152,7 @@ def left_contradicted(repair: Mapping[str, Any], ratio: float) -> float:
 def find_wrong_images(
     context: MappingContext, model: pycolmap.Reconstruction, pairs: Sequence[PairConsistency]
 ) -> set[int]:
-    """Return the ids of the images that matches or the rotation of the video contradict.
+    """Return the ids of the images whose pose or points contradict matches or the rotation of the video.
 
     If no part of the model agrees with itself, only the images that contradict the poses are returned.
 
@@ -177,7 +177,7 @@ def _without_confirmed(
 ) -> set[int]:
     """Return the ids of the wrong images without those whose pose a second registration confirms.
 
-    Images whose pose matches or the rotation of the video contradict are never confirmed.
+    An image whose pose contradicts its matches, or the rotation of its video, is never confirmed.
 
     Args:
         context: Workspace, mapper options.
