@@ -12,6 +12,7 @@ from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.mapping.further_maps import models_of_rest
 from bodycap_batch.mapping.inputs import (
     calibrated_camera_ids,
     frame_times_ns,
@@ -34,6 +35,7 @@ from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_k
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.model_files import (
+    keyframe_names,
     model_order,
     read_model,
     registered_ids,
@@ -70,7 +72,8 @@ def extend_map(
         skeletal_above: Maximum number of keyframes of a map that is not large (`MappingContext.is_large`).
 
     Returns:
-        The extended models, largest first, each in a new gauge.
+        The models, largest first, each in a new gauge: the extended ones and, if most keyframes are in none
+        of these, models of the others.
     """
     import pycolmap
 
@@ -119,6 +122,10 @@ def extend_map(
         removed += names
         # A removed keyframe may have connected others with the room.
         transient += remove_points_on_wearer(models[number])
+    rest = {ref.name for ref in (*existing, *new)} - set[str]().union(*map(keyframe_names, models))
+    if len(rest) > max(model.num_reg_images() for model in models):
+        # Most keyframes joined no model: the first ones were too few, or too far apart.
+        models += models_of_rest(rest, mapping.with_rotation_chains(capture))
     models.sort(key=model_order)
     write_models(workspace, models)
     entry = {

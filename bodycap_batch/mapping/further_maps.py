@@ -86,18 +86,9 @@ def _further_maps(
     for name, number in ids.items():
         update_camera(workspace, number, capture.camera(name))
     calibrated_ids = calibrated_camera_ids(capture, ids)
-    mapping = replace(
-        make_mapping_context(workspace, capture, options, calibrated_ids, context, SKELETAL_ABOVE),
-        rotation_chains={camera.name: camera.rotation_chain for camera in capture.cameras},
-    )
-    models = list[Any]()
-    while len(left) >= LEAST_MAPPED:
-        context.check_cancelled()
-        found = _consistent_models(left, mapping)
-        if not found:
-            break
-        models += found
-        left -= set[str]().union(*map(keyframe_names, found))
+    mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, SKELETAL_ABOVE)
+    mapping = mapping.with_rotation_chains(capture)
+    models = models_of_rest(left, mapping)
     readouts = readouts_of_maps(previous.maps)
     return [
         map_with_readouts(map_from_reconstruction(model, workspace), readouts)
@@ -110,6 +101,24 @@ def _lost_keyframes(workspace: Path, paths: Sequence[Trajectory]) -> set[str]:
     lost = {path.camera: ~path.localised for path in paths}
     refs = count_features(workspace)
     return {ref.name for ref in refs if ref.camera in lost and lost[ref.camera][ref.frame]}
+
+
+def models_of_rest(names: set[str], mapping: MappingContext) -> list[Any]:
+    """Return models of keyframes that are in no other model, until too few are left for a further one.
+
+    Args:
+        names: Image names of the keyframes.
+        mapping: Workspace, mapper options, and how each camera turns.
+    """
+    left, models = set(names), list[Any]()
+    while len(left) >= LEAST_MAPPED:
+        mapping.stage.check_cancelled()
+        found = _consistent_models(left, mapping)
+        if not found:
+            break
+        models += found
+        left -= set[str]().union(*map(keyframe_names, found))
+    return models
 
 
 def _consistent_models(names: set[str], mapping: MappingContext) -> Sequence[Any]:

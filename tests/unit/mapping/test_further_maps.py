@@ -1,7 +1,8 @@
-"""Further maps of lost keyframes: what the rotation of the video contradicts is taken out of them."""
+"""Maps of keyframes that joined no map: at the end, and when a map grows."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +12,17 @@ import pytest
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping import map_lost_keyframes
+from bodycap_batch.mapping import extend_map, map_lost_keyframes
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
+from bodycap_batch.mapping.inputs import make_mapping_context
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
+from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
+from bodycap_batch.mapping.reconstruction.model_files import write_models
+from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
+from bodycap_batch.mapping.results import make_result
 from bodycap_batch.model.geometry import so3_exp, so3_log
+from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.rotation_chain import RotationChain
 from bodycap_batch.model.scene import FrameStatus, MapResult, Trajectory
 from tests.scenes import small_map
@@ -35,6 +42,34 @@ NOTHING_POSED = Trajectory(
 )
 
 
+def match_frames(workspace: Path, frames: Iterable[int], context: StageContext) -> None:
+    refs = [ImageRef("cam", frame) for frame in frames]
+    pairs = [(a, b) for a in refs for b in refs if a < b and b.frame - a.frame <= 5]
+    match_pairs(workspace, pairs, {"cam": CameraIntrinsics(LENS, calibrated=True)}, context)
+
+
+def test_a_map_that_most_keyframes_do_not_join_gives_way_to_a_map_of_these(tmp_path: Path) -> None:
+    earlier, work = tmp_path / "earlier", tmp_path / "work"
+    earlier.mkdir()
+    work.mkdir()
+    write_wall(earlier)
+    context = StageContext(work_dir=work, threads=2)
+    match_frames(earlier, range(3), context)
+    match_frames(earlier, range(3, KEYFRAMES), context)
+    capture = Capture(cameras=(CAMERA,))
+    mapping = make_mapping_context(earlier, capture, MapOptions(), {1}, context, SKELETAL_ABOVE)
+    settings = mapping.mapper_options()
+    settings.image_names = [ImageRef("cam", frame).name for frame in range(3)]
+    models, _ = reconstruct(earlier, settings, context, 3)
+    write_models(earlier, models)
+    diagnostics = MapDiagnostics(details={"keyframes": KEYFRAMES})
+    first = make_result(models, earlier, diagnostics.to_log())
+    assert [item.keyframe_frame.tolist() for item in first.maps] == [[0, 1, 2]]
+    result = extend_map(capture, first, {}, MapOptions(), context)
+    frames = [sorted(item.keyframe_frame.tolist()) for item in result.maps]
+    assert frames == [list(range(3, KEYFRAMES)), [0, 1, 2]]
+
+
 @pytest.mark.parametrize("turned_from", [None, 11])
 def test_keyframes_after_a_turn_that_the_map_does_not_show_are_not_in_it(
     turned_from: int | None, tmp_path: Path
@@ -46,10 +81,8 @@ def test_keyframes_after_a_turn_that_the_map_does_not_show_are_not_in_it(
     rotations = write_wall(earlier)[:, :3, :3]
     if turned_from is not None:
         rotations[turned_from:] = so3_exp([0.0, np.pi / 2, 0.0]) @ rotations[turned_from:]
-    refs = [ImageRef("cam", frame) for frame in range(KEYFRAMES)]
-    pairs = [(a, b) for a in refs for b in refs if a < b and b.frame - a.frame <= 5]
     context = StageContext(work_dir=work, threads=2)
-    match_pairs(earlier, pairs, {"cam": CameraIntrinsics(LENS, calibrated=True)}, context)
+    match_frames(earlier, range(KEYFRAMES), context)
     chain = RotationChain(
         frames=np.arange(KEYFRAMES),
         turns=so3_log(rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2)),
