@@ -24,6 +24,9 @@ _MAX_LOG_SIGMA = 0.3
 _POSITION_SIGMA_DEG = 0.15
 """Standard deviation of a delivered position, as a parallax (degrees): 5 mm at a distance of 2 m. A short leg
 is longer or shorter by it, which is no jump of the scale. Evidence: docs/decisions/tracks.md."""
+_COMMON_SHARE = 0.4
+"""Part of this deviation that neighbouring positions have in common: more legs of one length do not make it
+smaller. Evidence: docs/decisions/tracks.md."""
 _MIN_PARALLAX_DEG = 1.0
 """Minimum parallax (degrees) of both legs of a ratio that is used. With less, errors of corners, which hands
 and pyramid levels give in common, are a large part of a leg, and have one sign."""
@@ -82,7 +85,7 @@ def scale_jumps(
     """
     step = np.nan_to_num(np.linalg.norm(np.diff(centres, axis=0), axis=1))
     way = np.concatenate([[0.0], np.cumsum(step)])
-    frames, difference, sigma = [], [], []
+    frames, difference, sigma, shared = [], [], [], []
     for triple, measured in legs:
         lengths = np.linalg.norm(np.diff(centres[list(triple)], axis=0), axis=1)
         value, deviation = measured.log_ratio
@@ -92,16 +95,17 @@ def scale_jumps(
         if is_seen and deviation < _MAX_LOG_SIGMA and not spanned:
             frames.append(triple)
             difference.append(np.log(lengths[1] / lengths[0]) - value)
-            sigma.append(float(np.hypot(deviation, _ratio_sigma(parallax))))
+            sigma.append(deviation)
+            shared.append(_ratio_sigma(parallax))
     if not frames:
         return []
-    spread = np.array(sigma)
+    spread, common = np.array(sigma), np.array(shared)
     gaps = np.diff(np.array(frames), axis=1)[:, 0]
     for gap in np.unique(gaps):
         # The stated deviations leave out what neighbouring frames have in common, so the data correct them.
-        normalised = np.abs(np.array(difference)[gaps == gap]) / spread[gaps == gap]
+        normalised = np.abs(np.array(difference)[gaps == gap]) / np.hypot(spread, common)[gaps == gap]
         spread[gaps == gap] *= max(1.0, 1.48 * float(np.median(normalised)))
-    return _jumps(np.array(frames), np.array(difference), spread, way)
+    return _jumps(np.array(frames), np.array(difference), spread, common, way)
 
 
 def _ratio_sigma(parallax: FloatArray) -> float:
@@ -110,14 +114,18 @@ def _ratio_sigma(parallax: FloatArray) -> float:
     return float(np.deg2rad(_POSITION_SIGMA_DEG) * np.sqrt(np.sum(ends**2) + middle**2))
 
 
-def _jumps(frames: IntArray, difference: FloatArray, sigma: FloatArray, way: FloatArray) -> list[int]:
+def _jumps(
+    frames: IntArray, difference: FloatArray, sigma: FloatArray, common: FloatArray, way: FloatArray
+) -> list[int]:
     best, strongest = 0, 0.0
     for time in range(int(frames.min()) + 1, int(frames.max()) + 1):
         spans = (frames[:, 0] < time) & (time <= frames[:, 2])
         spans[spans] = _effect(way[frames[spans]], way[time - 1]) >= _MIN_EFFECT
         if np.count_nonzero(spans) < _MIN_RATIOS:
             continue
-        jump, deviation = _jump(way[frames[spans]], way[time - 1], difference[spans], sigma[spans])
+        effect = _effect(way[frames[spans]], way[time - 1])
+        gaps = frames[spans, 1] - frames[spans, 0]
+        jump, deviation = _jump(effect, difference[spans], sigma[spans], common[spans], gaps)
         if abs(jump) > _MIN_SCALE_JUMP and abs(jump) / deviation > strongest:
             best, strongest = time, abs(jump) / deviation
     if strongest < _SCALE_SIGMAS:
@@ -125,7 +133,7 @@ def _jumps(frames: IntArray, difference: FloatArray, sigma: FloatArray, way: Flo
     found = [best]
     for side in (frames[:, 2] < best, frames[:, 0] >= best):
         if side.any():
-            found += _jumps(frames[side], difference[side], sigma[side], way)
+            found += _jumps(frames[side], difference[side], sigma[side], common[side], way)
     return sorted(found)
 
 
@@ -136,16 +144,29 @@ def _effect(way: FloatArray, at: float) -> FloatArray:
     return np.asarray(after[:, 1] - after[:, 0])
 
 
-def _jump(way: FloatArray, at: float, difference: FloatArray, sigma: FloatArray) -> tuple[float, float]:
-    """Return the jump of the logarithm of the scale at one place of the way, and its standard deviation."""
-    effect = _effect(way, at)
-    order = np.argsort(difference / effect)
-    share = np.cumsum((effect / sigma)[order] ** 2)
-    middle = order[np.searchsorted(share, share[-1] / 2)]
-    jump = float(difference[middle] / effect[middle])
+def _jump(
+    effect: FloatArray, difference: FloatArray, sigma: FloatArray, common: FloatArray, gaps: IntArray
+) -> tuple[float, float]:
+    """Return the jump of the logarithm of the scale at one place of the way, and its standard deviation.
+
+    Args:
+        effect: (M,) the part of the jump by which each ratio is larger.
+        difference: (M,) delivered minus measured logarithm of each ratio.
+        sigma: (M,) standard deviation of each measured logarithm.
+        common: (M,) standard deviation of each delivered logarithm. A share of it is common to one gap.
+        gaps: (M,) number of frames of each leg.
+    """
+    estimates, total = difference / effect, np.hypot(sigma, common) / effect
+    order = np.argsort(estimates)
+    share = np.cumsum(1.0 / total[order] ** 2)
+    jump = float(estimates[order[np.searchsorted(share, share[-1] / 2)]])
     for _ in range(5):
-        residual = (difference - jump * effect) / sigma
-        weight = 1.0 / (1.0 + (residual / 3.0) ** 2) ** 2 / sigma**2
-        information = float(np.sum(weight * effect**2))
-        jump = float(np.sum(weight * effect * difference)) / max(information, 1e-12)
-    return jump, float(1.0 / np.sqrt(max(information, 1e-12)))
+        weight = 1.0 / (1.0 + ((estimates - jump) / total / 3.0) ** 2) ** 2 / total**2
+        means, information = [], []
+        for gap in np.unique(gaps):
+            own = np.where(gaps == gap, weight, 0.0)
+            together = _COMMON_SHARE * float(np.sum(own * common / effect) / own.sum())
+            means.append(float(np.sum(own * estimates) / own.sum()))
+            information.append(1.0 / (1.0 / own.sum() + together**2))
+        jump = float(np.average(means, weights=information))
+    return jump, float(1.0 / np.sqrt(np.sum(information)))
