@@ -15,6 +15,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import NO_MOTION_HINT, EstimationError
 from bodycap_batch.core.mechanisms import Mechanism, record_act
+from bodycap_batch.mapping.further_maps import with_models_of_rest
 from bodycap_batch.mapping.initial_models import reconstruct_with_intrinsics
 from bodycap_batch.mapping.inputs import (
     calibrated_camera_ids,
@@ -237,11 +238,20 @@ def build_map_once(
     refused = add_flip_hint(check_coverage(models, len(refs), textured, attempts, options), flips)
     if refused is not None and not models:
         raise refused
+    count = len(models)
+    models, displaced = with_models_of_rest(
+        models,
+        {ref.name for ref in refs},
+        left_contradicted(log["repair"], ratio),
+        mapping.with_rotation_chains(capture),
+    )
     write_models(workspace, models)
     calibrated = {number: name for name, number in ids.items() if number in mapping.given_ids}
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
     removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
-    misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
+    misplaced = misplaced_frames(
+        [*removed, *log.get("contradicting", ()), *displaced], models[:1] if len(models) > count else models
+    )
     if readouts:
         log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
     unknown = unknown_shutters(capture, selections, readouts)

@@ -12,7 +12,7 @@ from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping.further_maps import models_of_rest
+from bodycap_batch.mapping.further_maps import with_models_of_rest
 from bodycap_batch.mapping.inputs import (
     calibrated_camera_ids,
     frame_times_ns,
@@ -35,7 +35,6 @@ from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_k
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.model_files import (
-    keyframe_names,
     model_order,
     read_model,
     registered_ids,
@@ -117,16 +116,21 @@ def extend_map(
         removed += cut
         resected.append(registered_ids(model) - kept if mapping.is_large(len(kept)) else None)
     transient = finalise_models(models, mapping, resected)
+    contradicted = list[float]()
     for number, model in enumerate(models):
-        models[number], names, _ = remove_without_adjustment(model, mapping)
+        models[number], names, ratio = remove_without_adjustment(model, mapping)
+        contradicted.append(ratio)
         removed += names
         # A removed keyframe may have connected others with the room.
         transient += remove_points_on_wearer(models[number])
-    rest = {ref.name for ref in (*existing, *new)} - set[str]().union(*map(keyframe_names, models))
-    if len(rest) > max(model.num_reg_images() for model in models):
-        # Most keyframes joined no model: the first ones were too few, or too far apart.
-        models += models_of_rest(rest, mapping.with_rotation_chains(capture))
     models.sort(key=model_order)
+    count = len(models)
+    models, displaced = with_models_of_rest(
+        models,
+        {ref.name for ref in (*existing, *new)},
+        max(contradicted),
+        mapping.with_rotation_chains(capture),
+    )
     write_models(workspace, models)
     entry = {
         "new_keyframes": len(new),
@@ -141,7 +145,9 @@ def extend_map(
     ]
     diagnostics = replace(
         diagnostics,
-        misplaced=misplaced_frames([*before, *removed], models),
+        misplaced=misplaced_frames(
+            [*before, *removed, *displaced], models[:1] if len(models) > count else models
+        ),
         extensions=(*diagnostics.extensions, entry),
         details={**diagnostics.details, "keyframes": len(existing) + len(new)},
     )

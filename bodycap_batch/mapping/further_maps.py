@@ -13,6 +13,7 @@ from bodycap_batch.config import MapOptions
 from bodycap_batch.config.lost_frames import LEAST_MAPPED
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.core.mechanisms import Mechanism, is_on
 from bodycap_batch.mapping.inputs import calibrated_camera_ids, make_mapping_context, with_lenses_of_maps
 from bodycap_batch.mapping.intrinsics.readout_time import map_with_readouts
 from bodycap_batch.mapping.intrinsics.shutters import readouts_of_maps
@@ -88,7 +89,7 @@ def _further_maps(
     calibrated_ids = calibrated_camera_ids(capture, ids)
     mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, SKELETAL_ABOVE)
     mapping = mapping.with_rotation_chains(capture)
-    models = models_of_rest(left, mapping)
+    models = _models_of_rest(left, mapping)
     readouts = readouts_of_maps(previous.maps)
     return [
         map_with_readouts(map_from_reconstruction(model, workspace), readouts)
@@ -103,13 +104,34 @@ def _lost_keyframes(workspace: Path, paths: Sequence[Trajectory]) -> set[str]:
     return {ref.name for ref in refs if ref.camera in lost and lost[ref.camera][ref.frame]}
 
 
-def models_of_rest(names: set[str], mapping: MappingContext) -> list[Any]:
-    """Return models of keyframes that are in no other model, until too few are left for a further one.
+def with_models_of_rest(
+    models: Sequence[Any], names: set[str], contradicted: float, mapping: MappingContext
+) -> tuple[list[Any], set[str]]:
+    """Add models of the keyframes that are in none, if these are more than the largest model has.
+
+    Then the first keyframes were too few or too far apart, or the largest model contradicts most of them. If
+    it also contradicts itself, places that look the same are in it, and nothing is added.
 
     Args:
-        names: Image names of the keyframes.
+        models: Reconstructions, the largest first.
+        names: Image names of all keyframes.
+        contradicted: Fraction of the matches of the largest model that contradict it.
         mapping: Workspace, mapper options, and how each camera turns.
+
+    Returns:
+        The models, the largest first. The image names of the keyframes of the model that was the largest, if
+        another one is the largest now; else empty.
     """
+    rest = names - set[str]().union(*map(keyframe_names, models))
+    is_base = not contradicted and is_on(Mechanism.FURTHER_MAPS)
+    if not models or not is_base or len(rest) <= models[0].num_reg_images():
+        return list(models), set()
+    found = sorted([*models, *_models_of_rest(rest, mapping)], key=model_order)
+    return found, set() if found[0] is models[0] else keyframe_names(models[0])
+
+
+def _models_of_rest(names: set[str], mapping: MappingContext) -> list[Any]:
+    """Return models of keyframes that are in no other model, until too few are left for a further one."""
     left, models = set(names), list[Any]()
     while len(left) >= LEAST_MAPPED:
         mapping.stage.check_cancelled()
