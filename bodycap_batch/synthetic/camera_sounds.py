@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from bodycap_batch.formats.mp4_writer import Sound
-from bodycap_batch.synthetic.camera_renderer import MovingBody
 from bodycap_batch.synthetic.clocks import first_and_last_s, true_clocks
 from bodycap_batch.synthetic.footsteps import footstep_times
+from bodycap_batch.synthetic.moving_body import MovingBody
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.sound import Microphone, make_scene, record
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.synthetic.camera_renderer import MovingBody, joint_poses_at
+from bodycap_batch.synthetic.moving_body import MovingBody, joint_poses_at
 from bodycap_batch.synthetic.stance_walk import StanceWalk
 
 _RATE_HZ = 100.0

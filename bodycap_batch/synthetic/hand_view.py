@@ -50,8 +50,8 @@ def with_hand_in_view(mount: Mount, skeleton: SkeletonModel, camera: Camera, sha
     elbow = skeleton.index_of_role(mount.role)
     joints[:, :3, 3] = rest_positions(skeleton) - rest_positions(skeleton)[elbow]
     wearer = Wearer(skeleton, np.random.SeedSequence(0))
-    wearer.place_textures(np.zeros((len(wearer.images), 2)))
-    limbs = [(shape, joints[joint, :3, 3]) for joint, shape in wearer.parts if joint in (hand, elbow)]
+    parts = wearer.parts(np.zeros((len(wearer.images), 2)))
+    limbs = [(shape, joints[joint, :3, 3]) for joint, shape in parts if joint in (hand, elbow)]
     starts = np.cumsum([0, *(len(shape.vertices) for shape, _ in limbs)])
     scene = RayScene(
         np.concatenate([shape.vertices + place for shape, place in limbs]),

@@ -20,33 +20,27 @@ from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.atomic_files import store_error_from_os_error
 from bodycap_batch.formats.gpmf_writer import append_settings
 from bodycap_batch.formats.mp4_writer import DataTrack, VideoWriter
-from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
-from bodycap_batch.synthetic.camera_renderer import (
-    AutoExposure,
-    CameraRenderer,
-    MovingBody,
-    Sensor,
-    camera_poses_at,
-    picture_poses_at,
-)
 from bodycap_batch.synthetic.camera_sounds import CameraSounds
 from bodycap_batch.synthetic.clip import load_clip
 from bodycap_batch.synthetic.clocks import first_and_last_s, true_clocks
 from bodycap_batch.synthetic.gait import Walk, WalkStyle
 from bodycap_batch.synthetic.hand_view import with_hand_in_view
 from bodycap_batch.synthetic.imu import write_imu
-from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
+from bodycap_batch.synthetic.lens import focal_and_centre
 from bodycap_batch.synthetic.measured import disturb_poses
+from bodycap_batch.synthetic.moving_body import MovingBody, camera_poses_at, picture_poses_at
 from bodycap_batch.synthetic.moving_camera import MovingCamera
+from bodycap_batch.synthetic.moving_scene import ROOM, MovingPart
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
 from bodycap_batch.synthetic.pressing import carrying, find_press
 from bodycap_batch.synthetic.room import BareSurfaces, RoomLayout, build_room
-from bodycap_batch.synthetic.stabilisation import GOPRO_SETTINGS, orientation_track
+from bodycap_batch.synthetic.sensor import AutoExposure, Sensor
+from bodycap_batch.synthetic.stabilisation import GOPRO_SETTINGS, orientation_track, turn_of_pictures
 from bodycap_batch.synthetic.stance_walk import StanceWalk
-from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, triangles_from_surfaces
+from bodycap_batch.synthetic.triangles import triangles_from_surfaces
 from bodycap_batch.synthetic.truth import (
     MARKER,
     common_ticks_ns,
@@ -229,7 +223,7 @@ def _write_camera_imu(folder: Path, options: SynthOptions, subject: Subject, mou
 class _FrameRecorder:
     """Function that renders one recorded frame of a camera. The frame depends only on the frame number."""
 
-    renderer: CameraRenderer | MovingCamera
+    renderer: MovingCamera
     sensor: Sensor
     times_s: FloatArray
 
@@ -254,7 +248,7 @@ def _write_videos(
         for renderer, seed in zip(renderers, subject.seeds["images"].spawn(len(renderers)), strict=True):
             camera = renderer.mount.camera
             recorder = _FrameRecorder(
-                renderer=video_renderer(renderer, options.camera()),
+                renderer=renderer,
                 sensor=Sensor(options.noise, 3 * options.width * options.height, seed),
                 times_s=clocks[camera].common_s(seconds_from_ns(frame_times_ns(options, camera))),
             )
@@ -282,7 +276,7 @@ def _write_videos(
                 append_settings(folder / f"{camera}.mp4", GOPRO_SETTINGS)
 
 
-def _orientations(options: SynthOptions, renderer: CameraRenderer, common_s: FloatArray) -> DataTrack | None:
+def _orientations(options: SynthOptions, renderer: MovingCamera, common_s: FloatArray) -> DataTrack | None:
     """Return the record of the orientations of stabilised pictures; None without one.
 
     Args:
@@ -293,12 +287,12 @@ def _orientations(options: SynthOptions, renderer: CameraRenderer, common_s: Flo
     if options.stabilised != "recorded":
         return None
     cameras = camera_poses_at(renderer.motion, renderer.mount, common_s)
-    turns = np.swapaxes(cameras[:, :3, :3], 1, 2) @ renderer.poses_at(common_s)[:, :3, :3]
+    turns = turn_of_pictures(lambda t_s: camera_poses_at(renderer.motion, renderer.mount, t_s), common_s)
     in_file_ns = np.round(np.arange(len(common_s)) * (1e9 / options.fps)).astype(np.int64)
     return orientation_track(in_file_ns, cameras, turns)
 
 
-def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRenderer]:
+def build_renderers(options: SynthOptions, subject: Subject) -> list[MovingCamera]:
     """Build the room around the motion, and return a renderer for each camera."""
     camera = options.camera()
     focal, _ = focal_and_centre(camera)
@@ -329,32 +323,21 @@ def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRende
         else None
     )
     atlas = Atlas(images + (wearer.images if wearer else []))
-    if wearer:
-        wearer.place_textures(atlas.origins[len(images) :])
-    room = triangles_from_surfaces(surfaces, atlas.origins[: len(images)])
-    scene, grid = SceneRenderer(room, atlas), ray_grid(camera)
+    clothes = atlas.origins[len(images) :]
+    room = MovingPart(ROOM, triangles_from_surfaces(surfaces, atlas.origins[: len(images)]))
     return [
-        CameraRenderer(
+        MovingCamera(
             motion=subject.motion,
             mount=mount,
-            grid=grid,
-            room=room,
+            camera=camera,
+            parts=[room, *(MovingPart(*limb) for limb in (wearer.parts(clothes, mount) if wearer else []))],
             atlas=atlas,
-            scene=scene,
-            wearer=wearer.visible_from(mount, subject.motion.skeleton) if wearer else None,
             exposure_s=options.exposure_s,
             rolling_shutter_s=options.rolling_shutter_s,
             stabilised=options.stabilised != "none",
         )
         for mount in subject.mounts
     ]
-
-
-def video_renderer(renderer: CameraRenderer, camera: Camera) -> CameraRenderer | MovingCamera:
-    """Return the renderer of a video's frames: a fast one if frames have an exposure or a readout time."""
-    if renderer.exposure_s == 0.0 and renderer.rolling_shutter_s == 0.0:
-        return renderer
-    return MovingCamera(renderer, camera)
 
 
 def walked_extent_m(options: SynthOptions, subject: Subject) -> tuple[float, float]:

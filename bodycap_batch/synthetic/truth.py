@@ -18,8 +18,8 @@ from bodycap_batch.formats.bvh import write_bvh
 from bodycap_batch.formats.tum import TimedPoses, seconds_text, write_tum
 from bodycap_batch.model.geometry import invert, make_transform, quat_xyzw_from_rotation, so3_exp, so3_log
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
-from bodycap_batch.synthetic.camera_renderer import MovingBody, joint_poses_at
 from bodycap_batch.synthetic.clocks import has_own_clocks, reference_name, true_clocks
+from bodycap_batch.synthetic.moving_body import MovingBody, joint_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.stance_walk import StanceWalk
 

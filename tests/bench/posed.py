@@ -14,9 +14,9 @@ from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Mount
-from bodycap_batch.synthetic.camera_renderer import MovingBody, camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.making import Subject, draw_subject, frame_times_ns
 from bodycap_batch.synthetic.measured import disturb_poses
+from bodycap_batch.synthetic.moving_body import MovingBody, camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.truth import common_ticks_ns, seconds_from_ns
 

@@ -6,13 +6,14 @@ import pytest
 
 from bodycap_batch.formats.mp4_writer import VideoWriter
 from bodycap_batch.model.geometry import rotation_angle_rad
-from bodycap_batch.synthetic.camera_renderer import AutoExposure, Sensor, camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.lens import ray_grid
 from bodycap_batch.synthetic.making import draw_subject
+from bodycap_batch.synthetic.moving_body import camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.raycast import NOTHING, RayScene
 from bodycap_batch.synthetic.room import RoomLayout, build_room
-from bodycap_batch.synthetic.triangle_renderer import triangles_from_surfaces
+from bodycap_batch.synthetic.sensor import AutoExposure, Sensor
+from bodycap_batch.synthetic.triangles import triangles_from_surfaces
 from bodycap_batch.synthetic.wearer import Wearer
 
 SMALL = {"width": 64, "height": 48, "seconds": 8.0, "body_in_view": True, "mount_sigma_m": 0.01}
@@ -115,8 +116,7 @@ def _shares(options, camera, times_s, joints=None):
     mount = next(mount for mount in subject.mounts if mount.camera == camera)
     sides = tuple(side.capitalize() for side in options.carried_s)
     wearer = Wearer(skeleton, np.random.SeedSequence(1), carrying=sides)
-    wearer.place_textures(np.zeros((len(wearer.images), 2)))
-    seen = wearer.visible_from(mount, skeleton).parts
+    seen = wearer.parts(np.zeros((len(wearer.images), 2)), mount)
     rays = ray_grid(options.camera()).in_cam[::2, ::2].reshape(-1, 3)
     out = []
     for t_s in times_s:

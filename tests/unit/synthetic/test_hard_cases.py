@@ -4,11 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from bodycap_batch.synthetic.camera_renderer import camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.making import build_renderers, draw_subject
+from bodycap_batch.synthetic.moving_body import joint_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.room import HEIGHT_M, BareSurfaces, build_room
-from bodycap_batch.synthetic.triangle_renderer import SceneRenderer
 from bodycap_batch.synthetic.wearer import Wearer
 
 SMALL = {"width": 64, "height": 48, "seconds": 5.0, "body_in_view": True}
@@ -22,11 +21,10 @@ def _body_ratios(options, camera, times_s):
     )
     shares = []
     for t_s in times_s:
-        at = np.array([t_s])
-        body = SceneRenderer(renderer.wearer.at(joint_poses_at(renderer.motion, at)[0]), renderer.atlas)
-        pose = camera_poses_at(renderer.motion, renderer.mount, at)[0]
-        image = body.image(renderer.grid, pose, slice(0, options.height))
-        shares.append(float((image.max(axis=-1) > 0).mean()))
+        _, poses = renderer._part_from_cam(np.array([t_s]))
+        _, hits = renderer.scene.sharp(renderer.grid, poses.transpose(1, 0, 2, 3), renderer._gain(t_s))
+        # The first part is the room.
+        shares.append(float((renderer.scene.part_of_face[hits.faces] > 0).mean()))
     return np.array(shares)
 
 
