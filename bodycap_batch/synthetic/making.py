@@ -28,7 +28,6 @@ from bodycap_batch.synthetic.clocks import first_and_last_s, true_clocks
 from bodycap_batch.synthetic.gait import Walk, WalkStyle
 from bodycap_batch.synthetic.hand_view import with_hand_in_view
 from bodycap_batch.synthetic.imu import write_imu
-from bodycap_batch.synthetic.lens import focal_and_centre
 from bodycap_batch.synthetic.measured import disturb_poses
 from bodycap_batch.synthetic.moving_body import MovingBody, camera_poses_at, picture_poses_at
 from bodycap_batch.synthetic.moving_camera import MovingCamera
@@ -295,8 +294,7 @@ def _orientations(options: SynthOptions, renderer: MovingCamera, common_s: Float
 def build_renderers(options: SynthOptions, subject: Subject) -> list[MovingCamera]:
     """Build the room around the motion, and return a renderer for each camera."""
     camera = options.camera()
-    focal, _ = focal_and_centre(camera)
-    texels_per_m = min(_TEXELS_PER_PIXEL_M * float(focal.mean()), _MAX_TEXELS_PER_M)
+    texels_per_m = min(_TEXELS_PER_PIXEL_M * camera.focal_px, _MAX_TEXELS_PER_M)
     surfaces = build_room(
         walked_extent_m(options, subject),
         texels_per_m,

@@ -20,7 +20,7 @@ from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes, Float32
-from bodycap_batch.synthetic.lens import RayGrid, project, ray_grid
+from bodycap_batch.synthetic.lens import RayGrid, ray_grid
 from bodycap_batch.synthetic.moving_body import MovingBody, joint_poses_at, picture_poses_at
 from bodycap_batch.synthetic.moving_scene import ROOM, Hits, MovingPart, MovingScene, rays_in_part
 from bodycap_batch.synthetic.triangles import dot
@@ -253,7 +253,7 @@ class MovingCamera:
         to_cam = invert(middle).reshape(-1, 4, 4)
         for _ in range(2 if instants > 1 else 1):
             direction, origin = rays_in_part(point, to_cam, part * instants + row)
-            at = project(self._camera, (direction + origin).T.astype(np.float64)) - 0.5 + margin
+            at = self._camera.project((direction + origin).T.astype(np.float64)) - 0.5 + margin
             row = np.clip(np.nan_to_num(np.rint(at[:, 1])), 0, size[0] - 1).astype(np.int64)
         limit = 2.0 * max(margin, 8)
         out = np.clip(at - np.stack([x, y], axis=1), -limit, limit)

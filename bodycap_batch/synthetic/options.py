@@ -21,9 +21,8 @@ from bodycap_batch.config.bounds import (
 )
 from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.config.options import Options
-from bodycap_batch.model.camera import CAMERA_MODELS, Camera, parameter_count
+from bodycap_batch.model.camera import CAMERA_MODELS, Camera, focal_count, parameter_count
 from bodycap_batch.synthetic.imu_options import ImuOptions, imu_from_word
-from bodycap_batch.synthetic.lens import SINGLE_FOCAL
 
 _EARLIEST_S = 3.0
 """Maximum time (seconds) from the start of a camera to time 0 of the common clock. The built-in walk starts
@@ -528,7 +527,7 @@ class SynthOptions(Options):
         if params is None:
             params = _default_lens_params(self.lens, self.width, self.height)
         if self.stabilised != "none":
-            focals = 1 if self.lens in SINGLE_FOCAL else 2
+            focals = focal_count(self.lens)
             params = (*(_CROP_ZOOM * focal for focal in params[:focals]), *params[focals:])
         return Camera(model=self.lens, width_px=self.width, height_px=self.height, params=list(params))  # type: ignore[arg-type]
 
@@ -539,8 +538,7 @@ def _default_lens_params(model: str, width: int, height: int) -> tuple[float, ..
     The lens has a usual angle of view. It has no distortion, except for the model FOV.
     """
     focal = width * _DEFAULT_FOCAL_PX / 640.0
-    head = [focal] if model in SINGLE_FOCAL else [focal, focal]
-    head += [width / 2.0, height / 2.0]
+    head = [focal] * focal_count(model) + [width / 2.0, height / 2.0]
     rest = [0.0] * (parameter_count(model) - len(head))
     if model == "FOV":
         rest = [_DEFAULT_FOV_OMEGA_RAD]

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from bodycap_batch.synthetic.lens import project, ray_grid
 from bodycap_batch.synthetic.making import build_renderers, draw_subject
 from bodycap_batch.synthetic.options import SynthOptions
 
@@ -56,13 +55,3 @@ def test_a_very_short_readout_gives_the_frame_of_one_instant():
     difference = np.abs(at_once - _renderer(exposure_s=0.0, rolling_shutter_s=1e-9).render(1.0))
     # Texel coordinates are interpolated over 4 px, and cells share filters.
     assert 0.0 < difference.mean() < 0.3
-
-
-@pytest.mark.parametrize("lens", [{}, FISHEYE])
-def test_projecting_the_viewing_rays_gives_the_pixels_back(lens):
-    camera = _options(**lens).camera()
-    grid = ray_grid(camera, margin_px=3)
-    assert grid.valid.shape == (86, 134)
-    pixels = project(camera, 2.5 * grid.in_cam.reshape(-1, 3)).reshape(86, 134, 2)
-    x, y = np.meshgrid(np.arange(-3, 131) + 0.5, np.arange(-3, 83) + 0.5)
-    assert np.abs(pixels - np.stack([x, y], axis=-1))[grid.valid].max() < 1e-6
