@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tempfile
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,11 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.progress_display import make_progress_display
-from bodycap_batch.cli.signals import event_on_signal
-from bodycap_batch.cli.terminal import print_line
+from bodycap_batch.cli.progress_display import command_context
+from bodycap_batch.cli.terminal import print_line, print_lines
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.core.progress import Event, StepProgress
 
 if TYPE_CHECKING:
     from bodycap_batch.calibration import CalibrationBoard
@@ -109,7 +106,6 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
         write_calibration,
         write_preview,
     )
-    from bodycap_batch.core.context import StageContext
 
     if print_ is not None:
         write_board(print_)
@@ -123,26 +119,13 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
         )
     stated = _stated_board(chessboard, charuco, dictionary, marker, legacy=legacy)
     target = out or video.parent / "calib.json"
-    with (
-        event_on_signal() as stop,
-        make_progress_display(as_json=json_progress) as display,
-        tempfile.TemporaryDirectory() as work,
-    ):
-
-        def report(done: int, total: int, what: str) -> None:
-            display(Event(kind="progress", stage="calibrate", done=done, total=total, what=what))
-
-        progress = StepProgress(report)
-        context = StageContext(work_dir=Path(work), progress=progress, cancelled=stop.is_set)
+    with command_context("calibrate", as_json=json_progress) as context:
         result = calibrate_clip(video, stated or find_board(video, context), lens.value, context)
-        progress.complete()
     preview = target.with_name(f"{target.stem}{f'_{camera}' if camera else ''}.png")
     write_calibration(result, target, camera)
     write_preview(result, preview)
     if not json_progress:
-        lines = [*result.lines(), f"calibration: {target.resolve()}", f"preview: {preview.resolve()}"]
-        for line in lines:
-            print_line(line)
+        print_lines([*result.lines(), f"calibration: {target.resolve()}", f"preview: {preview.resolve()}"])
 
 
 def _stated_board(

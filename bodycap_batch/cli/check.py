@@ -18,7 +18,7 @@ from bodycap_batch.cli.shared_options import (
     SkeletonOption,
     make_overrides,
 )
-from bodycap_batch.cli.terminal import print_json, print_line
+from bodycap_batch.cli.terminal import print_json, print_lines
 from bodycap_batch.job_places import find_job
 
 
@@ -56,6 +56,5 @@ def check(  # noqa: PLR0913, PLR0917 - the flags a user types
     if as_json:
         print_json(report.to_dict(), indent=1)
     else:
-        for line in report.lines():
-            print_line(line)
+        print_lines(report.lines())
     raise typer.Exit(report.exit_code)

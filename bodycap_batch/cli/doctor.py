@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.terminal import print_json, print_line
+from bodycap_batch.cli.terminal import print_json, print_line, print_lines
 from bodycap_batch.core.errors import StoreError
 
 
@@ -35,8 +35,7 @@ def doctor(
     for finding in examine_machine(out):
         findings.append(finding)
         if not as_json:
-            for line in finding.lines():
-                print_line(line)
+            print_lines(finding.lines())
     problems = [finding.what for finding in findings if finding.state == "problem"]
     if as_json:
         print_json([dataclasses.asdict(finding) for finding in findings], indent=1)

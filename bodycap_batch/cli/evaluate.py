@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.terminal import print_json, print_line
+from bodycap_batch.cli.terminal import print_json, print_line, print_lines
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.percent import format_percent
 
@@ -107,8 +107,7 @@ def evaluate(
     if as_json:
         print_json(values, indent=1)
         return
-    for line in _table_lines(values):
-        print_line(line)
+    print_lines(_table_lines(values))
 
 
 def _evaluate_with_pictures(results: Path, video: Path, *, as_json: bool) -> None:

@@ -13,6 +13,7 @@ from bodycap_batch.cli.shared_options import (
     JobArgument,
     StoreOption,
     ThreadsOption,
+    command_settings,
     make_overrides,
     results_folder,
 )
@@ -20,8 +21,7 @@ from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.config.bounds import MAX_FPS, MIN_FPS
 from bodycap_batch.config.export_targets import TARGETS
-from bodycap_batch.core.context import cores
-from bodycap_batch.job_places import find_store, load_last_run
+from bodycap_batch.job_places import load_last_run
 
 
 @app.command(short_help="Write the files for one program, or undistorted clips with their cameras.")
@@ -73,8 +73,7 @@ def export(  # noqa: PLR0913, PLR0917 - each option is a parameter
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.export_targets import export_target
     from bodycap_batch.core.errors import JobError
-    from bodycap_batch.pipeline import Settings, export_for, export_undistorted
-    from bodycap_batch.store.artefacts import Store
+    from bodycap_batch.pipeline import export_for, export_undistorted
 
     if target is not None:
         export_target(target)
@@ -86,12 +85,7 @@ def export(  # noqa: PLR0913, PLR0917 - each option is a parameter
     resolved = load_last_run(job, make_overrides())
     out_dir = results_folder(resolved)
     with event_on_signal() as stop, make_progress_display(as_json=False) as display:
-        settings = Settings(
-            store=Store(store or find_store(out_dir)),
-            threads=threads or cores(),
-            listener=display,
-            cancelled=stop.is_set,
-        )
+        settings = command_settings(out_dir, store, threads, listener=display, cancelled=stop.is_set)
         written = []
         if target is not None:
             written += export_for(

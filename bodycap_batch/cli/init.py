@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.terminal import print_line
+from bodycap_batch.cli.terminal import print_line, print_lines
 from bodycap_batch.core.errors import CaptureError, JobError
 
 
@@ -36,8 +36,7 @@ def init(
     text = path.read_text(encoding="utf-8")
     print_line(f"wrote {path}")
     try:
-        for line in overview_lines(path):
-            print_line(line)
+        print_lines(overview_lines(path))
     except (JobError, CaptureError) as error:
         print_line(f"problem: {error}")
     missing = text.count(UNKNOWN_MOUNT)

@@ -11,13 +11,13 @@ from bodycap_batch.cli.shared_options import (
     SkeletonOption,
     StoreOption,
     ThreadsOption,
+    command_settings,
     make_overrides,
     results_folder,
 )
 from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line
-from bodycap_batch.core.context import cores
-from bodycap_batch.job_places import find_store, load_last_run
+from bodycap_batch.job_places import load_last_run
 
 
 @app.command()
@@ -40,17 +40,11 @@ def report(
       bodycap report out/my_walk
       bodycap report my_walk/ --height 1.75
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.pipeline import Settings, remake_report
-    from bodycap_batch.store.artefacts import Store
+    from bodycap_batch.pipeline import remake_report
 
     resolved = load_last_run(job, make_overrides(out, skeleton, height))
     out_dir = results_folder(resolved)
     with event_on_signal() as stop, make_progress_display(as_json=False) as display:
-        settings = Settings(
-            store=Store(store or find_store(out_dir)),
-            threads=threads or cores(),
-            listener=display,
-            cancelled=stop.is_set,
-        )
+        settings = command_settings(out_dir, store, threads, listener=display, cancelled=stop.is_set)
         path = remake_report(resolved, out_dir=out_dir, settings=settings)
     print_line(f"report: {path}")

@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.open_report import REPORTS
+from bodycap_batch.cli.open_report import report_page
 from bodycap_batch.cli.shared_options import (
     JobArgument,
     OutOption,
     StoreOption,
+    command_settings,
     results_folder,
 )
 from bodycap_batch.cli.terminal import print_line, print_message
-from bodycap_batch.core.errors import BodycapError, JobError
+from bodycap_batch.core.errors import BodycapError
 from bodycap_batch.job_places import capture_of_results, find_store, load_last_run
 
 if TYPE_CHECKING:
@@ -65,13 +66,7 @@ def view(
         write_recording(_stored_inputs(resolved, out_dir, store), rerun)
         print_line(f"recording: {rerun}")
         return
-    page = next((out_dir / name for name in REPORTS if (out_dir / name).is_file()), None)
-    if page is None:
-        raise JobError(
-            "the folder contains no report",
-            path=out_dir,
-            hint="run the job, or write the report with `bodycap report`",
-        )
+    page = report_page(out_dir)
     server = make_server(
         make_served_content(
             page, capture_of_results(resolved, out_dir), _StoredMarks(resolved, out_dir, store)
@@ -88,11 +83,10 @@ def view(
 
 def _stored_inputs(job: Job, out_dir: Path, store: Path) -> ReportInputs:
     """Read the inputs of a job's report from the store."""
-    from bodycap_batch.pipeline import Settings, stored_for_report
-    from bodycap_batch.store.artefacts import Store
+    from bodycap_batch.pipeline import stored_for_report
     from bodycap_batch.tasks.report import load_inputs
 
-    settings = Settings(store=Store(store), threads=1, listener=lambda _: None, cancelled=lambda: False)
+    settings = command_settings(out_dir, store)
     return load_inputs(stored_for_report(job, out_dir=out_dir, settings=settings))
 
 
