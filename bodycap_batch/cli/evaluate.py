@@ -144,14 +144,14 @@ def _evaluate_with_pictures(results: Path, video: Path, *, as_json: bool) -> Non
 def _evaluate_trajectories(
     pairs: dict[str, tuple[Path, Path]], results: Path, align: str, reference: str | None
 ) -> dict[str, Any]:
-    from bodycap_batch.evaluate import TrajectoryOptions, relative_camera_error, score_trajectories
+    from bodycap_batch.evaluate import relative_camera_error, score_trajectories
     from bodycap_batch.formats.tum import read_tum
 
     estimates = {name: read_tum(pair[0]) for name, pair in pairs.items()}
     truths = {name: read_tum(pair[1]) for name, pair in pairs.items()}
     frames = _frame_counts(results) if results.is_dir() else {}
     reports: dict[str, Any] = {
-        "trajectories": score_trajectories(estimates, truths, TrajectoryOptions(align=align), frames)  # type: ignore[arg-type]
+        "trajectories": score_trajectories(estimates, truths, align, frames)  # type: ignore[arg-type]
     }
     if reference is not None:
         for name in sorted(set(pairs) - {reference}):

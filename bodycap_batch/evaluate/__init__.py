@@ -3,21 +3,21 @@
 from bodycap_batch.evaluate.motion import MotionOptions, MotionReport, evaluate_motion, score_motion
 from bodycap_batch.evaluate.relative_cameras import RelativeCameraError, relative_camera_error
 from bodycap_batch.evaluate.trajectories import (
+    Alignment,
     CameraScore,
     ErrorSummary,
-    TrajectoryOptions,
     TrajectoryReport,
     evaluate_trajectories,
     score_trajectories,
 )
 
 __all__ = [
+    "Alignment",
     "CameraScore",
     "ErrorSummary",
     "MotionOptions",
     "MotionReport",
     "RelativeCameraError",
-    "TrajectoryOptions",
     "TrajectoryReport",
     "evaluate_motion",
     "evaluate_trajectories",

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.evaluate.trajectories import ErrorSummary, TrajectoryOptions, truth_at
+from bodycap_batch.evaluate.association import interpolate_truth
+from bodycap_batch.evaluate.trajectories import ErrorSummary
 from bodycap_batch.formats.tum import TimedPoses
 from bodycap_batch.model.geometry import align_points, invert
 
@@ -40,7 +41,6 @@ def relative_camera_error(
     truths: Mapping[str, TimedPoses],
     camera: str,
     reference: str,
-    options: TrajectoryOptions | None = None,
 ) -> RelativeCameraError:
     """Compare the vector between two cameras with the true vector, without an estimation of the scale.
 
@@ -49,13 +49,11 @@ def relative_camera_error(
         truths: True poses world_from_camera (metres) at common times, by camera name.
         camera: Name of the camera on the limb.
         reference: Name of the camera on the trunk.
-        options: Options of the comparison. Only the options for the association of true poses are used.
 
     Raises:
         JobError: A camera is missing, or fewer than three frames have an estimated pose and a true pose of
             both cameras.
     """
-    options = options or TrajectoryOptions()
     for name in (camera, reference):
         if name not in estimates or name not in truths:
             raise JobError(
@@ -65,9 +63,9 @@ def relative_camera_error(
     times = estimates[camera].times_ns
     columns = [
         (estimates[camera].world_from_cam, np.ones(len(times), dtype=bool)),
-        truth_at(estimates[reference], times, options),
-        truth_at(truths[camera], times, options),
-        truth_at(truths[reference], times, options),
+        interpolate_truth(estimates[reference], times),
+        interpolate_truth(truths[camera], times),
+        interpolate_truth(truths[reference], times),
     ]
     found = np.logical_and.reduce([mask for _, mask in columns])
     if found.sum() < 3:

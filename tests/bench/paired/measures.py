@@ -17,7 +17,7 @@ from bodycap_batch import Result
 from bodycap_batch.config.calibration import read_calibration
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import BodycapError
-from bodycap_batch.evaluate import TrajectoryOptions, relative_camera_error
+from bodycap_batch.evaluate import relative_camera_error
 from bodycap_batch.evaluate.association import interpolate_truth
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.model.camera import Camera
@@ -214,7 +214,7 @@ def palm_error_m(results: Path, truth: Path, reference: str) -> float | None:
     for name in sorted(set(estimates) - {reference}):
         try:
             truths = {each: read_tum(truth / f"{each}.tum") for each in (name, reference)}
-            found = relative_camera_error(estimates, truths, name, reference, TrajectoryOptions())
+            found = relative_camera_error(estimates, truths, name, reference)
             errors.append(found.vector_m.mean)
         except BodycapError:
             continue
