@@ -13,7 +13,6 @@ from bodycap_batch.cli.shared_options import (
     JobArgument,
     StoreOption,
     ThreadsOption,
-    command_settings,
     make_overrides,
     results_folder,
 )
@@ -71,6 +70,7 @@ def export(  # noqa: PLR0913, PLR0917 - each option is a parameter
       bodycap export out/my_walk --for blender --to ~/scenes/walk
       bodycap export out/my_walk --undistorted
     """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.api import Execution
     from bodycap_batch.config.export_targets import export_target
     from bodycap_batch.core.errors import JobError
     from bodycap_batch.pipeline import export_for, export_undistorted
@@ -85,7 +85,9 @@ def export(  # noqa: PLR0913, PLR0917 - each option is a parameter
     resolved = load_last_run(job, make_overrides())
     out_dir = results_folder(resolved)
     with event_on_signal() as stop, make_progress_display(as_json=False) as display:
-        settings = command_settings(out_dir, store, threads, listener=display, cancelled=stop.is_set)
+        settings = Execution(store=store, threads=threads, progress=display, cancelled=stop.is_set).settings(
+            out_dir
+        )
         written = []
         if target is not None:
             written += export_for(

@@ -7,14 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bodycap_batch.core.context import cores
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.job_places import find_store
 
 if TYPE_CHECKING:
     from bodycap_batch.config.models import Job
     from bodycap_batch.config.overrides import Overrides
-    from bodycap_batch.pipeline import Settings
 
 STORE_VARIABLE = "BODYCAP_STORE"
 
@@ -153,25 +150,6 @@ def checked_requirement(text: str | None) -> str | None:
 def _mounts(words: list[str]) -> dict[str, str]:
     hint = "write the name of the video and its place on the body, for example gopro1=torso"
     return dict(split_pair(text, form="NAME=PLACE", field="--camera", hint=hint) for text in words)
-
-
-def command_settings(out_dir: Path, store: Path | None, threads: int | None = 1, **values: Any) -> Settings:
-    """Return the settings of a command that reads or completes the results of a job.
-
-    Args:
-        out_dir: The results folder of the job.
-        store: Folder of the store; None for the one that the results name.
-        threads: Number of cores; None for all.
-        values: Other settings. By default, no events are shown, and nothing stops the work.
-    """
-    from bodycap_batch.pipeline import Settings
-    from bodycap_batch.store.artefacts import Store
-
-    return Settings(
-        store=Store(store or find_store(out_dir)),
-        threads=threads or cores(),
-        **{"listener": lambda _: None, "cancelled": lambda: False, **values},
-    )
 
 
 def split_pair(text: str, *, form: str, field: str, hint: str) -> tuple[str, str]:

@@ -21,7 +21,6 @@ from bodycap_batch.cli.shared_options import (
     PlacesOption,
     SkeletonOption,
     StoreOption,
-    command_settings,
     make_overrides,
     results_folder,
 )
@@ -51,6 +50,7 @@ def why(  # noqa: PLR0913, PLR0917 - the flags a user types
     Example:
       bodycap why my_walk/ --height 1.75
     """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.api import Execution
     from bodycap_batch.config.job import load_job
     from bodycap_batch.pipeline import explain_job
 
@@ -59,7 +59,9 @@ def why(  # noqa: PLR0913, PLR0917 - the flags a user types
         place.file, make_overrides(out or place.results, skeleton, height, camera, activity, places)
     )
     out_dir = results_folder(resolved)
-    steps = explain_job(resolved, out_dir=out_dir, settings=command_settings(out_dir, store))
+    steps = explain_job(
+        resolved, out_dir=out_dir, settings=Execution(store=store, threads=1).settings(out_dir)
+    )
     if as_json:
         print_json([step.to_dict() for step in steps], indent=1)
         return

@@ -11,8 +11,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.evaluate.association import interpolate_truth
-from bodycap_batch.evaluate.trajectories import ErrorSummary
+from bodycap_batch.evaluate.trajectories import ErrorSummary, interpolate_truth
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.joint_positions import read_joint_positions
 from bodycap_batch.formats.tum import TimedPoses

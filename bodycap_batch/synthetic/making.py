@@ -35,13 +35,12 @@ from bodycap_batch.synthetic.moving_scene import ROOM, MovingPart
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
 from bodycap_batch.synthetic.pressing import carrying, find_press
-from bodycap_batch.synthetic.room import BareSurfaces, RoomLayout, build_room
+from bodycap_batch.synthetic.room import build_room
 from bodycap_batch.synthetic.sensor import AutoExposure, Sensor
 from bodycap_batch.synthetic.stabilisation import GOPRO_SETTINGS, orientation_track, turn_of_pictures
 from bodycap_batch.synthetic.stance_walk import StanceWalk
 from bodycap_batch.synthetic.triangles import triangles_from_surfaces
 from bodycap_batch.synthetic.truth import (
-    MARKER,
     common_ticks_ns,
     mean_poses,
     seconds_from_ns,
@@ -57,10 +56,6 @@ _TEXELS_PER_PIXEL_M = 0.85
 distance of 1 m covers slightly more than one pixel."""
 _MAX_TEXELS_PER_M = 500.0
 """Maximum texture detail (texels per metre). The limit saves memory."""
-
-
-_TABLE = (0.0, 0.62)
-"""Middle (x, y; metres) of the table in front of a person who stands still. The person faces +y."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,12 +125,12 @@ def draw_subject(options: SynthOptions) -> Subject:
     return Subject(motion=motion, mounts=mounts, seeds=seeds)
 
 
-def write_synthetic_capture(
-    options: SynthOptions, out_dir: Path, context: StageContext, *, overwrite: bool
-) -> None:
+def write_synthetic_capture(options: SynthOptions, out_dir: Path, context: StageContext) -> None:
     """Write a synthetic capture to `out_dir`, as `bodycap_batch.synthetic.synthesise` describes."""
-    out_dir = Path(out_dir)
-    _check_output_folder(out_dir, overwrite)
+    if out_dir.exists() and not (out_dir.is_dir() and not any(out_dir.iterdir())):
+        raise JobError(
+            "this folder exists already", path=out_dir, hint="choose another folder, or delete this folder"
+        )
     subject = draw_subject(options)
     with _atomic_folder(out_dir) as folder:
         write_calibration(folder, options)
@@ -180,10 +175,7 @@ def _write_camera_truth(
     poses = picture_poses_at(subject.motion, mount, common_s, stabilised=options.stabilised != "none")
     write_path(folder / "gt" / f"{camera}.tum", times_ns, poses, "world_from_camera, the camera's own clock")
     if options.exposure_s:
-
-        def pose_at(camera_s: FloatArray) -> FloatArray:
-            return camera_poses_at(subject.motion, mount, clock.common_s(camera_s))
-
+        pose_at = _poses_by_clock(options, subject, mount)
         mean = mean_poses(pose_at, seconds_from_ns(times_ns), options.exposure_s)
         note = "world_from_camera, mean over the exposure, the camera's own clock"
         write_path(folder / "gt" / "exposure" / f"{camera}.tum", times_ns, mean, note)
@@ -208,14 +200,18 @@ def _write_camera_imu(folder: Path, options: SynthOptions, subject: Subject, mou
     """Write the samples of the inertial sensors on a camera, if they are requested."""
     if options.imu is None:
         return
-    clock = true_clocks(options)[mount.camera]
-
-    def world_from_cam_at(camera_s: FloatArray) -> FloatArray:
-        return camera_poses_at(subject.motion, mount, clock.common_s(camera_s))
-
     number = options.cameras.index(mount.camera)
     seed = np.random.SeedSequence([number, *subject.seeds["imu"].generate_state(4).tolist()])
-    write_imu(folder, mount.camera, options.imu, options.seconds, world_from_cam_at, seed)
+    poses_at = _poses_by_clock(options, subject, mount)
+    write_imu(folder, mount.camera, options.imu, options.seconds, poses_at, seed)
+
+
+def _poses_by_clock(
+    options: SynthOptions, subject: Subject, mount: Mount
+) -> Callable[[FloatArray], FloatArray]:
+    """Return the function that gives the poses (T,4,4) of a camera at times (T,) of its clock, seconds."""
+    clock = true_clocks(options)[mount.camera]
+    return lambda camera_s: camera_poses_at(subject.motion, mount, clock.common_s(camera_s))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -295,19 +291,8 @@ def build_renderers(options: SynthOptions, subject: Subject) -> list[MovingCamer
     """Build the room around the motion, and return a renderer for each camera."""
     camera = options.camera()
     texels_per_m = min(_TEXELS_PER_PIXEL_M * camera.focal_px, _MAX_TEXELS_PER_M)
-    surfaces = build_room(
-        walked_extent_m(options, subject),
-        texels_per_m,
-        subject.seeds["room"],
-        furnished=options.furnished,
-        repeated_posters=options.repeated_posters,
-        bare=BareSurfaces(names=frozenset(options.bare), pictures=options.flat_pictures),
-        layout=RoomLayout(
-            repeats=options.room,
-            texture=options.texture,
-            table=_TABLE if options.still else None,
-        ),
-    )
+    extent_m = walked_extent_m(options, subject)
+    surfaces = build_room(extent_m, texels_per_m, subject.seeds["room"], options)
     images = [surface.image for surface in surfaces]
     patterned = options.clothes == "patterned"
     wearer = (
@@ -378,26 +363,6 @@ def _single_opencv_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _check_output_folder(out_dir: Path, overwrite: bool) -> None:
-    """Check that the capture overwrites nothing, or only an earlier synthetic capture on request.
-
-    Raises:
-        JobError: The folder exists and must not be overwritten.
-    """
-    if not out_dir.exists() or (out_dir.is_dir() and not any(out_dir.iterdir())):
-        return
-    if not overwrite:
-        raise JobError(
-            "this folder exists already", path=out_dir, hint="choose another folder, or delete this folder"
-        )
-    if not (out_dir / MARKER).is_file():
-        raise JobError(
-            "this folder is not a synthetic capture, so it is not overwritten",
-            path=out_dir,
-            hint="choose another folder",
-        )
-
-
 @contextmanager
 def _atomic_folder(out_dir: Path) -> Iterator[Path]:
     """Yield a temporary folder. Rename it to `out_dir` if the block succeeds; otherwise delete it.
@@ -406,12 +371,9 @@ def _atomic_folder(out_dir: Path) -> Iterator[Path]:
         StoreError: A file or folder cannot be written to the disk.
     """
     folder = out_dir.with_name(f".{out_dir.name}.{secrets.token_hex(4)}")
-    old = folder.with_name(folder.name + ".old")
     try:
         (folder / "gt").mkdir(parents=True)
         yield folder
-        if out_dir.exists():
-            out_dir.rename(old)
         folder.rename(out_dir)
     except OSError as error:
         raise store_error_from_os_error(error, out_dir) from error
@@ -422,4 +384,3 @@ def _atomic_folder(out_dir: Path) -> Iterator[Path]:
         raise StoreError(error.message, path=named, hint=error.hint) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)

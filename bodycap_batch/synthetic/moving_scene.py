@@ -259,7 +259,7 @@ class MovingScene:
         missed = faces < 0
         if missed.any():
             texel[:, missed], inverse[missed] = 0.0, 0.0
-        return Texels(faces=faces, rows=rows, inverse=inverse, at=texel)
+        return Texels(rows=rows, inverse=inverse, at=texel)
 
     def _homographies(self, face: IntArray, poses: FloatArray) -> Float32:
         """Return homographies (9,K) from directions in the camera frame to the textures of triangles (K,).

@@ -67,8 +67,6 @@ _CLOCK_OPTIONS = {"clocks", "drifts_ppm", "sound", "sound_ratio_db", "sound_skew
 _EXPOSURE_STEPS = 24
 """Number of instants whose mean is the pose over an exposure. Origin: 0.4 ms of an exposure of 10 ms, a
 twentieth of the interval of a recorded motion."""
-MARKER = Path("gt", "synth.json")
-"""Path of the file that marks a folder as a complete synthetic capture, relative to the folder."""
 
 
 def write_calibration(folder: Path, options: SynthOptions) -> None:
@@ -138,7 +136,7 @@ def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts:
     settings = options.model_dump(mode="json", exclude=hidden)
     if options.motion is not None:
         settings["motion"] = options.motion.name
-    _write_json(folder / MARKER, settings)
+    _write_json(truth / "synth.json", settings)
 
 
 def seconds_from_ns(times_ns: IntArray) -> FloatArray:

@@ -12,8 +12,7 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions, segment_axes, split_side
 from bodycap_batch.synthetic import textures
 from bodycap_batch.synthetic.pictures import WALL_PICTURES, abstract
-from bodycap_batch.synthetic.surfaces import UINT8, Surface, box_faces
-from bodycap_batch.synthetic.triangles import Triangles, triangles_from_surfaces
+from bodycap_batch.synthetic.triangles import UINT8, Surface, Triangles, box_faces, triangles_from_surfaces
 
 _RADII = {
     "Hips": (0.15, 0.14),

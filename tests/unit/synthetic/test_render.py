@@ -16,8 +16,7 @@ from bodycap_batch.synthetic.moving_body import camera_poses_at
 from bodycap_batch.synthetic.moving_camera import MovingCamera
 from bodycap_batch.synthetic.moving_scene import ROOM, MovingPart, MovingScene
 from bodycap_batch.synthetic.sensor import Sensor
-from bodycap_batch.synthetic.surfaces import Surface, surface_facing
-from bodycap_batch.synthetic.triangles import triangles_from_surfaces
+from bodycap_batch.synthetic.triangles import Surface, surface_facing, triangles_from_surfaces
 from bodycap_batch.synthetic.wearer import Wearer
 
 SQUARES, TEXELS = 6, 40

@@ -14,7 +14,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.skeleton import forward_kinematics
 from bodycap_batch.synthetic import SynthOptions, stance_walk, synthesise
-from bodycap_batch.synthetic.footsteps import footstep_times
+from bodycap_batch.synthetic.camera_sounds import footstep_times
 from bodycap_batch.synthetic.gait import WalkStyle
 from bodycap_batch.synthetic.gait_curves import stance_share, steps_per_s
 from bodycap_batch.synthetic.gait_plan import draw_walker
