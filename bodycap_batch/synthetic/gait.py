@@ -7,7 +7,7 @@ is a spline through given positions.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -53,33 +53,16 @@ _SAMPLE_HZ = 50.0
 """Sampling rate (Hz) of the two splines that describe the gait phase and the height of the root."""
 
 
-@dataclass(frozen=True, slots=True)
-class _SlowOscillation:
-    """A slow oscillation of an angle: the sum of K sinusoids between 0.1 and 0.6 Hz.
+def _draw_oscillation(degrees: float, rng: np.random.Generator) -> Callable[[FloatArray], FloatArray]:
+    """Draw a slow oscillation of an angle, which gives the angle (T,) in degrees at times (T,) in seconds.
 
-    Attributes:
-        amplitude: (K,) amplitudes of the sinusoids, degrees.
-        rate_hz: (K,) frequencies of the sinusoids, Hz.
-        phase: (K,) phases of the sinusoids at time 0, radians.
+    It is the sum of four sinusoids between 0.1 and 0.6 Hz. Its root mean square is about `degrees`.
     """
-
-    amplitude: FloatArray
-    rate_hz: FloatArray
-    phase: FloatArray
-
-    def __call__(self, t_s: FloatArray) -> FloatArray:
-        """Return the angle (T,) in degrees at common times (T,) in seconds."""
-        waves = np.sin(2 * np.pi * self.rate_hz * t_s[:, None] + self.phase)
-        return np.asarray((self.amplitude * waves).sum(axis=1))
-
-
-def _draw_oscillation(degrees: float, rng: np.random.Generator) -> _SlowOscillation:
-    """Draw an oscillation at random. Its root mean square is about `degrees`."""
     weight = rng.uniform(0.3, 1.0, 4)
-    return _SlowOscillation(
-        degrees * weight / np.linalg.norm(weight) * np.sqrt(2.0),
-        rng.uniform(0.1, 0.6, 4),
-        rng.uniform(0, 2 * np.pi, 4),
+    amplitude = degrees * weight / np.linalg.norm(weight) * np.sqrt(2.0)
+    rate_hz, phase = rng.uniform(0.1, 0.6, 4), rng.uniform(0, 2 * np.pi, 4)
+    return lambda t_s: np.asarray(
+        (amplitude * np.sin(2 * np.pi * rate_hz * t_s[:, None] + phase)).sum(axis=1)
     )
 
 

@@ -17,9 +17,10 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError, StoreError
-from bodycap_batch.formats.atomic_files import store_error_from_os_error
+from bodycap_batch.formats.atomic_files import store_error_from_os_error, write_text
 from bodycap_batch.formats.gpmf_writer import append_settings
 from bodycap_batch.formats.mp4_writer import DataTrack, VideoWriter
+from bodycap_batch.formats.tum import seconds_text
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.camera_sounds import CameraSounds
@@ -46,7 +47,6 @@ from bodycap_batch.synthetic.truth import (
     seconds_from_ns,
     write_calibration,
     write_path,
-    write_timestamps,
     write_truth,
 )
 from bodycap_batch.synthetic.wearer import Wearer
@@ -184,14 +184,15 @@ def _write_camera_truth(
         note = "world_from_lens of the camera that stabilises its pictures, the camera's own clock"
         write_path(folder / "gt" / "lens" / f"{camera}.tum", times_ns, lens, note)
     if not kept.all():
-        write_timestamps(folder / f"{camera}.timestamps.txt", times_ns)
+        seconds = (f"{seconds_text(int(time))}\n" for time in times_ns)
+        write_text(folder / f"{camera}.timestamps.txt", "".join(seconds))
     if options.poses_only:
         seed = [options.cameras.index(camera), *subject.seeds["poses"].generate_state(4).tolist()]
-        measured = disturb_poses(poses, options, np.random.default_rng(seed))
+        measured, present = disturb_poses(poses, options, np.random.default_rng(seed))
         write_path(
             folder / "poses" / f"{camera}.tum",
-            times_ns[measured.present],
-            measured.world_from_cam[measured.present],
+            times_ns[present],
+            measured[present],
             "world_from_camera with noise, gross errors and gaps; the camera's own clock",
         )
 
@@ -214,22 +215,6 @@ def _poses_by_clock(
     return lambda camera_s: camera_poses_at(subject.motion, mount, clock.common_s(camera_s))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _FrameRecorder:
-    """Function that renders one recorded frame of a camera. The frame depends only on the frame number."""
-
-    renderer: MovingCamera
-    sensor: Sensor
-    times_s: FloatArray
-
-    def ideal(self, frame: int) -> Bytes:
-        """Return a frame without noise."""
-        return self.renderer.render(float(self.times_s[frame]))
-
-    def __call__(self, frame: int) -> Bytes:
-        return self.sensor.record(self.ideal(frame), frame)
-
-
 def _write_videos(
     folder: Path, options: SynthOptions, subject: Subject, kept: dict[str, BoolArray], context: StageContext
 ) -> None:
@@ -242,33 +227,46 @@ def _write_videos(
     with _single_opencv_thread(), ThreadPoolExecutor(max_workers=max(1, context.threads)) as pool:
         for renderer, seed in zip(renderers, subject.seeds["images"].spawn(len(renderers)), strict=True):
             camera = renderer.mount.camera
-            recorder = _FrameRecorder(
-                renderer=renderer,
-                sensor=Sensor(options.noise, 3 * options.width * options.height, seed),
-                times_s=clocks[camera].common_s(seconds_from_ns(frame_times_ns(options, camera))),
-            )
-            size = (options.width, options.height)
-            heard = None if sounds is None else sounds.of_camera(camera)
+            times_s = clocks[camera].common_s(seconds_from_ns(frame_times_ns(options, camera)))
             frames = np.flatnonzero(kept[camera]).tolist()
-            exposure = AutoExposure(options.auto_exposure, 1.0 / options.fps)
-            render = recorder.ideal if options.auto_exposure else recorder
+            sensor = Sensor(options.noise, 3 * options.width * options.height, seed)
             with VideoWriter(
                 folder / f"{camera}.mp4",
                 options.fps,
-                size,
+                (options.width, options.height),
                 options.quality,
-                sound=heard,
+                sound=None if sounds is None else sounds.of_camera(camera),
                 bit_rate_mbps=options.bit_rate_mbps,
-                data=_orientations(options, renderer, recorder.times_s[frames]),
+                data=_orientations(options, renderer, times_s[frames]),
             ) as video:
-                for frame, image in zip(frames, _render_in_order(pool, render, frames, context), strict=True):
-                    if options.auto_exposure:
-                        image = recorder.sensor.record(image, frame, exposure.gain(image))  # noqa: PLW2901
+                for image in _recorded(options, renderer, sensor, times_s, frames, pool, context):
                     video.add(image)
                     done += 1
                     context.progress(done, total, camera)
             if options.stabilised != "none":
                 append_settings(folder / f"{camera}.mp4", GOPRO_SETTINGS)
+
+
+def _recorded(  # noqa: PLR0913, PLR0917 - one value each
+    options: SynthOptions,
+    renderer: MovingCamera,
+    sensor: Sensor,
+    times_s: FloatArray,
+    frames: list[int],
+    pool: ThreadPoolExecutor,
+    context: StageContext,
+) -> Iterator[Bytes]:
+    """Yield the recorded frames of a camera, which are rendered at given times in several threads."""
+
+    def ideal(frame: int) -> Bytes:
+        return renderer.render(float(times_s[frame]))
+
+    if not options.auto_exposure:
+        yield from _render_in_order(pool, lambda frame: sensor.record(ideal(frame), frame), frames, context)
+        return
+    exposure = AutoExposure(options.auto_exposure, 1.0 / options.fps)
+    for frame, image in zip(frames, _render_in_order(pool, ideal, frames, context), strict=True):
+        yield sensor.record(image, frame, exposure.gain(image))
 
 
 def _orientations(options: SynthOptions, renderer: MovingCamera, common_s: FloatArray) -> DataTrack | None:

@@ -15,7 +15,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 from bodycap_batch.formats.bvh import write_bvh
-from bodycap_batch.formats.tum import TimedPoses, seconds_text, write_tum
+from bodycap_batch.formats.tum import TimedPoses, write_tum
 from bodycap_batch.model.geometry import invert, make_transform, quat_xyzw_from_rotation, so3_exp, so3_log
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 from bodycap_batch.synthetic.clocks import has_own_clocks, reference_name, true_clocks
@@ -188,11 +188,6 @@ def write_path(path: Path, times_ns: IntArray, world_from_cam: FloatArray, note:
     """
     poses = TimedPoses(times_ns=times_ns, world_from_cam=world_from_cam)
     write_tum(path, poses, (note,))
-
-
-def write_timestamps(path: Path, times_ns: IntArray) -> None:
-    """Write the times of a video's frames in seconds, one time per line."""
-    write_text(path, "".join(f"{seconds_text(int(time))}\n" for time in times_ns))
 
 
 def _write_clocks(path: Path, options: SynthOptions) -> None:

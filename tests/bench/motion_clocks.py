@@ -152,8 +152,8 @@ def _measured(
         gap_frames=(3, max(4, int(0.6 * fps))),
     )
     true = camera_poses_at(subject.motion, subject.mounts[index], times_s + start_s)
-    measured = disturb_poses(true, options, rng)
-    return times_s[measured.present], measured.world_from_cam[measured.present].copy()
+    measured, present = disturb_poses(true, options, rng)
+    return times_s[present], measured[present].copy()
 
 
 def stored_paths(folder: Path) -> list[CameraPath]:
