@@ -15,7 +15,6 @@ from bodycap_batch.cli import (  # noqa: F401 - each module registers its comman
     check,
     evaluate,
     export,
-    lenses,
     look,
     run,
     skeleton,

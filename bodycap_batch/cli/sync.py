@@ -38,7 +38,7 @@ def sync(
     Example:
       bodycap sync my_walk/ --picture clocks.svg
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.cli.sync_picture import draw_clocks
+    from bodycap_batch.cli.pictures import draw_clocks
     from bodycap_batch.clocks import estimate_clocks
     from bodycap_batch.config.job import load_job
     from bodycap_batch.core.errors import JobError

@@ -57,7 +57,7 @@ def telemetry(
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.capture.frame_index import index_videos
     from bodycap_batch.capture.timeline import join_chapters
-    from bodycap_batch.cli.telemetry_picture import draw_telemetry
+    from bodycap_batch.cli.pictures import draw_telemetry
     from bodycap_batch.config.folder import chapters_in
     from bodycap_batch.config.sample_files import samples_beside
     from bodycap_batch.formats.atomic_files import write_text
