@@ -24,7 +24,7 @@ _SNAP_NS = 1_000_000
 Derivation: timestamps in some files have only four decimals."""
 _MAX_GAP_NS = 100_000_000
 """Maximum time (nanoseconds) between two true poses for an interpolation. Origin: three frames of a usual
-video. The truth of `tum_fr1_xyz` has a gap of 0.11 s, which is left out."""
+video."""
 
 
 def interpolate_truth(truth: TimedPoses, times_ns: IntArray) -> tuple[FloatArray, BoolArray]:
