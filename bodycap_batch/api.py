@@ -109,8 +109,9 @@ class Execution:
     until: str = ""
     results_ready: Callable[[Path], None] = _ignore
 
-    def settings(self, out: Path, overrides: Overrides) -> Settings:
+    def settings(self, out: Path, overrides: Overrides | None = None) -> Settings:
         """Return the settings of the pipeline for a job with this folder for its results."""
+        from bodycap_batch.config.overrides import Overrides
         from bodycap_batch.job_places import find_store
         from bodycap_batch.pipeline import Settings
         from bodycap_batch.store.artefacts import Store
@@ -125,7 +126,7 @@ class Execution:
             until=self.until,
             memory_mb=self.memory_mb,
             results_ready=self.results_ready,
-            overrides=overrides,
+            overrides=overrides or Overrides(),
         )
 
 

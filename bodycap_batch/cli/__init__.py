@@ -9,25 +9,19 @@ from typing import Any
 
 import typer
 
-from bodycap_batch.cli import (
+from bodycap_batch.cli import (  # noqa: F401 - each module registers its commands
     batch,
     calibrate,
     check,
-    compare,
-    doctor,
     evaluate,
     export,
-    init,
-    lenses,
-    open_report,
-    report,
+    look,
     run,
     skeleton,
     spool,
     sync,
     synth,
     telemetry,
-    view,
     watch,
     why,
 )
@@ -42,29 +36,7 @@ from bodycap_batch.cli.terminal import (
 )
 from bodycap_batch.core.errors import EXIT_BUG, BodycapError, Cancelled, StoreError
 
-__all__ = [
-    "batch",
-    "calibrate",
-    "check",
-    "compare",
-    "doctor",
-    "evaluate",
-    "export",
-    "init",
-    "lenses",
-    "main",
-    "open_report",
-    "report",
-    "run",
-    "skeleton",
-    "spool",
-    "sync",
-    "synth",
-    "telemetry",
-    "view",
-    "watch",
-    "why",
-]
+__all__ = ["main"]
 
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 """Type of the errors of the command line. Newer versions of Typer have their own copy of this type; older

@@ -1,9 +1,9 @@
-"""`bodycap calibrate`."""
+"""`bodycap calibrate` and `lenses`: the lens of a camera."""
 
 from __future__ import annotations
 
 import re
-import tempfile
+from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.progress_display import make_progress_display
-from bodycap_batch.cli.signals import event_on_signal
-from bodycap_batch.cli.terminal import print_line
+from bodycap_batch.cli.progress_display import command_context
+from bodycap_batch.cli.shared_options import JsonOption
+from bodycap_batch.cli.terminal import print_json, print_line, print_lines
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.core.progress import Event, StepProgress
 
 if TYPE_CHECKING:
     from bodycap_batch.calibration import CalibrationBoard
@@ -109,7 +108,6 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
         write_calibration,
         write_preview,
     )
-    from bodycap_batch.core.context import StageContext
 
     if print_ is not None:
         write_board(print_)
@@ -123,26 +121,13 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
         )
     stated = _stated_board(chessboard, charuco, dictionary, marker, legacy=legacy)
     target = out or video.parent / "calib.json"
-    with (
-        event_on_signal() as stop,
-        make_progress_display(as_json=json_progress) as display,
-        tempfile.TemporaryDirectory() as work,
-    ):
-
-        def report(done: int, total: int, what: str) -> None:
-            display(Event(kind="progress", stage="calibrate", done=done, total=total, what=what))
-
-        progress = StepProgress(report)
-        context = StageContext(work_dir=Path(work), progress=progress, cancelled=stop.is_set)
+    with command_context("calibrate", as_json=json_progress) as context:
         result = calibrate_clip(video, stated or find_board(video, context), lens.value, context)
-        progress.complete()
     preview = target.with_name(f"{target.stem}{f'_{camera}' if camera else ''}.png")
     write_calibration(result, target, camera)
     write_preview(result, preview)
     if not json_progress:
-        lines = [*result.lines(), f"calibration: {target.resolve()}", f"preview: {preview.resolve()}"]
-        for line in lines:
-            print_line(line)
+        print_lines([*result.lines(), f"calibration: {target.resolve()}", f"preview: {preview.resolve()}"])
 
 
 def _stated_board(
@@ -175,3 +160,43 @@ def _parse_size(text: str, flag: str) -> tuple[int, int]:
             f"{text!r} is not the size of a board", field=flag, hint="give columns x rows, for example 7x5"
         )
     return int(found[1]), int(found[2])
+
+
+_MAX_LISTED = 200
+"""Maximum number of profiles that the text lists."""
+
+
+@app.command()
+def lenses(
+    search: Annotated[
+        list[str],
+        typer.Argument(metavar="SEARCH...", help="Words of the model, lens mode or size: hero11 wide 4k."),
+    ],
+    as_json: JsonOption = False,
+) -> None:
+    """Search the lenses that a job can name.
+
+    A job names a lens as `calibration: GoPro HERO11 Black / Wide / 4K`. It is the first guess, which the map
+    refines. The profiles are from Gyroflow's collection (CC0).
+
+    \b
+    Example:
+      bodycap lenses hero11 wide 4k
+    """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.config.lens_profiles import search_lenses
+    from bodycap_batch.core.errors import JobError
+
+    words = " ".join(search)
+    found = search_lenses(words)
+    if not found:
+        raise JobError(
+            f"there is no lens profile with the words {words!r}",
+            hint="search with fewer words, for example the model alone",
+        )
+    if as_json:
+        print_json([{"name": each.name, **asdict(each)} for each in found], indent=1)
+        return
+    for profile in found[:_MAX_LISTED]:
+        print_line(profile.text())
+    if len(found) > _MAX_LISTED:
+        print_line(f"and {len(found) - _MAX_LISTED} more: search with more words")

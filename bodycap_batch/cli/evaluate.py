@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.terminal import print_json, print_line
+from bodycap_batch.cli.terminal import print_json, print_line, print_lines
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.percent import format_percent
 
@@ -107,8 +107,7 @@ def evaluate(
     if as_json:
         print_json(values, indent=1)
         return
-    for line in _table_lines(values):
-        print_line(line)
+    print_lines(_table_lines(values))
 
 
 def _evaluate_with_pictures(results: Path, video: Path, *, as_json: bool) -> None:
@@ -145,14 +144,14 @@ def _evaluate_with_pictures(results: Path, video: Path, *, as_json: bool) -> Non
 def _evaluate_trajectories(
     pairs: dict[str, tuple[Path, Path]], results: Path, align: str, reference: str | None
 ) -> dict[str, Any]:
-    from bodycap_batch.evaluate import TrajectoryOptions, relative_camera_error, score_trajectories
+    from bodycap_batch.evaluate import relative_camera_error, score_trajectories
     from bodycap_batch.formats.tum import read_tum
 
     estimates = {name: read_tum(pair[0]) for name, pair in pairs.items()}
     truths = {name: read_tum(pair[1]) for name, pair in pairs.items()}
     frames = _frame_counts(results) if results.is_dir() else {}
     reports: dict[str, Any] = {
-        "trajectories": score_trajectories(estimates, truths, TrajectoryOptions(align=align), frames)  # type: ignore[arg-type]
+        "trajectories": score_trajectories(estimates, truths, align, frames)  # type: ignore[arg-type]
     }
     if reference is not None:
         for name in sorted(set(pairs) - {reference}):

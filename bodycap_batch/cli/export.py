@@ -20,8 +20,7 @@ from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.config.bounds import MAX_FPS, MIN_FPS
 from bodycap_batch.config.export_targets import TARGETS
-from bodycap_batch.core.context import cores
-from bodycap_batch.job_places import find_store, load_last_run
+from bodycap_batch.job_places import load_last_run
 
 
 @app.command(short_help="Write the files for one program, or undistorted clips with their cameras.")
@@ -71,10 +70,10 @@ def export(  # noqa: PLR0913, PLR0917 - each option is a parameter
       bodycap export out/my_walk --for blender --to ~/scenes/walk
       bodycap export out/my_walk --undistorted
     """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.api import Execution
     from bodycap_batch.config.export_targets import export_target
     from bodycap_batch.core.errors import JobError
-    from bodycap_batch.pipeline import Settings, export_for, export_undistorted
-    from bodycap_batch.store.artefacts import Store
+    from bodycap_batch.pipeline import export_for, export_undistorted
 
     if target is not None:
         export_target(target)
@@ -86,11 +85,8 @@ def export(  # noqa: PLR0913, PLR0917 - each option is a parameter
     resolved = load_last_run(job, make_overrides())
     out_dir = results_folder(resolved)
     with event_on_signal() as stop, make_progress_display(as_json=False) as display:
-        settings = Settings(
-            store=Store(store or find_store(out_dir)),
-            threads=threads or cores(),
-            listener=display,
-            cancelled=stop.is_set,
+        settings = Execution(store=store, threads=threads, progress=display, cancelled=stop.is_set).settings(
+            out_dir
         )
         written = []
         if target is not None:

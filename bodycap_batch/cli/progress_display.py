@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import datetime as dt
 import sys
+import tempfile
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from bodycap_batch.cli.job_progress import READING_VIDEOS, JobProgress
+from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_json, print_timed_message
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.percent import format_percent
 from bodycap_batch.core.printable import printable
-from bodycap_batch.core.progress import Event
+from bodycap_batch.core.progress import Event, StepProgress
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -60,6 +65,23 @@ def make_progress_display(*, as_json: bool) -> ProgressDisplay:
     if as_json:
         return JsonLines()
     return LiveProgress() if sys.stderr.isatty() else ProgressLines()
+
+
+@contextmanager
+def command_context(stage: str, *, as_json: bool, threads: int = 1) -> Iterator[StageContext]:
+    """Yield the context of a command that runs one stage in this process, and shows its progress."""
+    with (
+        event_on_signal() as stop,
+        make_progress_display(as_json=as_json) as display,
+        tempfile.TemporaryDirectory() as work,
+    ):
+
+        def report(done: int, total: int, what: str) -> None:
+            display(Event(kind="progress", stage=stage, done=done, total=total, what=what))
+
+        progress = StepProgress(report)
+        yield StageContext(work_dir=Path(work), threads=threads, progress=progress, cancelled=stop.is_set)
+        progress.complete()
 
 
 class _Display:

@@ -148,17 +148,20 @@ def checked_requirement(text: str | None) -> str | None:
 
 
 def _mounts(words: list[str]) -> dict[str, str]:
-    found = {}
-    for text in words:
-        name, equals, place = text.rpartition("=")
-        if not (name and equals and place):
-            raise JobError(
-                f"{text[:60]!r} does not have the form NAME=PLACE",
-                field="--camera",
-                hint="write the name of the video and its place on the body, for example gopro1=torso",
-            )
-        found[name.strip()] = place.strip()
-    return found
+    hint = "write the name of the video and its place on the body, for example gopro1=torso"
+    return dict(split_pair(text, form="NAME=PLACE", field="--camera", hint=hint) for text in words)
+
+
+def split_pair(text: str, *, form: str, field: str, hint: str) -> tuple[str, str]:
+    """Return the two parts of a value of the command line that has a form such as NAME=PLACE.
+
+    Raises:
+        JobError: A part is missing.
+    """
+    name, equals, value = text.rpartition("=")
+    if not (name and equals and value):
+        raise JobError(f"{text[:60]!r} does not have the form {form}", field=field, hint=hint)
+    return name.strip(), value.strip()
 
 
 def results_folder(job: Job) -> Path:

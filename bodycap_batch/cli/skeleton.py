@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.shared_options import HeightOption, make_overrides
-from bodycap_batch.cli.terminal import print_json, print_line
-from bodycap_batch.core.errors import JobError
+from bodycap_batch.cli.shared_options import HeightOption, make_overrides, split_pair
+from bodycap_batch.cli.terminal import print_json, print_lines
 
 if TYPE_CHECKING:
     from bodycap_batch.formats.bvh import RigOptions
@@ -71,25 +70,15 @@ def skeleton(
         print_json({"joints": joints, "missing": missing_roles(rig), **findings}, indent=1)
     else:
         heading = _heading_lines(file, rig, motion, tpose_frame)
-        for line in (*heading, "", *_joint_table(rig), "", *_closing_lines(rig, options)):
-            print_line(line)
+        print_lines((*heading, "", *_joint_table(rig), "", *_closing_lines(rig, options)))
     if problem is not None:
         raise problem
 
 
 def _parse_roles(words: list[str]) -> dict[str, str]:
     """Return the role of each joint by joint name, from words of the form ``JOINT=ROLE``."""
-    pairs = [word.rpartition("=") for word in words]
-    bad = next(
-        (word for word, (name, _, role) in zip(words, pairs, strict=True) if not (name and role)), None
-    )
-    if bad is not None:
-        raise JobError(
-            f"{bad!r} does not have the form JOINT=ROLE",
-            field="--map",
-            hint="write JOINT=ROLE, for example --map Bip_Chest=Spine1",
-        )
-    return {name: role for name, _, role in pairs}
+    hint = "write JOINT=ROLE, for example --map Bip_Chest=Spine1"
+    return dict(split_pair(word, form="JOINT=ROLE", field="--map", hint=hint) for word in words)
 
 
 def _heading_lines(file: Path, rig: SkeletonModel, motion: Motion | None, frame: int | None) -> list[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.terminal import print_json, print_line
+from bodycap_batch.cli.terminal import print_json, print_line, print_lines
 from bodycap_batch.core.percent import format_percent
 from bodycap_batch.core.printable import printable
 
@@ -59,8 +59,7 @@ def status(
         }
         print_json(found, indent=1)
         return
-    for line in _job_table(rows):
-        print_line(line)
+    print_lines(_job_table(rows))
     if watcher is not None:
         print_line(str(watcher))
     elif any(row.state in ("waiting", "interrupted", "stopped") for row in rows):

@@ -13,7 +13,7 @@ import typer
 
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.shared_options import JobArgument, JsonOption, results_folder
-from bodycap_batch.cli.terminal import print_json, print_line
+from bodycap_batch.cli.terminal import print_json, print_lines
 
 if TYPE_CHECKING:
     from bodycap_batch.clocks import ClockEstimate, ClockEstimates
@@ -38,7 +38,7 @@ def sync(
     Example:
       bodycap sync my_walk/ --picture clocks.svg
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.cli.sync_picture import draw_clocks
+    from bodycap_batch.cli.pictures import draw_clocks
     from bodycap_batch.clocks import estimate_clocks
     from bodycap_batch.config.job import load_job
     from bodycap_batch.core.errors import JobError
@@ -59,8 +59,7 @@ def sync(
     if as_json:
         print_json(clocks_as_json(estimates), indent=1)
     else:
-        for line in lines_of(estimates):
-            print_line(line)
+        print_lines(lines_of(estimates))
 
 
 def with_clocks_of_run(estimates: ClockEstimates, results: Path) -> ClockEstimates:

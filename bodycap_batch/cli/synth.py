@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,13 +9,11 @@ from typing import Annotated, Any
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.progress_display import make_progress_display
+from bodycap_batch.cli.progress_display import command_context
 from bodycap_batch.cli.shared_options import ThreadsOption
-from bodycap_batch.cli.signals import event_on_signal
 from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.core.context import cores
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.core.progress import Event, StepProgress
 
 
 @app.command()
@@ -82,28 +79,14 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
       bodycap synth steps/ --poses --set walk=gait --seconds 30
       bodycap synth other/ --motion walk.bvh --cameras torso,head --size 960x540
     """  # noqa: D301 - \b keeps lines as they are
-    from bodycap_batch.core.context import StageContext
     from bodycap_batch.synthetic import synthesise
 
     values: dict[str, Any] = {"seconds": seconds, "fps": fps, "seed": seed, "motion": motion}
     values["cameras"] = cameras.split(",") if cameras else None
     values["poses_only"] = poses or None
     options = _synth_options({**values, **_parse_size(size), **_parse_settings(more or [])})
-    with (
-        event_on_signal() as stop,
-        make_progress_display(as_json=json_progress) as display,
-        tempfile.TemporaryDirectory() as work,
-    ):
-
-        def report(done: int, total: int, what: str) -> None:
-            display(Event(kind="progress", stage="synth", done=done, total=total, what=what))
-
-        progress = StepProgress(report)
-        context = StageContext(
-            work_dir=Path(work), threads=threads or cores(), progress=progress, cancelled=stop.is_set
-        )
+    with command_context("synth", as_json=json_progress, threads=threads or cores()) as context:
         synthesise(options, out, context)
-        progress.complete()
     if not json_progress:
         print_line(f"capture: {out.resolve()}")
 

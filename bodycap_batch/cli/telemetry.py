@@ -14,7 +14,7 @@ import typer
 
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.shared_options import JsonOption
-from bodycap_batch.cli.terminal import print_json, print_line
+from bodycap_batch.cli.terminal import print_json, print_lines
 
 if TYPE_CHECKING:
     from bodycap_batch.telemetry import CameraTelemetry, GpsTrack, PictureGyroComparison, Stream
@@ -57,7 +57,7 @@ def telemetry(
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.capture.frame_index import index_videos
     from bodycap_batch.capture.timeline import join_chapters
-    from bodycap_batch.cli.telemetry_picture import draw_telemetry
+    from bodycap_batch.cli.pictures import draw_telemetry
     from bodycap_batch.config.folder import chapters_in
     from bodycap_batch.config.sample_files import samples_beside
     from bodycap_batch.formats.atomic_files import write_text
@@ -73,10 +73,8 @@ def telemetry(
     if as_json:
         print_json(telemetry_as_json(found, compared), indent=1)
     else:
-        for line in lines_of(found, file.name):
-            print_line(line)
-        for line in [] if compared is None else comparison_lines(compared):
-            print_line(line)
+        print_lines(lines_of(found, file.name))
+        print_lines([] if compared is None else comparison_lines(compared))
 
 
 def _compared(paths: tuple[Path, ...], name: str, found: CameraTelemetry) -> PictureGyroComparison:

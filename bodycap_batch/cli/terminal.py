@@ -14,6 +14,7 @@ import shutil
 import sys
 import textwrap
 import time
+from collections.abc import Iterable
 from typing import Any, TextIO
 
 from bodycap_batch.core.errors import StoreError
@@ -23,6 +24,12 @@ from bodycap_batch.core.printable import printable
 def print_line(text: str = "") -> None:
     """Print one line on standard output. Raises `StoreError` if standard output cannot be written."""
     _write_output(printable(text) + "\n")
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines as `print_line` does."""
+    for line in lines:
+        print_line(line)
 
 
 def print_text(text: str) -> None:

@@ -50,22 +50,18 @@ def why(  # noqa: PLR0913, PLR0917 - the flags a user types
     Example:
       bodycap why my_walk/ --height 1.75
     """  # noqa: D301 - \b keeps lines as they are
+    from bodycap_batch.api import Execution
     from bodycap_batch.config.job import load_job
-    from bodycap_batch.pipeline import Settings, explain_job
-    from bodycap_batch.store.artefacts import Store
+    from bodycap_batch.pipeline import explain_job
 
     place = find_job(job)
     resolved = load_job(
         place.file, make_overrides(out or place.results, skeleton, height, camera, activity, places)
     )
     out_dir = results_folder(resolved)
-    settings = Settings(
-        store=Store(store or find_store(out_dir)),
-        threads=1,
-        listener=lambda _: None,
-        cancelled=lambda: False,
+    steps = explain_job(
+        resolved, out_dir=out_dir, settings=Execution(store=store, threads=1).settings(out_dir)
     )
-    steps = explain_job(resolved, out_dir=out_dir, settings=settings)
     if as_json:
         print_json([step.to_dict() for step in steps], indent=1)
         return

@@ -1,23 +1,24 @@
 """Compare results with ground truth: trajectories, relative camera poses and motions."""
 
 from bodycap_batch.evaluate.motion import MotionOptions, MotionReport, evaluate_motion, score_motion
-from bodycap_batch.evaluate.relative_cameras import RelativeCameraError, relative_camera_error
 from bodycap_batch.evaluate.trajectories import (
+    Alignment,
     CameraScore,
     ErrorSummary,
-    TrajectoryOptions,
+    RelativeCameraError,
     TrajectoryReport,
     evaluate_trajectories,
+    relative_camera_error,
     score_trajectories,
 )
 
 __all__ = [
+    "Alignment",
     "CameraScore",
     "ErrorSummary",
     "MotionOptions",
     "MotionReport",
     "RelativeCameraError",
-    "TrajectoryOptions",
     "TrajectoryReport",
     "evaluate_motion",
     "evaluate_trajectories",

@@ -11,13 +11,15 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.evaluate.association import interpolate_truth
-from bodycap_batch.evaluate.trajectories import ErrorSummary
+from bodycap_batch.evaluate.trajectories import ErrorSummary, interpolate_truth
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.joint_positions import read_joint_positions
 from bodycap_batch.formats.tum import TimedPoses
 from bodycap_batch.model.geometry import Similarity, align_points, nearest_rotation, rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion
+
+ROOT = "Hips"
+"""Role of the joint whose position is subtracted for the root-relative error."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,16 +29,12 @@ class MotionOptions:
     Attributes:
         align: Kind of the alignment: one rigid alignment ("se3") for all joints and frames, or no alignment
             ("none").
-        root: Role of the joint whose position is subtracted for the root-relative error.
         offset_s: Time (seconds) that is added to the times of the estimate before the truth is interpolated.
-        max_gap_s: Maximum time (seconds) between two true poses for an interpolation.
-        roles: Roles of the joints to compare, in addition to the root; if empty, all common roles.
+        roles: Roles of the joints to compare, in addition to `ROOT`; if empty, all common roles.
     """
 
     align: Literal["se3", "none"] = "se3"
-    root: str = "Hips"
     offset_s: float = 0.0
-    max_gap_s: float = 0.1
     roles: tuple[str, ...] = ()
 
 
@@ -165,11 +163,11 @@ def _joints_from_motion(motion: Motion) -> _JointPoses:
 
 def _compare_joints(estimate: _JointPoses, truth: _JointPoses, options: MotionOptions) -> MotionReport:
     """Compare the joints that have the same role in both motions, and return their errors."""
-    selected = {*options.roles, options.root} if options.roles else set(truth.roles)
+    selected = {*options.roles, ROOT} if options.roles else set(truth.roles)
     roles = tuple(role for role in estimate.roles if role in truth.roles and role in selected)
-    if options.root not in roles or len(roles) < 3:
+    if ROOT not in roles or len(roles) < 3:
         message = (
-            f"the two motions have {len(roles)} joints in common ({', '.join(roles)}), but {options.root} "
+            f"the two motions have {len(roles)} joints in common ({', '.join(roles)}), but {ROOT} "
             "and two more common joints are needed"
         )
         raise JobError(
@@ -186,7 +184,7 @@ def _compare_joints(estimate: _JointPoses, truth: _JointPoses, options: MotionOp
     if options.align == "se3":
         alignment = align_points(positions.reshape(-1, 3), true_positions.reshape(-1, 3), with_scale=False)
     aligned = alignment.apply(positions)
-    root = roles.index(options.root)
+    root = roles.index(ROOT)
     relative = np.linalg.norm(
         (aligned - aligned[:, root : root + 1]) - (true_positions - true_positions[:, root : root + 1]),
         axis=-1,
@@ -233,7 +231,7 @@ def _match_joints(
         poses[:, :3, 3] = truth.positions[:, joint]
         poses[:, :3, :3] = truth.rotations[:, joint]
         timed = TimedPoses(times_ns=truth.times_ns, world_from_cam=poses)
-        at_times, found = interpolate_truth(timed, times, options.max_gap_s)
+        at_times, found = interpolate_truth(timed, times)
         positions[:, index], rotations[:, index] = at_times[:, :3, 3], at_times[:, :3, :3]
     return (
         estimate.positions[found][:, estimate_joints],

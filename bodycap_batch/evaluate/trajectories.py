@@ -1,6 +1,7 @@
 """Compare camera trajectories with ground truth: absolute and relative errors (ATE, RPE) and coverage.
 
-One alignment is estimated for all cameras together.
+One alignment is estimated for all cameras together. The position of a camera relative to another one is
+compared without an estimation of the scale.
 """
 
 from __future__ import annotations
@@ -14,32 +15,35 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.evaluate.association import Association, interpolate_truth, nearest_truth
 from bodycap_batch.formats.tum import TimedPoses, read_tum
-from bodycap_batch.model.geometry import Similarity, align_points, invert, rotation_angle_rad
+from bodycap_batch.model.geometry import Similarity, align_points, invert, poses_at, rotation_angle_rad
+
+_SNAP_NS = 1_000_000
+"""Maximum time difference (nanoseconds) at which a true pose is used without interpolation.
+
+Derivation: timestamps in some files have only four decimals."""
+_MAX_GAP_NS = 100_000_000
+"""Maximum time (nanoseconds) between two true poses for an interpolation. Origin: three frames of a usual
+video."""
+
+
+def interpolate_truth(truth: TimedPoses, times_ns: IntArray) -> tuple[FloatArray, BoolArray]:
+    """Interpolate true poses at given times: rotations by slerp, positions linearly.
+
+    Args:
+        truth: True poses in time order.
+        times_ns: (N,) times at which the truth is interpolated, nanoseconds.
+
+    Returns:
+        (N,4,4) true poses, identity matrices at times without truth; (N,) mask, True at times with truth.
+    """
+    return poses_at(truth.times_ns, truth.world_from_cam, times_ns, max_gap_ns=_MAX_GAP_NS, snap_ns=_SNAP_NS)
+
 
 Alignment = Literal["sim3", "se3", "none"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrajectoryOptions:
-    """Options for the comparison of trajectories.
-
-    Attributes:
-        align: Kind of the alignment: similarity ("sim3"), rigid ("se3") or no alignment ("none"). All cameras
-            have one common alignment.
-        association: Association of true poses with frames: the truth is interpolated at the frame's time
-            ("interpolate"), or the true pose nearest in time is used ("nearest").
-        max_gap_s: Maximum time (seconds) between two true poses for an interpolation.
-        max_diff_s: Maximum time difference (seconds) between a frame and the nearest true pose.
-        rpe_delta_s: Time (seconds) between the two poses of a relative pose error.
-    """
-
-    align: Alignment = "sim3"
-    association: Association = "interpolate"
-    max_gap_s: float = 0.1
-    max_diff_s: float = 0.02
-    rpe_delta_s: float = 1.0
+"""Kind of the alignment: similarity, rigid, or none. All cameras have one common alignment."""
+_RPE_DELTA_S = 1.0
+"""Time (seconds) between the two poses of a relative pose error, which is then an error per second."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,8 +85,8 @@ class CameraScore:
         ate_m: Absolute trajectory error: distance (metres) between estimated and true camera centre after
             alignment.
         rotation_deg: Angle (degrees) between estimated and true orientation after alignment.
-        rpe_m: Translation part (metres) of the relative pose error over `rpe_delta_s`.
-        rpe_deg: Rotation part (degrees) of the relative pose error over `rpe_delta_s`.
+        rpe_m: Translation part (metres) of the relative pose error over a second.
+        rpe_deg: Rotation part (degrees) of the relative pose error over a second.
     """
 
     frames: int | None
@@ -100,14 +104,14 @@ class TrajectoryReport:
     """The result of comparing the trajectories of a capture with the true trajectories.
 
     Attributes:
-        options: Options of the comparison.
+        align: Kind of the alignment.
         scale: Scale of the alignment (truth = scale · estimate).
         cameras: Errors of each camera, by camera name.
         total: Errors of all cameras together.
         truth_from_estimate: The alignment that maps estimated positions to true positions.
     """
 
-    options: TrajectoryOptions
+    align: Alignment
     scale: float
     cameras: Mapping[str, CameraScore]
     total: CameraScore
@@ -116,7 +120,7 @@ class TrajectoryReport:
     def to_dict(self) -> dict[str, Any]:
         """Return the errors as plain JSON values."""
         return {
-            "options": asdict(self.options),
+            "options": {"align": self.align},
             "scale": self.scale,
             "cameras": {name: asdict(score) for name, score in self.cameras.items()},
             "total": asdict(self.total),
@@ -126,7 +130,7 @@ class TrajectoryReport:
 def evaluate_trajectories(
     estimates: Mapping[str, Path],
     truths: Mapping[str, Path],
-    options: TrajectoryOptions | None = None,
+    align: Alignment = "sim3",
     frames: Mapping[str, int] | None = None,
 ) -> TrajectoryReport:
     """Compare estimated trajectories with true trajectories, given as TUM files.
@@ -135,7 +139,7 @@ def evaluate_trajectories(
         estimates: Files of estimated poses world_from_camera in one gauge for all cameras, by camera name.
         truths: Files of true poses world_from_camera, by camera name. Every camera in `estimates` needs a
             file.
-        options: Options of the comparison.
+        align: Kind of the alignment.
         frames: Number of frames of each camera's video, by camera name, for the coverage.
 
     Raises:
@@ -144,7 +148,7 @@ def evaluate_trajectories(
     return score_trajectories(
         {name: read_tum(path) for name, path in estimates.items()},
         {name: read_tum(path) for name, path in truths.items()},
-        options,
+        align,
         frames,
     )
 
@@ -169,7 +173,7 @@ class _MatchedPoses:
 def score_trajectories(
     estimates: Mapping[str, TimedPoses],
     truths: Mapping[str, TimedPoses],
-    options: TrajectoryOptions | None = None,
+    align: Alignment = "sim3",
     frames: Mapping[str, int] | None = None,
 ) -> TrajectoryReport:
     """Compare estimated poses with true poses.
@@ -179,7 +183,6 @@ def score_trajectories(
     Source: S. Umeyama, PAMI 1991 (alignment); J. Sturm et al., "A benchmark for the evaluation of RGB-D
         SLAM systems", IROS 2012 (ATE and RPE).
     """
-    options = options or TrajectoryOptions()
     missing = sorted(set(estimates) - set(truths))
     if missing:
         hint = (
@@ -193,10 +196,10 @@ def score_trajectories(
             f"the true path of camera {', '.join(empty)} has no poses",
             hint="write one pose on each line: time tx ty tz qx qy qz qw",
         )
-    pairs = {name: _match_poses(estimates[name], truths[name], options) for name in sorted(estimates)}
-    alignment = _truth_from_estimate(pairs, options.align)
+    pairs = {name: _match_poses(estimates[name], truths[name]) for name in sorted(estimates)}
+    alignment = _truth_from_estimate(pairs, align)
     counts = frames or {}
-    errors = {name: _pose_errors(pair, alignment, options.rpe_delta_s) for name, pair in pairs.items()}
+    errors = {name: _pose_errors(pair, alignment) for name, pair in pairs.items()}
     cameras = {
         name: _score(counts.get(name), pairs[name].registered, len(pairs[name].times_ns), errors[name])
         for name in pairs
@@ -209,7 +212,7 @@ def score_trajectories(
         tuple(np.concatenate(parts) for parts in zip(*errors.values(), strict=True)),
     )
     return TrajectoryReport(
-        options=options,
+        align=align,
         scale=alignment.scale,
         cameras=cameras,
         total=total,
@@ -217,18 +220,9 @@ def score_trajectories(
     )
 
 
-def truth_at(
-    truth: TimedPoses, times_ns: IntArray, options: TrajectoryOptions
-) -> tuple[FloatArray, BoolArray]:
-    """Return true poses (N,4,4) at given times (N,), and a mask (N,) that is True at times with truth."""
-    if options.association == "nearest":
-        return nearest_truth(truth, times_ns, options.max_diff_s)
-    return interpolate_truth(truth, times_ns, options.max_gap_s)
-
-
-def _match_poses(estimate: TimedPoses, truth: TimedPoses, options: TrajectoryOptions) -> _MatchedPoses:
+def _match_poses(estimate: TimedPoses, truth: TimedPoses) -> _MatchedPoses:
     """Associate the estimated poses of one camera with true poses."""
-    poses, found = truth_at(truth, estimate.times_ns, options)
+    poses, found = interpolate_truth(truth, estimate.times_ns)
     return _MatchedPoses(
         times_ns=estimate.times_ns[found],
         estimate=estimate.world_from_cam[found],
@@ -253,7 +247,7 @@ def _truth_from_estimate(pairs: Mapping[str, _MatchedPoses], align: Alignment) -
         ) from error
 
 
-def _pose_errors(pair: _MatchedPoses, alignment: Similarity, delta_s: float) -> tuple[FloatArray, ...]:
+def _pose_errors(pair: _MatchedPoses, alignment: Similarity) -> tuple[FloatArray, ...]:
     """Return the errors of one camera's poses.
 
     Returns:
@@ -264,7 +258,7 @@ def _pose_errors(pair: _MatchedPoses, alignment: Similarity, delta_s: float) -> 
     centres = np.linalg.norm(aligned[:, :3, 3] - pair.truth[:, :3, 3], axis=1)
     difference = invert(pair.truth) @ aligned
     angles = np.rad2deg(rotation_angle_rad(difference[:, :3, :3])) if len(aligned) else np.zeros(0)
-    first, second = _pairs_at_interval(pair.times_ns, delta_s)
+    first, second = _pairs_at_interval(pair.times_ns)
     estimated = invert(aligned[first]) @ aligned[second]
     expected = invert(pair.truth[first]) @ pair.truth[second]
     relative = invert(expected) @ estimated
@@ -272,15 +266,15 @@ def _pose_errors(pair: _MatchedPoses, alignment: Similarity, delta_s: float) -> 
     return centres, angles, np.linalg.norm(relative[:, :3, 3], axis=1), relative_angles
 
 
-def _pairs_at_interval(times_ns: IntArray, delta_s: float) -> tuple[IntArray, IntArray]:
-    """Find the pairs of poses with a time difference of `delta_s`, within half a frame interval.
+def _pairs_at_interval(times_ns: IntArray) -> tuple[IntArray, IntArray]:
+    """Find the pairs of poses with a time difference of `_RPE_DELTA_S`, within half a frame interval.
 
     Returns:
         (M,) index of the first pose of each pair; (M,) index of the second pose of each pair.
     """
     if len(times_ns) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    target_ns = times_ns + round(delta_s * 1e9)
+    target_ns = times_ns + round(_RPE_DELTA_S * 1e9)
     after = np.minimum(np.searchsorted(times_ns, target_ns), len(times_ns) - 1)
     before = after - 1
     nearest = np.where(target_ns - times_ns[before] < np.abs(times_ns[after] - target_ns), before, after)
@@ -308,4 +302,75 @@ def _score(frames: int | None, registered: int, scored: int, errors: tuple[Float
         rotation_deg=rotation,
         rpe_m=rpe_m,
         rpe_deg=rpe_deg,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelativeCameraError:
+    """The result of comparing the vector from the reference camera to another camera with the true vector.
+
+    Attributes:
+        frames: Number of frames in which both cameras have an estimated pose and a true pose.
+        vector_m: Error (metres) of the vector between the camera centres in the world, after one rigid
+            alignment of both trajectories with the truth.
+        in_reference_m: Error (metres) of the vector between the camera centres in the coordinates of the
+            reference camera, without alignment.
+    """
+
+    frames: int
+    vector_m: ErrorSummary
+    in_reference_m: ErrorSummary
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the errors as plain JSON values."""
+        return asdict(self)
+
+
+def relative_camera_error(
+    estimates: Mapping[str, TimedPoses],
+    truths: Mapping[str, TimedPoses],
+    camera: str,
+    reference: str,
+) -> RelativeCameraError:
+    """Compare the vector between two cameras with the true vector, without an estimation of the scale.
+
+    Args:
+        estimates: Estimated poses world_from_camera (metres) at common times, by camera name.
+        truths: True poses world_from_camera (metres) at common times, by camera name.
+        camera: Name of the camera on the limb.
+        reference: Name of the camera on the trunk.
+
+    Raises:
+        JobError: A camera is missing, or fewer than three frames have an estimated pose and a true pose of
+            both cameras.
+    """
+    for name in (camera, reference):
+        if name not in estimates or name not in truths:
+            raise JobError(
+                f"camera {name!r} has no estimated path or no true path",
+                hint="give a camera that both folders contain",
+            )
+    times = estimates[camera].times_ns
+    columns = [
+        (estimates[camera].world_from_cam, np.ones(len(times), dtype=bool)),
+        interpolate_truth(estimates[reference], times),
+        interpolate_truth(truths[camera], times),
+        interpolate_truth(truths[reference], times),
+    ]
+    found = np.logical_and.reduce([mask for _, mask in columns])
+    if found.sum() < 3:
+        hint = "check that all files use the same clock"
+        raise JobError(f"only {found.sum()} frames have estimated and true poses of both cameras", hint=hint)
+    limb, trunk, true_limb, true_trunk = (poses[found] for poses, _ in columns)
+    centres = np.concatenate([limb[:, :3, 3], trunk[:, :3, 3]])
+    alignment = align_points(
+        centres, np.concatenate([true_limb[:, :3, 3], true_trunk[:, :3, 3]]), with_scale=False
+    )
+    vector = (limb[:, :3, 3] - trunk[:, :3, 3]) @ alignment.rotation.T
+    true_vector = true_limb[:, :3, 3] - true_trunk[:, :3, 3]
+    in_reference = (invert(trunk) @ limb)[:, :3, 3] - (invert(true_trunk) @ true_limb)[:, :3, 3]
+    return RelativeCameraError(
+        frames=int(found.sum()),
+        vector_m=ErrorSummary.of(np.linalg.norm(vector - true_vector, axis=1)),
+        in_reference_m=ErrorSummary.of(np.linalg.norm(in_reference, axis=1)),
     )

@@ -68,6 +68,11 @@ def parameter_count(model: str) -> int:
     return _PARAM_COUNT[model]
 
 
+def focal_count(model: str) -> int:
+    """Return the number of focal lengths, 1 or 2, of a COLMAP camera model."""
+    return len(_FOCAL_INDICES[model])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Camera:
     """Intrinsics of one camera at one image size, for projecting points and for computing viewing rays.

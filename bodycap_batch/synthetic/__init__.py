@@ -10,9 +10,7 @@ from bodycap_batch.synthetic.options import SynthOptions
 __all__ = ["SynthOptions", "synthesise"]
 
 
-def synthesise(
-    options: SynthOptions, out_dir: Path, context: StageContext, *, overwrite: bool = False
-) -> None:
+def synthesise(options: SynthOptions, out_dir: Path, context: StageContext) -> None:
     """Write a synthetic capture.
 
     The folder holds ``<camera>.mp4`` (or ``poses/<camera>.tum``), ``calib.json``, ``skeleton.bvh`` with the
@@ -28,13 +26,12 @@ def synthesise(
         out_dir: Path of the folder to write. It must not exist, or must be empty. The folder is written
             completely or not at all.
         context: Number of threads, progress reports and cancellation.
-        overwrite: True: replace an earlier synthetic capture in `out_dir`.
 
     Raises:
-        JobError: The folder must not be overwritten, or the BVH file cannot be used.
+        JobError: The folder exists and is not empty, or the BVH file cannot be used.
         StoreError: A file cannot be written to the disk.
         Cancelled: The work was cancelled.
     """
     from bodycap_batch.synthetic.making import write_synthetic_capture
 
-    write_synthetic_capture(options, out_dir, context, overwrite=overwrite)
+    write_synthetic_capture(options, out_dir, context)

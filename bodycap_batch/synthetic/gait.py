@@ -7,7 +7,7 @@ is a spline through given positions.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
-from bodycap_batch.synthetic.pressing import ArmAngles, Press
+from bodycap_batch.synthetic.gait_plan import MARGIN_S, smooth_step
+from bodycap_batch.synthetic.pressing import ArmAngles, Press, rotation_about
 
 _LAP_S = 13.0
 """Duration (seconds) of one lap of the path."""
@@ -50,37 +51,18 @@ _ARM_PARTS = ("Lift", "Ahead", "Arm", "Out", "Spin", "Elbow", "Twist")
 """Names of the angles of an arm's posture, which `WalkStyle.posture` explains."""
 _SAMPLE_HZ = 50.0
 """Sampling rate (Hz) of the two splines that describe the gait phase and the height of the root."""
-_MARGIN_S = 4.0
-"""Additional time (seconds) that the motion covers before and after the capture."""
 
 
-@dataclass(frozen=True, slots=True)
-class _SlowOscillation:
-    """A slow oscillation of an angle: the sum of K sinusoids between 0.1 and 0.6 Hz.
+def _draw_oscillation(degrees: float, rng: np.random.Generator) -> Callable[[FloatArray], FloatArray]:
+    """Draw a slow oscillation of an angle, which gives the angle (T,) in degrees at times (T,) in seconds.
 
-    Attributes:
-        amplitude: (K,) amplitudes of the sinusoids, degrees.
-        rate_hz: (K,) frequencies of the sinusoids, Hz.
-        phase: (K,) phases of the sinusoids at time 0, radians.
+    It is the sum of four sinusoids between 0.1 and 0.6 Hz. Its root mean square is about `degrees`.
     """
-
-    amplitude: FloatArray
-    rate_hz: FloatArray
-    phase: FloatArray
-
-    def __call__(self, t_s: FloatArray) -> FloatArray:
-        """Return the angle (T,) in degrees at common times (T,) in seconds."""
-        waves = np.sin(2 * np.pi * self.rate_hz * t_s[:, None] + self.phase)
-        return np.asarray((self.amplitude * waves).sum(axis=1))
-
-
-def _draw_oscillation(degrees: float, rng: np.random.Generator) -> _SlowOscillation:
-    """Draw an oscillation at random. Its root mean square is about `degrees`."""
     weight = rng.uniform(0.3, 1.0, 4)
-    return _SlowOscillation(
-        degrees * weight / np.linalg.norm(weight) * np.sqrt(2.0),
-        rng.uniform(0.1, 0.6, 4),
-        rng.uniform(0, 2 * np.pi, 4),
+    amplitude = degrees * weight / np.linalg.norm(weight) * np.sqrt(2.0)
+    rate_hz, phase = rng.uniform(0.1, 0.6, 4), rng.uniform(0, 2 * np.pi, 4)
+    return lambda t_s: np.asarray(
+        (amplitude * np.sin(2 * np.pi * rate_hz * t_s[:, None] + phase)).sum(axis=1)
     )
 
 
@@ -110,24 +92,14 @@ class _ArmReach:
 
     def weight(self, t_s: FloatArray) -> FloatArray:
         """Return the weight (T,) of the additional angles at common times (T,). It is smooth, 0 to 1."""
-        up = np.clip((t_s - self.start_s) / self.ramp_s, 0, 1)
-        down = np.clip((t_s - self.start_s - self.ramp_s - self.hold_s) / self.ramp_s, 0, 1)
-        return np.asarray(_smooth_step(up) - _smooth_step(down))
-
-
-def _smooth_step(x: FloatArray) -> FloatArray:
-    """Return a smooth step from 0 to 1. Its first and second derivatives are zero at both ends."""
-    return np.asarray(x**3 * (10 - 15 * x + 6 * x * x))
+        since_s = t_s - self.start_s
+        up = smooth_step(since_s / self.ramp_s)
+        return np.asarray(up - smooth_step((since_s - self.ramp_s - self.hold_s) / self.ramp_s))
 
 
 def _periodic_bump(phase: FloatArray, centre_deg: float, width: float) -> FloatArray:
     """Return a smooth periodic function (T,) of the phase (radians) with a peak of height 1 at a centre."""
     return np.asarray(np.exp((np.cos(phase - np.radians(centre_deg)) - 1.0) / width**2))
-
-
-def _rotation_about(axis: str, degrees: FloatArray) -> Rotation:
-    """Return rotations by Euler angles (T,len(axis)) in degrees about the intrinsic axes `axis`."""
-    return Rotation.from_euler(axis, degrees.reshape(-1, len(axis)), degrees=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,7 +134,7 @@ class Walk:
 
     Args:
         skeleton: Skeleton of the body, with HumanIK joint names.
-        length_s: Latest common time of the capture, seconds. The walk also covers `_MARGIN_S` seconds before
+        length_s: Latest common time of the capture, seconds. The walk also covers `MARGIN_S` seconds before
             time 0 and after this time.
         style: How the person walks.
         rng: Source of randomness for path and gait.
@@ -194,7 +166,7 @@ class Walk:
             )
         }  # fmt: skip
         self._reaches = _draw_reaches(length_s, style.t_pose_s, for_reaches)
-        sample_s = np.arange(-_MARGIN_S, length_s + _MARGIN_S, 1.0 / _SAMPLE_HZ)
+        sample_s = np.arange(-MARGIN_S, length_s + MARGIN_S, 1.0 / _SAMPLE_HZ)
         speed = np.linalg.norm(self._path(sample_s, 1)[:, :2], axis=1)
         cycles = np.cumsum(0.32 * np.tanh(speed / 0.1) + 0.45 * speed) / _SAMPLE_HZ
         self._phase = CubicSpline(sample_s, 2 * np.pi * (cycles + rng.uniform()))
@@ -214,7 +186,7 @@ class Walk:
         if self._t_pose_s == 0.0:
             return np.asarray(self._route(t_s, derivative))
         x = np.clip(t_s - self._t_pose_s, 0, None)
-        rate = _smooth_step(np.minimum(x, 1.0))
+        rate = smooth_step(x)
         walked = np.where(x < 1, x**4 * (2.5 - 3 * x + x * x), x - 0.5)
         return np.asarray(self._route(walked, 1) * rate[:, None] if derivative else self._route(walked))
 
@@ -254,7 +226,7 @@ class Walk:
             walk_weight * 1.5 * np.cos(2 * phase) * effort,
             walk_weight * 2.0 * np.sin(phase) * effort,
         ]
-        out = {"Hips": _rotation_about("Z", pelvis_yaw) * _rotation_about("XY", np.column_stack(pelvis_tilt))}
+        out = {"Hips": rotation_about("Z", pelvis_yaw) * rotation_about("XY", np.column_stack(pelvis_tilt))}
         twist = walk_weight * (wave["Turn"](t_s) - 3.0 * stride * np.cos(phase))
         bend, turn = (self._posture.get(part, 0.0) for part in ("Bend", "Turn"))
         for share, name in ((0.45, "Spine"), (0.55, "Spine1")):
@@ -263,9 +235,9 @@ class Walk:
                 share * walk_weight * (2.0 + wave["Bend"](t_s)) + share * bend,
                 share * walk_weight * wave["Lean"](t_s),
             ]
-            out[name] = _rotation_about("ZXY", np.column_stack(angles))
+            out[name] = rotation_about("ZXY", np.column_stack(angles))
         look = [0.6 * walk_weight * wave["Look"](t_s), 0.6 * walk_weight * (wave["Nod"](t_s) + self._nod_deg)]
-        out["Neck"] = out["Head"] = _rotation_about("ZX", np.column_stack(look))
+        out["Neck"] = out["Head"] = rotation_about("ZX", np.column_stack(look))
         for side, leg_phase in (("Left", phase + np.pi), ("Right", phase)):
             self._leg(side, leg_phase, (stride * walk_weight, sidestep * walk_weight), out)
             self._arm(side, t_s, (stride * np.cos(leg_phase + np.pi), walk_weight), out)
@@ -277,11 +249,7 @@ class Walk:
 
         The weight is 1 during the T-pose, and decreases to 0 within 1 s after the T-pose.
         """
-        return (
-            np.asarray(1.0 - _smooth_step(np.clip(t_s - self._t_pose_s, 0, 1)))
-            if self._t_pose_s
-            else 0.0 * t_s
-        )
+        return 1.0 - smooth_step(t_s - self._t_pose_s) if self._t_pose_s else 0.0 * t_s
 
     @staticmethod
     def _leg(
@@ -304,9 +272,9 @@ class Walk:
         ankle = effort * (6.0 * _periodic_bump(phase, 150.0, 0.7) - 12.0 * _periodic_bump(phase, 225.0, 0.4))
         abduction = 2.0 + sidestep * outward * 9.0 * np.cos(phase)
         # Abduction swings the left leg towards +X: a negative rotation about +Y.
-        out[f"{side}UpLeg"] = _rotation_about("X", -hip) * _rotation_about("Y", -outward * abduction)
-        out[f"{side}Leg"] = _rotation_about("X", knee)
-        out[f"{side}Foot"] = _rotation_about("X", hip - knee - ankle)
+        out[f"{side}UpLeg"] = rotation_about("X", -hip) * rotation_about("Y", -outward * abduction)
+        out[f"{side}Leg"] = rotation_about("X", knee)
+        out[f"{side}Foot"] = rotation_about("X", hip - knee - ankle)
 
     def _arm(
         self, side: str, t_s: FloatArray, swing: tuple[FloatArray, FloatArray], out: dict[str, Rotation]
@@ -342,9 +310,9 @@ class Walk:
         for press in self._presses:
             if press.side == side:
                 angles, lift = press.blended(angles, t_s), lift * (1.0 - press.weight(t_s))
-        shoulder = _rotation_about("Y", -outward * (walk_weight * lift + held["Lift"]))
+        shoulder = rotation_about("Y", -outward * (walk_weight * lift + held["Lift"]))
         if held["Ahead"]:
-            shoulder = _rotation_about("Z", np.full_like(t_s, -outward * held["Ahead"])) * shoulder
+            shoulder = rotation_about("Z", np.full_like(t_s, -outward * held["Ahead"])) * shoulder
         out[f"{side}Shoulder"] = shoulder
         out.update(angles.rotations(side, walk_weight))
 
@@ -363,7 +331,7 @@ def _draw_path(length_s: float, rng: np.random.Generator) -> CubicSpline:
 
 def _draw_turns(length_s: float, rng: np.random.Generator) -> CubicSpline:
     """Return x, y (m) and heading (degrees) over time for a person who rotates on the spot."""
-    times = np.arange(-2.0 * _MARGIN_S, length_s + 2.0 * _MARGIN_S, 0.1)
+    times = np.arange(-2.0 * MARGIN_S, length_s + 2.0 * MARGIN_S, 0.1)
     phase = rng.uniform(0, 2 * np.pi, 3)
     x, y = (_SWAY_M * np.sin(rate * times + phase[axis]) for axis, rate in enumerate((1.1, 0.9)))
     heading = 90.0 + _TURN_DEG * np.sin(2 * np.pi * times / _TURN_S + phase[2])
@@ -372,7 +340,7 @@ def _draw_turns(length_s: float, rng: np.random.Generator) -> CubicSpline:
 
 def _draw_stillness(length_s: float, rng: np.random.Generator) -> CubicSpline:
     """Return x, y (m) and heading (degrees) over time for a person who stands still and faces +y."""
-    times = np.arange(-2.0 * _MARGIN_S, length_s + 2.0 * _MARGIN_S, 0.1)
+    times = np.arange(-2.0 * MARGIN_S, length_s + 2.0 * MARGIN_S, 0.1)
     phase = rng.uniform(0, 2 * np.pi, 3)
     waves = [np.sin(rate * times + start) for rate, start in zip((1.3, 0.9, 0.7), phase, strict=True)]
     x, y, heading = (size * wave for size, wave in zip((0.003, 0.003, 0.4), waves, strict=True))

@@ -276,32 +276,28 @@ class Plan:
 
     def _turn(self, degrees: float) -> None:
         """Turn on the spot by an angle; positive: to the left."""
-        here = self._rows[-1][1:].copy()
         pairs = int(np.ceil(abs(degrees) / _PAIR_DEG))
-        full = max(pairs * _PAIR_S - _RAMP_S, 0.5 * pairs * _PAIR_S)
-        first = 0 if degrees > 0 else 1
-        self._move(
-            "turn", lambda passed: here + np.outer(passed / full, [0.0, 0.0, degrees]), full, first, 0.0
-        )
+        self._step("turn", [0.0, 0.0, degrees], _pairs_s(pairs), 0 if degrees > 0 else 1)
 
     def _aside(self) -> None:
         """Step to one side, towards the middle of the room."""
-        here = self._rows[-1][1:].copy()
+        here = self._rows[-1][1:]
         left = _forward(here[2] + 90.0)
         first = 0 if float(left @ here[:2]) < 0 else 1
         pairs = int(self._rng.integers(2, 4))
         way = (1.0 if first == 0 else -1.0) * pairs * _PAIR_M * float(self._rng.uniform(0.85, 1.15)) * left
-        full = max(pairs * _PAIR_S - _RAMP_S, 0.5 * pairs * _PAIR_S)
-        self._move("aside", lambda passed: here + np.outer(passed / full, [*way, 0.0]), full, first, 0.0)
+        self._step("aside", [*way, 0.0], _pairs_s(pairs), first)
 
     def _back(self) -> None:
         """Step back."""
-        here = self._rows[-1][1:].copy()
         steps = int(self._rng.integers(3, 6))
-        way = -_forward(here[2]) * steps * _BACK_STEP_M
-        full = steps * _BACK_STEP_S
-        first = int(self._rng.integers(2))
-        self._move("back", lambda passed: here + np.outer(passed / full, [*way, 0.0]), full, first, 0.0)
+        way = -_forward(self._rows[-1][3]) * steps * _BACK_STEP_M
+        self._step("back", [*way, 0.0], steps * _BACK_STEP_S, int(self._rng.integers(2)))
+
+    def _step(self, kind: str, change: list[float], effort_s: float, first: int) -> None:
+        """Add a bout in which x, y and direction change steadily by given values."""
+        here = self._rows[-1][1:].copy()
+        self._move(kind, lambda passed: here + np.outer(passed / effort_s, change), effort_s, first, 0.0)
 
     def _plant_first(self) -> None:
         """Put both feet beside the body at the start."""
@@ -376,6 +372,11 @@ def smooth_step(x: FloatArray) -> FloatArray:
     """Return a smooth step from 0 to 1, with first and second derivatives of 0 at both ends and outside."""
     x = np.clip(x, 0.0, 1.0)
     return np.asarray(x**3 * (10 - 15 * x + 6 * x * x))
+
+
+def _pairs_s(pairs: int) -> float:
+    """Return the time at full speed, seconds, of pairs of steps on the spot or aside."""
+    return max(pairs * _PAIR_S - _RAMP_S, 0.5 * pairs * _PAIR_S)
 
 
 def _ramped(times_s: FloatArray, length_s: float, ramp_s: float) -> FloatArray:

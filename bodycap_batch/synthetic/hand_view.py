@@ -50,15 +50,12 @@ def with_hand_in_view(mount: Mount, skeleton: SkeletonModel, camera: Camera, sha
     elbow = skeleton.index_of_role(mount.role)
     joints[:, :3, 3] = rest_positions(skeleton) - rest_positions(skeleton)[elbow]
     wearer = Wearer(skeleton, np.random.SeedSequence(0))
-    wearer.place_textures(np.zeros((len(wearer.images), 2)))
-    limbs = [(shape, joints[joint, :3, 3]) for joint, shape in wearer.parts if joint in (hand, elbow)]
-    starts = np.cumsum([0, *(len(shape.vertices) for shape, _ in limbs)])
-    scene = RayScene(
-        np.concatenate([shape.vertices + place for shape, place in limbs]),
-        np.concatenate(
-            [shape.faces + np.uint32(start) for (shape, _), start in zip(limbs, starts, strict=False)]
-        ),
-    )
+    parts = wearer.parts(np.zeros((len(wearer.images), 2)))
+    limbs = [
+        RayScene(shape.vertices + joints[joint, :3, 3], shape.faces)
+        for joint, shape in parts
+        if joint in (hand, elbow)
+    ]
     rays = ray_grid(camera).in_cam[::_RAY_STEP, ::_RAY_STEP].reshape(-1, 3)
     centre = _PLACE * bone + _OFF_M * forward
     found, least = mount.joint_from_cam, np.inf
@@ -66,7 +63,8 @@ def with_hand_in_view(mount: Mount, skeleton: SkeletonModel, camera: Camera, sha
         pose = _looking_at_hand(along, forward, centre, float(down_deg))
         turned = rays @ pose[:3, :3].T
         origins = np.broadcast_to(pose[:3, 3], turned.shape)
-        seen = scene.first_face(np.concatenate([origins, turned], axis=1).astype(np.float32)) != NOTHING
+        cast = np.concatenate([origins, turned], axis=1).astype(np.float32)
+        seen = np.any([limb.first_face(cast) != NOTHING for limb in limbs], axis=0)
         if abs(seen.mean() - share) < least:
             found, least = pose, abs(float(seen.mean()) - share)
     return replace(mount, joint_from_cam=found)

@@ -14,7 +14,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.model.geometry import so3_exp, so3_log
-from bodycap_batch.synthetic.imu_options import ImuOptions
+from bodycap_batch.synthetic.options import ImuOptions
 
 _GRAVITY_M_S2 = 9.81
 """Acceleration of gravity along −z of the world, m/s²."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.synthetic.raycast import RayScene
-from bodycap_batch.synthetic.surfaces import Surface
 from bodycap_batch.synthetic.textures import shade_image
+from bodycap_batch.synthetic.triangles import Surface
 
 _CELL_M = 0.08
 """Distance (metres) between the points of a surface at which the light is computed."""

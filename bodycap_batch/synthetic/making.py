@@ -17,44 +17,36 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import JobError, StoreError
-from bodycap_batch.formats.atomic_files import store_error_from_os_error
+from bodycap_batch.formats.atomic_files import store_error_from_os_error, write_text
 from bodycap_batch.formats.gpmf_writer import append_settings
 from bodycap_batch.formats.mp4_writer import DataTrack, VideoWriter
-from bodycap_batch.model.camera import Camera
+from bodycap_batch.formats.tum import seconds_text
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
-from bodycap_batch.synthetic.camera_renderer import (
-    AutoExposure,
-    CameraRenderer,
-    MovingBody,
-    Sensor,
-    camera_poses_at,
-    picture_poses_at,
-)
 from bodycap_batch.synthetic.camera_sounds import CameraSounds
 from bodycap_batch.synthetic.clip import load_clip
 from bodycap_batch.synthetic.clocks import first_and_last_s, true_clocks
 from bodycap_batch.synthetic.gait import Walk, WalkStyle
 from bodycap_batch.synthetic.hand_view import with_hand_in_view
 from bodycap_batch.synthetic.imu import write_imu
-from bodycap_batch.synthetic.lens import focal_and_centre, ray_grid
 from bodycap_batch.synthetic.measured import disturb_poses
+from bodycap_batch.synthetic.moving_body import MovingBody, camera_poses_at, picture_poses_at
 from bodycap_batch.synthetic.moving_camera import MovingCamera
+from bodycap_batch.synthetic.moving_scene import ROOM, MovingPart
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
 from bodycap_batch.synthetic.pressing import carrying, find_press
-from bodycap_batch.synthetic.room import BareSurfaces, RoomLayout, build_room
-from bodycap_batch.synthetic.stabilisation import GOPRO_SETTINGS, orientation_track
+from bodycap_batch.synthetic.room import build_room
+from bodycap_batch.synthetic.sensor import AutoExposure, Sensor
+from bodycap_batch.synthetic.stabilisation import GOPRO_SETTINGS, orientation_track, turn_of_pictures
 from bodycap_batch.synthetic.stance_walk import StanceWalk
-from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, triangles_from_surfaces
+from bodycap_batch.synthetic.triangles import triangles_from_surfaces
 from bodycap_batch.synthetic.truth import (
-    MARKER,
     common_ticks_ns,
     mean_poses,
     seconds_from_ns,
     write_calibration,
     write_path,
-    write_timestamps,
     write_truth,
 )
 from bodycap_batch.synthetic.wearer import Wearer
@@ -64,10 +56,6 @@ _TEXELS_PER_PIXEL_M = 0.85
 distance of 1 m covers slightly more than one pixel."""
 _MAX_TEXELS_PER_M = 500.0
 """Maximum texture detail (texels per metre). The limit saves memory."""
-
-
-_TABLE = (0.0, 0.62)
-"""Middle (x, y; metres) of the table in front of a person who stands still. The person faces +y."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,12 +125,12 @@ def draw_subject(options: SynthOptions) -> Subject:
     return Subject(motion=motion, mounts=mounts, seeds=seeds)
 
 
-def write_synthetic_capture(
-    options: SynthOptions, out_dir: Path, context: StageContext, *, overwrite: bool
-) -> None:
+def write_synthetic_capture(options: SynthOptions, out_dir: Path, context: StageContext) -> None:
     """Write a synthetic capture to `out_dir`, as `bodycap_batch.synthetic.synthesise` describes."""
-    out_dir = Path(out_dir)
-    _check_output_folder(out_dir, overwrite)
+    if out_dir.exists() and not (out_dir.is_dir() and not any(out_dir.iterdir())):
+        raise JobError(
+            "this folder exists already", path=out_dir, hint="choose another folder, or delete this folder"
+        )
     subject = draw_subject(options)
     with _atomic_folder(out_dir) as folder:
         write_calibration(folder, options)
@@ -187,10 +175,7 @@ def _write_camera_truth(
     poses = picture_poses_at(subject.motion, mount, common_s, stabilised=options.stabilised != "none")
     write_path(folder / "gt" / f"{camera}.tum", times_ns, poses, "world_from_camera, the camera's own clock")
     if options.exposure_s:
-
-        def pose_at(camera_s: FloatArray) -> FloatArray:
-            return camera_poses_at(subject.motion, mount, clock.common_s(camera_s))
-
+        pose_at = _poses_by_clock(options, subject, mount)
         mean = mean_poses(pose_at, seconds_from_ns(times_ns), options.exposure_s)
         note = "world_from_camera, mean over the exposure, the camera's own clock"
         write_path(folder / "gt" / "exposure" / f"{camera}.tum", times_ns, mean, note)
@@ -199,14 +184,15 @@ def _write_camera_truth(
         note = "world_from_lens of the camera that stabilises its pictures, the camera's own clock"
         write_path(folder / "gt" / "lens" / f"{camera}.tum", times_ns, lens, note)
     if not kept.all():
-        write_timestamps(folder / f"{camera}.timestamps.txt", times_ns)
+        seconds = (f"{seconds_text(int(time))}\n" for time in times_ns)
+        write_text(folder / f"{camera}.timestamps.txt", "".join(seconds))
     if options.poses_only:
         seed = [options.cameras.index(camera), *subject.seeds["poses"].generate_state(4).tolist()]
-        measured = disturb_poses(poses, options, np.random.default_rng(seed))
+        measured, present = disturb_poses(poses, options, np.random.default_rng(seed))
         write_path(
             folder / "poses" / f"{camera}.tum",
-            times_ns[measured.present],
-            measured.world_from_cam[measured.present],
+            times_ns[present],
+            measured[present],
             "world_from_camera with noise, gross errors and gaps; the camera's own clock",
         )
 
@@ -215,30 +201,18 @@ def _write_camera_imu(folder: Path, options: SynthOptions, subject: Subject, mou
     """Write the samples of the inertial sensors on a camera, if they are requested."""
     if options.imu is None:
         return
-    clock = true_clocks(options)[mount.camera]
-
-    def world_from_cam_at(camera_s: FloatArray) -> FloatArray:
-        return camera_poses_at(subject.motion, mount, clock.common_s(camera_s))
-
     number = options.cameras.index(mount.camera)
     seed = np.random.SeedSequence([number, *subject.seeds["imu"].generate_state(4).tolist()])
-    write_imu(folder, mount.camera, options.imu, options.seconds, world_from_cam_at, seed)
+    poses_at = _poses_by_clock(options, subject, mount)
+    write_imu(folder, mount.camera, options.imu, options.seconds, poses_at, seed)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _FrameRecorder:
-    """Function that renders one recorded frame of a camera. The frame depends only on the frame number."""
-
-    renderer: CameraRenderer | MovingCamera
-    sensor: Sensor
-    times_s: FloatArray
-
-    def ideal(self, frame: int) -> Bytes:
-        """Return a frame without noise."""
-        return self.renderer.render(float(self.times_s[frame]))
-
-    def __call__(self, frame: int) -> Bytes:
-        return self.sensor.record(self.ideal(frame), frame)
+def _poses_by_clock(
+    options: SynthOptions, subject: Subject, mount: Mount
+) -> Callable[[FloatArray], FloatArray]:
+    """Return the function that gives the poses (T,4,4) of a camera at times (T,) of its clock, seconds."""
+    clock = true_clocks(options)[mount.camera]
+    return lambda camera_s: camera_poses_at(subject.motion, mount, clock.common_s(camera_s))
 
 
 def _write_videos(
@@ -253,28 +227,19 @@ def _write_videos(
     with _single_opencv_thread(), ThreadPoolExecutor(max_workers=max(1, context.threads)) as pool:
         for renderer, seed in zip(renderers, subject.seeds["images"].spawn(len(renderers)), strict=True):
             camera = renderer.mount.camera
-            recorder = _FrameRecorder(
-                renderer=video_renderer(renderer, options.camera()),
-                sensor=Sensor(options.noise, 3 * options.width * options.height, seed),
-                times_s=clocks[camera].common_s(seconds_from_ns(frame_times_ns(options, camera))),
-            )
-            size = (options.width, options.height)
-            heard = None if sounds is None else sounds.of_camera(camera)
+            times_s = clocks[camera].common_s(seconds_from_ns(frame_times_ns(options, camera)))
             frames = np.flatnonzero(kept[camera]).tolist()
-            exposure = AutoExposure(options.auto_exposure, 1.0 / options.fps)
-            render = recorder.ideal if options.auto_exposure else recorder
+            sensor = Sensor(options.noise, 3 * options.width * options.height, seed)
             with VideoWriter(
                 folder / f"{camera}.mp4",
                 options.fps,
-                size,
+                (options.width, options.height),
                 options.quality,
-                sound=heard,
+                sound=None if sounds is None else sounds.of_camera(camera),
                 bit_rate_mbps=options.bit_rate_mbps,
-                data=_orientations(options, renderer, recorder.times_s[frames]),
+                data=_orientations(options, renderer, times_s[frames]),
             ) as video:
-                for frame, image in zip(frames, _render_in_order(pool, render, frames, context), strict=True):
-                    if options.auto_exposure:
-                        image = recorder.sensor.record(image, frame, exposure.gain(image))  # noqa: PLW2901
+                for image in _recorded(options, renderer, sensor, times_s, frames, pool, context):
                     video.add(image)
                     done += 1
                     context.progress(done, total, camera)
@@ -282,7 +247,29 @@ def _write_videos(
                 append_settings(folder / f"{camera}.mp4", GOPRO_SETTINGS)
 
 
-def _orientations(options: SynthOptions, renderer: CameraRenderer, common_s: FloatArray) -> DataTrack | None:
+def _recorded(  # noqa: PLR0913, PLR0917 - one value each
+    options: SynthOptions,
+    renderer: MovingCamera,
+    sensor: Sensor,
+    times_s: FloatArray,
+    frames: list[int],
+    pool: ThreadPoolExecutor,
+    context: StageContext,
+) -> Iterator[Bytes]:
+    """Yield the recorded frames of a camera, which are rendered at given times in several threads."""
+
+    def ideal(frame: int) -> Bytes:
+        return renderer.render(float(times_s[frame]))
+
+    if not options.auto_exposure:
+        yield from _render_in_order(pool, lambda frame: sensor.record(ideal(frame), frame), frames, context)
+        return
+    exposure = AutoExposure(options.auto_exposure, 1.0 / options.fps)
+    for frame, image in zip(frames, _render_in_order(pool, ideal, frames, context), strict=True):
+        yield sensor.record(image, frame, exposure.gain(image))
+
+
+def _orientations(options: SynthOptions, renderer: MovingCamera, common_s: FloatArray) -> DataTrack | None:
     """Return the record of the orientations of stabilised pictures; None without one.
 
     Args:
@@ -293,29 +280,17 @@ def _orientations(options: SynthOptions, renderer: CameraRenderer, common_s: Flo
     if options.stabilised != "recorded":
         return None
     cameras = camera_poses_at(renderer.motion, renderer.mount, common_s)
-    turns = np.swapaxes(cameras[:, :3, :3], 1, 2) @ renderer.poses_at(common_s)[:, :3, :3]
+    turns = turn_of_pictures(lambda t_s: camera_poses_at(renderer.motion, renderer.mount, t_s), common_s)
     in_file_ns = np.round(np.arange(len(common_s)) * (1e9 / options.fps)).astype(np.int64)
     return orientation_track(in_file_ns, cameras, turns)
 
 
-def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRenderer]:
+def build_renderers(options: SynthOptions, subject: Subject) -> list[MovingCamera]:
     """Build the room around the motion, and return a renderer for each camera."""
     camera = options.camera()
-    focal, _ = focal_and_centre(camera)
-    texels_per_m = min(_TEXELS_PER_PIXEL_M * float(focal.mean()), _MAX_TEXELS_PER_M)
-    surfaces = build_room(
-        walked_extent_m(options, subject),
-        texels_per_m,
-        subject.seeds["room"],
-        furnished=options.furnished,
-        repeated_posters=options.repeated_posters,
-        bare=BareSurfaces(names=frozenset(options.bare), pictures=options.flat_pictures),
-        layout=RoomLayout(
-            repeats=options.room,
-            texture=options.texture,
-            table=_TABLE if options.still else None,
-        ),
-    )
+    texels_per_m = min(_TEXELS_PER_PIXEL_M * camera.focal_px, _MAX_TEXELS_PER_M)
+    extent_m = walked_extent_m(options, subject)
+    surfaces = build_room(extent_m, texels_per_m, subject.seeds["room"], options)
     images = [surface.image for surface in surfaces]
     patterned = options.clothes == "patterned"
     wearer = (
@@ -329,32 +304,21 @@ def build_renderers(options: SynthOptions, subject: Subject) -> list[CameraRende
         else None
     )
     atlas = Atlas(images + (wearer.images if wearer else []))
-    if wearer:
-        wearer.place_textures(atlas.origins[len(images) :])
-    room = triangles_from_surfaces(surfaces, atlas.origins[: len(images)])
-    scene, grid = SceneRenderer(room, atlas), ray_grid(camera)
+    clothes = atlas.origins[len(images) :]
+    room = MovingPart(ROOM, triangles_from_surfaces(surfaces, atlas.origins[: len(images)]))
     return [
-        CameraRenderer(
+        MovingCamera(
             motion=subject.motion,
             mount=mount,
-            grid=grid,
-            room=room,
+            camera=camera,
+            parts=[room, *(MovingPart(*limb) for limb in (wearer.parts(clothes, mount) if wearer else []))],
             atlas=atlas,
-            scene=scene,
-            wearer=wearer.visible_from(mount, subject.motion.skeleton) if wearer else None,
             exposure_s=options.exposure_s,
             rolling_shutter_s=options.rolling_shutter_s,
             stabilised=options.stabilised != "none",
         )
         for mount in subject.mounts
     ]
-
-
-def video_renderer(renderer: CameraRenderer, camera: Camera) -> CameraRenderer | MovingCamera:
-    """Return the renderer of a video's frames: a fast one if frames have an exposure or a readout time."""
-    if renderer.exposure_s == 0.0 and renderer.rolling_shutter_s == 0.0:
-        return renderer
-    return MovingCamera(renderer, camera)
 
 
 def walked_extent_m(options: SynthOptions, subject: Subject) -> tuple[float, float]:
@@ -397,26 +361,6 @@ def _single_opencv_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _check_output_folder(out_dir: Path, overwrite: bool) -> None:
-    """Check that the capture overwrites nothing, or only an earlier synthetic capture on request.
-
-    Raises:
-        JobError: The folder exists and must not be overwritten.
-    """
-    if not out_dir.exists() or (out_dir.is_dir() and not any(out_dir.iterdir())):
-        return
-    if not overwrite:
-        raise JobError(
-            "this folder exists already", path=out_dir, hint="choose another folder, or delete this folder"
-        )
-    if not (out_dir / MARKER).is_file():
-        raise JobError(
-            "this folder is not a synthetic capture, so it is not overwritten",
-            path=out_dir,
-            hint="choose another folder",
-        )
-
-
 @contextmanager
 def _atomic_folder(out_dir: Path) -> Iterator[Path]:
     """Yield a temporary folder. Rename it to `out_dir` if the block succeeds; otherwise delete it.
@@ -425,12 +369,9 @@ def _atomic_folder(out_dir: Path) -> Iterator[Path]:
         StoreError: A file or folder cannot be written to the disk.
     """
     folder = out_dir.with_name(f".{out_dir.name}.{secrets.token_hex(4)}")
-    old = folder.with_name(folder.name + ".old")
     try:
         (folder / "gt").mkdir(parents=True)
         yield folder
-        if out_dir.exists():
-            out_dir.rename(old)
         folder.rename(out_dir)
     except OSError as error:
         raise store_error_from_os_error(error, out_dir) from error
@@ -441,4 +382,3 @@ def _atomic_folder(out_dir: Path) -> Iterator[Path]:
         raise StoreError(error.message, path=named, hint=error.hint) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
@@ -18,27 +16,15 @@ _GROSS_RAD = 0.5
 """Standard deviation (radians) of the rotation of a gross error about each axis."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MeasuredPoses:
-    """The measured poses of a camera over T frames, with errors and gaps.
-
-    Attributes:
-        world_from_cam: (T,4,4) poses with noise and gross errors.
-        present: (T,) False for a frame in a gap.
-        outlier: (T,) True for a frame whose pose has a gross error.
-    """
-
-    world_from_cam: FloatArray
-    present: BoolArray
-    outlier: BoolArray
-
-
 def disturb_poses(
     world_from_cam: FloatArray, options: SynthOptions, rng: np.random.Generator
-) -> MeasuredPoses:
+) -> tuple[FloatArray, BoolArray]:
     """Add noise, gross errors and gaps to true poses (T,4,4).
 
     The first and the last frame are never in a gap.
+
+    Returns:
+        (T,4,4) poses with noise and gross errors, and a mask (T,) that is False for a frame in a gap.
     """
     count = len(world_from_cam)
     outlier = _draw_runs(count, round(options.outliers * count), _BURST_FRAMES, rng)
@@ -54,7 +40,7 @@ def disturb_poses(
     # the number of lost frames is exact.
     shortest, longest = options.gap_frames
     present[1:-1] = ~_draw_runs(max(count - 2, 0), round(options.lost * count), (shortest, longest + 1), rng)
-    return MeasuredPoses(world_from_cam=poses, present=present, outlier=outlier)
+    return poses, present
 
 
 def _draw_runs(count: int, wanted: int, lengths: tuple[int, int], rng: np.random.Generator) -> BoolArray:

@@ -1,4 +1,4 @@
-"""Render frames with exposure and rolling shutter from one sharp image of each frame.
+"""Render the frames of a camera with exposure and rolling shutter from one sharp image of each frame.
 
 The sharp image shows each row at the middle of its exposure, and is exact. The motion blur is the mean of
 several copies of it. In each copy, every pixel takes the colour of the point that it shows at an instant of
@@ -9,6 +9,7 @@ near surface is tried first, and the surface that is found decides.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,11 +18,12 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert
-from bodycap_batch.synthetic.atlas import Bytes, Float32
-from bodycap_batch.synthetic.camera_renderer import CameraRenderer, joint_poses_at
-from bodycap_batch.synthetic.lens import RayGrid, project, ray_grid
+from bodycap_batch.model.skeleton import Mount
+from bodycap_batch.synthetic.atlas import Atlas, Bytes, Float32
+from bodycap_batch.synthetic.lens import RayGrid, ray_grid
+from bodycap_batch.synthetic.moving_body import MovingBody, joint_poses_at, picture_poses_at
 from bodycap_batch.synthetic.moving_scene import ROOM, Hits, MovingPart, MovingScene, rays_in_part
-from bodycap_batch.synthetic.triangle_renderer import dot
+from bodycap_batch.synthetic.triangles import dot
 
 _NODE_S = 0.0005
 """Interval (seconds) of the instants at which the motion is evaluated. Poses between them are interpolated
@@ -83,33 +85,52 @@ class _Jumps:
 
 
 class MovingCamera:
-    """Renderer of frames with exposure and rolling shutter.
+    """Renderer of the frames of a camera on a moving body in a room.
 
     Args:
-        renderer: The renderer of single instants, with body, mount, room, exposure and readout time.
+        motion: The moving body.
+        mount: True mount of the camera.
         camera: Intrinsics of the camera.
+        parts: The room, and the limbs of the wearer that the camera can see.
+        atlas: Atlas of all textures.
+        exposure_s: Exposure time, seconds.
+        rolling_shutter_s: Time (seconds) between the exposures of the first and the last row.
+        stabilised: Whether the camera stabilises its pictures.
     """
 
-    def __init__(self, renderer: CameraRenderer, camera: Camera) -> None:
-        self._motion, self._camera, self._poses_at = renderer.motion, camera, renderer.poses_at
-        self._exposure_s, self._rolling_s = renderer.exposure_s, renderer.rolling_shutter_s
-        limbs = renderer.wearer.parts if renderer.wearer else []
-        parts = [MovingPart(ROOM, renderer.room), *(MovingPart(joint, shape) for joint, shape in limbs)]
-        self._scene = MovingScene(parts, renderer.atlas)
-        shape = self._scene.triangles
+    def __init__(  # noqa: PLR0913 - what a camera consists of
+        self,
+        *,
+        motion: MovingBody,
+        mount: Mount,
+        camera: Camera,
+        parts: Sequence[MovingPart],
+        atlas: Atlas,
+        exposure_s: float = 0.0,
+        rolling_shutter_s: float = 0.0,
+        stabilised: bool = False,
+    ) -> None:
+        self.motion, self.mount, self._camera, self._stabilised = motion, mount, camera, stabilised
+        self._exposure_s, self._rolling_s = exposure_s, rolling_shutter_s
+        self._is_instant = exposure_s == 0.0 and rolling_shutter_s == 0.0
+        self.scene = MovingScene(parts, atlas, fine=self._is_instant)
+        shape = self.scene.triangles
         self._normals = shape.normal.T.astype(np.float32)
         self._offsets = (shape.normal * shape.point).sum(axis=1).astype(np.float32)
         share = _MARGIN_SHARE if self._exposure_s else 0.0
         self._margin = round(share * max(camera.width_px, camera.height_px))
-        self._grid = ray_grid(camera, self._margin)
-        self._px_per_rad = 1.0 / float(np.linalg.norm(self._grid.per_px_x[self._grid.valid], axis=-1).min())
+        self.grid = ray_grid(camera, self._margin)
+        self._px_per_rad = 1.0 / float(np.linalg.norm(self.grid.per_px_x[self.grid.valid], axis=-1).min())
 
     def render(self, t_s: float) -> Bytes:
         """Return the image (H,W,3) without noise. The exposure is centred on a common time (seconds)."""
+        if self._is_instant:
+            poses = self._part_from_cam(np.array([t_s]))[1]
+            return self.scene.sharp(self.grid, poses.transpose(1, 0, 2, 3), self._gain(t_s))[0]
         frame = self._frame(t_s)
-        grid = _cropped(self._grid, self._margin - frame.margin)
+        grid = _cropped(self.grid, self._margin - frame.margin)
         middle = frame.at(0.0)
-        image, hits = self._scene.sharp(grid, middle, self._gain(t_s))
+        image, hits = self.scene.sharp(grid, middle, self._gain(t_s))
         if self._exposure_s == 0.0:
             return image
         ends = [frame.at(sign * 0.5 * self._exposure_s) for sign in (-1.0, 1.0)]
@@ -129,20 +150,25 @@ class MovingCamera:
         half = self._exposure_s / 2
         count = int(np.ceil((row_s[-1] - row_s[0] + 2 * half) / _NODE_S)) + 2
         node_s = np.linspace(row_s[0] - half, row_s[-1] + half, count)
-        joints = joint_poses_at(self._motion, node_s)
-        world_from_cam = self._poses_at(node_s)
-        poses = [
-            world_from_cam if part.joint == ROOM else invert(joints[:, part.joint]) @ world_from_cam
-            for part in self._scene.parts
-        ]
+        world_from_cam, part_from_cam = self._part_from_cam(node_s)
         margin = self._needed_margin(world_from_cam[np.abs(node_s - t_s) <= half + _NODE_S])
         unused = self._margin - margin
         return _Frame(
             node_s=node_s,
-            part_from_cam=np.stack(poses, axis=1),
+            part_from_cam=part_from_cam,
             row_s=row_s[unused : len(row_s) - unused] if self._rolling_s else row_s,
             margin=margin,
         )
+
+    def _part_from_cam(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the poses (T,4,4) of the camera in the world, and (T,P,4,4) in the frames of the parts."""
+        joints = joint_poses_at(self.motion, times_s)
+        world_from_cam = picture_poses_at(self.motion, self.mount, times_s, stabilised=self._stabilised)
+        poses = [
+            world_from_cam if part.joint == ROOM else invert(joints[:, part.joint]) @ world_from_cam
+            for part in self.scene.parts
+        ]
+        return world_from_cam, np.stack(poses, axis=1)
 
     def _needed_margin(self, world_from_cam: FloatArray) -> int:
         """Return the width (px) of the border that the motion (T,4,4) of the camera in an exposure needs."""
@@ -157,9 +183,9 @@ class MovingCamera:
 
     def _gain(self, t_s: float) -> Float32:
         """Return the brightness factor (F,) of each triangle: moving parts are lit from above."""
-        joints = joint_poses_at(self._motion, np.array([t_s]))[0]
+        joints = joint_poses_at(self.motion, np.array([t_s]))[0]
         gains = []
-        for part in self._scene.parts:
+        for part in self.scene.parts:
             up = part.triangles.normal @ joints[part.joint, 2, :3]
             gains.append(np.ones(len(up)) if part.joint == ROOM else 0.75 + 0.25 * up)
         return np.concatenate(gains).astype(np.float32)
@@ -185,7 +211,7 @@ class MovingCamera:
 
         cells = motion_of(coarse.ravel()).reshape(2, *coarse.shape, 2)
         far = float(np.abs(cells).sum(axis=0).max())
-        plane = np.append(self._scene.triangles.plane, -1)[hits.faces[coarse]]
+        plane = np.append(self.scene.triangles.plane, -1)[hits.faces[coarse]]
         jump = _find_jumps(cells, plane)
         whole = np.empty((2, *size, 2), np.float32)
         # Pixel (x, y) of the image is at ((x − s) / c, (y − s) / c) of the cells.
@@ -217,7 +243,7 @@ class MovingCamera:
         """Return the image motion (N,2) of pixels at another instant. They show triangles `faces` (N,)."""
         y, x = np.divmod(pixels, size[1])
         found, instants = np.maximum(faces, 0), then.shape[1]
-        part = self._scene.part_of_face[found]
+        part = self.scene.part_of_face[found]
         row = y if instants > 1 else np.zeros_like(y)
         turned, start = rays_in_part(rays, then.reshape(-1, 4, 4), part * instants + row)
         normal = self._normals.take(found, axis=1)
@@ -227,7 +253,7 @@ class MovingCamera:
         to_cam = invert(middle).reshape(-1, 4, 4)
         for _ in range(2 if instants > 1 else 1):
             direction, origin = rays_in_part(point, to_cam, part * instants + row)
-            at = project(self._camera, (direction + origin).T.astype(np.float64)) - 0.5 + margin
+            at = self._camera.project((direction + origin).T.astype(np.float64)) - 0.5 + margin
             row = np.clip(np.nan_to_num(np.rint(at[:, 1])), 0, size[0] - 1).astype(np.int64)
         limit = 2.0 * max(margin, 8)
         out = np.clip(at - np.stack([x, y], axis=1), -limit, limit)

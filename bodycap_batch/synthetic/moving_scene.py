@@ -3,6 +3,11 @@
 The room and each limb of the wearer are parts. Each part has its triangles in a frame of its own. Viewing
 rays are converted to this frame with the pose of the camera at the instant of the ray. So one tree of
 triangles for each part serves all instants.
+
+The library Embree finds the triangle of each ray. A homography gives the position of the pixel on the
+triangle's texture. On a flat triangle with an affine texture, the texture coordinates are a projective
+function of the viewing direction. The derivative of this function gives the exact footprint of a pixel.
+Pixels at the edge between two surfaces get four samples.
 """
 
 from __future__ import annotations
@@ -18,7 +23,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.synthetic.atlas import Atlas, Bytes, Filter, Float32, select_filter
 from bodycap_batch.synthetic.lens import RayGrid
 from bodycap_batch.synthetic.raycast import NOTHING, RayScene
-from bodycap_batch.synthetic.triangle_renderer import (
+from bodycap_batch.synthetic.triangles import (
     NEAR_M,
     SUBPIXELS,
     Texels,
@@ -37,9 +42,9 @@ _CONE_MARGIN_RAD = 0.02
 length. Evidence: none."""
 
 
-_CELLS = (4, 2, 1)
-"""Sides (px) of the cells at whose corners rays are cast. Objects thinner than 2 px can be missed,
-and isolated ones smaller than 4 px."""
+_CELLS, _FINE_CELLS = (4, 2, 1), (2, 1)
+"""Sides (px) of the cells at whose corners rays are cast, and of those of a fine image. Objects thinner than
+2 px can be missed, and isolated ones smaller than 4 px if the image is not fine."""
 
 
 class MovingPart:
@@ -77,10 +82,12 @@ class MovingScene:
     Args:
         parts: The parts. The first one is the room.
         atlas: Atlas that holds the textures of all parts.
+        fine: True: each pixel has exact texture coordinates. False: they are interpolated over cells of 4 px
+            away from edges, which is faster, and enough for a frame that is blurred or read out row by row.
     """
 
-    def __init__(self, parts: Sequence[MovingPart], atlas: Atlas) -> None:
-        self.parts, self._atlas = tuple(parts), atlas
+    def __init__(self, parts: Sequence[MovingPart], atlas: Atlas, *, fine: bool = False) -> None:
+        self.parts, self._atlas, self._fine = tuple(parts), atlas, fine
         triangles = parts[0].triangles
         for part in parts[1:]:
             triangles = concatenate_triangles(triangles, part.triangles)
@@ -173,7 +180,8 @@ class MovingScene:
         known = np.zeros(size, dtype=bool)
         smooth = known
         planes = np.append(self.triangles.plane, NOTHING)
-        for side in _CELLS:
+        cells = _FINE_CELLS if self._fine else _CELLS
+        for side in cells:
             corners = index[::side, ::side]
             wanted = corners[~known[::side, ::side]]
             found = self.hit(rays[:, wanted], part_from_cam, at[wanted])
@@ -189,6 +197,7 @@ class MovingScene:
             if side == _CELLS[0]:
                 # A corner of an object can lie inside a cell, but then its edges cross the cells around it.
                 one = cv2.erode(one.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            if side == cells[0]:
                 smooth = one
             filled = _enlarged(one, side, size) & ~known
             np.copyto(faces.reshape(size), _enlarged(faces[corners], side, size), where=filled)
@@ -207,24 +216,27 @@ class MovingScene:
     ) -> tuple[Float32, Filter, IntArray]:
         """Return texel coordinates (2,H·W) of all pixels, filters, and the filter (H·W,) of each pixel.
 
-        In the cells of the mask `smooth` (R,C) the coordinates are interpolated between the corners, and all
-        pixels share the filter of the first corner.
+        In the cells of the mask `smooth` (R,C) all pixels share the filter of the first corner, and if the
+        image is not fine, their coordinates are interpolated between the corners.
         """
-        side = _CELLS[0]
+        side = (_FINE_CELLS if self._fine else _CELLS)[0]
         index = np.arange(len(faces)).reshape(size)
         corners = index[::side, ::side].ravel()
         single = np.flatnonzero(~_enlarged(smooth, side, size))
+        cell = _enlarged(np.arange(len(corners)).reshape(smooth.shape), side, size).flatten()
+        cell[single] = len(corners) + np.arange(len(single))
         only = np.concatenate([corners, single])
+        right, down = lens[1][:, only], lens[2][:, only]
+        if self._fine:
+            texels = self._texels(faces, at, part_from_cam, lens[0])
+            return texels.at, select_filter(texels.footprint(right, down, only)), cell
         texels = self._texels(faces[only], at[only], part_from_cam, lens[0][:, only])
-        filters = select_filter(texels.footprint(lens[1][:, only], lens[2][:, only]))
         grid = texels.at[:, : len(corners)].reshape(2, *smooth.shape)
         matrix = np.array([[1.0 / side, 0, 0], [0, 1.0 / side, 0]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         texel = np.stack([cv2.warpAffine(part, matrix, size[::-1], flags=flags).ravel() for part in grid])
         texel[:, single] = texels.at[:, len(corners) :]
-        cell = _enlarged(np.arange(len(corners)).reshape(smooth.shape), side, size).flatten()
-        cell[single] = len(corners) + np.arange(len(single))
-        return texel, filters, cell
+        return texel, select_filter(texels.footprint(right, down)), cell
 
     def _texels(self, faces: IntArray, at: IntArray, part_from_cam: FloatArray, rays: Float32) -> Texels:
         """Return the texture coordinates of rays (3,N) that meet triangles `faces` (N,) at instants (N,).
@@ -247,7 +259,7 @@ class MovingScene:
         missed = faces < 0
         if missed.any():
             texel[:, missed], inverse[missed] = 0.0, 0.0
-        return Texels(faces=faces, rows=rows, inverse=inverse, at=texel)
+        return Texels(rows=rows, inverse=inverse, at=texel)
 
     def _homographies(self, face: IntArray, poses: FloatArray) -> Float32:
         """Return homographies (9,K) from directions in the camera frame to the textures of triangles (K,).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -21,9 +21,68 @@ from bodycap_batch.config.bounds import (
 )
 from bodycap_batch.config.mounts import mount_of
 from bodycap_batch.config.options import Options
-from bodycap_batch.model.camera import CAMERA_MODELS, Camera, parameter_count
-from bodycap_batch.synthetic.imu_options import ImuOptions, imu_from_word
-from bodycap_batch.synthetic.lens import SINGLE_FOCAL
+from bodycap_batch.model.camera import CAMERA_MODELS, Camera, focal_count, parameter_count
+
+_MAX_RATE_HZ = 2000.0
+"""Maximum samples per second of an inertial sensor. Sensors of cameras have 100 to 1,600. Evidence: none."""
+_MAX_DELAY_S = 1.0
+"""Maximum delay of an inertial sensor, seconds. Evidence: none."""
+_PERFECT = {
+    "gyro_noise_rad_s": 0.0,
+    "accelerometer_noise_m_s2": 0.0,
+    "gyro_bias_rad_s": 0.0,
+    "accelerometer_bias_m_s2": 0.0,
+    "turned_deg": 0.0,
+    "late_s": 0.0,
+}
+"""Options of a sensor without errors."""
+
+
+class ImuOptions(Options):
+    """Inertial sensors that are written beside the videos, by default those of a consumer's camera."""
+
+    rate_hz: float = Field(200.0, ge=10.0, le=_MAX_RATE_HZ, description="samples per second")
+    gyro_noise_rad_s: float = Field(
+        0.004,
+        ge=0,
+        le=10,
+        description="white noise of each sample of the gyroscope at 100 samples per second, in rad/s; at "
+        "another rate it grows with the root of the rate",
+    )
+    accelerometer_noise_m_s2: float = Field(
+        0.03, ge=0, le=100, description="the same of the accelerometer, in m/s²"
+    )
+    gyro_bias_rad_s: float = Field(
+        0.01, ge=0, le=1, description="standard deviation of the gyroscope's bias, per axis, in rad/s"
+    )
+    accelerometer_bias_m_s2: float = Field(
+        0.1, ge=0, le=10, description="standard deviation of the accelerometer's bias, per axis, in m/s²"
+    )
+    gyro_range_deg_s: float = Field(
+        2000.0, gt=0, le=100_000, description="largest angular rate that the sensor measures, in degrees/s"
+    )
+    accelerometer_range_g: float = Field(
+        16.0, gt=0, le=1000, description="largest acceleration that the sensor measures, in multiples of g"
+    )
+    turned_deg: float = Field(
+        2.0, ge=0, le=MAX_ANGLE_DEG, description="angle between the sensor and the camera, in degrees"
+    )
+    late_s: float = Field(
+        0.008,
+        ge=-_MAX_DELAY_S,
+        le=_MAX_DELAY_S,
+        description="the sensor's time stamp of an instant is later than the camera's by this, in seconds",
+    )
+
+
+def imu_from_word(value: Any) -> Any:
+    """Return the options for a word: ``true`` or ``consumer``, ``perfect``, ``false``."""
+    if value is True or value == "consumer":
+        return {}
+    if value == "perfect":
+        return _PERFECT
+    return None if value is False else value
+
 
 _EARLIEST_S = 3.0
 """Maximum time (seconds) from the start of a camera to time 0 of the common clock. The built-in walk starts
@@ -528,7 +587,7 @@ class SynthOptions(Options):
         if params is None:
             params = _default_lens_params(self.lens, self.width, self.height)
         if self.stabilised != "none":
-            focals = 1 if self.lens in SINGLE_FOCAL else 2
+            focals = focal_count(self.lens)
             params = (*(_CROP_ZOOM * focal for focal in params[:focals]), *params[focals:])
         return Camera(model=self.lens, width_px=self.width, height_px=self.height, params=list(params))  # type: ignore[arg-type]
 
@@ -539,8 +598,7 @@ def _default_lens_params(model: str, width: int, height: int) -> tuple[float, ..
     The lens has a usual angle of view. It has no distortion, except for the model FOV.
     """
     focal = width * _DEFAULT_FOCAL_PX / 640.0
-    head = [focal] if model in SINGLE_FOCAL else [focal, focal]
-    head += [width / 2.0, height / 2.0]
+    head = [focal] * focal_count(model) + [width / 2.0, height / 2.0]
     rest = [0.0] * (parameter_count(model) - len(head))
     if model == "FOV":
         rest = [_DEFAULT_FOV_OMEGA_RAD]

@@ -5,6 +5,8 @@ The true proportions, posture and mounts differ from the nominal values.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from bodycap_batch.config.mounts import mount_of
@@ -35,25 +37,11 @@ def draw_body(height_m: float, proportion_range: float, rng: np.random.Generator
     offsets = nominal.offsets_m * gain[:, None]
     ends = nominal.end_offsets_m * gain[:, None]
     offsets[0] = 0.0
-    body = _with_bones(nominal, offsets, ends)
-    low, high = _height_range(body)
+    low, high = _height_range(replace(nominal, offsets_m=offsets, end_offsets_m=ends))
     scale = height_m / (high - low)
     offsets, ends = offsets * scale, ends * scale
     offsets[0] = (0.0, 0.0, -low * scale)
-    return _with_bones(nominal, offsets, ends)
-
-
-def _with_bones(model: SkeletonModel, offsets_m: FloatArray, end_offsets_m: FloatArray) -> SkeletonModel:
-    """Return a copy of a skeleton with new bone vectors (metres)."""
-    return SkeletonModel(
-        name="synthetic",
-        joints=model.joints,
-        parents=model.parents,
-        offsets_m=offsets_m,
-        end_offsets_m=end_offsets_m,
-        roles=model.roles,
-        bvh_channels=model.bvh_channels,
-    )
+    return replace(nominal, name="synthetic", offsets_m=offsets, end_offsets_m=ends)
 
 
 def _height_range(body: SkeletonModel) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import segment_axes
+from bodycap_batch.synthetic.gait_plan import smooth_step
 
 RAMP_S = 0.5
 """Duration of the movement of a hand from its walking position to the chest. The movement back takes the same
@@ -75,21 +76,21 @@ class ArmAngles:
         """
         outward = 1.0 if side == "Left" else -1.0
         hang = walk_weight * (90.0 - self.abduction)
-        arm = _rotation_about("X", -walk_weight * self.flexion) * _rotation_about("Y", outward * hang)
+        arm = rotation_about("X", -walk_weight * self.flexion) * rotation_about("Y", outward * hang)
         if np.any(self.spin):
-            arm = arm * _rotation_about("X", walk_weight * self.spin)
+            arm = arm * rotation_about("X", walk_weight * self.spin)
         # Pronation rotates the forearm about its bone, so that the thumb moves from the front to the body.
         # It is a positive rotation about X on both sides. The left bone points along +X, the right along -X.
-        forearm = _rotation_about("Z", -outward * walk_weight * self.elbow) * _rotation_about(
+        forearm = rotation_about("Z", -outward * walk_weight * self.elbow) * rotation_about(
             "X", walk_weight * self.pronation
         )
-        hand = _rotation_about(
+        hand = rotation_about(
             "YZ", np.column_stack([walk_weight * self.wrist, -outward * walk_weight * self.radial])
         )
         return {f"{side}Arm": arm, f"{side}ForeArm": forearm, f"{side}Hand": hand}
 
 
-def _rotation_about(axis: str, degrees: FloatArray) -> Rotation:
+def rotation_about(axis: str, degrees: FloatArray) -> Rotation:
     """Return rotations by Euler angles (T,len(axis)) in degrees about the intrinsic axes `axis`."""
     return Rotation.from_euler(axis, degrees.reshape(-1, len(axis)), degrees=True)
 
@@ -117,10 +118,8 @@ class Press:
 
         The weight is 1 from `start_s` to `end_s`, and changes smoothly before and after.
         """
-        up = np.clip((t_s - self.start_s) / RAMP_S + 1.0, 0, 1)
-        down = np.clip((t_s - self.end_s) / RAMP_S, 0, 1)
-        smooth = [x**3 * (10 - 15 * x + 6 * x * x) for x in (up, down)]
-        return np.asarray(smooth[0] - smooth[1])
+        up = smooth_step((t_s - self.start_s) / RAMP_S + 1.0)
+        return np.asarray(up - smooth_step((t_s - self.end_s) / RAMP_S))
 
     def blended(self, angles: ArmAngles, t_s: FloatArray) -> ArmAngles:
         """Return a weighted mean of given arm angles and the angles of the press at common times (T,)."""

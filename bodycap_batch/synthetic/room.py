@@ -15,8 +15,9 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.synthetic import pictures, textures
 from bodycap_batch.synthetic.lighting import light_surfaces
-from bodycap_batch.synthetic.surfaces import UINT8, Surface, box_faces, surface_facing
+from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.textures import Texture
+from bodycap_batch.synthetic.triangles import UINT8, Surface, box_faces, surface_facing
 
 _PICTURE_DETAIL = 1.3
 """Ratio of the texture detail (texels per metre) of pictures and books to the detail of walls and furniture.
@@ -52,6 +53,8 @@ _OPENING_M = (0.2, 1.95)
 built-in walk passes it at 0.7 m and at 1.4 m."""
 _OPENING_TOP_M = 2.15
 """Height (metres) of the openings."""
+_TABLE = (0.0, 0.62)
+"""Middle (x, y; metres) of the table in front of a person who stands still. The person faces +y."""
 _TABLE_TOP_M = 0.98
 """Height (metres) of the table for a person who stands."""
 _PICTURE_BASES_M = (2.05, 1.25, 1.55, 1.10)
@@ -115,34 +118,6 @@ class _Builder:
                 self.textured(face, texture)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BareSurfaces:
-    """The plain surfaces of a room.
-
-    Attributes:
-        names: Names of the plain surfaces: ``ceiling``, ``floor``, or a name in `_WALL_NAMES`.
-        pictures: Number of flat pictures on each plain surface.
-    """
-
-    names: frozenset[str] = frozenset()
-    pictures: int = 0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RoomLayout:
-    """What repeats in a room, and how much texture it has.
-
-    Attributes:
-        repeats: ``single``, or one of the kinds of identical parts of `SynthOptions.room`.
-        texture: Contrast of the textures, and density of the pictures on the walls, 0 to 1.
-        table: Middle (x, y; metres) of a table, or None.
-    """
-
-    repeats: str = "single"
-    texture: float = 1.0
-    table: tuple[float, float] | None = None
-
-
 @dataclass(frozen=True, slots=True)
 class _Wall:
     """One wall of the room. It gives world positions for the objects at the wall.
@@ -176,15 +151,11 @@ class _Wall:
         return float(np.degrees(np.arctan2(self.right[1], self.right[0])))
 
 
-def build_room(  # noqa: PLR0913 - what a room consists of
+def build_room(
     half_extent_m: tuple[float, float],
     texels_per_m: float,
     seed: np.random.SeedSequence,
-    *,
-    furnished: bool = True,
-    repeated_posters: bool = False,
-    bare: BareSurfaces | None = None,
-    layout: RoomLayout | None = None,
+    options: SynthOptions,
 ) -> list[Surface]:
     """Build a furnished and lit room around a walk.
 
@@ -192,33 +163,30 @@ def build_room(  # noqa: PLR0913 - what a room consists of
         half_extent_m: Maximum distances (metres) of the walk from the room's middle along x and y.
         texels_per_m: Detail of the textures, texels per metre.
         seed: Seed of all textures and positions.
-        furnished: False: the room has plain walls, floor and ceiling, and pictures on the walls only.
-        repeated_posters: True: copies of only three different pictures hang at many positions.
-        bare: The plain surfaces; None: no surface is plain on request.
-        layout: What repeats, and how much texture there is; None: nothing repeats, with full texture.
+        options: What the room contains, what repeats in it, and how much texture there is.
 
     Returns:
         The surfaces of the room. Their textures include the light of the lamps.
     """
     half = half_size_m(half_extent_m)
-    bare, layout = bare or BareSurfaces(), layout or RoomLayout()
-    if layout.repeats == "bays_90":
+    bare = frozenset[str](options.bare)
+    if options.room == "bays_90":
         half = [max(half)] * 2
-    build = _Builder(seed, texels_per_m, layout.texture)
-    plain = bare.names if furnished else bare.names | {"ceiling", "floor", "east"}
+    build = _Builder(seed, texels_per_m, options.texture)
+    plain = bare if options.furnished else bare | {"ceiling", "floor", "east"}
     walls = _build_shell(build, half, plain)
     furnish = (_add_shelves, _add_desks, _add_cupboards, _add_sofa)
     for name, wall, furniture in zip(_WALL_NAMES, walls, furnish, strict=True):
-        if furnished and name not in bare.names and layout.repeats == "single":
+        if options.furnished and name not in bare and options.room == "single":
             furniture(build, wall)
-    if layout.table is not None:
-        _add_table(build, layout.table)
-    if layout.repeats != "single":
-        return _with_repeats(build, walls, half, layout.repeats)
-    _add_pictures(build, walls, repeated_posters, bare.names)
+    if options.still:
+        _add_table(build)
+    if options.room != "single":
+        return _with_repeats(build, walls, half, options.room)
+    _add_pictures(build, walls, options.repeated_posters, bare)
     if "ceiling" not in plain:
         _add_ceiling_fittings(build, half)
-    _add_flat_pictures(build, half, walls, bare)
+    _add_flat_pictures(build, half, walls, options)
     return _lit(build, half)
 
 
@@ -273,9 +241,7 @@ def _build_shell(build: _Builder, half: list[float], plain: frozenset[str]) -> l
         axis = int(np.argmax(np.abs(outward)))
         wall = _Wall(outward * half[axis], np.cross(up, -outward), -outward, 2 * half[1 - axis])
         walls.append(wall)
-        middle = wall.point_at(0.0, HEIGHT_M / 2, 0.0)
-        face = surface_facing(middle, wall.normal, (wall.length_m, HEIGHT_M), np.zeros((1, 1, 3), np.uint8))
-        build.textured(face, texture)
+        build.textured(_face_of(wall), texture)
     return walls
 
 
@@ -488,10 +454,10 @@ def _add_partition(build: _Builder, half: list[float]) -> None:
             build.surfaces.append(replace(face, image=build.image(size, one_paint)))
 
 
-def _add_table(build: _Builder, middle: tuple[float, float]) -> None:
+def _add_table(build: _Builder) -> None:
     """Add a high table with boxes, a screen and papers, for a person who stands at it."""
     rng = build.rng()
-    centre = np.array([*middle, 0.0])
+    centre = np.array([*_TABLE, 0.0])
     build.box(centre + np.array([0, 0, _TABLE_TOP_M - 0.02]), (1.5, 0.7, 0.04), 0.0, textures.planks)
     for side in (-1, 1):
         build.box(
@@ -517,16 +483,15 @@ def _add_table(build: _Builder, middle: tuple[float, float]) -> None:
         )
 
 
-def _add_flat_pictures(build: _Builder, half: list[float], walls: list[_Wall], bare: BareSurfaces) -> None:
+def _add_flat_pictures(build: _Builder, half: list[float], walls: list[_Wall], options: SynthOptions) -> None:
     """Add flat pictures at random positions on the plain surfaces that were requested."""
     floor, ceiling = box_faces([0, 0, HEIGHT_M / 2], [2 * half[0], 2 * half[1], HEIGHT_M], 0.0)[4:][::-1]
     faces = {"floor": _seen_from_behind(floor), "ceiling": _seen_from_behind(ceiling)}
     for name, wall in zip(_WALL_NAMES, walls, strict=True):
-        middle = wall.point_at(0.0, HEIGHT_M / 2, 0.0)
-        faces[name] = surface_facing(middle, wall.normal, (wall.length_m, HEIGHT_M), _BLANK)
-    for name in sorted(bare.names):
+        faces[name] = _face_of(wall)
+    for name in sorted(options.bare):
         rng = build.rng()
-        for _ in range(bare.pictures):
+        for _ in range(options.flat_pictures):
             kind = pictures.WALL_PICTURES[int(rng.integers(len(pictures.WALL_PICTURES)))]
             build.surfaces.append(_picture_on(build, faces[name], kind, rng))
 

@@ -8,6 +8,7 @@ its own frequency band and gain. The noise of cloth is added. The same seed give
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -143,8 +144,7 @@ def record(scene: Scene, microphone: Microphone) -> Samples:
         distance_m = rng.uniform(*_DISTANCES_M[name])
         response = _room_response(rng, rate, distance_m, microphone.band_hz)
         wet = np.asarray(oaconvolve(dry, response)[: len(dry)], np.float32)
-        swing = _Swing.drawn(rng, distance_m)
-        _add_delayed(out, wet, scene, microphone, swing)
+        _add_delayed(out, wet, scene, microphone, _draw_delay(rng, distance_m))
     if microphone.noise_ratio_db is not None:
         noise = cloth_noise(count, rate, rng)
         ratio = _band_power(out, rate) / max(_band_power(noise, rate), 1e-20)
@@ -164,53 +164,43 @@ def cloth_noise(count: int, rate_hz: int, rng: np.random.Generator) -> Samples:
     return ((2.0 * low + 0.7 * high) * (0.15 + envelope)).astype(np.float32)
 
 
-@dataclass(frozen=True, slots=True)
-class _Swing:
-    """The distance of a microphone from a source over time, as the arms swing and the body turns.
+def _draw_delay(rng: np.random.Generator, distance_m: float) -> Callable[[FloatArray], FloatArray]:
+    """Return the delay (N,) of a source, seconds, at times (N,), as the arms swing and the body turns.
 
-    Attributes:
-        distance_m: Mean distance, metres.
-        amplitude_m: Amplitude of the swing, metres.
-        rate_hz: Swings per second.
-        phase_rad: Phase of the swing.
-        slow_m: Amplitude of a slow change, metres.
-        slow_rate_hz: Frequency of the slow change.
+    Args:
+        rng: Source of randomness.
+        distance_m: Mean distance of the microphone from the source, metres.
     """
+    swing_m, swing_hz, phase_rad = (
+        rng.uniform(0.0, _SWING_M),
+        rng.uniform(0.7, 1.1),
+        rng.uniform(0.0, 2 * np.pi),
+    )
+    slow_m, slow_hz = rng.uniform(0.0, _SWING_M), rng.uniform(0.02, 0.1)
 
-    distance_m: float
-    amplitude_m: float
-    rate_hz: float
-    phase_rad: float
-    slow_m: float
-    slow_rate_hz: float
+    def delay_s(times_s: FloatArray) -> FloatArray:
+        swing = swing_m * np.sin(2 * np.pi * swing_hz * times_s + phase_rad)
+        slow = slow_m * np.sin(2 * np.pi * slow_hz * times_s + 2 * phase_rad)
+        return np.asarray((distance_m + swing + slow) / SOUND_M_S)
 
-    @classmethod
-    def drawn(cls, rng: np.random.Generator, distance_m: float) -> _Swing:
-        return cls(
-            distance_m,
-            float(rng.uniform(0.0, _SWING_M)),
-            float(rng.uniform(0.7, 1.1)),
-            float(rng.uniform(0.0, 2 * np.pi)),
-            float(rng.uniform(0.0, _SWING_M)),
-            float(rng.uniform(0.02, 0.1)),
-        )
-
-    def delay_s(self, times_s: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Return the time (N,) that the sound takes, seconds."""
-        swing = self.amplitude_m * np.sin(2 * np.pi * self.rate_hz * times_s + self.phase_rad)
-        slow = self.slow_m * np.sin(2 * np.pi * self.slow_rate_hz * times_s + 2 * self.phase_rad)
-        return np.asarray((self.distance_m + swing + slow) / SOUND_M_S)
+    return delay_s
 
 
-def _add_delayed(out: Samples, wet: Samples, scene: Scene, microphone: Microphone, swing: _Swing) -> None:
+def _add_delayed(
+    out: Samples,
+    wet: Samples,
+    scene: Scene,
+    microphone: Microphone,
+    delay_s: Callable[[FloatArray], FloatArray],
+) -> None:
     """Add the sound of one source, on the camera's clock and with its delay, to the recording."""
     rate, block = scene.rate_hz, round(_BLOCK_S * scene.rate_hz)
     for first in range(0, len(out), block):
         camera_s = np.arange(first, min(first + block, len(out))) / rate
         common_s = camera_s * (1.0 + 1e-6 * microphone.drift_ppm) + microphone.offset_s
         knots_s = np.arange(common_s[0], common_s[-1] + 0.02, 0.01)
-        delay_s = np.interp(common_s, knots_s, swing.delay_s(knots_s))
-        position = (common_s - delay_s - scene.start_s) * rate
+        late_s = np.interp(common_s, knots_s, delay_s(knots_s))
+        position = (common_s - late_s - scene.start_s) * rate
         out[first : first + block] += _interpolated(wet, position)
 
 

@@ -9,7 +9,7 @@ angles of both legs follow from the places of root and feet.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -100,23 +100,33 @@ class _Foot:
     stride: FloatArray
     rise_power: FloatArray
 
+    def stance_at(self, t_s: FloatArray) -> tuple[IntArray, IntArray, BoolArray]:
+        """Return the numbers of the latest stance (T,) and of the next one (T,), and if the foot stands (T,).
+
+        The last stance has no next one, and is returned twice.
+        """
+        index = np.searchsorted(self.strike_s, t_s, side="right") - 1
+        return index, self.after(index), t_s <= self.off_s[index]
+
+    def after(self, index: IntArray) -> IntArray:
+        """Return the numbers (T,) of the stances after other ones."""
+        return np.minimum(index + 1, len(self.strike_s) - 1)
+
+    def swung(self, index: IntArray, stands: BoolArray, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the part (T,) of the swing after a stance that is over, and the length (T,) of the swing.
+
+        While the foot stands, they are 0 and 1.
+        """
+        start = self.off_s[index]
+        length = np.where(stands, 1.0, self.strike_s[self.after(index)] - start)
+        return np.where(stands, 0.0, t_s - np.where(stands, 0.0, start)) / length, length
+
 
 def _as_arrays(side: str, number: int, shape: FootShape, prints: Footprints) -> _Foot:
     """Return a foot with its footprints as arrays."""
+    arrays = {each.name: np.array(getattr(prints, each.name)) for each in fields(prints)}
     return _Foot(
-        side=side,
-        number=number,
-        shape=shape,
-        strike_s=np.array(prints.strike_s),
-        off_s=np.array(prints.off_s),
-        place_m=np.array(prints.place_m),
-        yaw_deg=np.array(prints.yaw_deg),
-        strike_deg=np.array(prints.strike_deg),
-        off_deg=np.array(prints.off_deg),
-        cycle_s=np.array(prints.cycle_s),
-        speed_m_s=np.array(prints.speed_m_s),
-        stride=np.array(prints.stride),
-        rise_power=np.full(len(prints.strike_s), _RISE_POWER),
+        side=side, number=number, shape=shape, rise_power=np.full(len(prints.strike_s), _RISE_POWER), **arrays
     )
 
 
@@ -190,16 +200,10 @@ class StanceWalk:
     # The plan at one instant.
 
     @staticmethod
-    def _stance_of(foot: _Foot, t_s: FloatArray) -> tuple[IntArray, BoolArray]:
-        """Return the number of the latest stance (T,), and whether the foot stands (T,)."""
-        index = np.searchsorted(foot.strike_s, t_s, side="right") - 1
-        return index, t_s <= foot.off_s[index]
-
-    @staticmethod
     def _stance_pitch(foot: _Foot, index: IntArray, t_s: FloatArray) -> FloatArray:
         """Return the angle (T,) of a foot in the stances `index` (T,), degrees."""
         after = (t_s - foot.strike_s[index]) / (_FLAT_AT * foot.cycle_s[index])
-        later = np.minimum(index + 1, len(foot.cycle_s) - 1)
+        later = foot.after(index)
         share = stance_share(foot.speed_m_s[later])
         early = np.where(foot.off_deg[index] > _ROLLING_DEG, share - _HEEL_RISE_AT, share - 0.5)
         rise_s = np.minimum(early * foot.cycle_s[later], 0.6 * (foot.off_s[index] - foot.strike_s[index]))
@@ -218,11 +222,9 @@ class StanceWalk:
 
     def _foot_angles(self, foot: _Foot, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return direction (T,) and angle (T,) of a foot, degrees."""
-        index, stands = self._stance_of(foot, t_s)
-        later = np.minimum(index + 1, len(foot.strike_s) - 1)
-        start, end = foot.off_s[index], foot.strike_s[later]
-        length = np.where(stands, 1.0, end - start)
-        part = np.where(stands, 0.0, t_s - np.where(stands, 0.0, start)) / length
+        index, later, stands = foot.stance_at(t_s)
+        part, length = foot.swung(index, stands, t_s)
+        start = foot.off_s[index]
         yaw = foot.yaw_deg[index] + smooth_step(part) * (foot.yaw_deg[later] - foot.yaw_deg[index])
         step = 1e-3
         edge = np.where(np.isfinite(start), start, 0.0)
@@ -234,23 +236,19 @@ class StanceWalk:
 
     def _cycle(self, foot: _Foot, t_s: FloatArray) -> FloatArray:
         """Return the position (T,) in a leg's gait cycle, 0 to 1. It waits in the middle of long stances."""
-        index, stands = self._stance_of(foot, t_s)
-        later = np.minimum(index + 1, len(foot.strike_s) - 1)
+        index, later, stands = foot.stance_at(t_s)
         share = stance_share(foot.speed_m_s[later])
         since = (t_s - foot.strike_s[index]) / foot.cycle_s[index]
         left = np.where(np.isfinite(foot.off_s[index]), foot.off_s[index] - t_s, 1e3) / foot.cycle_s[later]
         middle = 0.5 * share
         first, second = np.minimum(since, middle), np.maximum(share - left, middle)
         held = np.where(since < middle, first, second)
-        start, end = foot.off_s[index], foot.strike_s[later]
-        length = np.where(stands, 1.0, end - start)
-        part = np.where(stands, 0.0, t_s - np.where(stands, 0.0, start)) / length
+        part, _ = foot.swung(index, stands, t_s)
         return np.asarray(np.where(stands, held, share + part * (1.0 - share)))
 
     def _knee_curve(self, foot: _Foot, t_s: FloatArray) -> FloatArray:
         """Return the flexion (T,) of the knee that the curves give, degrees."""
-        index, stands = self._stance_of(foot, t_s)
-        later = np.minimum(index + 1, len(foot.strike_s) - 1)
+        index, later, stands = foot.stance_at(t_s)
         cycle = self._cycle(foot, t_s)
         newer = np.where(stands, smooth_step((cycle - 0.2) / 0.25), 1.0)
         stride = foot.stride[index] + newer * (foot.stride[later] - foot.stride[index])
@@ -321,8 +319,7 @@ class StanceWalk:
         loads: list[FloatArray] = []
         limits: list[FloatArray] = []
         for foot in self._feet:
-            index, stands = self._stance_of(foot, t_s)
-            later = np.minimum(index + 1, len(foot.strike_s) - 1)
+            index, later, stands = foot.stance_at(t_s)
             both_s = self._both_s(foot, later)
             index = np.where(~stands & (t_s > foot.strike_s[later] - both_s), later, index)
             ankle = self._stance_ankle(foot, index, np.clip(t_s, foot.strike_s[index], foot.off_s[index]))
@@ -355,7 +352,7 @@ class StanceWalk:
         index = np.flatnonzero(foot.off_deg > _ROLLING_DEG)
         if not len(index):
             return foot
-        later = np.minimum(index + 1, len(foot.strike_s) - 1)
+        later = foot.after(index)
         share = stance_share(foot.speed_m_s[later])
         rise_s = np.minimum(
             (share - _HEEL_RISE_AT) * foot.cycle_s[later], 0.6 * (foot.off_s[index] - foot.strike_s[index])
@@ -392,8 +389,7 @@ class StanceWalk:
         """Return how much of the body each foot carries (T,2). The sum is 1."""
         loads = []
         for foot in self._feet:
-            index, stands = self._stance_of(foot, t_s)
-            later = np.minimum(index + 1, len(foot.strike_s) - 1)
+            index, later, stands = foot.stance_at(t_s)
             both = np.maximum(2 * stance_share(foot.speed_m_s[later]) - 1.0, 0.1) * 0.5
             on = smooth_step((t_s - foot.strike_s[index]) / (both * foot.cycle_s[index]))
             off = smooth_step((foot.off_s[index] - t_s) / (both * foot.cycle_s[later]))
@@ -405,7 +401,7 @@ class StanceWalk:
         """Return by how much the pelvis moves from the path towards the standing foot (T,2), metres."""
         centre = np.zeros((len(t_s), 2))
         for foot in self._feet:
-            index, _ = self._stance_of(foot, t_s)
+            index, _, _ = foot.stance_at(t_s)
             centre = centre + weights[:, foot.number, None] * foot.place_m[index]
         angle = np.radians(body[:, 2])
         left = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -476,7 +472,7 @@ class StanceWalk:
 
     def _ankle(self, foot: _Foot, t_s: FloatArray, yaw_deg: FloatArray, pitch_deg: FloatArray) -> FloatArray:
         """Return the ankle (T,3) of a foot, metres."""
-        index, stands = self._stance_of(foot, t_s)
+        index, _, stands = foot.stance_at(t_s)
         out = self._stance_ankle(foot, index, t_s)
         flying = ~stands
         if not flying.any():

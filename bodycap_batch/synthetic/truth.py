@@ -15,11 +15,11 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 from bodycap_batch.formats.bvh import write_bvh
-from bodycap_batch.formats.tum import TimedPoses, seconds_text, write_tum
+from bodycap_batch.formats.tum import TimedPoses, write_tum
 from bodycap_batch.model.geometry import invert, make_transform, quat_xyzw_from_rotation, so3_exp, so3_log
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
-from bodycap_batch.synthetic.camera_renderer import MovingBody, joint_poses_at
 from bodycap_batch.synthetic.clocks import has_own_clocks, reference_name, true_clocks
+from bodycap_batch.synthetic.moving_body import MovingBody, joint_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.stance_walk import StanceWalk
 
@@ -67,8 +67,6 @@ _CLOCK_OPTIONS = {"clocks", "drifts_ppm", "sound", "sound_ratio_db", "sound_skew
 _EXPOSURE_STEPS = 24
 """Number of instants whose mean is the pose over an exposure. Origin: 0.4 ms of an exposure of 10 ms, a
 twentieth of the interval of a recorded motion."""
-MARKER = Path("gt", "synth.json")
-"""Path of the file that marks a folder as a complete synthetic capture, relative to the folder."""
 
 
 def write_calibration(folder: Path, options: SynthOptions) -> None:
@@ -138,7 +136,7 @@ def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts:
     settings = options.model_dump(mode="json", exclude=hidden)
     if options.motion is not None:
         settings["motion"] = options.motion.name
-    _write_json(folder / MARKER, settings)
+    _write_json(truth / "synth.json", settings)
 
 
 def seconds_from_ns(times_ns: IntArray) -> FloatArray:
@@ -190,11 +188,6 @@ def write_path(path: Path, times_ns: IntArray, world_from_cam: FloatArray, note:
     """
     poses = TimedPoses(times_ns=times_ns, world_from_cam=world_from_cam)
     write_tum(path, poses, (note,))
-
-
-def write_timestamps(path: Path, times_ns: IntArray) -> None:
-    """Write the times of a video's frames in seconds, one time per line."""
-    write_text(path, "".join(f"{seconds_text(int(time))}\n" for time in times_ns))
 
 
 def _write_clocks(path: Path, options: SynthOptions) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,8 +12,7 @@ from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions, segment_axes, split_side
 from bodycap_batch.synthetic import textures
 from bodycap_batch.synthetic.pictures import WALL_PICTURES, abstract
-from bodycap_batch.synthetic.surfaces import UINT8, Surface, box_faces
-from bodycap_batch.synthetic.triangle_renderer import Triangles, triangles_from_surfaces
+from bodycap_batch.synthetic.triangles import UINT8, Surface, Triangles, box_faces, triangles_from_surfaces
 
 _RADII = {
     "Hips": (0.15, 0.14),
@@ -57,15 +56,6 @@ _CLEARANCE_M = 0.02
 than this threshold. Unit: metres."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Limb:
-    """One limb: a rounded cone in the frame of its joint. Or a box that the hand of the joint carries."""
-
-    joint: int
-    triangles: Triangles
-    carried: bool = False
-
-
 class Wearer:
     """The surface of the wearer's body, which gives the triangles to render in any pose.
 
@@ -85,6 +75,7 @@ class Wearer:
         carrying: tuple[str, ...] = (),
     ) -> None:
         self._bones = _find_bones(skeleton)
+        self._skeleton = skeleton
         self.images: list[UINT8] = []
         dyes = np.random.default_rng(seed.spawn(1)[0])
         shirt, trousers = (textures.colour(dyes, 0.5, (0.3, 0.6)) for _ in range(2))
@@ -95,7 +86,6 @@ class Wearer:
             dye = trousers if part in _TROUSERS else shirt
             image = _skin(height, width, rng) if part in _SKIN else _cloth(height, width, dye, rng)
             self.images.append(_print_pattern(image, rng) if patterned and part not in _SKIN else image)
-        self._limbs: list[_Limb] = []
         self._boxes = [_box_in_hand(skeleton, side) for side in carrying]
         for _, faces in self._boxes:
             rng = np.random.default_rng(seed.spawn(1)[0])
@@ -107,72 +97,33 @@ class Wearer:
                 kind = WALL_PICTURES[int(rng.integers(len(WALL_PICTURES)))]
                 self.images.append(np.asarray(kind(tall, wide, _BOX_TEXELS_PER_M, rng)))
 
-    def place_textures(self, origins: FloatArray) -> None:
-        """Build the N limbs.
+    def parts(self, origins: FloatArray, mount: Mount | None = None) -> list[tuple[int, Triangles]]:
+        """Return the joint of each limb, and the limb's triangles in the frame of this joint.
 
         Args:
-            origins: (N,2) atlas coordinates (texels) of the top left corners of the limbs' images.
+            origins: (N,2) atlas coordinates (texels) of the top left corners of `images`.
+            mount: Mount of the camera that sees the body. If the camera is inside the limb on which it is
+                mounted, this limb is left out. Otherwise it would block the view of the camera. A real camera
+                has a free view, because its housing presses the cloth in.
         """
-        self._limbs = [
-            _Limb(joint=joint, triangles=_rounded_cone(start, end, radii, image, origin, index))
-            for index, ((joint, start, end, radii, _), image, origin) in enumerate(
-                zip(self._bones, self.images, origins, strict=False)
-            )
-        ]
+        out = []
+        own = None if mount is None else self._skeleton.index_of_role(mount.role)
+        for index, (joint, start, end, radii, _) in enumerate(self._bones):
+            if (
+                mount is None
+                or joint != own
+                or not _is_inside(mount.joint_from_cam[:3, 3], start, end, radii)
+            ):
+                shape = _rounded_cone(start, end, radii, self.images[index], origins[index], index)
+                out.append((joint, shape))
         used = len(self._bones)
         for joint, faces in self._boxes:
             pictures = self.images[used : used + len(faces)]
             sides = [replace(face, image=image) for face, image in zip(faces, pictures, strict=True)]
             shape = triangles_from_surfaces(sides, origins[used : used + len(faces)])
-            shape = replace(shape, surface=shape.surface + used)
-            self._limbs.append(_Limb(joint=joint, triangles=shape, carried=True))
+            out.append((joint, replace(shape, surface=shape.surface + used)))
             used += len(faces)
-
-    def visible_from(self, mount: Mount, skeleton: SkeletonModel) -> Wearer:
-        """Return the body without the limb on which a camera is mounted, if the camera is inside this limb.
-
-        Otherwise the limb would block the view of the camera. A real camera has a free view, because its
-        housing presses the cloth in.
-        """
-        joint = skeleton.index_of_role(mount.role)
-        centre = mount.joint_from_cam[:3, 3]
-        kept = object.__new__(Wearer)
-        kept._bones, kept.images = self._bones, self.images
-        kept._boxes = self._boxes
-        kept._limbs = [
-            limb
-            for limb, (_, start, end, radii, _) in zip(self._limbs, self._bones, strict=False)
-            if limb.joint != joint or _distance_to_segment(centre, start, end) > max(radii) + _CLEARANCE_M
-        ]
-        kept._limbs += [limb for limb in self._limbs if limb.carried]
-        return kept
-
-    @property
-    def parts(self) -> list[tuple[int, Triangles]]:
-        """The joint of each limb, and the limb's triangles in the frame of this joint."""
-        return [(limb.joint, limb.triangles) for limb in self._limbs]
-
-    def at(self, world_from_joint: FloatArray) -> Triangles:
-        """Return the triangles of all limbs in the world frame.
-
-        Args:
-            world_from_joint: (J,4,4) poses of the joints.
-        """
-        parts = [_triangles_in_world(limb.triangles, world_from_joint[limb.joint]) for limb in self._limbs]
-        starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-        return Triangles(
-            vertices=np.concatenate([part.vertices for part in parts]),
-            faces=np.concatenate(
-                [part.faces + np.uint32(start) for part, start in zip(parts, starts, strict=True)]
-            ),
-            normal=np.concatenate([part.normal for part in parts]),
-            point=np.concatenate([part.point for part in parts]),
-            texel_at_point=np.concatenate([part.texel_at_point for part in parts]),
-            texels_per_m=np.concatenate([part.texels_per_m for part in parts]),
-            plane=np.arange(sum(len(part.faces) for part in parts)),
-            surface=np.concatenate([part.surface for part in parts]),
-            gain=np.concatenate([part.gain for part in parts]),
-        )
+        return out
 
 
 def _box_in_hand(skeleton: SkeletonModel, side: str) -> tuple[int, list[Surface]]:
@@ -208,10 +159,10 @@ def _find_bones(skeleton: SkeletonModel) -> list[_Bone]:
     return out
 
 
-def _distance_to_segment(point: FloatArray, start: FloatArray, end: FloatArray) -> float:
-    """Return the distance between a point (3,) and a line segment with the ends `start` and `end` (3,)."""
+def _is_inside(point: FloatArray, start: FloatArray, end: FloatArray, radii: tuple[float, float]) -> bool:
+    """Return True if a point (3,) is inside a limb between two points (3,), or near its surface."""
     ratio = np.clip((point - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
-    return float(np.linalg.norm(point - start - ratio * (end - start)))
+    return bool(np.linalg.norm(point - start - ratio * (end - start)) <= max(radii) + _CLEARANCE_M)
 
 
 def _rounded_cone(
@@ -284,24 +235,6 @@ def _textured_triangles(vertices: FloatArray, texels: FloatArray, faces: FloatAr
         texels_per_m=gradient / area2[:, None, None],
         plane=np.arange(int(keep.sum())),
         surface=np.full(int(keep.sum()), index),
-        gain=np.ones(int(keep.sum()), np.float32),
-    )
-
-
-def _triangles_in_world(limb: Triangles, world_from_joint: FloatArray) -> Triangles:
-    """Return a limb in the world frame. Its brightness corresponds to light from above."""
-    turn, shift = world_from_joint[:3, :3], world_from_joint[:3, 3]
-    normal = limb.normal @ turn.T
-    return Triangles(
-        vertices=limb.vertices @ turn.T + shift,
-        faces=limb.faces,
-        normal=normal,
-        point=limb.point @ turn.T + shift,
-        texel_at_point=limb.texel_at_point,
-        texels_per_m=limb.texels_per_m @ turn.T,
-        plane=limb.plane,
-        surface=limb.surface,
-        gain=(0.75 + 0.25 * normal[:, 2]).astype(np.float32),
     )
 
 

@@ -9,7 +9,8 @@ import socket
 import threading
 import traceback
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from bodycap_batch.core.errors import (
@@ -22,14 +23,45 @@ from bodycap_batch.core.errors import (
     one_line,
 )
 from bodycap_batch.pipeline import Settings, run_job
+from bodycap_batch.runner import CHILD_COMMAND
 from bodycap_batch.runner.turns import Turns
 from bodycap_batch.store.artefacts import Store, disk_error, store_error
 from bodycap_batch.store.references import StoreBusy, moving
-from bodycap_batch.watch.dropped_job import make_result_paths_relative, read_job
+from bodycap_batch.watch.dropped_job import JobPermissions, make_result_paths_relative, read_job
 from bodycap_batch.watch.inbox_claim import path_exists
 from bodycap_batch.watch.job_status import FINAL, JobStatusFile, State, append_log, read_status, utc_text
 from bodycap_batch.watch.spool import RUNNING, JobDir, Spool, move_to_free_name
-from bodycap_batch.watch.watch_options import WatchOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WatchOptions:
+    """Options of a watcher. The options do not change the results of a job.
+
+    Attributes:
+        permissions: Which folders a job may read, and the maximum size of a job.
+        store: Folder of the artefacts; None for the folder ``.store`` beside `running`.
+        jobs: Maximum number of jobs that run at the same time.
+        threads: Number of processor cores that all running jobs share.
+        memory_mb: Memory limit (MB) of one task; None for four fifths of the machine's memory.
+        unchanged_s: Time (seconds) for which an entry must not change before it is treated as complete.
+        retry_s: Time (seconds) until a job or an entry that a disk failure stopped is tried again. With
+            `once`, also the maximum time for which the watcher waits for a missing disk.
+        require: What the results of jobs that state no requirement must reach, such as ``good,0.9``.
+        once: True: stop when nothing is left to do.
+        command: Command line that starts the child process of a job.
+    """
+
+    permissions: JobPermissions = field(default_factory=JobPermissions)
+    store: Path | None = None
+    jobs: int = 1
+    threads: int = 1
+    memory_mb: int | None = None
+    unchanged_s: float = 10.0
+    retry_s: float = 60.0
+    require: str | None = None
+    once: bool = False
+    command: Sequence[str] = CHILD_COMMAND
+
 
 _MAX_DISK_FAILURES = 5
 """Maximum number of counted disk failures of a job. After one more failure, the job ends as failed. A failure

@@ -238,7 +238,7 @@ def _frames_that_see(
         settings["motion"] = motions / Path(settings["motion"]).name
     options = SynthOptions.model_validate(settings)
     renderer = build_renderers(options, draw_subject(options))[0]
-    surfaces = RayScene(renderer.room.vertices, renderer.room.faces)
+    surfaces = renderer.scene.parts[0].scene
     own = [path for name, path in paths.items() if name in matched and path.gauge == scene_map.gauge]
     in_map = np.concatenate([path.gauge_from_cam[path.localised, :3, 3] for path in own])
     true = np.concatenate([truth[path.camera].world_from_cam[path.localised, :3, 3] for path in own])

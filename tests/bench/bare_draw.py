@@ -12,9 +12,9 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.synthetic import SynthOptions
-from bodycap_batch.synthetic.camera_renderer import camera_poses_at
 from bodycap_batch.synthetic.lens import ray_grid
 from bodycap_batch.synthetic.making import draw_subject, walked_extent_m
+from bodycap_batch.synthetic.moving_body import camera_poses_at
 from bodycap_batch.synthetic.room import HEIGHT_M, half_size_m
 
 CAMERAS = ("torso", "left_palm", "right_palm")

@@ -21,9 +21,9 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.model.geometry import make_transform, so3_exp
-from bodycap_batch.synthetic.camera_renderer import camera_poses_at
 from bodycap_batch.synthetic.making import Subject, draw_subject
 from bodycap_batch.synthetic.measured import disturb_poses
+from bodycap_batch.synthetic.moving_body import camera_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 
 WRONG_S = 0.100
@@ -152,8 +152,8 @@ def _measured(
         gap_frames=(3, max(4, int(0.6 * fps))),
     )
     true = camera_poses_at(subject.motion, subject.mounts[index], times_s + start_s)
-    measured = disturb_poses(true, options, rng)
-    return times_s[measured.present], measured.world_from_cam[measured.present].copy()
+    measured, present = disturb_poses(true, options, rng)
+    return times_s[present], measured[present].copy()
 
 
 def stored_paths(folder: Path) -> list[CameraPath]:

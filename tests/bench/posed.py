@@ -14,9 +14,9 @@ from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.model.skeleton import Mount
-from bodycap_batch.synthetic.camera_renderer import MovingBody, camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.making import Subject, draw_subject, frame_times_ns
 from bodycap_batch.synthetic.measured import disturb_poses
+from bodycap_batch.synthetic.moving_body import MovingBody, camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.truth import common_ticks_ns, seconds_from_ns
 
@@ -104,8 +104,8 @@ def _trajectory(
         subject.motion, mount, seconds_from_ns(times_ns) + options.offsets_s.get(mount.camera, 0.0)
     )
     seed = [options.cameras.index(mount.camera), *subject.seeds["poses"].generate_state(4).tolist()]
-    seen = disturb_poses(true, options, np.random.default_rng(seed))
-    hidden = ~seen.present[:, None, None]
+    seen, present = disturb_poses(true, options, np.random.default_rng(seed))
+    hidden = ~present[:, None, None]
     sigmas = np.repeat(
         [np.radians(options.pose_sigma_deg), options.pose_sigma_m * map_from_world.scale], 3
     ).astype(np.float64)
@@ -114,11 +114,9 @@ def _trajectory(
         gauge=name,
         frame_numbers=np.arange(len(times_ns)),
         times_ns=times_ns,
-        gauge_from_cam=np.where(hidden, np.nan, map_from_world.apply_to_poses(seen.world_from_cam)),
+        gauge_from_cam=np.where(hidden, np.nan, map_from_world.apply_to_poses(seen)),
         covariance=np.where(hidden, np.nan, np.diag(sigmas**2)),
-        status=tuple(
-            FrameStatus.REGISTERED if present else FrameStatus.FEW_TRACKS for present in seen.present
-        ),
-        inliers=np.where(seen.present, 60, 0),
-        error_px=np.where(seen.present, 0.5, np.nan),
+        status=tuple(FrameStatus.REGISTERED if is_seen else FrameStatus.FEW_TRACKS for is_seen in present),
+        inliers=np.where(present, 60, 0),
+        error_px=np.where(present, 0.5, np.nan),
     )

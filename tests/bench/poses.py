@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from bodycap_batch import Result
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.evaluate.association import interpolate_truth
+from bodycap_batch.evaluate.trajectories import interpolate_truth
 from bodycap_batch.formats.tum import TimedPoses, read_tum
 from bodycap_batch.model.geometry import (
     Similarity,
@@ -32,7 +32,6 @@ from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.tasks.loading import load_registration
 
 _SOLVERS = ("registration", "recover", "rig")
-_MAX_GAP_S = 0.1
 _LEAST_POSES = 3
 _INSIDE = 0.95
 _MAX_UNEVEN = 0.15
@@ -102,7 +101,7 @@ def _with_truth(
         file = truth / f"{name}.tum" if truth.is_dir() else truth
         if not file.exists() or path.gauge != gauges.most_common(1)[0][0]:
             continue
-        true, found = interpolate_truth(read_tum(file), path.times_ns, _MAX_GAP_S)
+        true, found = interpolate_truth(read_tum(file), path.times_ns)
         scored = np.asarray(path.localised & found)
         if scored.any():
             known.append((path, scored))

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
 import tempfile
 import time
@@ -192,7 +193,8 @@ def run_case(case: Case, work: Path, height_m: float | None = None) -> dict[str,
 
     folder = work / f"{case.cameras}-{case.seed}-{case.t_pose}-{case.shifted}"
     context = StageContext(work_dir=work)
-    synthesise(case.options(), folder, context, overwrite=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    synthesise(case.options(), folder, context)
     inputs = load_inputs(folder, height_m)
     started = time.process_time()
     result = merge_trajectories(inputs, MergeOptions(), context)

@@ -30,7 +30,7 @@ from bodycap_batch.model.geometry import make_transform, rotation_angle_rad, so3
 from bodycap_batch.model.merge_data import MergeInputs, MergeResult
 from bodycap_batch.model.skeleton import MountSlip, SkeletonModel
 from bodycap_batch.synthetic import SynthOptions
-from bodycap_batch.synthetic.camera_renderer import MovingBody
+from bodycap_batch.synthetic.moving_body import MovingBody
 from tests.bench.posed import GAUGE, Posed, posed
 from tests.bench.rows import DATA
 from tests.bench.scale import length_s

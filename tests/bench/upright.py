@@ -26,7 +26,7 @@ from bodycap_batch.inertial.camera_sensor import use_sensor
 from bodycap_batch.model.gravity import fit_gravity
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
-from bodycap_batch.synthetic.camera_renderer import MovingBody, camera_poses_at
+from bodycap_batch.synthetic.moving_body import MovingBody, camera_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 from tests.bench import posed
 from tests.inertial import Sensor

@@ -28,7 +28,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, runs
 from bodycap_batch.model.geometry import align_points, make_transform, rotation_from_quat_xyzw
 from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.synthetic.imu import write_imu
-from bodycap_batch.synthetic.imu_options import ImuOptions
+from bodycap_batch.synthetic.options import ImuOptions
 from tests.bench import ours
 from tests.bench.rows import Row
 

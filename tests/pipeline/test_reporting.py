@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bodycap_batch.cli.view import _StoredMarks
+from bodycap_batch.cli.look import _StoredMarks
 from bodycap_batch.pipeline import Settings, stored_for_report
 from bodycap_batch.store.artefacts import Store
 from tests.pipeline.test_run import CAMERAS, Bench

@@ -21,10 +21,10 @@ from bodycap_batch.core.progress import Event
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.checked_json import checked_json, parse_checked_json
 from bodycap_batch.watch import Watcher, active_watcher, inbox_claim, job_rows, job_worker
-from bodycap_batch.watch.access_failures import AccessFailures
 from bodycap_batch.watch.job_status import JobStatusFile, read_status
 from bodycap_batch.watch.job_worker import JobWorker
 from bodycap_batch.watch.spool import JobDir
+from bodycap_batch.watch.watcher import AccessFailures
 from bodycap_batch.watch.watcher_status import WatcherStatusFile
 from tests.pipeline.spools import SpoolFixture, wait_for
 

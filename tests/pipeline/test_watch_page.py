@@ -175,7 +175,7 @@ def test_a_result_that_cannot_be_read_is_an_error_of_the_disk(
     def fail(*_: object) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr("bodycap_batch.watch.web.app._file_in", fail)
+    monkeypatch.setattr("bodycap_batch.watch.web.app._file_response", fail)
     code, data, _ = client.ask("GET", "/results/walk/metrics.json")
     assert (code, json.loads(data)["message"]) == (507, "Input/output error")
 

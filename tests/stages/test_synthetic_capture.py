@@ -25,11 +25,11 @@ from bodycap_batch.synthetic.clocks import true_clocks
 TINY = {"width": 64, "height": 48, "seconds": 0.3, "cameras": ("torso", "left_palm")}
 
 
-def _make(folder, progress=None, cancelled=None, overwrite=False, **values):
+def _make(folder, progress=None, cancelled=None, **values):
     hooks = {"progress": progress} if progress else {}
     hooks |= {"cancelled": cancelled} if cancelled else {}
     context = StageContext(work_dir=folder.parent, threads=2, **hooks)
-    synthesise(SynthOptions(**{**TINY, **values}), folder, context, overwrite=overwrite)
+    synthesise(SynthOptions(**{**TINY, **values}), folder, context)
     return folder
 
 
@@ -346,18 +346,7 @@ def test_a_folder_in_use_is_not_changed(capture, tmp_path):
     (tmp_path / "mine" / "thesis.txt").write_text("important")
     with pytest.raises(JobError, match="exists already"):
         _make(tmp_path / "mine")
-    with pytest.raises(JobError, match="not a synthetic capture"):
-        _make(tmp_path / "mine", overwrite=True)
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
-
-
-def test_an_earlier_capture_is_replaced_on_request(tmp_path):
-    _make(tmp_path / "c", poses_only=True)
-    with pytest.raises(JobError, match="exists already"):
-        _make(tmp_path / "c", poses_only=True)
-    _make(tmp_path / "c", poses_only=True, overwrite=True, cameras=("head",))
-    assert [path.name for path in (tmp_path / "c" / "poses").iterdir()] == ["head.tum"]
-    assert [path.name for path in tmp_path.iterdir()] == ["c"]
 
 
 def test_a_disk_that_refuses_a_file_is_reported(tmp_path):

@@ -5,7 +5,7 @@ import json
 import av
 import numpy as np
 
-from bodycap_batch.evaluate.association import interpolate_truth
+from bodycap_batch.evaluate.trajectories import interpolate_truth
 from bodycap_batch.formats.frame_table import COLUMNS
 from bodycap_batch.formats.tum import TimedPoses
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
@@ -201,7 +201,7 @@ def test_a_measured_truth_has_errors_of_its_own():
     times_ns = np.round(frame_s * 1e9).astype(np.int64)
     estimates = noisy(poses_at(frame_s + 0.008), 0.5 * sigma)
     stated = np.tile(np.diag((0.5 * sigma) ** 2), (300, 1, 1))
-    true, _ = interpolate_truth(truth, times_ns, 0.1)
+    true, _ = interpolate_truth(truth, times_ns)
     assert poses.figures(poses.least_errors(estimates, true, stated), stated)["pose_inside"] < 0.2
     measured = poses.MeasuredTruth.create(truth, times_ns)
     stated = stated + measured.noise

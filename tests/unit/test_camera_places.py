@@ -13,8 +13,8 @@ from bodycap_batch.clocks.registered_paths import clocks_from_paths
 from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.geometry import Similarity, make_transform
 from bodycap_batch.model.scene import FrameStatus, Trajectory
-from bodycap_batch.synthetic.camera_renderer import camera_poses_at
 from bodycap_batch.synthetic.making import draw_subject
+from bodycap_batch.synthetic.moving_body import camera_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 
 PLACES = ("torso", "left_palm", "right_palm")

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import MutableHeaders
+from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import (
     FileResponse,
@@ -36,7 +38,7 @@ from bodycap_batch.watch.web.questions import questions_about, write_answers
 from bodycap_batch.watch.web.uploads import Uploads, is_accepted
 
 if TYPE_CHECKING:
-    from starlette.types import ASGIApp, Receive, Scope, Send
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 _PAGE_FOLDER = Path(__file__).with_name("page")
 _UPDATE_PERIOD_S = 1.0
@@ -45,12 +47,12 @@ Evidence: none."""
 _KEEP_ALIVE_S = 15.0
 """Maximum time (seconds) without data on an event stream. After this time the server sends a comment, which
 keeps the connection open. Evidence: none."""
-_MAX_JSON_BYTES = 4096
-"""Maximum size (bytes) of a request's JSON document. The document holds only a name. Evidence: none."""
-_MAX_NAMES_BYTES = 1 << 20
-"""Maximum size (bytes) of a JSON document with the names of all files of a folder. Evidence: none."""
+_MAX_JSON_BYTES = 1 << 20
+"""Maximum size (bytes) of a request's JSON document. The longest ones hold the names of all files of a
+folder. Evidence: none."""
 _NO_SUCH_PATH = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP)
 """Error numbers (errno) that mean that a path does not exist or cannot exist."""
+_NOT_FOUND = "not found\n"
 _PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
     "media-src 'self' blob:; "
@@ -115,18 +117,24 @@ class _AccessControl:
         """Check one request, and answer it or pass it to the page."""
         if scope["type"] != "http":
             return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(_COMMON_HEADERS)
+            await send(message)
+
         request = Request(scope)
         query = request.url.query
         refusal = self._access.refusal(request.method, dict(request.headers), query)
         if refusal is not None:
             code, reason = refusal
-            await PlainTextResponse(f"{reason}\n", code, headers=_COMMON_HEADERS)(scope, receive, send)
+            await PlainTextResponse(f"{reason}\n", code)(scope, receive, send_with_headers)
         elif request.url.path == "/" and self._access.token_in(query):
-            response = RedirectResponse("/", 303, headers=_COMMON_HEADERS)
+            response = RedirectResponse("/", 303)
             response.set_cookie(COOKIE, self._access.token, httponly=True, samesite="strict")
-            await response(scope, receive, send)
+            await response(scope, receive, send_with_headers)
         else:
-            await self._app(scope, receive, send)
+            await self._app(scope, receive, send_with_headers)
 
 
 class _Routes:
@@ -138,80 +146,69 @@ class _Routes:
         self._stopped = stopped
         self._job_list = job_list
 
-    async def index(self, _: Request) -> Response:
-        return self._static("index.html")
+    # Starlette calls functions that are not asynchronous in a thread, because they read the disk.
 
-    async def asset(self, request: Request) -> Response:
+    def index(self, _: Request) -> Response:
+        return _static("index.html")
+
+    def asset(self, request: Request) -> Response:
         name = request.path_params["name"]
-        return self._static(name) if name in ("page.js", "page.css") else _not_found()
+        if name not in ("page.js", "page.css"):
+            raise _not_found()
+        return _static(name)
 
-    async def jobs(self, _: Request) -> Response:
-        text = await run_in_threadpool(self._job_list.json_text)
-        return Response(text, media_type="application/json", headers=_COMMON_HEADERS)
+    def jobs(self, _: Request) -> Response:
+        return Response(self._job_list.json_text(), media_type="application/json")
 
     async def events(self, request: Request) -> Response:
-        return StreamingResponse(
-            self._changes(request), media_type="text/event-stream", headers=_COMMON_HEADERS
-        )
+        return StreamingResponse(self._changes(request), media_type="text/event-stream")
 
-    async def log(self, request: Request) -> Response:
-        job = await run_in_threadpool(self._job, request)
-        return (
-            PlainTextResponse(await run_in_threadpool(read_log_end, job), headers=_COMMON_HEADERS)
-            if job
-            else _not_found()
-        )
+    def log(self, request: Request) -> Response:
+        return PlainTextResponse(read_log_end(self._job(request)))
 
-    async def files(self, request: Request) -> Response:
-        job = await run_in_threadpool(self._job, request)
-        return (
-            JSONResponse(await run_in_threadpool(list_result_files, job), headers=_COMMON_HEADERS)
-            if job
-            else _not_found()
-        )
+    def files(self, request: Request) -> Response:
+        return JSONResponse(list_result_files(self._job(request)))
 
-    async def result(self, request: Request) -> Response:
+    def result(self, request: Request) -> Response:
         """Return one file from a job's folder of results. Files outside this folder are not found."""
-        job = await run_in_threadpool(self._job, request)
-        return _not_found() if job is None else await _file_response(job.result, request)
+        return _file_response(self._job(request).result, request)
 
-    async def input_video(self, request: Request) -> Response:
+    def input_video(self, request: Request) -> Response:
         """Return one video of a job, which the page shows where it asks for the place of the camera."""
-        job = await run_in_threadpool(self._job, request)
-        if job is None or Path(request.path_params["file"]).suffix.lower() not in VIDEO_SUFFIXES:
-            return _not_found()
-        return await _file_response(job.input, request)
+        if Path(request.path_params["file"]).suffix.lower() not in VIDEO_SUFFIXES:
+            raise _not_found()
+        return _file_response(self._job(request).input, request)
 
     async def retry(self, request: Request) -> Response:
-        answers = await _read_small_json(request, _MAX_NAMES_BYTES)
-        job = await run_in_threadpool(self._job, request)
+        answers = await _read_small_json(request)
+        job = await run_in_threadpool(self._spool.find, request.path_params["name"])
         if job is not None and job.path.parent == self._spool.failed:
             await run_in_threadpool(write_answers, job.input, answers)
         path = await run_in_threadpool(retry_job, self._spool, request.path_params["name"])
-        return JSONResponse({"name": path.name}, headers=_COMMON_HEADERS)
+        return JSONResponse({"name": path.name})
 
-    async def cancel(self, request: Request) -> Response:
-        await run_in_threadpool(cancel_job, self._spool, request.path_params["name"])
-        return JSONResponse({}, headers=_COMMON_HEADERS)
+    def cancel(self, request: Request) -> Response:
+        cancel_job(self._spool, request.path_params["name"])
+        return JSONResponse({})
 
     async def questions(self, request: Request) -> Response:
         """Return what the page asks about a folder before the folder is sent."""
-        body = await _read_small_json(request, _MAX_NAMES_BYTES)
+        body = await _read_small_json(request)
         given = body.get("names")
         names = [str(name) for name in given] if isinstance(given, list) else []
         found = {**questions_about(names), "ignored": [name for name in names if not is_accepted(name)]}
-        return JSONResponse(found, headers=_COMMON_HEADERS)
+        return JSONResponse(found)
 
     async def check_answers(self, request: Request) -> Response:
         """Check the height, so that the page can ask again before it sends the videos."""
-        height = str((await _read_small_json(request, _MAX_NAMES_BYTES)).get("height") or "").strip()
+        height = str((await _read_small_json(request)).get("height") or "").strip()
         metres = height_from_text(height) if height else None
-        return JSONResponse({"height_m": metres}, headers=_COMMON_HEADERS)
+        return JSONResponse({"height_m": metres})
 
     async def start_upload(self, request: Request) -> Response:
         body = await _read_small_json(request)
         key = await run_in_threadpool(self._uploads.start, str(body.get("name", "")))
-        return JSONResponse({"key": key}, headers=_COMMON_HEADERS)
+        return JSONResponse({"key": key})
 
     async def write_upload(self, request: Request) -> Response:
         size = request.headers.get("content-length", "")
@@ -222,24 +219,22 @@ class _Routes:
             await self._uploads.write(key, name, int(size), request.stream())
         except ClientDisconnect:  # the browser can no longer receive an error message
             return Response(status_code=400)
-        return JSONResponse({}, headers=_COMMON_HEADERS)
+        return JSONResponse({})
 
     async def finish_upload(self, request: Request) -> Response:
-        answers = await _read_small_json(request, _MAX_NAMES_BYTES)
+        answers = await _read_small_json(request)
         name = await run_in_threadpool(self._uploads.finish, request.path_params["key"], answers)
-        return JSONResponse({"name": name}, headers=_COMMON_HEADERS)
+        return JSONResponse({"name": name})
 
-    async def discard_upload(self, request: Request) -> Response:
-        await run_in_threadpool(self._uploads.discard, request.path_params["key"])
-        return JSONResponse({}, headers=_COMMON_HEADERS)
+    def discard_upload(self, request: Request) -> Response:
+        self._uploads.discard(request.path_params["key"])
+        return JSONResponse({})
 
-    def _job(self, request: Request) -> JobDir | None:
-        return self._spool.find(request.path_params["name"])
-
-    def _static(self, name: str) -> Response:
-        return FileResponse(
-            _PAGE_FOLDER / name, headers={**_COMMON_HEADERS, "content-security-policy": _PAGE_POLICY}
-        )
+    def _job(self, request: Request) -> JobDir:
+        job = self._spool.find(request.path_params["name"])
+        if job is None:
+            raise _not_found()
+        return job
 
     async def _changes(self, request: Request) -> AsyncIterator[str]:
         """Yield the list of all jobs as a server-sent event whenever a job has changed."""
@@ -256,34 +251,29 @@ class _Routes:
             silent_s += _UPDATE_PERIOD_S
 
 
-async def _file_response(folder: Path, request: Request) -> Response:
+def _static(name: str) -> Response:
+    return FileResponse(_PAGE_FOLDER / name, headers={"content-security-policy": _PAGE_POLICY})
+
+
+def _file_response(folder: Path, request: Request) -> Response:
     """Return one file of a folder. Files outside this folder are not found."""
-    path = await run_in_threadpool(_file_in, folder, request.path_params["file"])
-    if path is None:
-        return _not_found()
-    return FileResponse(
-        path,
-        headers={**_COMMON_HEADERS, "content-security-policy": _RESULT_POLICY},
-        # Because `stat_result` is given, the response raises `FileNotFoundError` if the job's folder is
-        # moved before the file is opened.
-        stat_result=await run_in_threadpool(path.stat),
-    )
-
-
-def _file_in(folder: Path, name: str) -> Path | None:
-    """Return the path of a file in a folder; None if there is no such file."""
     try:
-        path = (folder / name).resolve()
+        path = (folder / request.path_params["file"]).resolve()
     except (ValueError, RuntimeError):  # the name holds a NUL character, or links form a circle
-        return None
-    return path if path.is_relative_to(folder.resolve()) and path.is_file() else None
+        raise _not_found() from None
+    if not path.is_relative_to(folder.resolve()) or not path.is_file():
+        raise _not_found()
+    # Because `stat_result` is given, the response raises `FileNotFoundError` if the job's folder is moved
+    # before the file is opened.
+    headers = {"content-security-policy": _RESULT_POLICY}
+    return FileResponse(path, headers=headers, stat_result=path.stat())
 
 
-async def _read_small_json(request: Request, max_bytes: int = _MAX_JSON_BYTES) -> dict[str, Any]:
+async def _read_small_json(request: Request) -> dict[str, Any]:
     body = b""
     async for chunk in request.stream():
         body += chunk
-        if len(body) > max_bytes:
+        if len(body) > _MAX_JSON_BYTES:
             return {}
     try:
         found = json.loads(body)
@@ -296,16 +286,16 @@ async def _error_response(_: Request, error: Exception) -> Response:
     """Return an error in the form that the page can show."""
     assert isinstance(error, BodycapError)
     code = 507 if isinstance(error, StoreError) else 413 if isinstance(error, CaptureError) else 400
-    return JSONResponse({"message": error.message, "hint": error.hint}, code, headers=_COMMON_HEADERS)
+    return JSONResponse({"message": error.message, "hint": error.hint}, code)
 
 
 async def _os_error_response(spool: Spool, request: Request, error: Exception) -> Response:
     """Return 404 if a path does not exist or cannot exist, and otherwise the error of the disk."""
     assert isinstance(error, OSError)
     if error.errno in _NO_SUCH_PATH:
-        return _not_found()
+        return PlainTextResponse(_NOT_FOUND, 404)
     return await _error_response(request, store_error(error, spool.root))
 
 
-def _not_found() -> Response:
-    return PlainTextResponse("not found\n", 404, headers=_COMMON_HEADERS)
+def _not_found() -> HTTPException:
+    return HTTPException(404, _NOT_FOUND)

@@ -17,8 +17,8 @@ from bodycap_batch import Result
 from bodycap_batch.config.calibration import read_calibration
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import BodycapError
-from bodycap_batch.evaluate import TrajectoryOptions, relative_camera_error
-from bodycap_batch.evaluate.association import interpolate_truth
+from bodycap_batch.evaluate import relative_camera_error
+from bodycap_batch.evaluate.trajectories import interpolate_truth
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import Similarity, align_points, nearest_rotation, rotation_angle_rad
@@ -35,7 +35,6 @@ the noise of a truth from glasses, and 2 % of the diagonal, the drift of a truth
 MAX_WRONG, MIN_RIGHT = 0.02, 0.9
 """A result is wrong if more than 2 % of its posed frames are wrong. It is right if at least 90 % of all
 frames are right and it is not wrong."""
-_MAX_GAP_S = 0.1
 _PARTS = 4
 """Number of parts of each path that the alignment by the majority starts from."""
 _STARTS = 64
@@ -121,7 +120,7 @@ def read_paths(results: Path, truth: Path) -> Paths | None:
         if not known.exists():
             continue
         mine = path.poses
-        true, found = interpolate_truth(read_tum(known), mine.times_ns, _MAX_GAP_S)
+        true, found = interpolate_truth(read_tum(known), mine.times_ns)
         parts.append(
             (np.full(found.sum(), name), mine.times_ns[found], mine.world_from_cam[found], true[found])
         )
@@ -214,7 +213,7 @@ def palm_error_m(results: Path, truth: Path, reference: str) -> float | None:
     for name in sorted(set(estimates) - {reference}):
         try:
             truths = {each: read_tum(truth / f"{each}.tum") for each in (name, reference)}
-            found = relative_camera_error(estimates, truths, name, reference, TrajectoryOptions())
+            found = relative_camera_error(estimates, truths, name, reference)
             errors.append(found.vector_m.mean)
         except BodycapError:
             continue

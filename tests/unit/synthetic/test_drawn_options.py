@@ -6,20 +6,21 @@ import pytest
 
 from bodycap_batch.formats.mp4_writer import VideoWriter
 from bodycap_batch.model.geometry import rotation_angle_rad
-from bodycap_batch.synthetic.camera_renderer import AutoExposure, Sensor, camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.lens import ray_grid
 from bodycap_batch.synthetic.making import draw_subject
+from bodycap_batch.synthetic.moving_body import camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.raycast import NOTHING, RayScene
-from bodycap_batch.synthetic.room import RoomLayout, build_room
-from bodycap_batch.synthetic.triangle_renderer import triangles_from_surfaces
+from bodycap_batch.synthetic.room import build_room
+from bodycap_batch.synthetic.sensor import AutoExposure, Sensor
+from bodycap_batch.synthetic.triangles import triangles_from_surfaces
 from bodycap_batch.synthetic.wearer import Wearer
 
 SMALL = {"width": 64, "height": 48, "seconds": 8.0, "body_in_view": True, "mount_sigma_m": 0.01}
 
 
-def _room(**layout):
-    surfaces = build_room((1.8, 1.5), 10.0, np.random.SeedSequence(1), layout=RoomLayout(**layout))
+def _room(**options):
+    surfaces = build_room((1.8, 1.5), 10.0, np.random.SeedSequence(1), SynthOptions(**options))
     return [surface for surface in surfaces if not surface.shines]
 
 
@@ -36,7 +37,7 @@ def test_texture_fades_furniture_and_takes_pictures_away():
 
 @pytest.mark.parametrize(("repeats", "quarters"), [("bays_90", 1), ("bays_180", 2), ("two_rooms", 2)])
 def test_a_turned_room_is_the_same_room(repeats, quarters):
-    surfaces = _room(repeats=repeats)
+    surfaces = _room(room=repeats)
     turn = np.linalg.matrix_power(np.array([[0.0, -1.0, 0], [1.0, 0, 0], [0, 0, 1.0]]), quarters)
     frames = np.array([[each.corner, each.across, each.down] for each in surfaces])
     turned = frames @ turn.T
@@ -52,7 +53,7 @@ def test_a_turned_room_is_the_same_room(repeats, quarters):
 
 
 def test_a_wall_between_two_rooms_has_openings_where_the_walk_passes():
-    surfaces = _room(repeats="two_rooms")
+    surfaces = _room(room="two_rooms")
     triangles = triangles_from_surfaces(surfaces, np.zeros((len(surfaces), 2)))
     scene = RayScene(triangles.vertices, triangles.faces)
     heights = [(y, z) for y in (-2.5, -0.7, 0.0, 1.4, 2.5) for z in (1.2, 2.4)]
@@ -63,7 +64,7 @@ def test_a_wall_between_two_rooms_has_openings_where_the_walk_passes():
 
 
 def test_bays_along_a_wall_are_shifted_copies():
-    surfaces = _room(repeats="bays_along")
+    surfaces = _room(room="bays_along")
     north = max(each.corners()[:, 1].max() for each in surfaces)
     near = [each for each in surfaces if each.corners()[:, 1].mean() > north - 0.4]
     first = [np.array([each.corner, each.across, each.down]) for each in near]
@@ -115,8 +116,7 @@ def _shares(options, camera, times_s, joints=None):
     mount = next(mount for mount in subject.mounts if mount.camera == camera)
     sides = tuple(side.capitalize() for side in options.carried_s)
     wearer = Wearer(skeleton, np.random.SeedSequence(1), carrying=sides)
-    wearer.place_textures(np.zeros((len(wearer.images), 2)))
-    seen = wearer.visible_from(mount, skeleton).parts
+    seen = wearer.parts(np.zeros((len(wearer.images), 2)), mount)
     rays = ray_grid(options.camera()).in_cam[::2, ::2].reshape(-1, 3)
     out = []
     for t_s in times_s:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from bodycap_batch.synthetic import SynthOptions
-from bodycap_batch.synthetic.camera_renderer import joint_poses_at
-from bodycap_batch.synthetic.footsteps import footstep_times
+from bodycap_batch.synthetic.camera_sounds import footstep_times
 from bodycap_batch.synthetic.making import draw_subject
+from bodycap_batch.synthetic.moving_body import joint_poses_at
 from bodycap_batch.synthetic.sound import make_scene
 
 

@@ -4,11 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from bodycap_batch.synthetic.camera_renderer import camera_poses_at, joint_poses_at
 from bodycap_batch.synthetic.making import build_renderers, draw_subject
+from bodycap_batch.synthetic.moving_body import joint_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
-from bodycap_batch.synthetic.room import HEIGHT_M, BareSurfaces, build_room
-from bodycap_batch.synthetic.triangle_renderer import SceneRenderer
+from bodycap_batch.synthetic.room import HEIGHT_M, build_room
 from bodycap_batch.synthetic.wearer import Wearer
 
 SMALL = {"width": 64, "height": 48, "seconds": 5.0, "body_in_view": True}
@@ -22,11 +21,10 @@ def _body_ratios(options, camera, times_s):
     )
     shares = []
     for t_s in times_s:
-        at = np.array([t_s])
-        body = SceneRenderer(renderer.wearer.at(joint_poses_at(renderer.motion, at)[0]), renderer.atlas)
-        pose = camera_poses_at(renderer.motion, renderer.mount, at)[0]
-        image = body.image(renderer.grid, pose, slice(0, options.height))
-        shares.append(float((image.max(axis=-1) > 0).mean()))
+        _, poses = renderer._part_from_cam(np.array([t_s]))
+        _, hits = renderer.scene.sharp(renderer.grid, poses.transpose(1, 0, 2, 3), renderer._gain(t_s))
+        # The first part is the room.
+        shares.append(float((renderer.scene.part_of_face[hits.faces] > 0).mean()))
     return np.array(shares)
 
 
@@ -98,7 +96,7 @@ def test_patterned_clothes_have_many_corners_and_plain_ones_few():
 
 def test_a_bare_room_has_pictures_on_its_walls_only():
     seed = np.random.SeedSequence(1)
-    surfaces = build_room((1.0, 1.0), 20.0, seed, furnished=False, repeated_posters=True)
+    surfaces = build_room((1.0, 1.0), 20.0, seed, SynthOptions(furnished=False, repeated_posters=True))
     hanging = [surface for surface in surfaces[6:] if not surface.shines]
     assert len(hanging) >= 8
     assert {surface.image.shape for surface in hanging} == {(21, 16, 3)}
@@ -111,8 +109,7 @@ def test_a_bare_room_has_pictures_on_its_walls_only():
 @pytest.mark.parametrize("name", ["ceiling", "floor", "east"])
 def test_a_bare_surface_has_only_its_flat_pictures(name):
     seed = np.random.SeedSequence(1)
-    bare = BareSurfaces(names=frozenset({name}), pictures=4)
-    surfaces = build_room((1.0, 1.0), 20.0, seed, bare=bare)
+    surfaces = build_room((1.0, 1.0), 20.0, seed, SynthOptions(bare=(name,), flat_pictures=4))
     normal = {"ceiling": (0, 0, -1), "floor": (0, 0, 1), "east": (-1, 0, 0)}[name]
     place = {"ceiling": HEIGHT_M, "floor": 0.0, "east": surfaces[0].corners()[:, 0].max()}[name]
     axis = int(np.argmax(np.abs(normal)))

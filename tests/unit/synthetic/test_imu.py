@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.synthetic import SynthOptions, synthesise
-from bodycap_batch.synthetic.imu_options import ImuOptions
+from bodycap_batch.synthetic.options import ImuOptions
 from bodycap_batch.telemetry.text_files import read_imu_file
 
 

@@ -1,4 +1,4 @@
-"""The renderer's rays agree with OpenCV's projection, or with the solver's if OpenCV lacks the model."""
+"""The renderer's rays agree with OpenCV's projection."""
 
 import cv2
 import numpy as np
@@ -9,8 +9,7 @@ from bodycap_batch.synthetic.lens import ray_grid
 
 WIDTH, HEIGHT = 96, 72
 HEAD = [70.0, 68.0, 47.0, 37.5]
-SINGLE = [70.0, 47.0, 37.5]
-# Newton's method stops at 1e-14 on the image plane. A pixel may be off by 1e-9 times the focal length.
+# The inversion may be off by 1e-8 on the image plane, times the focal length.
 TOLERANCE_PX = 70 * 1e-8
 
 
@@ -51,29 +50,6 @@ def test_fisheye_rays_project_to_their_pixels_with_opencv():
     points = grid.in_cam.reshape(-1, 1, 3)[front]
     pixels, _ = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(extra))
     assert np.abs(pixels[:, 0] + 0.5 - _pixels()[front]).max() < TOLERANCE_PX
-
-
-@pytest.mark.parametrize(
-    ("model", "params"),
-    [
-        ("SIMPLE_PINHOLE", SINGLE),
-        ("SIMPLE_RADIAL", [*SINGLE, -0.1]),
-        ("RADIAL", [*SINGLE, -0.2, 0.05]),
-        ("SIMPLE_RADIAL_FISHEYE", [*SINGLE, 0.03]),
-        ("RADIAL_FISHEYE", [*SINGLE, 0.03, -0.01]),
-        ("THIN_PRISM_FISHEYE", [*HEAD, 0.02, -0.01, 0.001, -0.002, 0.003, -0.001, 0.002, -0.001]),
-        ("FOV", [*HEAD, 0.9]),
-        ("EUCM", [*HEAD, 0.6, 1.1]),
-    ],
-)
-def test_rays_agree_with_the_solvers_projection(model, params):
-    camera = _camera(model, params)
-    grid = ray_grid(camera)
-    assert grid.valid.all()
-    pixels = camera.project(grid.in_cam.reshape(-1, 3))
-    seen = np.isfinite(pixels).all(axis=1)
-    assert seen.mean() > 0.95
-    assert np.abs(pixels - _pixels())[seen].max() < TOLERANCE_PX
 
 
 def test_rays_are_unit_vectors_with_right_derivatives():

@@ -11,9 +11,9 @@ from bodycap_batch.model.geometry import invert, rotation_angle_rad
 from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.skeleton import Motion, forward_kinematics
 from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions
-from bodycap_batch.synthetic.camera_renderer import camera_poses_at
 from bodycap_batch.synthetic.clip import load_clip
 from bodycap_batch.synthetic.gait import Walk, WalkStyle
+from bodycap_batch.synthetic.moving_body import camera_poses_at
 from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
 
 

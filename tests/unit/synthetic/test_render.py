@@ -11,10 +11,12 @@ from bodycap_batch.model.geometry import invert, make_transform, so3_exp
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.synthetic.atlas import Atlas, select_filter
-from bodycap_batch.synthetic.camera_renderer import CameraRenderer, Sensor, camera_poses_at
 from bodycap_batch.synthetic.lens import ray_grid
-from bodycap_batch.synthetic.surfaces import Surface, box_faces, surface_facing
-from bodycap_batch.synthetic.triangle_renderer import SceneRenderer, triangles_from_surfaces
+from bodycap_batch.synthetic.moving_body import camera_poses_at
+from bodycap_batch.synthetic.moving_camera import MovingCamera
+from bodycap_batch.synthetic.moving_scene import ROOM, MovingPart, MovingScene
+from bodycap_batch.synthetic.sensor import Sensor
+from bodycap_batch.synthetic.triangles import Surface, surface_facing, triangles_from_surfaces
 from bodycap_batch.synthetic.wearer import Wearer
 
 SQUARES, TEXELS = 6, 40
@@ -52,8 +54,20 @@ def board():
         surface_facing([0, 0, 1.0], [0, -1, 0], (0.2, 0.2), np.full((9, 9, 3), 90, np.uint8)),
     ]
     atlas = Atlas([surface.image for surface in surfaces])
-    room = triangles_from_surfaces(surfaces, atlas.origins)
-    return room, atlas, SceneRenderer(room, atlas)
+    return MovingPart(ROOM, triangles_from_surfaces(surfaces, atlas.origins)), atlas
+
+
+def _image(parts, atlas, world_from_cam, lens=None):
+    """Return a sharp image of parts that are all in the world frame."""
+    scene = MovingScene(parts, atlas, fine=True)
+    poses = np.tile(world_from_cam, (len(parts), 1, 1, 1))
+    gain = np.ones(len(scene.triangles.faces), np.float32)
+    return scene.sharp(ray_grid(lens or _lens()), poses, gain)[0]
+
+
+def _image_of(surfaces, world_from_cam):
+    atlas = Atlas([surface.image for surface in surfaces])
+    return _image([MovingPart(ROOM, triangles_from_surfaces(surfaces, atlas.origins))], atlas, world_from_cam)
 
 
 def _lens(params=(FOCAL, FOCAL, 160.0, 120.0), model="PINHOLE"):
@@ -97,7 +111,7 @@ def _inside(pixels, border=12):
 def test_marker_corners_appear_where_opencv_projects_them(board, turn_deg, centre_m, distortion):
     pose = make_transform(so3_exp(np.radians(turn_deg)), centre_m)
     lens = _lens((FOCAL, FOCAL, 160.0, 120.0, *distortion), "OPENCV") if distortion else _lens()
-    image = board[2].image(ray_grid(lens), pose, slice(0, HEIGHT))
+    image = _image([board[0]], board[1], pose, lens)
     predicted = _predicted(pose, distortion)
     seen = _inside(predicted)
     assert seen.sum() >= 9
@@ -122,21 +136,17 @@ class _Straight:
 
 
 def _renderer(board, speed, **values):
-    motion, settings = (
-        _Straight(speed),
-        {"exposure_s": 0.0, "rolling_shutter_s": 0.0, "wearer": None, **values},
-    )
     mount = Mount(camera="hips", role="Hips", joint_from_cam=LOOKING, sigma_rad=0.0, sigma_m=0.0)
-    room, atlas, view = board
-    return CameraRenderer(
-        motion=motion, mount=mount, grid=ray_grid(_lens()), room=room, atlas=atlas, scene=view, **settings
+    parts, atlas = [board[0]], board[1]
+    return MovingCamera(
+        motion=_Straight(speed), mount=mount, camera=_lens(), parts=parts, atlas=atlas, **values
     )
 
 
 def test_motion_blur_is_centred_on_the_timestamp(board):
     renderer = _renderer(board, 3.0, exposure_s=0.02)
     pose = camera_poses_at(renderer.motion, renderer.mount, np.array([0.01]))[0]
-    image, sharp = renderer.render(0.01), board[2].image(renderer.grid, pose, slice(0, HEIGHT))
+    image, sharp = renderer.render(0.01), _image([board[0]], board[1], pose)
     predicted = _predicted(pose)
     # 3 m/s · 0.02 s · 210 px / 1.6 m = 7.9 px of blur; symmetric, so the corners stay.
     assert np.abs(_found(image, predicted) - predicted).max() < 0.15
@@ -144,11 +154,9 @@ def test_motion_blur_is_centred_on_the_timestamp(board):
     assert slope < 0.3 * slope_sharp
 
 
-@pytest.mark.parametrize("shown", [False, True])
-def test_rolling_shutter_exposes_each_row_at_its_own_time(board, shown):
+def test_rolling_shutter_exposes_each_row_at_its_own_time(board):
     speed, shutter = 2.0, 0.03
-    renderer = _renderer(board, speed, rolling_shutter_s=shutter, wearer=_nobody() if shown else None)
-    image = renderer.render(0.0)
+    image = _renderer(board, speed, rolling_shutter_s=shutter).render(0.0)
     still = _predicted(LOOKING)
     # Row r is exposed at x = speed · (r/h − ½) · shutter; points move the other way. Row r's centre is
     # r in OpenCV's pixels, r + ½ in COLMAP's.
@@ -159,18 +167,6 @@ def test_rolling_shutter_exposes_each_row_at_its_own_time(board, shown):
     assert np.abs(_found(image, predicted) - predicted).max() < 0.1
 
 
-def _nobody():
-    """Return a wearer out of view; it makes the renderer use bands of rows."""
-
-    class Nobody:
-        def at(self, world_from_joint):
-            atlas = Atlas([np.full((8, 8, 3), 9, np.uint8)])
-            faces = box_faces([0, 0, -30], [1, 1, 1], 0.0)
-            return triangles_from_surfaces(faces, np.repeat(atlas.origins, len(faces), axis=0))
-
-    return Nobody()
-
-
 def test_near_surfaces_hide_far_ones():
     near = replace(
         _board(),
@@ -179,11 +175,7 @@ def test_near_surfaces_hide_far_ones():
         down=np.array([0, 0.6, 0]),
     )
     near = replace(near, image=np.full((20, 20, 3), 250, np.uint8))
-    surfaces = [_board(), near]
-    atlas = Atlas([surface.image for surface in surfaces])
-    image = SceneRenderer(triangles_from_surfaces(surfaces, atlas.origins), atlas).image(
-        ray_grid(_lens()), LOOKING, slice(0, HEIGHT)
-    )
+    image = _image_of([_board(), near], LOOKING)
     assert (image[100:140, 140:180] == 250).all()
     # 0.3 m at 1.1 m is 57.3 px from the middle. The border lies inside the 218th pixel, which is a mixture.
     assert (image[120, 160:216] == 250).all()
@@ -193,11 +185,8 @@ def test_near_surfaces_hide_far_ones():
 def test_a_pixel_on_an_edge_is_a_mixture():
     bright = surface_facing([0, 0, 0], [0, -1, 0], (2.0, 2.0), np.full((16, 16, 3), 200, np.uint8))
     dark = surface_facing([0, -0.5, 0], [0, -1, 0], (1.0, 1.0), np.full((16, 16, 3), 20, np.uint8))
-    atlas = Atlas([bright.image, dark.image])
     looking = make_transform(so3_exp([-np.pi / 2, 0, 0]) @ so3_exp([0, 0, 0.2]), [0.0, -2.5, 0.0])
-    image = SceneRenderer(triangles_from_surfaces([bright, dark], atlas.origins), atlas).image(
-        ray_grid(_lens()), looking, slice(0, HEIGHT)
-    )
+    image = _image_of([bright, dark], looking)
     values = np.unique(image)
     assert {0, 20, 200} <= set(values.tolist())
     # A slanted border crosses pixels everywhere: mixtures of one, two and three quarters.
@@ -208,11 +197,7 @@ def test_distant_fine_texture_averages_out():
     stripes = np.zeros((512, 512, 3), np.uint8)
     stripes[:, ::2] = 200
     wall = surface_facing([0, 0, 0], [0, -1, 0], (1.0, 1.0), stripes)
-    atlas = Atlas([wall.image])
-    looking = make_transform(so3_exp([-np.pi / 2, 0, 0]), [0.0, -6.0, 0.0])
-    image = SceneRenderer(triangles_from_surfaces([wall], atlas.origins), atlas).image(
-        ray_grid(_lens()), looking, slice(0, HEIGHT)
-    )
+    image = _image_of([wall], make_transform(so3_exp([-np.pi / 2, 0, 0]), [0.0, -6.0, 0.0]))
     inside = image[108:132, 148:172].astype(float)
     # With 15 texels per pixel, stripes of 0 and 200 appear as their mean, up to rounding.
     assert np.abs(inside - 100).max() <= 2
@@ -248,15 +233,16 @@ def test_the_wearers_arm_appears_at_its_joints():
     skeleton = load_skeleton("full_body", 1.75)
     wearer = Wearer(skeleton, np.random.SeedSequence(1))
     atlas = Atlas(wearer.images)
-    wearer.place_textures(atlas.origins)
     joints = np.tile(np.eye(4), (len(skeleton.joints), 1, 1))
     for joint, parent in enumerate(skeleton.parents):
         start = np.zeros(3) if parent < 0 else joints[parent, :3, 3]
         joints[joint, :3, 3] = start + skeleton.offsets_m[joint]
-    view = SceneRenderer(wearer.at(joints), atlas)
+    parts = [MovingPart(joint, shape) for joint, shape in wearer.parts(atlas.origins)]
     # From the front: OpenCV axes with z along +y, x along −x... the body's left is on the right.
     front = make_transform(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]), [0.0, -2.5, 1.2])
-    image = view.image(ray_grid(_lens()), front, slice(0, HEIGHT))
+    scene = MovingScene(parts, atlas, fine=True)
+    poses = np.stack([invert(joints[part.joint]) @ front for part in parts])[:, None]
+    image, _ = scene.sharp(ray_grid(_lens()), poses, np.ones(len(scene.triangles.faces), np.float32))
     in_cam = (joints[:, :3, 3] - front[:3, 3]) @ front[:3, :3]
     pixels = in_cam[:, :2] / in_cam[:, 2:] * FOCAL + [160.0, 120.0]
     for name in ("LeftForeArm", "RightHand", "Head", "Spine", "LeftLeg"):

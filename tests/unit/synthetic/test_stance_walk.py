@@ -14,12 +14,12 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.skeleton import forward_kinematics
 from bodycap_batch.synthetic import SynthOptions, stance_walk, synthesise
-from bodycap_batch.synthetic.camera_renderer import camera_poses_at
-from bodycap_batch.synthetic.footsteps import footstep_times
+from bodycap_batch.synthetic.camera_sounds import footstep_times
 from bodycap_batch.synthetic.gait import WalkStyle
 from bodycap_batch.synthetic.gait_curves import stance_share, steps_per_s
 from bodycap_batch.synthetic.gait_plan import draw_walker
 from bodycap_batch.synthetic.making import draw_subject
+from bodycap_batch.synthetic.moving_body import camera_poses_at
 from bodycap_batch.synthetic.person import draw_body
 from bodycap_batch.synthetic.stance_walk import StanceWalk
 
