@@ -15,7 +15,6 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import NO_MOTION_HINT, EstimationError
 from bodycap_batch.core.mechanisms import Mechanism, record_act
-from bodycap_batch.mapping.further_maps import with_models_of_rest
 from bodycap_batch.mapping.initial_models import reconstruct_with_intrinsics
 from bodycap_batch.mapping.inputs import (
     calibrated_camera_ids,
@@ -50,6 +49,7 @@ from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.model_joining import join_models
 from bodycap_batch.mapping.reconstruction.mapper_options import MIN_RESECTION_INLIERS
 from bodycap_batch.mapping.reconstruction.model_files import write_models
+from bodycap_batch.mapping.rest_models import with_models_of_rest
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
@@ -242,7 +242,7 @@ def build_map_once(
     models, displaced = with_models_of_rest(
         models,
         {ref.name for ref in refs},
-        left_contradicted(log["repair"], ratio),
+        max(log["repair"]["contradicted_share"], ratio),
         mapping.with_rotation_chains(capture),
     )
     write_models(workspace, models)

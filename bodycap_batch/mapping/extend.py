@@ -12,7 +12,6 @@ from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping.further_maps import with_models_of_rest
 from bodycap_batch.mapping.inputs import (
     calibrated_camera_ids,
     frame_times_ns,
@@ -40,6 +39,7 @@ from bodycap_batch.mapping.reconstruction.model_files import (
     registered_ids,
     write_models,
 )
+from bodycap_batch.mapping.rest_models import with_models_of_rest
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
@@ -116,7 +116,7 @@ def extend_map(
         removed += cut
         resected.append(registered_ids(model) - kept if mapping.is_large(len(kept)) else None)
     transient = finalise_models(models, mapping, resected)
-    contradicted = list[float]()
+    contradicted = [float(previous.log.get("repair", {}).get("contradicted_share", 0.0))]
     for number, model in enumerate(models):
         models[number], names, ratio = remove_without_adjustment(model, mapping)
         contradicted.append(ratio)

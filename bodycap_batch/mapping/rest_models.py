@@ -1,0 +1,76 @@
+"""Models of the keyframes that are in no other model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from bodycap_batch.config.lost_frames import LEAST_MAPPED
+from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.core.mechanisms import Mechanism, is_on
+from bodycap_batch.mapping.mapping_context import MappingContext
+from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, model_order
+from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
+from bodycap_batch.mapping.results import finalise_models
+from bodycap_batch.mapping.validation.repair import remove_without_adjustment
+
+
+def with_models_of_rest(
+    models: Sequence[Any], names: set[str], contradicted: float, mapping: MappingContext
+) -> tuple[list[Any], set[str]]:
+    """Add models of the keyframes that are in none, if these are more than the largest model has.
+
+    Then the first keyframes were too few or too far apart, or the largest model contradicts most of them. If
+    it also contradicts itself, places that look the same are in it, and nothing is added.
+
+    Args:
+        models: Reconstructions, the largest first.
+        names: Image names of all keyframes.
+        contradicted: Fraction of the matches of the largest model that contradict it.
+        mapping: Workspace, mapper options, and how each camera turns.
+
+    Returns:
+        The models, the largest first. The image names of the keyframes of the model that was the largest, if
+        another one is the largest now; else empty.
+    """
+    rest = names - set[str]().union(*map(keyframe_names, models))
+    is_base = not contradicted and is_on(Mechanism.FURTHER_MAPS)
+    if not models or not is_base or len(rest) <= models[0].num_reg_images():
+        return list(models), set()
+    found = sorted([*models, *models_of_rest(rest, mapping)], key=model_order)
+    return found, set() if found[0] is models[0] else keyframe_names(models[0])
+
+
+def models_of_rest(names: set[str], mapping: MappingContext) -> list[Any]:
+    """Return models of keyframes that are in no other model, until too few are left for a further one."""
+    left, models = set(names), list[Any]()
+    while len(left) >= LEAST_MAPPED:
+        mapping.stage.check_cancelled()
+        found = _consistent_models(left, mapping)
+        if not found:
+            break
+        models += found
+        left -= set[str]().union(*map(keyframe_names, found))
+    return models
+
+
+def _consistent_models(names: set[str], mapping: MappingContext) -> Sequence[Any]:
+    """Return models of some keyframes, without the keyframes that contradict them, the largest first."""
+    settings = mapping.mapper_options()
+    settings.image_names = sorted(names)
+    models, _ = reconstruct(mapping.workspace, settings, mapping.stage, len(names))
+    taken, out = set[str](), list[Any]()
+    for model in models:
+        if model.num_reg_images() < LEAST_MAPPED or not model.num_points3D():
+            continue
+        kept, _, _ = remove_without_adjustment(model, mapping)
+        if keyframe_names(kept) & taken:
+            continue  # The models of one search may share keyframes. The next search builds the rest.
+        try:
+            finalise_models([kept], mapping, [None])
+        except EstimationError:
+            continue  # No point is left: the model consisted of things that move by themselves.
+        if kept.num_reg_images() >= LEAST_MAPPED:
+            taken |= keyframe_names(kept)
+            out.append(kept)
+    return out
