@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body_calibration.joint_variability import transient_variance_shares
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import JOINT_PRIOR_SCALE, CalibrationGraph
 from bodycap_batch.merging.body_calibration.mount_covariance import (
     LinearisedCalibration,
@@ -32,7 +31,6 @@ from bodycap_batch.merging.graph.error_modes import (
 )
 from bodycap_batch.merging.graph.factors import MountPoints, mount_keys
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph
-from bodycap_batch.model.nominal_mounts import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_RAD
 from bodycap_batch.model.skeleton import Mount
 
 _TRANSIENT_SHARE = float(np.sqrt(1.0 - POSTURE_BIAS_SHARE**2))
@@ -125,7 +123,7 @@ def error_modes(
         ]
     )
     transient = [
-        posture_bias_modes(graph.bones, cameras, _transient_shares(samples, linearised, reduced)),
+        posture_bias_modes(graph.bones, cameras, _TRANSIENT_SHARE),
         map_error_modes(graph.bones, dict(zip(cameras, bends, strict=True))),
     ]
     transient += [] if skeleton is None else [linearised.propagated(reduced, skeleton.joint_placement)]
@@ -170,7 +168,7 @@ def variance_factors(
         reduced: The reduced system of `linearised`.
 
     Returns:
-        (5,) variance factors.
+        (4,) variance factors.
     """
     correlated = samples.correlated_samples
     map_error = _map_error_variance(samples, linearised, reduced)
@@ -184,9 +182,6 @@ def variance_factors(
         # The graph uses joint rotation priors with widened sigmas. The factor restores the original sigmas,
         # reduced to the transient part, because only this part differs between samples.
         RowType.JOINT_ROTATION: (_TRANSIENT_SHARE / JOINT_PRIOR_SCALE) ** 2,
-        # Some mount orientations are assumed from the camera's name only. The graph uses a larger sigma for
-        # these orientations than their expected error.
-        RowType.NAMED_MOUNT: (NOMINAL_ERROR_RAD / NOMINAL_SIGMA_RAD) ** 2,
     }
     return np.array([factors[row_type] for row_type in RowType])
 
@@ -264,15 +259,6 @@ def scale_jacobian(graph: CalibrationGraph, linearised: LinearisedCalibration) -
         for point, share in enumerate((1.0, *[MountPoints.AXIS_WHITENING_RATIO] * 3)):
             out[centre + 3 * point] = -share * linear.rhs[centre]
     return out
-
-
-def _transient_shares(
-    samples: CalibrationSamples, linearised: LinearisedCalibration, reduced: ReducedSystem
-) -> FloatArray:
-    """Return the transient part of the sigma of each joint's rotation prior, as a fraction (B,)."""
-    usual = np.flatnonzero(~samples.posture.t_pose)
-    shares = transient_variance_shares(linearised, reduced, usual, samples.times_ns[usual], JOINT_PRIOR_SCALE)
-    return np.sqrt(shares)
 
 
 def _map_error_variance(

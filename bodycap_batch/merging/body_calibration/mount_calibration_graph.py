@@ -239,7 +239,6 @@ class CalibrationGraph:
                 first,
                 first + count * self._samples.valid.shape[1],
                 (first + count * t_pose_ticks[:, None] + np.arange(count)).reshape(-1),
-                self._named_mount_factors(),
             ),
             first_joint_factor=first,
         )
@@ -255,15 +254,6 @@ class CalibrationGraph:
             first + POINTS_PER_MOUNT * np.arange(count)[:, None] + np.arange(POINTS_PER_MOUNT),
             dtype=np.int64,
         )
-
-    def _named_mount_factors(self) -> IntArray:
-        """Return the factor indices of mount orientations that are assumed from the camera's name only."""
-        out, first = [], 0
-        for camera, name in enumerate(self._samples.cameras):
-            if self._priors[name].by_name:
-                out += [first + 1, first + 2, first + 3]  # the first factor of a prior is for the centre
-            first += POINTS_PER_MOUNT + POINTS_PER_MOUNT * int(self._samples.valid[camera].sum())
-        return np.array(out, dtype=np.int64)
 
     def _set_rest_bones(self, bones: tuple[Bone, ...], repetitions: float) -> None:
         """Set the bones, and reduce the weight of their hinges.

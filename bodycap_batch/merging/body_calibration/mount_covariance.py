@@ -54,8 +54,6 @@ class RowType(IntEnum):
     """Gaps of joints, and the distances between the anchors of a hinge and the following joint."""
     JOINT_ROTATION = 3
     """Priors of joint rotations."""
-    NAMED_MOUNT = 4
-    """Priors of mount orientations that are assumed from the camera's name only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,7 +163,7 @@ class LinearisedCalibration:
 
         Args:
             reduced: The reduced system of this linearisation.
-            factors: (5,) variance factor of each `RowType`.
+            factors: (4,) variance factor of each `RowType`.
             body_modes: Error modes of the assumed body.
 
         Returns:
@@ -228,7 +226,6 @@ def row_types(
     first_joint_factor: int,
     end_joint_factor: int,
     t_pose_factors: IntArray,
-    named_factors: IntArray,
 ) -> IntArray:
     """Return the `RowType` of each row of a linearised calibration graph.
 
@@ -238,8 +235,6 @@ def row_types(
         end_joint_factor: Index of the last joint factor plus one.
         t_pose_factors: Indices of the joint factors at ticks in a T-pose. The assumed sigmas of the rotation
             priors of these factors are used unchanged.
-        named_factors: Indices of the factors of mount orientations that are assumed from the camera's name
-            only.
 
     Returns:
         (R,) the `RowType` of each row.
@@ -256,7 +251,6 @@ def row_types(
     out[of_mounts & ~of_bones] = RowType.PRIOR
     is_joint = (factor >= first_joint_factor) & (factor < end_joint_factor)
     out[(factor >= end_joint_factor) | np.isin(factor, t_pose_factors)] = RowType.PRIOR
-    out[np.isin(factor, named_factors)] = RowType.NAMED_MOUNT
     # A joint factor has three rows for the rotation, then three rows for the gap. A hinge factor has one row.
     out[is_joint & ((height[factor] == 1) | (row_in_factor >= 3))] = RowType.JOINT_GAP
     return out

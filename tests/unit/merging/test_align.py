@@ -24,7 +24,6 @@ from bodycap_batch.merging.map_alignment.initial_alignment import align_map
 from bodycap_batch.model.geometry import Similarity, so3_exp
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import run_case
-from tests.bench.posed import posed
 from tests.bench.simulation import ARMS
 from tests.calibrations import calibration_of
 from tests.stages.walker import ROLES, make_inputs, make_walk, record
@@ -146,25 +145,6 @@ def test_what_no_residual_can_contradict_is_as_believed(arms):
     # Samples that share the map's error were weighed down for it; that does not make the map bend more.
     assert samples.correlated_samples > 1.5
     assert_allclose(variance_factors(samples, silent, free)[[RowType.MEASUREMENT, RowType.JOINT_GAP]], 1.0)
-
-
-def test_a_mounts_name_is_believed_better_than_it_is_weighed(arms):
-    samples, calibration, metric = arms
-    inputs = posed(SynthOptions(seconds=1.0, cameras=ARMS, poses_only=True)).inputs
-    calibration.solve(metric)
-    mounts = calibration.linearised()
-    # 15 degrees an axis against 15 in all; three differences of three rows for each of five cameras.
-    assert variance_factors(samples, mounts, mounts.reduced())[RowType.NAMED_MOUNT] == pytest.approx(
-        1.0 / 3.0
-    )
-    assert (mounts.row_types == RowType.NAMED_MOUNT).sum() == 5 * 9
-    # A job that knows it to 20 degrees only has said so, and no name.
-    told = {
-        mount.camera: replace(mount, sigma_rad=np.radians(20.0), by_name=False) for mount in inputs.mounts
-    }
-    stated = CalibrationGraph(inputs.skeleton, mounts.body.bones, samples, told, metric, lambda: None)
-    stated.solve(metric, iterations=1)
-    assert not (stated.linearised().row_types == RowType.NAMED_MOUNT).any()
 
 
 @pytest.mark.slow
