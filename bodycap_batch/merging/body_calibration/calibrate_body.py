@@ -11,7 +11,6 @@ import numpy as np
 from bodycap_batch.config.options import MarkerBoard, MergeOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import Bone
-from bodycap_batch.merging.body.clock_scale_error import scale_sigma_from_clocks
 from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose
 from bodycap_batch.merging.body.trunk_lean import trunk_orientation, trunk_orientation_from_prior
 from bodycap_batch.merging.body_calibration.calibration_covariance import (
@@ -198,7 +197,6 @@ def calibrate_body(
         estimate,
         is_measured=inputs.skeleton_is_measured,
         has_height=inputs.height_m is not None,
-        clock_sigma=scale_sigma_from_clocks(bones, tracks, priors, inputs.clocks),
     )
     scale = combine_sources(
         bones_alone,
