@@ -32,7 +32,7 @@ from bodycap_batch.merging.graph.foot_contact import FootContact
 from bodycap_batch.merging.graph.joint_covariance import JointUncertainty, SolvedGraph, joint_covariance
 from bodycap_batch.merging.graph.joint_distance_limits import DistanceLimit
 from bodycap_batch.merging.graph.motion_prior import add_motion_prior
-from bodycap_batch.merging.graph.optimiser import gauss_newton_then_lm
+from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.model.geometry import interpolate_pose, invert, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel
 
@@ -154,7 +154,7 @@ class MotionGraph:
         """
         if error_modes is not None:
             step("solving")
-        values, count = gauss_newton_then_lm(
+        values, count = levenberg_marquardt(
             self._graph, self.initial_values(), iterations=iterations, step=step, tolerance=_TOLERANCE
         )
         poses = np.array(
