@@ -20,7 +20,6 @@ Other modules estimate scales for other purposes. These scales are not used in t
 - ``body/provisional_scale.py``: the provisional scale, the initial value of the calibration.
 - ``map_alignment/similarity_refinement.py`` and ``map_alignment/scale_sources.py``: the scale of the main map
   while other maps are aligned to it. It uses the limbs' reach, the floor and the sources given in the job.
-- ``limb_scales.py``: a separate scale for each limb, a diagnostic of the report.
 """
 
 from __future__ import annotations
