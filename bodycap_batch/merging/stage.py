@@ -179,7 +179,8 @@ def _solve_body(
     tracks = [within_ticks(track, tick_times) for track in tracks]
     metric = [track.scaled(scale) for track in tracks]
     rules = soft_limits(inputs.skeleton, bones, inputs.activity)
-    psd_bones = scale_motion_noise(bones, metric)
+    loose = tuple(replace(bone, off_hinge_m=calibration.off_hinge_m.get(bone.role, 0.0)) for bone in bones)
+    psd_bones = scale_motion_noise(loose, metric)
     mounts = {mount.camera: mount.joint_from_cam for mount in calibration.mounts}
     contact_tracks = metric if options.foot_contact else ()
     contacts = find_contacts(

@@ -314,6 +314,20 @@ class AlignedCameraReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class HingeReport:
+    """A hinge joint, such as the elbow, that the motion bends out of the hinge's plane.
+
+    Attributes:
+        sigma_m: Sigma, metres, that the solver used for the distance of a point from the hinge's plane. The
+            point is the far end of the bone below the hinge.
+        known_to: Sentence about the violation, with advice.
+    """
+
+    sigma_m: float
+    known_to: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ActivityReport:
     """The soft rules of the activity.
 
@@ -377,6 +391,8 @@ class MergeReport:
             percentiles of the sigma of its flexion, degrees.
         hinge_off_plane_m: By role of a joint, percentiles of its distance, metres, from the plane of a hinge.
             The joint is at the far end of the bone below the hinge.
+        loose_hinges: By role of the bone below a hinge, the violation of the hinge. Hinges that the motion
+            does not violate have no entry.
         activity: The soft rules of the activity.
         foot_contact: By foot, figures on how often the foot stands and how fast the standing foot slides.
         solver: The solution of the motion graph.
@@ -400,6 +416,7 @@ class MergeReport:
     joint_sigma_m: Mapping[str, Mapping[str, Percentiles]]
     flexion_sigma_deg: Mapping[str, Mapping[str, Percentiles]]
     hinge_off_plane_m: Mapping[str, Percentiles]
+    loose_hinges: Mapping[str, HingeReport]
     activity: ActivityReport
     foot_contact: Mapping[str, Mapping[str, float]]
     solver: SolverReport

@@ -13,6 +13,7 @@ from bodycap_batch.core.percent import format_percent
 from bodycap_batch.model.scene import Map
 from bodycap_batch.report.drawn_scene import common_times_s
 from bodycap_batch.report.grades import Advice
+from bodycap_batch.report.readings import ADVICE_SEPARATOR, as_sentence
 from bodycap_batch.report.report_inputs import ReportInputs
 from bodycap_batch.report.verdict import Verdict
 
@@ -58,6 +59,7 @@ def recommend_changes(inputs: ReportInputs, verdict: Verdict) -> list[Advice]:
         *_about_overlap(inputs),
         *_about_parallax(inputs),
         *_about_start_and_end(inputs),
+        *_about_hinges(inputs),
     ]
     # Criteria with the same remedy give it once, with the first reason.
     first = {each.action: each for each in reversed(found)}
@@ -224,3 +226,17 @@ def _median_triangulation_deg(scene: Map) -> float | None:
     smallest_cosine = np.full(len(scene.points), 1.0)
     np.minimum.at(smallest_cosine, point, cosine)
     return float(np.degrees(np.arccos(np.median(smallest_cosine[np.unique(point)]))))
+
+
+def _about_hinges(inputs: ReportInputs) -> Iterator[Advice]:
+    """Yield advice about elbows and knees that the motion bends out of their plane."""
+    hinges = {} if inputs.merge is None else inputs.merge.report.loose_hinges
+    for hinge in hinges.values():
+        finding, _, advice = hinge.known_to.partition(ADVICE_SEPARATOR)
+        action, _, settings = advice.partition(", and ")
+        yield Advice(
+            action=as_sentence(action),
+            reason=finding,
+            priority=1.1 + hinge.sigma_m,
+            how=as_sentence(settings),
+        )

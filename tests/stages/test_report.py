@@ -18,6 +18,7 @@ from bodycap_batch.capture import Capture, CaptureCamera, open_capture
 from bodycap_batch.config.models import CaptureConfig, Job
 from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.geometry import interpolate_pose
+from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Trajectory
 from bodycap_batch.model.skeleton import MountSlip
@@ -781,6 +782,24 @@ def test_at_most_three_changes_are_recommended(inputs: ReportInputs, tmp_path: P
     found = advice(inputs, tuple(lost_frames("torso", cause, 30) for cause in causes))
     assert len(found) == 3
     assert "`" not in "".join(each.action + each.reason for each in found)
+
+
+def test_an_elbow_that_violates_its_hinge_model_gets_a_recommendation(inputs: ReportInputs) -> None:
+    assert inputs.merge is not None
+    loose = {
+        "LeftForeArm": {
+            "sigma_m": 0.021,
+            "known_to": "the left elbow moves 2.1 cm out of its bending plane; to reduce this, strap it",
+        }
+    }
+    changed = replace(
+        inputs, merge=replace(inputs.merge, report=MergeReport.from_dict({"loose_hinges": loose}))
+    )
+    (found,) = (each for each in advice(changed) if "left elbow" in each.reason)
+    assert (found.action, found.reason) == (
+        "Strap it.",
+        "the left elbow moves 2.1 cm out of its bending plane",
+    )
 
 
 def test_a_t_pose_that_improves_several_constants_is_recommended_once(inputs: ReportInputs) -> None:

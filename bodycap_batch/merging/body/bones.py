@@ -99,6 +99,8 @@ class Hinge:
         following: Index of the bone that starts at the lower bone's far end.
         anchors_m: (2,3) positions of the two points in the upper bone's frame.
         range_m: Distance (metres) of each point from the following bone's joint.
+        sigma_m: Sigma (metres) of this distance due to violations of the hinge. The slack of a joint is not
+            included. The value comes from `off_hinge_m` of the lower bone.
     """
 
     upper: int
@@ -106,6 +108,7 @@ class Hinge:
     following: int
     anchors_m: FloatArray
     range_m: float
+    sigma_m: float = 0.0
 
     def axis(self) -> FloatArray:
         """Return the axis (3,) of the hinge in the upper bone's frame; a positive turn bends the elbow."""
@@ -126,6 +129,8 @@ class Bone:
         rotation_covariance: (3,3) covariance, rad², of the joint's rotation in the bone's own axes.
         psd: (6,) power spectral density of the bone's acceleration: three rotations (rad²/s³), then three
             translations (m²/s³).
+        off_hinge_m: Sigma (metres) of the distance between the bone's far end and the plane of its hinge. The
+            slack of a joint is not included. The value is 0 if the motion obeys the hinge.
     """
 
     joint: int
@@ -135,6 +140,7 @@ class Bone:
     mean_rotation: FloatArray
     rotation_covariance: FloatArray
     psd: FloatArray
+    off_hinge_m: float = 0.0
 
 
 def kinematic_chain(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tuple[Bone, ...]:
@@ -224,6 +230,7 @@ def hinges(skeleton: SkeletonModel, bones: tuple[Bone, ...]) -> tuple[Hinge, ...
                 following=following,
                 anchors_m=bone.offset_m + HINGE_ARM_M * np.array([axis, -axis]),
                 range_m=float(np.hypot(HINGE_ARM_M, length)),
+                sigma_m=bone.off_hinge_m,
             )
         )
     return tuple(out)

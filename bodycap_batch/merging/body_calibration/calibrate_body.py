@@ -100,6 +100,8 @@ class BodyCalibration:
         t_pose_ns: First and last common time of the T-pose; None if the capture has no T-pose.
         rolls: For each camera whose roll was searched, the costs of all rolls. The reference camera is not
             among these cameras.
+        off_hinge_m: Size of each hinge violation. The key is the role of the bone below the hinge. The value
+            is the sigma of the distance between the bone's far end and the plane of the hinge, metres.
     """
 
     scale: MetricScale
@@ -111,6 +113,7 @@ class BodyCalibration:
     height_over_floor_m: float | None
     t_pose_ns: tuple[int, int] | None
     rolls: tuple[RollSearch, ...]
+    off_hinge_m: Mapping[str, float] = field(default_factory=dict)
 
 
 class ReferenceCameraRoll(NamedTuple):
@@ -168,6 +171,8 @@ def calibrate_body(
     graph.solve(provisional)
     graph.widen_joint_priors()
     estimate = estimate_scale(graph, provisional)
+    if graph.test_hinges():
+        estimate = estimate_scale(graph, estimate.scale)
     poses = graph.poses()
     scene = SceneContext(
         points_m=estimate.scale * map_points_of(inputs, tracks[0].camera),
@@ -213,6 +218,7 @@ def calibrate_body(
         height_over_floor_m=height_m,
         t_pose_ns=t_pose_ns,
         rolls=rolls,
+        off_hinge_m=graph.hinge_violation_m(),
     )
 
 

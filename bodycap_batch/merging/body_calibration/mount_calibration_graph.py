@@ -16,6 +16,12 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, hinges
 from bodycap_batch.merging.body.initial_poses import fill_gaps, pose_bones
 from bodycap_batch.merging.body.t_pose import with_t_pose_prior
+from bodycap_batch.merging.body_calibration.hinge_test import (
+    FREE_SIGMA_M,
+    hinge_violation_sigma,
+    observable_hinges,
+    with_hinge_slack,
+)
 from bodycap_batch.merging.body_calibration.mount_covariance import JOINT_PRIOR_SCALE, LinearisedCalibration
 from bodycap_batch.merging.body_calibration.samples import CalibrationSamples
 from bodycap_batch.merging.graph.attitude_factors import AttitudeFactors
@@ -31,18 +37,12 @@ from bodycap_batch.merging.graph.factors import (
     mount_keys,
     values_from_poses,
 )
-from bodycap_batch.merging.graph.joint_priors import widen_joint_priors
+from bodycap_batch.merging.graph.joint_priors import samples_per_gesture, widen_joint_priors
 from bodycap_batch.merging.graph.linearisation import linearise
 from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 
-_HINGE_SLACK_RATIO = 8.0
-"""Sigma of the distances that define a hinge, divided by the sigma of the gap at a joint.
-
-Hinges are loose here, because no elbow is a perfect one: mounts and scale would take up what the motion
-violates of a tight hinge. Evidence: docs/decisions/body_calibration.md.
-"""
 POINTS_PER_MOUNT = 4
 """Number of points that represent a mount.
 
@@ -98,7 +98,7 @@ class CalibrationGraph:
 
     @property
     def bones(self) -> tuple[Bone, ...]:
-        """Original bones of the graph, before `widen_joint_priors` changed their priors."""
+        """Original bones of the graph, before `widen_joint_priors` and `test_hinges` changed their priors."""
         return self._bones
 
     @property
@@ -163,6 +163,39 @@ class CalibrationGraph:
             poses, times_ns = self.poses()[usual], self._samples.times_ns[usual]
             self._rest_bones = widen_joint_priors(self._skeleton, self._bones, poses, times_ns)
 
+    def test_hinges(self) -> bool:
+        """Test the hinges that cameras can contradict, and loosen the violated hinges.
+
+        A hinge violation lasts for a whole gesture, so the samples of one gesture are not independent. If a
+        hinge is violated, all samples of one gesture together therefore get the weight of one sample. With
+        full weights, a violated hinge would distort the mounts.
+
+        Returns:
+            True if a hinge is violated. The graph then has loosened hinges and must be solved again.
+        """
+        tested = observable_hinges(self._hinges, self._samples.bones)
+        if not tested:
+            return False
+        before = self._rest_bones, self._hinges, self._values, dict(self.mounts)
+        free = with_hinge_slack(self._rest_bones, {hinge.lower: FREE_SIGMA_M for hinge in tested})
+        self._set_rest_bones(free, repetitions=1.0)
+        self.solve(self._scale)
+        violated = with_hinge_slack(self._rest_bones, hinge_violation_sigma(self.linearised()))
+        self._set_rest_bones(violated, repetitions=samples_per_gesture(self._samples.times_ns))
+        if not self.hinge_violation_m():
+            self._rest_bones, self._hinges, self._values, self.mounts = before
+            return False
+        return True
+
+    def hinge_violation_m(self) -> dict[str, float]:
+        """Return the size of each hinge violation, as `test_hinges` estimated it.
+
+        Returns:
+            By role of the bone below the hinge, the sigma of the distance between the far end of this bone
+            and the plane of the hinge, metres. Hinges without a violation are missing.
+        """
+        return {bone.role: bone.off_hinge_m for bone in self._rest_bones if bone.off_hinge_m > 0.0}
+
     def poses(self) -> FloatArray:
         """Return the bone poses world_from_bone (K,B,4,4) of the last solution, metres."""
         ticks = self._samples.valid.shape[1]
@@ -204,6 +237,19 @@ class CalibrationGraph:
         return np.asarray(
             first + POINTS_PER_MOUNT * np.arange(count)[:, None] + np.arange(POINTS_PER_MOUNT),
             dtype=np.int64,
+        )
+
+    def _set_rest_bones(self, bones: tuple[Bone, ...], repetitions: float) -> None:
+        """Set the bones, and reduce the weight of their hinges.
+
+        Args:
+            bones: The new bones of the graph.
+            repetitions: Number of samples of one gesture. The weight of each hinge is divided by this number.
+        """
+        self._rest_bones = bones
+        self._hinges = tuple(
+            replace(hinge, sigma_m=float(np.sqrt(repetitions)) * hinge.sigma_m)
+            for hinge in hinges(self._skeleton, bones)
         )
 
     def _metric_poses(self, scale: float) -> FloatArray:
@@ -248,11 +294,10 @@ class CalibrationGraph:
         The T-pose prior has the weight of a single tick, distributed over all ticks of the T-pose.
         """
         slack_m = scale * self.slack_factor * self._slack_map
-        sigmas = {"gap_m": slack_m, "hinge_m": _HINGE_SLACK_RATIO * slack_m}
         repetitions = float(np.sqrt(max(self._samples.posture.t_pose.sum(), 1)))
         return (
-            JointFactors(self._rest_bones, self._hinges, prior_scale=JOINT_PRIOR_SCALE, **sigmas),
-            JointFactors(self._t_pose_bones, self._hinges, prior_scale=repetitions, **sigmas),
+            JointFactors(self._rest_bones, self._hinges, prior_scale=JOINT_PRIOR_SCALE, slack_m=slack_m),
+            JointFactors(self._t_pose_bones, self._hinges, prior_scale=repetitions, slack_m=slack_m),
         )
 
     def _initial_values(self, world_from_cam: FloatArray, scale: float) -> Any:

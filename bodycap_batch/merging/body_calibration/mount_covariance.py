@@ -96,15 +96,20 @@ class LinearisedCalibration:
         jacobian = matrix[:, mounts].toarray()
         if common_jacobian is not None:
             jacobian = np.hstack([jacobian, common_jacobian])
+        pose_leverage = np.zeros(matrix.shape[0])
         by_column = matrix.tocsc()
         for tick in range(len(self.world_from_bone)):
             start = self.linear.columns[bone_key(tick, 0)]
             columns = by_column[:, start : start + 6 * len(self.body.bones)]
             rows = np.unique(columns.indices)
             dense = columns[rows].toarray()
-            half = dense @ np.linalg.inv(dense.T @ dense)
+            normal = np.linalg.inv(dense.T @ dense)
+            half = dense @ normal
             jacobian[rows] -= half @ (dense.T @ jacobian[rows])
-        return ReducedSystem(jacobian=jacobian, covariance=np.linalg.inv(jacobian.T @ jacobian))
+            pose_leverage[rows] = (half * dense).sum(axis=1)
+        covariance = np.linalg.inv(jacobian.T @ jacobian)
+        leverage = pose_leverage + np.einsum("ri,ij,rj->r", jacobian, covariance, jacobian)
+        return ReducedSystem(jacobian=jacobian, covariance=covariance, redundancy=1.0 - leverage)
 
     def rotation_rows(self, ticks: IntArray) -> IntArray:
         """Return the indices of the rows of all joint rotation priors at some ticks."""
@@ -192,7 +197,9 @@ class ReducedSystem:
         jacobian: (R,U) derivatives of the rows with respect to U unknowns: the unknowns of all mounts, then
             the additional unknowns that all ticks share.
         covariance: (U,U) covariance of these unknowns if the variance of every row is 1.
+        redundancy: (R,) redundancy of each row, 0 to 1.
     """
 
     jacobian: FloatArray
     covariance: FloatArray
+    redundancy: FloatArray

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body.bones import Bone, Hinge
+from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, Hinge
 from bodycap_batch.model.geometry import nearest_rotation, skew
 
 MAX_BONES = 64
@@ -23,6 +23,8 @@ GEMAN_MCCLURE_C = 6.0
 """Scale of the Geman-McClure loss, in sigmas of a six-dimensional residual. Such a residual typically has a
 length of 2.4 sigmas. Gross errors are removed before the graph is built. Evidence:
 docs/decisions/merging.md."""
+HINGE_SLACK_RATIO = 2.0
+"""Sigma of the distances that define a hinge, divided by the sigma of the gap at a joint. Evidence: none."""
 _AXIS_WEIGHT = 0.1
 """Ratio of the information of a mount's axis point to the information of the mount's centre point. The ratio
 is small, so that the rotation of the mount hardly depends on its translation."""
@@ -100,9 +102,9 @@ class JointFactors:
     Args:
         bones: The graph's bones.
         hinges: The graph's hinges.
-        gap_m: Sigma of the gap at a joint, metres.
-        hinge_m: Sigma of the distances that define a hinge, metres.
         prior_scale: Factor on the sigmas of the rotation prior.
+        slack_m: Slack of a joint: sigma of its gap, metres. The sigma of a hinge is proportional to it.
+        gap_m: Sigma of the gap, if it is not the slack, metres.
     """
 
     def __init__(
@@ -110,9 +112,9 @@ class JointFactors:
         bones: Sequence[Bone],
         hinges: Sequence[Hinge],
         *,
-        gap_m: float,
-        hinge_m: float,
         prior_scale: float = 1.0,
+        slack_m: float = JOINT_SLACK_M,
+        gap_m: float | None = None,
     ) -> None:
         self._hinges = hinges
         self._children = [(index, bone) for index, bone in enumerate(bones) if bone.parent >= 0]
@@ -120,8 +122,12 @@ class JointFactors:
             index: gtsam.Pose3(gtsam.Rot3(bone.mean_rotation), bone.offset_m)
             for index, bone in self._children
         }
+        gap_m = slack_m if gap_m is None else gap_m
         self._noise = {index: _joint_noise(bone, prior_scale, gap_m) for index, bone in self._children}
-        self._hinge_noise = gtsam.noiseModel.Isotropic.Sigma(1, hinge_m)
+        self._hinge_noises = [
+            gtsam.noiseModel.Isotropic.Sigma(1, float(np.hypot(HINGE_SLACK_RATIO * slack_m, hinge.sigma_m)))
+            for hinge in hinges
+        ]
         self._anchors = [
             [gtsam.Pose3(gtsam.Rot3(), anchor) for anchor in hinge.anchors_m] for hinge in hinges
         ]
@@ -131,8 +137,7 @@ class JointFactors:
         for index, bone in self._children:
             parent, child = bone_key(tick, bone.parent), bone_key(tick, index)
             graph.add(gtsam.BetweenFactorPose3(parent, child, self._rest[index], self._noise[index]))
-        noise = self._hinge_noise
-        for hinge, anchors in zip(self._hinges, self._anchors, strict=True):
+        for hinge, anchors, noise in zip(self._hinges, self._anchors, self._hinge_noises, strict=True):
             upper, following = bone_key(tick, hinge.upper), bone_key(tick, hinge.following)
             for anchor in anchors:
                 graph.add(gtsam.RangeFactorWithTransformPose3(upper, following, hinge.range_m, noise, anchor))

@@ -54,6 +54,11 @@ def widen_joint_priors(
     return tuple(out)
 
 
+def samples_per_gesture(times_ns: IntArray) -> float:
+    """Return the mean number of ticks per gesture for ticks at times (K,); at least 1."""
+    return max(1.0, len(times_ns) / _gesture_count(times_ns))
+
+
 def _gesture_count(times_ns: IntArray) -> float:
     """Return the number of gestures in the time span of ticks (K,), without gestures that have no tick."""
     duration_ns = round(1e9 * GESTURE_DURATION_S)

@@ -44,9 +44,6 @@ _GAP_M = 0.001
 """Sigma (metres) of the gap at a joint. The skeleton of the result has no gaps, and takes only the rotations
 of this graph. Evidence: docs/decisions/merging.md."""
 
-_HINGE_M = 0.01
-"""Sigma (metres) of the distances that define a hinge. Evidence: none."""
-
 _TOLERANCE = 1e-4
 """Minimum relative decrease of the error per step. The solver stops after a smaller decrease. Convergence is
 quadratic: after such a step, joints move by less than 0.1 mm."""
@@ -244,9 +241,7 @@ class MotionGraph:
 
     def _add_joints(self) -> None:
         before = self._graph.size()
-        joints = JointFactors(
-            self._bones, hinges(self._skeleton, tuple(self._bones)), gap_m=_GAP_M, hinge_m=_HINGE_M
-        )
+        joints = JointFactors(self._bones, hinges(self._skeleton, tuple(self._bones)), gap_m=_GAP_M)
         for tick in range(len(self._times)):
             joints.add(self._graph, tick)
         self._factor_counts["joints"] = int(self._graph.size() - before)

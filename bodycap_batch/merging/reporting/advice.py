@@ -138,6 +138,27 @@ def describe_mount(mount: Mount, *, t_pose: bool) -> str:
     return f"{text}; to reduce this, {movement}{stand}"
 
 
+def describe_hinge(role: str, off_m: float) -> str:
+    """Describe a hinge that the motion violates.
+
+    Args:
+        role: Anatomical name of the bone below the hinge.
+        off_m: Sigma of the distance between the bone's far end and the plane of the hinge, metres.
+
+    Returns:
+        A sentence for the report, with advice.
+    """
+    side, part = split_side(role)
+    hinge = "elbow" if part == "ForeArm" else "knee"
+    joint = f"{side.lower()} {hinge}"
+    return (
+        f"the {joint} moves {100.0 * off_m:.1f} cm (1 sigma) out of its bending plane, which a real "
+        f"{hinge} cannot do; to reduce this, strap the cameras above and below the {joint} so "
+        "that no camera slides, and check the cameras' clocks (offset_s) and the direction of the "
+        f"{joint}'s axis in the skeleton"
+    )
+
+
 def describe_scale(calibration: BodyCalibration) -> str:
     """Describe how well the metric scale is known.
 

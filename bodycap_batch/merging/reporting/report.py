@@ -20,6 +20,7 @@ from bodycap_batch.merging.cameras.side_check import swapped_sides
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.motion_graph import MotionSolution, PostureDeviation
 from bodycap_batch.merging.reporting.advice import (
+    describe_hinge,
     describe_inverted_cameras,
     describe_mount,
     describe_scale,
@@ -38,6 +39,7 @@ from bodycap_batch.model.merge_report import (
     BodyScaleReport,
     CameraReport,
     FloorReport,
+    HingeReport,
     InvertedCamerasReport,
     MergeReport,
     MountReport,
@@ -159,6 +161,10 @@ def build_report(
         joint_sigma_m=_sigmas_by_role(facts.joint_sigma_m),
         flexion_sigma_deg=_sigmas_by_role(facts.flexion_sigma_deg),
         hinge_off_plane_m=_percentiles_by_name(facts.hinge_off_plane_m),
+        loose_hinges={
+            role: HingeReport(sigma_m=round(off_m, 5), known_to=describe_hinge(role, off_m))
+            for role, off_m in calibration.off_hinge_m.items()
+        },
         activity=_activity_report(inputs.activity, facts.rule_violation_m),
         foot_contact=facts.contacts,
         solver=SolverReport(
