@@ -110,14 +110,6 @@ def _merge_report(paths: tuple[Trajectory, ...]) -> dict[str, object]:
             "sources": [{"name": "height", "relative_sigma": 0.045, "off": -0.012, "used": True}],
             "chi2": 0.0,
             "degrees_of_freedom": 0,
-            "limbs": {
-                "alone": [
-                    {"name": "Spine1-LeftHand", "relative_sigma": 0.05, "off": 0.031, "used": True},
-                    {"name": "Spine1-RightHand", "relative_sigma": 0.06, "off": -0.04, "used": True},
-                ],
-                "chi2": 2.4,
-                "degrees_of_freedom": 1,
-            },
         },
         "mounts": {path.camera: {"role": CAMERAS[path.camera], **mount} for path in paths},
         "cameras": {

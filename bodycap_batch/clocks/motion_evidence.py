@@ -106,20 +106,18 @@ def _against_stated(motion: MotionClocks, camera: str, offset_s: float) -> str:
         camera: Name of the camera.
         offset_s: Stated offset relative to the reference camera, seconds.
     """
-    for pair in motion.pairs:
-        if {pair.first, pair.second} != {motion.reference, camera} or pair.curve is None:
+    for curve in motion.curves:
+        if {curve.first, curve.second} != {motion.reference, camera}:
             continue
-        assert pair.curve_lags_s is not None
-        sign = 1.0 if pair.first == motion.reference else -1.0
-        lags_s = pair.curve_lags_s
-        if not lags_s[0] <= sign * offset_s <= lags_s[-1]:
+        sign = 1.0 if curve.first == motion.reference else -1.0
+        if not curve.lags_s[0] <= sign * offset_s <= curve.lags_s[-1]:
             continue
-        best = int(np.argmax(pair.curve))
-        drop = float(pair.curve[best] - np.interp(sign * offset_s, lags_s, pair.curve))
+        best = int(np.argmax(curve.score))
+        drop = float(curve.score[best] - np.interp(sign * offset_s, curve.lags_s, curve.score))
         if drop >= _MIN_SCORE_DROP:
             return (
                 f"the motion contradicts the offset of {offset_s:.3f} s that the job uses: an offset of "
-                f"about {sign * lags_s[best]:.1f} s fits much better"
+                f"about {sign * curve.lags_s[best]:.1f} s fits much better"
             )
     return ""
 

@@ -1,8 +1,9 @@
-"""Measure the difference between the clocks of cameras from their motion in one map.
+"""Measure the clocks of cameras from their motion in one map.
 
-The score of `motion_score` is the logarithm of the likelihood of each offset. An offset is accepted only if
-it is much more likely than all offsets far from it together, and if its score is higher than that of
-unrelated motions. The scores of all pairs are added: cameras join into groups, the clearest pair first.
+The score of `motion_score` is the logarithm of the likelihood of each offset of a pair of cameras. Cameras
+are added to the reference camera one after the other, the clearest first: the scores of a camera with all of
+those before it are summed. An offset is accepted only if it is much more likely than all offsets far from it
+together, and if its score is higher than that of unrelated motions.
 """
 
 from __future__ import annotations
@@ -67,26 +68,43 @@ _MAX_DRIFT_PPM = 150.0
 _MAX_PAIR_SIGMA_S = 0.1
 """Maximum width, seconds, of the peak of a pair that is used in the common solution. A wider peak contains no
 information within `_NEAR_S`."""
+_MIN_LAGS, _MIN_WINDOW_LAGS, _MIN_WINDOWS = 2, 4, 3
+"""Minimum number of offsets with a score of a pair and of a window, and minimum number of windows of a drift.
+Origin: a line, a cubic spline, and a residual."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MotionOffset(ClockPair):
-    """What the motion of two cameras says about their clocks.
-
-    `sigma_s` contains that of a limb which lags behind the trunk.
+class MotionCurve:
+    """The score of a pair of cameras for all offsets.
 
     Attributes:
-        evidence: Score of the offset: logarithm of its likelihood relative to a typical offset.
-        log_odds: Logarithm of the likelihood of this peak over that of all other offsets.
-        common_s: Time in which both cameras were localised, seconds.
-        curve_lags_s: (L,) offsets of the curve, seconds; None if there is none.
-        curve: (L,) score of each offset.
+        first: Name of the first camera.
+        second: Name of the second camera.
+        signals: Signals of both.
+        weights_hz: Weights of the parts of the score.
+        limb_lag_s: Standard deviation of the offset that more motion does not reduce, seconds.
+        lags_s: (L,) offsets, seconds.
+        common_s: (L,) times in which both cameras were localised, seconds.
+        score: (L,) scores.
     """
 
-    log_odds: float = 0.0
-    common_s: float = 0.0
-    curve_lags_s: FloatArray | None = field(default=None, repr=False)
-    curve: FloatArray | None = field(default=None, repr=False)
+    first: str
+    second: str
+    signals: tuple[MotionSignals, MotionSignals] = field(repr=False)
+    weights_hz: tuple[float, ...]
+    limb_lag_s: float
+    lags_s: FloatArray = field(repr=False)
+    common_s: FloatArray = field(repr=False)
+    score: FloatArray = field(repr=False)
+
+    def at(self, lags_s: FloatArray) -> FloatArray:
+        """Return the score at offsets (K,), seconds; 0 where it is unknown."""
+        from scipy.interpolate import CubicSpline
+
+        out = np.zeros(len(lags_s))
+        inside = (lags_s >= self.lags_s[0]) & (lags_s <= self.lags_s[-1])
+        out[inside] = CubicSpline(self.lags_s, self.score)(lags_s[inside])
+        return out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,68 +114,14 @@ class MotionClocks:
     Attributes:
         reference: Name of the reference camera.
         clocks: Clock of each camera that is connected to the reference camera, with that camera.
-        pairs: What each pair of cameras gives alone.
+        curves: The score of each pair of cameras with enough common time.
         reasons: Why a camera has no clock, by camera.
-        dropped: Pairs that contradict the others, with the difference in seconds.
     """
 
     reference: str
     clocks: dict[str, JointClock]
-    pairs: tuple[MotionOffset, ...]
+    curves: tuple[MotionCurve, ...]
     reasons: dict[str, str]
-    dropped: tuple[tuple[MotionOffset, float], ...] = ()
-
-
-def measure_motion_offset(
-    first: CameraPath, second: CameraPath, limits_s: tuple[float, float] | None = None
-) -> MotionOffset:
-    """Measure the difference between the clocks of two cameras.
-
-    Args:
-        first: Path of the first camera.
-        second: Path of the second camera, in the same gauge.
-        limits_s: Least and greatest offset, seconds; None for all offsets with enough common time.
-    """
-    signals = motion_signals(first), motion_signals(second)
-    curve = _pair_curve(first, second, *signals, limits_s)
-    return _measured(curve)
-
-
-@dataclass(frozen=True, slots=True)
-class _Curve:
-    """The score of a pair for all offsets.
-
-    Attributes:
-        first: Path of the first camera.
-        second: Path of the second camera.
-        signals: Signals of both; None if a path is too short.
-        lags_s: (L,) offsets, seconds.
-        common_s: (L,) common times, seconds.
-        score: (L,) scores.
-    """
-
-    first: CameraPath
-    second: CameraPath
-    signals: tuple[MotionSignals, MotionSignals] | None
-    lags_s: FloatArray
-    common_s: FloatArray
-    score: FloatArray
-
-    @property
-    def limb_lag_s(self) -> float:
-        """Standard deviation of the offset that more motion does not reduce, seconds."""
-        return max(_limb_lag_s(self.first), _limb_lag_s(self.second))
-
-    def at(self, lags_s: FloatArray) -> FloatArray:
-        """Return the score at offsets (K,), seconds; 0 where it is unknown."""
-        from scipy.interpolate import CubicSpline
-
-        out = np.zeros(len(lags_s))
-        if len(self.lags_s) < 2:
-            return out
-        inside = (lags_s >= self.lags_s[0]) & (lags_s <= self.lags_s[-1])
-        out[inside] = CubicSpline(self.lags_s, self.score)(lags_s[inside])
-        return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,29 +166,34 @@ def _limb_lag_s(path: CameraPath) -> float:
     return _LEG_LAG_SIGMA_S if path.role.endswith(_LEG_ROLES) else _LIMB_LAG_SIGMA_S
 
 
-def _pair_curve(
-    first: CameraPath,
-    second: CameraPath,
-    first_signals: MotionSignals | None,
-    second_signals: MotionSignals | None,
-    limits_s: tuple[float, float] | None,
-) -> _Curve:
-    """Return the scores of a pair. The axes are those of the camera on the trunk."""
-    if first_signals is None or second_signals is None:
-        return _Curve(first, second, None, *np.zeros((3, 0)))
-    least = _MIN_COMMON_SHARE * min(first_signals.present_s, second_signals.present_s)
-    weights = TRUNK_WEIGHTS_HZ if first.is_on_trunk or second.is_on_trunk else LIMB_WEIGHTS_HZ
-    signals = first_signals, second_signals
-    # All offsets are evaluated, because the score is relative to that of a typical one.
-    if second.is_on_trunk and not first.is_on_trunk:
-        found = motion_score(second_signals, first_signals, weights, max(MIN_COMMON_S, least))
-        lags, common, score = -found.lags_s[::-1], found.common_s[::-1], found.score[::-1]
-    else:
-        found = motion_score(first_signals, second_signals, weights, max(MIN_COMMON_S, least))
-        lags, common, score = found.lags_s, found.common_s, found.score
-    low, high = limits_s or (-np.inf, np.inf)
-    inside = (lags >= low) & (lags <= high)
-    return _Curve(first, second, signals, lags[inside], common[inside], score[inside])
+def _pair_curves(
+    paths: Sequence[CameraPath], signals: Mapping[str, MotionSignals | None]
+) -> list[MotionCurve]:
+    """Return the scores of all pairs with enough common time, in the axes of a camera on the trunk."""
+    curves = []
+    # A camera on the trunk is the first of its pairs.
+    ordered = sorted(paths, key=lambda path: not path.is_on_trunk)
+    for first, second in itertools.combinations(ordered, 2):
+        one, two = signals[first.camera], signals[second.camera]
+        if one is None or two is None:
+            continue
+        weights_hz = TRUNK_WEIGHTS_HZ if first.is_on_trunk else LIMB_WEIGHTS_HZ
+        least_s = max(MIN_COMMON_S, _MIN_COMMON_SHARE * min(one.present_s, two.present_s))
+        found = motion_score(one, two, weights_hz, least_s)
+        if len(found.lags_s) >= _MIN_LAGS:
+            curves.append(
+                MotionCurve(
+                    first=first.camera,
+                    second=second.camera,
+                    signals=(one, two),
+                    weights_hz=weights_hz,
+                    limb_lag_s=max(_limb_lag_s(first), _limb_lag_s(second)),
+                    lags_s=found.lags_s,
+                    common_s=found.common_s,
+                    score=found.score,
+                )
+            )
+    return curves
 
 
 def _find_peak(lags_s: FloatArray, score: FloatArray, step_s: float, limb_lag_s: float) -> _Peak:
@@ -243,102 +212,66 @@ def _find_peak(lags_s: FloatArray, score: FloatArray, step_s: float, limb_lag_s:
     return _Peak(lag_s, float(np.sqrt(variance)), height, log_odds, edge_s, limb_lag_s)
 
 
-def _measured(curve: _Curve) -> MotionOffset:
-    """Return the result of a pair alone."""
-    pair = MotionOffset(first=curve.first.camera, second=curve.second.camera)
-    short = _short_reason(curve)
-    if short:
-        return replace(pair, reason=short)
-    fine = np.arange(curve.lags_s[0], curve.lags_s[-1], _GRID_S)
-    if len(fine) < 2:
-        return replace(pair, reason="the searched offsets are too few")
-    peak = _find_peak(fine, curve.at(fine), _GRID_S, curve.limb_lag_s)
-    pair = replace(
-        pair,
-        reason=peak.problem(),
-        accepted=not peak.problem(),
-        evidence=peak.score,
-        log_odds=peak.log_odds,
-        curve_lags_s=curve.lags_s,
-        curve=curve.score,
-    )
-    return _refined(curve, pair, peak.lag_s)
-
-
-def _short_reason(curve: _Curve) -> str:
-    """Return why a pair has no scores; empty if it has."""
-    if curve.signals is None:
-        short = curve.first if motion_signals(curve.first) is None else curve.second
-        return f"{short.camera} was localised in too few frames"
-    if len(curve.lags_s) < 2:
-        return f"the cameras were localised together for less than {MIN_COMMON_S:g} s"
-    return ""
-
-
-def _refined(curve: _Curve, pair: MotionOffset, lag_s: float) -> MotionOffset:
-    """Return the pair with offset, drift and their standard deviations near an offset."""
-    assert curve.signals is not None
+def _refined(curve: MotionCurve, lag_s: float) -> ClockPair | None:
+    """Return offset, drift and their standard deviations near an offset; None if it is no clear peak."""
+    if not curve.lags_s[0] <= lag_s <= curve.lags_s[-1]:
+        return None
     first, second = curve.signals
     near = np.arange(
         max(lag_s - _NEAR_S, curve.lags_s[0]), min(lag_s + _NEAR_S, curve.lags_s[-1]) + 1e-9, _FINE_S
     )
     peak = _find_peak(near, curve.at(near), _FINE_S, curve.limb_lag_s)
-    common_s = float(np.interp(peak.lag_s, curve.lags_s, curve.common_s))
     start_s = max(second.first_step * STEP_S, first.first_step * STEP_S - peak.lag_s)
     end_s = min(
         (second.first_step + second.count) * STEP_S,
         (first.first_step + first.count) * STEP_S - peak.lag_s,
     )
-    pair = replace(
-        pair,
+    pair = ClockPair(
+        first=curve.first,
+        second=curve.second,
+        accepted=True,
         pivot_s=0.5 * (start_s + end_s),
         offset_s=peak.lag_s,
         sigma_s=peak.sigma_s,
-        common_s=common_s,
+        evidence=peak.score,
     )
-    if common_s < _MIN_DRIFT_SPAN_S:
-        return pair
-    return _with_drift(curve, pair, start_s, end_s)
+    if float(np.interp(peak.lag_s, curve.lags_s, curve.common_s)) >= _MIN_DRIFT_SPAN_S:
+        pair = _with_drift(curve, pair, start_s, end_s)
+    is_clear = pair.sigma_s <= _MAX_PAIR_SIGMA_S and abs(pair.offset_s - lag_s) < _NEAR_S
+    return pair if is_clear else None
 
 
-def _with_drift(curve: _Curve, pair: MotionOffset, start_s: float, end_s: float) -> MotionOffset:
+def _with_drift(curve: MotionCurve, pair: ClockPair, start_s: float, end_s: float) -> ClockPair:
     """Measure offset and drift from windows along the common time."""
-    assert curve.signals is not None
     first, second = curve.signals
-    is_turned = curve.second.is_on_trunk and not curve.first.is_on_trunk
-    weights = TRUNK_WEIGHTS_HZ if curve.first.is_on_trunk or curve.second.is_on_trunk else LIMB_WEIGHTS_HZ
     square = mean_square_distance(first, second)
     grid = np.arange(-_WINDOW_REACH_S, _WINDOW_REACH_S + 1e-9, _FINE_S)
     middles, curves = [], []
     edges = np.linspace(start_s, end_s, max(3, round((end_s - start_s) / _WINDOW_S)) + 1)
+    reach = _WINDOW_REACH_S + 2 * STEP_S
+    limits = pair.offset_s - reach, pair.offset_s + reach
     for begin, end in itertools.pairwise(edges.tolist()):
-        steps = [round(time / STEP_S) - second.first_step for time in (begin, end)]
-        part = second.part(*steps)
-        reach = _WINDOW_REACH_S + 2 * STEP_S
-        steps = [
-            round((time + pair.offset_s) / STEP_S) - first.first_step for time in (begin - reach, end + reach)
-        ]
-        other = first.part(*steps)
-        limits = pair.offset_s - reach, pair.offset_s + reach
-        if is_turned:
-            found = motion_score(part, other, weights, MIN_COMMON_S, (-limits[1], -limits[0]), square)
-            lags, score = -found.lags_s[::-1], found.score[::-1]
-        else:
-            found = motion_score(other, part, weights, MIN_COMMON_S, limits, square)
-            lags, score = found.lags_s, found.score
-        if len(lags) < 4 or lags[0] > limits[0] + 2 * STEP_S or lags[-1] < limits[1] - 2 * STEP_S:
+        part = second.part(*(round(time / STEP_S) - second.first_step for time in (begin, end)))
+        around = (begin + limits[0], end + limits[1])
+        other = first.part(*(round(time / STEP_S) - first.first_step for time in around))
+        found = motion_score(other, part, curve.weights_hz, MIN_COMMON_S, limits, square)
+        lags = found.lags_s
+        if (
+            len(lags) < _MIN_WINDOW_LAGS
+            or lags[0] > limits[0] + 2 * STEP_S
+            or lags[-1] < limits[1] - 2 * STEP_S
+        ):
             continue
-        window = _Curve(curve.first, curve.second, curve.signals, lags, found.common_s, score)
         middles.append(0.5 * (begin + end))
-        curves.append(window.at(pair.offset_s + grid))
-    if len(middles) < 3:
+        curves.append(replace(curve, lags_s=lags, score=found.score).at(pair.offset_s + grid))
+    if len(middles) < _MIN_WINDOWS:
         return pair
     return _fit_drift(pair, np.array(middles), np.array(curves), grid, curve.limb_lag_s)
 
 
 def _fit_drift(
-    pair: MotionOffset, times_s: FloatArray, curves: FloatArray, grid: FloatArray, limb_lag_s: float
-) -> MotionOffset:
+    pair: ClockPair, times_s: FloatArray, curves: FloatArray, grid: FloatArray, limb_lag_s: float
+) -> ClockPair:
     """Fit a line through the windows: the sum of their scores along it is the greatest.
 
     Args:
@@ -377,123 +310,81 @@ def _fit_drift(
     )
 
 
-def motion_clocks(
-    paths: Sequence[CameraPath],
-    reference: str,
-    priors: Mapping[tuple[str, str], tuple[float, float]] | None = None,
-) -> MotionClocks:
+def motion_clocks(paths: Sequence[CameraPath], reference: str) -> MotionClocks:
     """Measure the clocks of all cameras from their motion.
 
     Args:
         paths: Paths of the cameras in one gauge.
         reference: Name of the reference camera.
-        priors: Least and greatest offset, seconds, by (first, second) camera; other offsets are not searched.
     """
-    limits = dict(priors or {})
-    limits.update({(two, one): (-high, -low) for (one, two), (low, high) in limits.items()})
     signals = {path.camera: motion_signals(path) for path in paths}
-    curves = {
-        (one.camera, two.camera): _pair_curve(
-            one, two, signals[one.camera], signals[two.camera], limits.get((one.camera, two.camera))
-        )
-        for one, two in itertools.combinations(paths, 2)
-    }
-    pairs = {names: _measured(curve) for names, curve in curves.items()}
-    group, reasons, dropped = _group_of(reference, [path.camera for path in paths], curves, pairs)
-    used = []
-    for (one, two), curve in curves.items():
-        if one in group and two in group:
-            lag_s = group[two] - group[one]
-            if len(curve.lags_s) < 2 or not curve.lags_s[0] <= lag_s <= curve.lags_s[-1]:
-                continue
-            near = _refined(curve, pairs[one, two], lag_s)
-            if near.sigma_s <= _MAX_PAIR_SIGMA_S and abs(near.offset_s - lag_s) < _NEAR_S:
-                used.append(near)
+    curves = _pair_curves(paths, signals)
+    offsets_s, reasons = _offsets_from(reference, signals, curves)
+    pairs = [
+        _refined(curve, offsets_s[curve.second] - offsets_s[curve.first])
+        for curve in curves
+        if curve.first in offsets_s and curve.second in offsets_s
+    ]
     starts = {path.camera: path.times_ns[0] * 1e-9 for path in paths if len(path.times_ns)}
     starts.setdefault(reference, 0.0)
     floors = {path.camera: _limb_lag_s(path) for path in paths}
-    solved: JointClocks[MotionOffset] = solve_clocks(reference, used, starts, floors)
-    for name in group:
+    solved: JointClocks[ClockPair] = solve_clocks(
+        reference, [pair for pair in pairs if pair is not None], starts, floors
+    )
+    for name in offsets_s:
         clock = solved.clocks.get(name)
         if clock is None:
             reasons[name] = "the motion does not determine the offset near the common solution"
         elif clock.sigma_at(starts[name]) > _MAX_CLOCK_SIGMA_S:
             del solved.clocks[name]
             reasons[name] = f"the motion determines the offset only to ± {clock.sigma_at(starts[name]):.2f} s"
-    return MotionClocks(
-        reference=reference,
-        clocks=solved.clocks,
-        pairs=tuple(pairs.values()),
-        reasons=reasons,
-        dropped=(*dropped, *solved.dropped),
-    )
+    return MotionClocks(reference=reference, clocks=solved.clocks, curves=tuple(curves), reasons=reasons)
 
 
-def _group_of(
-    reference: str,
-    names: Sequence[str],
-    curves: Mapping[tuple[str, str], _Curve],
-    pairs: Mapping[tuple[str, str], MotionOffset],
-) -> tuple[dict[str, float], dict[str, str], list[tuple[MotionOffset, float]]]:
-    """Join cameras into groups, the clearest peak of added scores first.
+def _offsets_from(
+    reference: str, signals: Mapping[str, MotionSignals | None], curves: Sequence[MotionCurve]
+) -> tuple[dict[str, float], dict[str, str]]:
+    """Add cameras to the reference camera, the clearest peak of added scores first.
 
     Returns:
-        The offset of each camera in the group of the reference camera, reasons of the others, and pairs that
-        are accepted alone and contradict the groups.
+        The offset of each camera with a clear peak, seconds, and the reasons of the others.
     """
-    groups = [{name: 0.0} for name in names]
-    peaks: dict[tuple[int, int], _Peak | None] = {}
+    offsets_s, reasons = {reference: 0.0}, {}
     while True:
-        peaks = {
-            (i, j): _joint_peak(groups[i], groups[j], curves)
-            for i, j in itertools.combinations(range(len(groups)), 2)
-        }
-        clear = [(peak.log_odds, at) for at, peak in peaks.items() if peak is not None and not peak.problem()]
+        others = [name for name in signals if name not in offsets_s]
+        peaks = {name: _peak_of(name, offsets_s, curves) for name in others}
+        clear = [(peak.log_odds, name) for name, peak in peaks.items() if peak and not peak.problem()]
         if not clear:
             break
-        i, j = max(clear)[1]
-        peak = peaks[i, j]
-        assert peak is not None
-        groups[i].update({name: offset + peak.lag_s for name, offset in groups[j].items()})
-        del groups[j]
-    own = next(index for index, group in enumerate(groups) if reference in group)
-    group = groups[own]
-    contradictions = []
-    for (one, two), pair in pairs.items():
-        if pair.accepted and one in group and two in group:
-            difference = pair.offset_s - (group[two] - group[one])
-            if abs(difference) > _NEAR_S:
-                contradictions.append((pair, difference))
-    reasons = {}
-    for index, other in enumerate(groups):
-        if index == own:
-            continue
-        found = peaks[min(own, index), max(own, index)]
-        for name in other:
-            reasons[name] = (
-                found.problem()
-                if found is not None
-                else f"it was not localised together with the others for {MIN_COMMON_S:g} s"
-            )
-    return {name: offset - group[reference] for name, offset in group.items()}, reasons, contradictions
+        name = max(clear)[1]
+        found = peaks[name]
+        assert found is not None  # it is clear
+        offsets_s[name] = found.lag_s
+    for name, peak in peaks.items():
+        if peak is not None:
+            reasons[name] = peak.problem()
+        elif signals[name] is None:
+            reasons[name] = f"{name} was localised in too few frames"
+        else:
+            reasons[name] = f"it was not localised together with the others for {MIN_COMMON_S:g} s"
+    return offsets_s, reasons
 
 
-def _joint_peak(
-    one: Mapping[str, float], two: Mapping[str, float], curves: Mapping[tuple[str, str], _Curve]
-) -> _Peak | None:
-    """Return the peak of the added scores of two groups; its lag is added to the offsets of the second."""
-    terms = []
-    for (first, second), curve in curves.items():
-        if len(curve.lags_s) < 2:
-            continue
-        if first in one and second in two:
-            terms.append((curve, one[first] - two[second], 1.0))
-        elif first in two and second in one:
-            terms.append((curve, two[first] - one[second], -1.0))
+def _peak_of(name: str, offsets_s: Mapping[str, float], curves: Sequence[MotionCurve]) -> _Peak | None:
+    """Return the peak of the added scores of a camera with all cameras whose offset is known."""
+    terms = [
+        (curve, offsets_s[curve.first], 1.0)
+        for curve in curves
+        if curve.second == name and curve.first in offsets_s
+    ]
+    terms += [
+        (curve, offsets_s[curve.second], -1.0)
+        for curve in curves
+        if curve.first == name and curve.second in offsets_s
+    ]
     if not terms:
         return None
-    low = min(min(sign * (curve.lags_s[[0, -1]] + shift)) for curve, shift, sign in terms)
-    high = max(max(sign * (curve.lags_s[[0, -1]] + shift)) for curve, shift, sign in terms)
-    grid = np.arange(low, high + _GRID_S, _GRID_S)
-    total = sum((curve.at(sign * grid - shift) for curve, shift, sign in terms), np.zeros(len(grid)))
+    ends = [known_s + sign * curve.lags_s[[0, -1]] for curve, known_s, sign in terms]
+    grid = np.arange(np.min(ends), np.max(ends) + _GRID_S, _GRID_S)
+    total = sum((curve.at(sign * (grid - known_s)) for curve, known_s, sign in terms), np.zeros(len(grid)))
     return _find_peak(grid, total, _GRID_S, min(curve.limb_lag_s for curve, _, _ in terms))

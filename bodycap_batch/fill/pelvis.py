@@ -17,14 +17,6 @@ _YAW_RAD = np.radians(3.0)
 """Amplitude of the pelvis's yaw with each stride, at 1.3 m/s. Source: M. P. Murray, A. B. Drought, R. C.
 Kory, "Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964: ± 3 to 5°. The smaller
 value, because the turn that reaches the feet is added."""
-_YAW_PER_SWING = np.radians(4.0)
-"""Amplitude (radians) of this yaw for each m/s of the velocity of one hand relative to the other hand.
-Evidence: docs/decisions/filling.md."""
-_MAX_YAW_RAD = np.radians(12.0)
-"""Maximum amplitude of this yaw. Evidence: none."""
-_MIN_YAW_SHARE = 0.4
-"""Minimum amplitude of this yaw, as a share of `_YAW_RAD`, of a person whose arms do not swing. Evidence:
-none."""
 _LIST_RAD = np.radians(3.5)
 """Amplitude of the pelvis's list with each stride, at 1.3 m/s. Source: as `_YAW_RAD`."""
 _FULL_SPEED = 1.3
@@ -142,23 +134,10 @@ def pelvis_rotation(
         phase = stride_phase_rad(steps, ticks)
         walking = low_pass((contacts.state != STAND).astype(np.float64), _FADE_HZ, signals.fps)
         strength = np.clip(walking, 0.0, 1.0) * np.clip(signals.speed_m_per_s() / _FULL_SPEED, 0.0, 1.3)
-        yaw = yaw - np.clip(walking, 0.0, 1.0) * _yaw_amplitude_rad(signals) * np.cos(phase)
+        yaw = yaw - _YAW_RAD * strength * np.cos(phase)
         tilt = -_LIST_RAD * strength * np.sin(phase)
     turn = so3_exp(np.column_stack([zero, zero, yaw]))
     return np.asarray(turn @ so3_exp(np.column_stack([zero, tilt, zero])))
-
-
-def _yaw_amplitude_rad(signals: TrunkSignals) -> FloatArray:
-    """Return the amplitude (T,) of the pelvis's yaw with each stride, from the arm swing and the speed.
-
-    Arms and legs swing against each other so that the body as a whole does not yaw. A person with a wide arm
-    swing therefore turns the pelvis far.
-    """
-    usual = _YAW_RAD * np.clip(signals.speed_m_per_s() / _FULL_SPEED, 0.0, 1.3)
-    if signals.arm_swing_m_per_s is None:
-        return np.asarray(usual)
-    own = np.minimum(_YAW_PER_SWING * signals.arm_swing_m_per_s, _MAX_YAW_RAD)
-    return np.asarray(np.clip(own, _MIN_YAW_SHARE * usual, None))
 
 
 def reaching_pelvis(

@@ -18,9 +18,6 @@ steps, 2 Hz."""
 _STRIDE_HZ = 2.5
 """Cutoff frequency (Hz) of sway, yaw and arm swing, which repeat with each stride. Derivation: more than
 twice the frequency of ordinary strides, 1 Hz."""
-_SWING_HZ = 0.4
-"""Cutoff frequency (Hz) of the amplitude of the arm swing. Derivation: less than half of the frequency of
-slow strides."""
 _MIN_TICKS = 16
 """Minimum number of ticks of a filtered signal. Derivation: the padding of the filter."""
 
@@ -40,7 +37,6 @@ class TrunkSignals:
         sway_m_per_s2: (T,) acceleration of the hips to the left, without that of the slow path.
         twist_rad_per_s: (T,) rate of the trunk's yaw to the left, without that of the slow heading.
         arm_m_per_s: (T,) forward velocity of the left hand relative to the right hand, without its slow part.
-        arm_swing_m_per_s: (T,) amplitude of `arm_m_per_s` over some strides; None if a hand is not measured.
     """
 
     fps: float
@@ -53,7 +49,6 @@ class TrunkSignals:
     sway_m_per_s2: FloatArray
     twist_rad_per_s: FloatArray
     arm_m_per_s: FloatArray
-    arm_swing_m_per_s: FloatArray | None
 
     def speed_m_per_s(self) -> FloatArray:
         """Return the horizontal speed (T,) of the slow path."""
@@ -88,12 +83,10 @@ def trunk_signals(motion: Motion, trunk: int, hands: tuple[int | None, int | Non
     sway = low_pass(hips, _STRIDE_HZ, fps)[:, :2] - slow[:, :2]
     height = low_pass(poses[:, trunk, 2, 3], _STEP_HZ, fps)
     arm = np.zeros(len(hips))
-    swing = None
     if hands[0] is not None and hands[1] is not None:
         apart = poses[:, hands[0], :2, 3] - poses[:, hands[1], :2, 3]
         ahead = (apart * forward).sum(axis=1)
         arm = _rate(low_pass(ahead, _STRIDE_HZ, fps) - low_pass(ahead, _SLOW_HZ, fps), fps)
-        swing = oscillation_amplitude(arm, _SWING_HZ, fps)
     return TrunkSignals(
         fps=fps,
         hips_m=hips,
@@ -105,7 +98,6 @@ def trunk_signals(motion: Motion, trunk: int, hands: tuple[int | None, int | Non
         sway_m_per_s2=(_rate(_rate(sway, fps), fps) * left).sum(axis=1),
         twist_rad_per_s=_rate(low_pass(yaw, _STRIDE_HZ, fps) - heading, fps),
         arm_m_per_s=arm,
-        arm_swing_m_per_s=swing,
     )
 
 

@@ -23,16 +23,6 @@ _PAIR_S, _PAIR_RAD = 0.15, 0.35
 """Maximum time (seconds) and maximum sum of the rotations (radians) between the two frames of a pair, unless
 they are successive. The longer the time, the less the noise of the poses counts; the less the rotation, the
 nearer it is to the integral of the rate. Evidence: none."""
-_BIAS_SPAN_S, _MAX_SPAN_RATIO = 1.0, 1.5
-"""Time (seconds) between the two frames of a pair that shows the bias, and maximum of the true time as a
-ratio to it. The error of a pose has 30 times less effect on a bias over 1 s than between successive
-frames."""
-_BIAS_ROUNDS = 5
-"""Number of times that robust weights of these pairs are computed. Evidence: none."""
-_MIN_SPANS = 3
-"""Minimum number of such pairs for a better bias. Evidence: none."""
-_MIN_BIAS_SIGMA_RAD_S = 1e-4
-"""Minimum standard deviation of a bias, rad/s. Evidence: none."""
 _ROUNDS = 3
 """Number of fits. Each one corrects the rotations for the change of the axis within a pair of frames, with
 the rates of the fit before. Evidence: none."""
@@ -76,10 +66,7 @@ def align_sensor(trajectory: Trajectory, telemetry: CameraTelemetry) -> SensorAl
             return SensorAlignment(comparison=compared)
         samples = samples_of_fit(gyro, telemetry.accelerometer, compared.fit)
         corrected = replace(seen, turn_rad=seen.turn_rad - _axis_change(seen, samples))
-    assert compared.fit is not None  # the pictures agree with the gyroscope
-    fit = _with_better_bias(compared.fit, trajectory, samples)
-    samples = samples_of_fit(gyro, telemetry.accelerometer, fit)
-    return SensorAlignment(comparison=replace(compared, fit=fit), samples=samples)
+    return SensorAlignment(comparison=compared, samples=samples)
 
 
 def rotations_between_frames(trajectory: Trajectory) -> PictureRotation:
@@ -105,12 +92,10 @@ def rotations_between_frames(trajectory: Trajectory) -> PictureRotation:
             break
         turned = turned + np.where(longer, step_rad[following], 0.0)
         last = last + longer
-    sigma = np.sqrt(np.diagonal(trajectory.covariance[frames], axis1=1, axis2=2)[:, :3].mean(axis=1))
     return PictureRotation(
         start_s=times_s[first],
         end_s=times_s[last],
         turn_rad=so3_log(np.swapaxes(rotation[first], 1, 2) @ rotation[last]).reshape(-1, 3),
-        spread_rad=np.hypot(sigma[first], sigma[last]),
     )
 
 
@@ -134,51 +119,3 @@ def _axis_change(pairs: PictureRotation, samples: InertialSamples) -> FloatArray
     )
     outside = ~samples.covers(pairs.start_s, pairs.end_s)
     return np.where(outside[:, None], 0.0, exact - plain)
-
-
-def _with_better_bias(fit: GyroFit, trajectory: Trajectory, samples: InertialSamples) -> GyroFit:
-    """Return the fit with the bias that explains the rotations over about a second."""
-    frames = np.flatnonzero(trajectory.localised)
-    times_s = trajectory.seconds[frames]
-    wanted_s = np.arange(times_s[0], times_s[-1] - _BIAS_SPAN_S, 0.5 * _BIAS_SPAN_S)
-    first = np.searchsorted(times_s, wanted_s)
-    last = np.searchsorted(times_s, times_s[first] + _BIAS_SPAN_S)
-    known = np.flatnonzero(last < len(times_s))
-    first, last = first[known], last[known]
-    span_s = times_s[last] - times_s[first]
-    kept = samples.covers(times_s[first], times_s[last]) & (span_s < _MAX_SPAN_RATIO * _BIAS_SPAN_S)
-    first, last = first[kept], last[kept]
-    if len(first) < _MIN_SPANS:
-        return fit
-    oriented = GyroOrientation(samples.times_s, samples.rate_rad_s)
-    start, end = oriented.at(times_s[first]), oriented.at(times_s[last])
-    rotation = trajectory.gauge_from_cam[frames][:, :3, :3]
-    solved = np.swapaxes(rotation[first], 1, 2) @ rotation[last]
-    error = so3_log(np.swapaxes(solved, 1, 2) @ np.swapaxes(start, 1, 2) @ end)
-    steps = 0.5 * (oriented.rotation[1:] + oriented.rotation[:-1])
-    steps = steps * np.diff(samples.times_s)[:, None, None]
-    total = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
-    nearest = [np.searchsorted(samples.times_s, times_s[index]) for index in (first, last)]
-    before, after = (total[np.minimum(index, len(total) - 1)] for index in nearest)
-    effect = np.swapaxes(end, 1, 2) @ (after - before)
-    bias, sigma = _robust_mean(effect, error)
-    return replace(
-        fit,
-        bias_rad_s=fit.bias_rad_s + fit.cam_from_sensor.T @ bias,
-        bias_sigma_rad_s=np.abs(fit.cam_from_sensor.T) @ sigma,
-    )
-
-
-def _robust_mean(effect: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return x (3,) with effect (N,3,3) · x ≈ error (N,3), and its standard deviations."""
-    weight, noise, found = np.ones(len(error)), 1.0, np.zeros(3)
-    information = np.eye(3)
-    for _ in range(_BIAS_ROUNDS):
-        information = np.einsum("nki,n,nkj->ij", effect, weight, effect)
-        found = np.linalg.solve(information, np.einsum("nki,n,nk->i", effect, weight, error))
-        size = np.linalg.norm(error - effect @ found, axis=1)
-        noise = max(1.2 * float(np.median(size)) / np.sqrt(3.0), 1e-6)
-        weight = 1.0 / (1.0 + (size / (2.5 * noise)) ** 2) ** 2
-    # Successive pairs overlap by half.
-    sigma = np.sqrt(2.0 * np.diag(np.linalg.inv(information))) * noise
-    return found, np.maximum(sigma, _MIN_BIAS_SIGMA_RAD_S)

@@ -83,7 +83,6 @@ class SolvedStretch:
     Attributes:
         gauge_from_cam: (N,4,4) poses of all frames in the gauge.
         covariance: (N,6,6) covariance in the axes of the camera, rotation before translation (gauge units).
-        chi2_per_dof: Weighted sum of squared residuals per degree of freedom; 1 is ideal.
         worst_fix: Largest residual of a solved pose, in sigmas of six axes together.
         worst_frame: Index of the frame with this residual.
         fix_sigmas: (F,) residuals of all solved poses, in the same unit.
@@ -92,7 +91,6 @@ class SolvedStretch:
 
     gauge_from_cam: FloatArray
     covariance: FloatArray
-    chi2_per_dof: float
     worst_fix: float
     worst_frame: int
     fix_sigmas: FloatArray
@@ -130,20 +128,19 @@ def solve_stretch(
         noise: Noise of the sensor.
 
     Returns:
-        The solution. The caller decides from `chi2_per_dof`, `worst_fix` and the covariance whether it is
-        used.
+        The solution. The caller decides from `worst_fix` and the covariance whether it is used.
     """
     problem = _Problem(stretch, samples, constants, noise)
     state = problem.initial()
     for _ in range(_MAX_ITERATIONS):
-        information, vector, _, _ = problem.linearise(state)
+        information, vector, _ = problem.linearise(state)
         scale = np.sqrt(np.diag(information))
         step = np.linalg.solve(information / np.outer(scale, scale), vector / scale)
         state = state.moved(step / scale)
         if float(np.abs(step).max()) < _CONVERGED * max(float(scale.max()), 1.0):
             break
-    information, _, cost, sizes = problem.linearise(state)
-    return problem.result(state, information, cost, sizes)
+    information, _, sizes = problem.linearise(state)
+    return problem.result(state, information, sizes)
 
 
 class _Problem:
@@ -184,15 +181,14 @@ class _Problem:
         position = path(times_s) + rotation @ mean[LEVER]
         return _State(rotation, position, np.asarray(path(times_s, 1)), mean.copy())
 
-    def linearise(self, state: _State) -> tuple[FloatArray, FloatArray, float, FloatArray]:
-        """Return information, vector, cost, and the residuals (F,) of the solved poses in sigmas."""
+    def linearise(self, state: _State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return information, vector, and the residuals (F,) of the solved poses in sigmas."""
         size = _NODE * self._nodes + CONSTANTS
         information, vector = np.zeros((size, size)), np.zeros(size)
         tail = slice(size - CONSTANTS, size)
         off = state.constants - self._prior.mean
         information[tail, tail] = self._prior_information
         vector[tail] = -self._prior_information @ off
-        cost = float(off @ self._prior_information @ off)
         spans = preintegrate(
             self._steps, state.constants[GYRO_BIAS], state.constants[FORCE_BIAS], self._noise
         )
@@ -205,7 +201,6 @@ class _Problem:
             weighted = jacobian.T @ weight[node]
             information[np.ix_(columns, columns)] += weighted @ jacobian
             vector[columns] -= weighted @ residual[node]
-            cost += float(residual[node] @ weight[node] @ residual[node])
         residual, first, common = self._fix_rows(state)
         sizes = np.zeros(len(self._fixes))
         for index, node in enumerate(self._fixes.tolist()):
@@ -219,8 +214,7 @@ class _Problem:
             weighted = share * jacobian.T @ weights
             information[np.ix_(columns, columns)] += weighted @ jacobian
             vector[columns] -= weighted @ residual[index]
-            cost += share * size2
-        return information, vector, cost, sizes
+        return information, vector, sizes
 
     def _span_rows(
         self, state: _State, spans: Preintegrated
@@ -294,7 +288,7 @@ class _Problem:
             rows[:, :3], rows[:, 3:] = right @ rows[:, :3], back @ rows[:, 3:]
         return np.concatenate([turn, shift], axis=1), first, common
 
-    def result(self, state: _State, information: FloatArray, cost: float, sizes: FloatArray) -> SolvedStretch:
+    def result(self, state: _State, information: FloatArray, sizes: FloatArray) -> SolvedStretch:
         """Return the poses of the camera with their covariances."""
         nodes = np.arange(self._nodes)
         rotation, position = self._camera(state, nodes)
@@ -307,11 +301,9 @@ class _Problem:
             columns = np.r_[_NODE * node : _NODE * (node + 1), size - CONSTANTS : size]
             jacobian = np.concatenate([first[node], common[node]], axis=1)
             out[node] = jacobian @ covariance[np.ix_(columns, columns)] @ jacobian.T
-        rows = _NODE * (self._nodes - 1) + 6 * len(self._fixes) + CONSTANTS
         return SolvedStretch(
             gauge_from_cam=make_transform(rotation, position + self._origin),
             covariance=0.5 * (out + np.swapaxes(out, 1, 2)),
-            chi2_per_dof=cost / max(rows - size, 1),
             worst_fix=float(sizes.max()),
             worst_frame=int(self._fixes[int(np.argmax(sizes))]),
             fix_sigmas=sizes,

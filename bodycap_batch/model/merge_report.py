@@ -67,21 +67,6 @@ class BodyScaleReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LimbScalesReport:
-    """The metric scales from single limbs, for checking whether the limbs agree on the scale.
-
-    Attributes:
-        alone: For each limb, the scale that follows from this limb only.
-        chi2: Chi-square of these scales about their mean.
-        degrees_of_freedom: Number of degrees of freedom of the chi-square.
-    """
-
-    alone: tuple[ScaleSourceReport, ...]
-    chi2: float
-    degrees_of_freedom: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleReport:
     """The selected metric scale, with its sources and its uncertainty.
 
@@ -96,7 +81,6 @@ class ScaleReport:
         trunk_over_floor_m: Height above the floor, metres, of the joint that the reference camera is mounted
             on; None if no floor was found.
         known_to: Sentence about the uncertainty of the scale, with advice.
-        limbs: The scales from single limbs; None if fewer than two limbs can be used.
     """
 
     source: str
@@ -108,7 +92,6 @@ class ScaleReport:
     body_alone: BodyScaleReport
     trunk_over_floor_m: float | None
     known_to: str
-    limbs: LimbScalesReport | None = field(default=None, metadata=_OMIT_NONE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -308,13 +308,6 @@ BODY_RULES = (
         rationale=_SCALES_RATIONALE,
     ),
     Rule(
-        name="Scales of the limbs",
-        read=readings.chance("merge.scale.limbs", "alone"),
-        bounds=Bounds(good=0.01, fair=0.0001, more_is_better=True),
-        finding=_SCALES_FINDING,
-        rationale=_SCALES_RATIONALE,
-    ),
-    Rule(
         name="Cameras in their usual places",
         read=readings.largest("merge.mounts", "from_usual_deg"),
         bounds=Bounds(good=35.0, fair=60.0),

@@ -77,7 +77,6 @@ def make_tables(inputs: ReportInputs) -> dict[str, Table]:
             "mounts": _mounts_table(merge),
             "joined": _joined_cameras_table(merge),
             "scale": _scale_table(merge),
-            "limbs": _limb_scales_table(merge),
             "rules": _soft_limits_table(merge),
             "sigma": _joint_sigma_table(inputs),
             "flexion": _flexion_table(merge),
@@ -388,20 +387,6 @@ def _scale_table(merge: Mapping[str, Any]) -> Table:
         heads=("Source", "Uncertainty", "Difference from the used scale", ""),
         rows=rows,
         note=_chi_square_note(scale),
-    )
-
-
-def _limb_scales_table(merge: Mapping[str, Any]) -> Table:
-    limbs = merge.get("scale", {}).get("limbs", {})
-    rows = tuple(
-        _scale_source_cells(merge, f"merge.scale.limbs.alone.{index}")
-        for index in range(len(limbs.get("alone", ())))
-    )
-    return Table(
-        caption="Metric scale, estimated from each limb alone",
-        heads=("Limb", "Uncertainty", "Difference from the used scale"),
-        rows=rows,
-        note=_chi_square_note(limbs),
     )
 
 

@@ -75,7 +75,6 @@ def _rotations(step: FloatArray, times_s: FloatArray, known: BoolArray) -> Pictu
         start_s=times_s[:-1][known],
         end_s=times_s[1:][known],
         turn_rad=-so3_log(step).reshape(-1, 3),
-        spread_rad=np.zeros(len(step)),
     )
 
 

@@ -56,8 +56,6 @@ _SHAKE_QUANTILE = 0.75
 _MAX_AUTOCORRELATION = 0.98
 """Largest autocorrelation of successive residuals that is believed: at 30 frames per second, residuals that
 last for 1.7 s. Evidence: none."""
-_LAGS = 8
-"""Largest distance (pairs) of residuals whose products count: twice the length of a pair of poses."""
 _GROWTH_BY_TRIMMING = 1.255
 """Factor of the standard deviations because the largest tenth of the residuals is left out, which makes the
 others look more exact than they are. Origin: the asymptotic variance of such an estimate for three normally
@@ -91,8 +89,6 @@ class GyroFit:
         typical_r_squared: Median of this share over all delays that were tried: high if there is no peak.
         gyro_shake_rad_s: Typical size of the fast changes of the gyroscope's rate, rad/s.
         picture_shake_rad_s: The same of the pictures' rotations, corrected by the focal ratio.
-        turn_rms_rad_s: Root mean square of the gyroscope's rate over the pairs, without its mean, rad/s.
-        picture_rms_rad_s: The same of the pictures' rotations.
         pairs: Number of pairs of frames that were used.
     """
 
@@ -110,8 +106,6 @@ class GyroFit:
     typical_r_squared: float
     gyro_shake_rad_s: float
     picture_shake_rad_s: float
-    turn_rms_rad_s: float
-    picture_rms_rad_s: float
     pairs: int
 
 
@@ -260,17 +254,12 @@ class _Problem:
         x0 = np.concatenate([np.zeros(3), bias, [first.delay_s, 0.0, math.log(first.ratio)]])
         found = least_squares(residuals, x0, method="lm", max_nfev=400)
         slope = np.asarray(found.jac)
-        information = slope.T @ slope
-        sigma = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information)), 0.0))
+        sigma = np.sqrt(np.maximum(np.diag(np.linalg.pinv(slope.T @ slope)), 0.0))
         error = self._seen - predicted(found.x)
         weighted = weight * error
         noise_rad_s = max(float(np.sqrt((weighted[kept] ** 2).mean())), _LEAST_NOISE_RAD_S)
-        sigma *= _growth_by_autocorrelation(weighted, kept) * noise_rad_s / first.noise_rad_s
-        rows = slice(0, 3 * int(kept.sum()))
-        robust = _robust_sigma(information, slope[rows], np.asarray(found.fun)[rows])
-        ends_s = self._start_s[kept], self._end_s[kept]
-        shared = _sigma_of_frames(information, slope[rows], ends_s, noise_rad_s / first.noise_rad_s)
-        sigma = _GROWTH_BY_TRIMMING * np.maximum(np.maximum(sigma, shared), robust)
+        sigma *= _GROWTH_BY_TRIMMING * _growth_by_autocorrelation(weighted, kept)
+        sigma *= noise_rad_s / first.noise_rad_s
         seen = self._seen[kept]
         ratio = math.exp(float(found.x[8]))
         rate = self.measured(float(found.x[6]), float(found.x[7])) - found.x[3:6]
@@ -291,57 +280,8 @@ class _Problem:
             typical_r_squared=typical,
             gyro_shake_rad_s=shakes[0],
             picture_shake_rad_s=shakes[1],
-            turn_rms_rad_s=float(np.sqrt(((turned - turned.mean(axis=0)) ** 2).sum(axis=1).mean())),
-            picture_rms_rad_s=float(np.sqrt(((seen - seen.mean(axis=0)) ** 2).sum(axis=1).mean())),
             pairs=int(kept.sum()),
         )
-
-
-def _robust_sigma(information: FloatArray, slope: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return standard deviations (U,) from the products of residuals that are near in time.
-
-    Fast turns determine the delay, and the errors of the rotations are larger in them. Pairs that share a
-    frame have correlated errors.
-
-    Args:
-        information: (U,U) information of the U unknowns.
-        slope: (3N,U) derivatives of the residuals of N pairs, in the order of time.
-        residual: (3N,) residuals.
-
-    Source: Newey and West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation
-        consistent covariance matrix", 1987.
-    """
-    score = (slope * residual[:, None]).reshape(-1, 3, slope.shape[1]).sum(axis=1)
-    spread = score.T @ score
-    for lag in range(1, min(_LAGS, len(score) - 1) + 1):
-        product = score[lag:].T @ score[:-lag]
-        spread += (1.0 - lag / (_LAGS + 1.0)) * (product + product.T)
-    inverse = np.linalg.pinv(information)
-    return np.asarray(np.sqrt(np.maximum(np.diag(inverse @ spread @ inverse), 0.0)))
-
-
-def _sigma_of_frames(
-    information: FloatArray, slope: FloatArray, ends_s: tuple[FloatArray, FloatArray], noise: float
-) -> FloatArray:
-    """Return standard deviations (U,) for errors that belong to frames, not to pairs.
-
-    The error of a pose is in the pairs that end with it and, with the other sign, in those that start with
-    it. Where the derivatives of these pairs have different signs, the errors add up.
-
-    Args:
-        information: (U,U) information of the U unknowns.
-        slope: (3N,U) derivatives of the residuals of N pairs.
-        ends_s: Times (N,) of the first and of the second frame of each pair, seconds.
-        noise: Standard deviation of a residual.
-    """
-    _, frame = np.unique(np.concatenate(ends_s), return_inverse=True)
-    own = slope.reshape(-1, 3, slope.shape[1])
-    effect = np.zeros((int(frame.max()) + 1, *own.shape[1:]))
-    np.add.at(effect, frame[: len(own)], -own)
-    np.add.at(effect, frame[len(own) :], own)
-    spread = 0.5 * noise**2 * np.einsum("fki,fkj->ij", effect, effect)
-    inverse = np.linalg.pinv(information)
-    return np.asarray(np.sqrt(np.maximum(np.diag(inverse @ spread @ inverse), 0.0)))
 
 
 def _growth_by_autocorrelation(error: FloatArray, kept: BoolArray) -> float:

@@ -44,20 +44,17 @@ class PictureRotation:
         end_s: (N,) time of the second frame of each pair, seconds.
         turn_rad: (N,3) rotation vector of the camera from the first to the second frame, in the frame of the
             camera, radians. It is turned by the angular rate times the interval.
-        spread_rad: (N,) median distance of the directions from the rotation, radians.
     """
 
     start_s: FloatArray
     end_s: FloatArray
     turn_rad: FloatArray
-    spread_rad: FloatArray
 
     def __post_init__(self) -> None:
         count = len(self.start_s)
         set_array(self, "start_s", (count,))
         set_array(self, "end_s", (count,))
         set_array(self, "turn_rad", (count, 3))
-        set_array(self, "spread_rad", (count,))
 
     def chosen(self, keep: IntArray) -> PictureRotation:
         """Return selected pairs."""
@@ -66,7 +63,6 @@ class PictureRotation:
             start_s=self.start_s[keep],
             end_s=self.end_s[keep],
             turn_rad=self.turn_rad[keep],
-            spread_rad=self.spread_rad[keep],
         )
 
 
@@ -80,7 +76,7 @@ def measure_picture_rotation(camera: CaptureCamera, gyro: Stream) -> PictureRota
     Raises:
         CaptureError: The video cannot be read.
     """
-    rows: list[tuple[float, float, FloatArray, float]] = []
+    rows: list[tuple[float, float, FloatArray]] = []
     times_s = np.asarray(camera.times_ns * 1e-9, dtype=np.float64)
     for window in _windows(times_s, gyro):
         before: tuple[int, GreyImage] | None = None
@@ -88,13 +84,12 @@ def measure_picture_rotation(camera: CaptureCamera, gyro: Stream) -> PictureRota
             if before is not None and before[0] == index - 1:
                 found = _rotation_between(camera.camera, before[1], image)
                 if found is not None:
-                    rows.append((float(times_s[index - 1]), float(times_s[index]), *found))
+                    rows.append((float(times_s[index - 1]), float(times_s[index]), found))
             before = (index, image)
     return PictureRotation(
         start_s=np.array([row[0] for row in rows]),
         end_s=np.array([row[1] for row in rows]),
         turn_rad=np.array([row[2] for row in rows]).reshape(-1, 3),
-        spread_rad=np.array([row[3] for row in rows]),
     )
 
 
@@ -116,11 +111,8 @@ def _windows(times_s: FloatArray, gyro: Stream) -> list[IntArray]:
     return [np.arange(edges[index], edges[index + 1]) for index in best.tolist()]
 
 
-def _rotation_between(camera: Camera, first: GreyImage, second: GreyImage) -> tuple[FloatArray, float] | None:
-    """Return the rotation vector of the camera between two images, and the median distance from it.
-
-    The result is None if too few corners were tracked.
-    """
+def _rotation_between(camera: Camera, first: GreyImage, second: GreyImage) -> FloatArray | None:
+    """Return the rotation vector of the camera between two images; None if too few corners were tracked."""
     from scipy.spatial.transform import Rotation
 
     px = detect_corners(first, _CORNERS, _SPACING_PX)
@@ -131,5 +123,4 @@ def _rotation_between(camera: Camera, first: GreyImage, second: GreyImage) -> tu
         return None
     one, other = (unit_directions(each[valid]) for each in rays)
     second_from_first = fit_rotation(one, other, _ROUNDS)
-    distance = np.linalg.norm(other - one @ second_from_first.T, axis=1)
-    return -Rotation.from_matrix(second_from_first).as_rotvec(), float(np.median(distance))
+    return np.asarray(-Rotation.from_matrix(second_from_first).as_rotvec())

@@ -96,7 +96,7 @@ def summary(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 def main(arguments: Sequence[str]) -> int:
     """Run all cases; print one line per seed and one per split."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench joining", description=__doc__)
-    parser.add_argument("--splits", nargs="*", default=list(SPLITS), candidate_main_maps=list(SPLITS))
+    parser.add_argument("--splits", nargs="*", default=list(SPLITS), choices=list(SPLITS))
     parser.add_argument(
         "--seeds", type=_seeds, default=range(24), help="number of seeds, or FIRST-LAST, both included"
     )

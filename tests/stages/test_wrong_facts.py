@@ -81,7 +81,6 @@ def _contradicted_clocks(trajectories: list[Trajectory]) -> set[str]:
 CONTRADICTIONS = (
     "Postures",
     "Sources of the scale",
-    "Scales of the limbs",
     "Cameras in their usual places",
 )
 """Criteria that a wrong fact violates; scale and mounts can be uncertain without any wrong fact."""

@@ -11,7 +11,6 @@ import numpy as np
 from bodycap_batch.config.options import MarkerBoard, MergeOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import Bone
-from bodycap_batch.merging.body.clock_scale_error import scale_sigma_from_clocks
 from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose
 from bodycap_batch.merging.body.trunk_lean import trunk_orientation, trunk_orientation_from_prior
 from bodycap_batch.merging.body_calibration.calibration_covariance import (
@@ -27,14 +26,12 @@ from bodycap_batch.merging.body_calibration.camera_roll import (
     with_roll,
 )
 from bodycap_batch.merging.body_calibration.known_distance import known_distance
-from bodycap_batch.merging.body_calibration.limb_scales import limb_scales
 from bodycap_batch.merging.body_calibration.marker_board import LocatedBoard, locate_board
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import PostureHints, take_samples
 from bodycap_batch.merging.body_calibration.scale import (
     MetricScale,
     ScaleEstimate,
-    ScaleSource,
     combine_sources,
     estimate_scale,
     scale_from_bones,
@@ -93,7 +90,6 @@ class BodyCalibration:
         scale: The metric scale, combined from all of its sources.
         bones_alone: The scale from the bones without other sources. At this scale the calibration graph has
             the lowest cost.
-        limbs: One scale per limb, estimated from the cameras of this limb. The scales are a diagnostic only.
         mounts: The solved mounts with their sigmas. The mount of the reference camera is the first.
         reference_prior: Mount prior of the reference camera, rotated by the roll that was found.
         error_modes: Error modes of scale, mounts and body. Some are constant over the capture, the others
@@ -110,7 +106,6 @@ class BodyCalibration:
 
     scale: MetricScale
     bones_alone: ScaleEstimate
-    limbs: tuple[ScaleSource, ...]
     mounts: tuple[Mount, ...]
     reference_prior: Mount
     error_modes: ErrorModes
@@ -198,7 +193,6 @@ def calibrate_body(
         estimate,
         is_measured=inputs.skeleton_is_measured,
         has_height=inputs.height_m is not None,
-        clock_sigma=scale_sigma_from_clocks(bones, tracks, priors, inputs.clocks),
     )
     scale = combine_sources(
         bones_alone,
@@ -217,7 +211,6 @@ def calibrate_body(
     return BodyCalibration(
         scale=scale,
         bones_alone=estimate,
-        limbs=limb_scales(inputs.skeleton, priors, tracks, scale.metres_per_unit, hints, step),
         mounts=mounts_with_sigmas(graph, modes.constant),
         reference_prior=priors[tracks[0].camera],
         error_modes=modes.stacked(),

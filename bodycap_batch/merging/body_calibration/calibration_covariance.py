@@ -12,14 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body_calibration.joint_variability import transient_variance_shares
-from bodycap_batch.merging.body_calibration.mount_calibration_graph import JOINT_PRIOR_SCALE, CalibrationGraph
-from bodycap_batch.merging.body_calibration.mount_covariance import (
-    LinearisedCalibration,
-    ReducedSystem,
-    RowType,
-)
-from bodycap_batch.merging.body_calibration.samples import CalibrationSamples
+from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
+from bodycap_batch.merging.body_calibration.mount_covariance import TRANSIENT_SHARE, LinearisedCalibration
 from bodycap_batch.merging.body_calibration.skeleton_error_modes import SkeletonErrorModes
 from bodycap_batch.merging.graph.error_modes import (
     POSTURE_BIAS_SHARE,
@@ -32,16 +26,7 @@ from bodycap_batch.merging.graph.error_modes import (
 )
 from bodycap_batch.merging.graph.factors import MountPoints, mount_keys
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph
-from bodycap_batch.model.nominal_mounts import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_RAD
 from bodycap_batch.model.skeleton import Mount
-
-_TRANSIENT_SHARE = float(np.sqrt(1.0 - POSTURE_BIAS_SHARE**2))
-"""Transient part of the sigma of a joint's rotation prior, as a fraction of this sigma.
-
-The rotation prior has a constant and a transient part. The constant part is one posture bias for the whole
-capture. It has the fraction `POSTURE_BIAS_SHARE` of the sigma. The transient part varies within the capture.
-The squares of the two fractions add up to 1.
-"""
 
 
 class PoseSigma(NamedTuple):
@@ -111,21 +96,21 @@ def error_modes(
     samples, cameras = graph.samples, graph.samples.cameras
     linearised = graph.linearised()
     reduced = linearised.reduced()
-    factors = variance_factors(samples, linearised, reduced)
-    map_error = _map_error_variance(samples, linearised, reduced)
     body_modes = [posture_bias_modes(linearised.body.bones, cameras, POSTURE_BIAS_SHARE)]
     body_modes += [] if skeleton is None else [skeleton.bone_lengths]
     follow = {name: mount_perturbation(graph.mounts[name], scale.mount_slope[name]) for name in cameras}
+    # The sigmas of the samples contain the map's error, multiplied by the number of samples that share it.
+    map_error = (1.0 - samples.white_noise_share) / samples.correlated_samples
     bends = np.sqrt(map_error) * np.stack([samples.sigma_rad, graph.scale * samples.sigma_map], axis=1)
     bends = np.hypot(bends, [alignment.get(name, (0.0, 0.0)) for name in cameras])
     constant = stack_modes(
         [
-            linearised.error_modes(reduced, factors, stack_modes(body_modes)),
+            linearised.error_modes(reduced, stack_modes(body_modes)),
             scale_modes(graph.bones, scale.sigma_log, follow),
         ]
     )
     transient = [
-        posture_bias_modes(graph.bones, cameras, _transient_shares(samples, linearised, reduced)),
+        posture_bias_modes(graph.bones, cameras, TRANSIENT_SHARE),
         map_error_modes(graph.bones, dict(zip(cameras, bends, strict=True))),
     ]
     transient += [] if skeleton is None else [linearised.propagated(reduced, skeleton.joint_placement)]
@@ -155,59 +140,6 @@ def mounts_with_sigmas(graph: CalibrationGraph, modes: ErrorModes) -> tuple[Moun
             )
         )
     return tuple(out)
-
-
-def variance_factors(
-    samples: CalibrationSamples, linearised: LinearisedCalibration, reduced: ReducedSystem
-) -> FloatArray:
-    """Estimate the variance factor of each `RowType` from the residuals.
-
-    The variance factor is the ratio of the actual variance of the residuals to the assumed variance.
-
-    Args:
-        samples: The camera poses of the calibration graph.
-        linearised: The calibration graph, linearised at its solution.
-        reduced: The reduced system of `linearised`.
-
-    Returns:
-        (5,) variance factors.
-    """
-    correlated = samples.correlated_samples
-    map_error = _map_error_variance(samples, linearised, reduced)
-    # Because of errors of the map, the camera poses of successive samples are correlated. The joint gaps may
-    # be correlated in the same way.
-    gap = correlated * linearised.variance_factor(reduced, RowType.JOINT_GAP, 1.0 / correlated)
-    factors = {
-        RowType.PRIOR: 1.0,
-        RowType.MEASUREMENT: samples.white_noise_share + correlated * map_error,
-        RowType.JOINT_GAP: gap,
-        # The graph uses joint rotation priors with widened sigmas. The factor restores the original sigmas,
-        # reduced to the transient part, because only this part differs between samples.
-        RowType.JOINT_ROTATION: (_TRANSIENT_SHARE / JOINT_PRIOR_SCALE) ** 2,
-        # Some mount orientations are assumed from the camera's name only. The graph uses a larger sigma for
-        # these orientations than their expected error.
-        RowType.NAMED_MOUNT: (NOMINAL_ERROR_RAD / NOMINAL_SIGMA_RAD) ** 2,
-    }
-    return np.array([factors[row_type] for row_type in RowType])
-
-
-def rescale_sigmas(
-    graph: CalibrationGraph, linearised: LinearisedCalibration, reduced: ReducedSystem
-) -> None:
-    """Reduce the sigmas of camera poses and joint gaps to the sigmas estimated from the residuals.
-
-    Small residuals show that the map has smaller errors than assumed. Large residuals do not change the
-    sigmas: this function never increases a sigma.
-
-    Args:
-        graph: The solved calibration graph. Its sigmas are changed.
-        linearised: The graph, linearised at its solution.
-        reduced: The reduced system of `linearised`.
-    """
-    factors = variance_factors(graph.samples, linearised, reduced)
-    graph.rescale_sigmas(
-        min(float(factors[RowType.MEASUREMENT]), 1.0), min(float(factors[RowType.JOINT_GAP]), 1.0)
-    )
 
 
 def measurement_jacobian(
@@ -258,32 +190,13 @@ def scale_jacobian(graph: CalibrationGraph, linearised: LinearisedCalibration) -
         (R,) change of the whitened residuals per unit of log scale.
     """
     linear = linearised.linear
-    out = np.where(linearised.row_types == RowType.JOINT_GAP, -linear.rhs, 0.0)
+    out = np.zeros(len(linear.rhs))
+    first, ticks = linearised.first_joint_factor, len(linearised.world_from_bone)
+    start, end = linear.first_row[[first, first + linearised.body.factors_per_tick * ticks]]
+    out[start:end] = -linear.rhs[start:end]
+    out[linearised.rotation_rows(np.arange(ticks))] = 0.0
     for camera in range(len(graph.samples.cameras)):
         centre = linear.first_row[graph.measurement_factors(camera)[:, 0]][:, None] + np.arange(3)
         for point, share in enumerate((1.0, *[MountPoints.AXIS_WHITENING_RATIO] * 3)):
             out[centre + 3 * point] = -share * linear.rhs[centre]
     return out
-
-
-def _transient_shares(
-    samples: CalibrationSamples, linearised: LinearisedCalibration, reduced: ReducedSystem
-) -> FloatArray:
-    """Return the transient part of the sigma of each joint's rotation prior, as a fraction (B,)."""
-    usual = np.flatnonzero(~samples.posture.t_pose)
-    shares = transient_variance_shares(linearised, reduced, usual, samples.times_ns[usual], JOINT_PRIOR_SCALE)
-    return np.sqrt(shares)
-
-
-def _map_error_variance(
-    samples: CalibrationSamples, linearised: LinearisedCalibration, reduced: ReducedSystem
-) -> float:
-    """Return the variance of the map's error, as a fraction of the assumed variance of the camera poses.
-
-    The variance of the map's error is the variance of the residuals minus the variance of independent noise.
-    """
-    white, correlated = samples.white_noise_share, samples.correlated_samples
-    # The assumed variance contains the variance of the map's error, multiplied by the number of samples that
-    # share one error. The residuals of single samples do not contain this factor.
-    prior = white + (1.0 - white) / correlated
-    return max(linearised.variance_factor(reduced, RowType.MEASUREMENT, prior) - white, 0.0)

@@ -22,7 +22,7 @@ from bodycap_batch.merging.body_calibration.hinge_test import (
     observable_hinges,
     with_hinge_slack,
 )
-from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration, row_types
+from bodycap_batch.merging.body_calibration.mount_covariance import JOINT_PRIOR_SCALE, LinearisedCalibration
 from bodycap_batch.merging.body_calibration.samples import CalibrationSamples
 from bodycap_batch.merging.graph.attitude_factors import AttitudeFactors
 from bodycap_batch.merging.graph.error_modes import BodyModel
@@ -43,12 +43,6 @@ from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 
-JOINT_PRIOR_SCALE = 4.0
-"""Factor on the sigmas of the joint rotation priors in this graph.
-
-The graph applies each prior once per sampled tick. Without the factor, these repeated priors would outweigh
-the measurements. Evidence: none.
-"""
 POINTS_PER_MOUNT = 4
 """Number of points that represent a mount.
 
@@ -125,22 +119,20 @@ class CalibrationGraph:
         """
         self._samples = samples
 
-    def rescale_sigmas(self, measurement_variance: float, gap_variance: float) -> None:
-        """Rescale the sigmas of the camera poses and of the joint gaps.
+    def leave_out_map_errors(self) -> None:
+        """Reduce the sigmas of the camera poses and of the joint gaps to those of one sample alone.
 
-        Args:
-            measurement_variance: Factor on the variance of the camera poses. The variance of their
-                independent noise remains unchanged.
-            gap_variance: Factor on the variance of the joint gaps.
+        What samples share as an error of the map does not move one map against another one.
         """
         samples = self._samples
+        share = samples.white_noise_share
         self._samples = replace(
             samples,
-            sigma_rad=np.sqrt(measurement_variance) * samples.sigma_rad,
-            sigma_map=np.sqrt(measurement_variance) * samples.sigma_map,
-            white_noise_share=samples.white_noise_share / measurement_variance,
+            sigma_rad=np.sqrt(share) * samples.sigma_rad,
+            sigma_map=np.sqrt(share) * samples.sigma_map,
+            white_noise_share=1.0,
         )
-        self._slack_map *= float(np.sqrt(gap_variance))
+        self._slack_map /= np.sqrt(samples.correlated_samples)
 
     def solve(self, scale: float, iterations: int = 30) -> float:
         """Solve the graph at a scale.
@@ -219,12 +211,9 @@ class CalibrationGraph:
         cameras = self._samples.cameras
         all_points = self._samples.mount_points(self._scale)
         linear = linearise(self._graph(self._metric_poses(self._scale), self._scale), self._values)
-        body = BodyModel(bones=self._rest_bones, hinges=self._hinges)
-        first, count = self._first_joint_factor, body.factors_per_tick
-        t_pose_ticks = np.flatnonzero(self._samples.posture.t_pose)
         return LinearisedCalibration(
             linear=linear,
-            body=body,
+            body=BodyModel(bones=self._rest_bones, hinges=self._hinges),
             world_from_bone=self.poses(),
             mount_columns={
                 name: np.concatenate([linear.columns[key] + np.arange(3) for key in mount_keys(camera)])
@@ -234,14 +223,8 @@ class CalibrationGraph:
                 name: mount_jacobian(self.mounts[name], all_points[camera])
                 for camera, name in enumerate(cameras)
             },
-            row_types=row_types(
-                linear,
-                first,
-                first + count * self._samples.valid.shape[1],
-                (first + count * t_pose_ticks[:, None] + np.arange(count)).reshape(-1),
-                self._named_mount_factors(),
-            ),
-            first_joint_factor=first,
+            first_joint_factor=self._first_joint_factor,
+            t_pose=self._samples.posture.t_pose,
         )
 
     def measurement_factors(self, camera: int) -> IntArray:
@@ -255,15 +238,6 @@ class CalibrationGraph:
             first + POINTS_PER_MOUNT * np.arange(count)[:, None] + np.arange(POINTS_PER_MOUNT),
             dtype=np.int64,
         )
-
-    def _named_mount_factors(self) -> IntArray:
-        """Return the factor indices of mount orientations that are assumed from the camera's name only."""
-        out, first = [], 0
-        for camera, name in enumerate(self._samples.cameras):
-            if self._priors[name].by_name:
-                out += [first + 1, first + 2, first + 3]  # the first factor of a prior is for the centre
-            first += POINTS_PER_MOUNT + POINTS_PER_MOUNT * int(self._samples.valid[camera].sum())
-        return np.array(out, dtype=np.int64)
 
     def _set_rest_bones(self, bones: tuple[Bone, ...], repetitions: float) -> None:
         """Set the bones, and reduce the weight of their hinges.

@@ -1,29 +1,20 @@
-"""Estimate the covariance of the calibrated mounts from the residuals of the calibration graph.
+"""Estimate the covariance of the calibrated mounts from the assumed errors of the calibration graph.
 
-The calibration graph assumes sigmas that are larger than the actual errors. The actual uncertainty is
-therefore estimated from the residuals at the solution, in two steps:
-
-1. Estimate the actual variance of each type of residual rows from the residuals and redundancies of its rows.
-   The redundancy of a row is its contribution to the degrees of freedom, 0 to 1.
-2. Propagate these variances to the mounts. Near the solution, the mounts are a linear function of the noise
-   in the rows. The resulting covariance has the sandwich form.
-
-Source: estimation of variance components from redundancies, W. Foerstner, "Ein Verfahren zur Schaetzung von
-Varianz- und Kovarianzkomponenten", AVN 1979.
+Near the solution, the mounts are a linear function of the noise in the rows of residuals. The covariance has
+the sandwich form, because the graph uses wider joint rotation priors than those that are assumed here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg import block_diag
 
-from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.graph.error_modes import (
     POSTURE_BIAS_SHARE,
@@ -33,29 +24,22 @@ from bodycap_batch.merging.graph.error_modes import (
     posture_bias_modes,
     stack_modes,
 )
-from bodycap_batch.merging.graph.factors import bone_key, mount_keys
+from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph
 
-_PRIOR_REDUNDANCY = 30.0
-"""Weight of the expected variance factor against the residuals. Evidence: none.
+JOINT_PRIOR_SCALE = 4.0
+"""Factor on the sigmas of the joint rotation priors in the calibration graph.
 
-For each row type, the expected factor has the same weight as the residuals of 30 fully redundant rows.
+The graph applies each prior once per sampled tick. Without the factor, these repeated priors would outweigh
+the measurements. Evidence: none.
 """
+TRANSIENT_SHARE = float(np.sqrt(1.0 - POSTURE_BIAS_SHARE**2))
+"""Transient part of the sigma of a joint's rotation prior, as a fraction of this sigma.
 
-
-class RowType(IntEnum):
-    """The types of residual rows. Each type has a separate variance factor."""
-
-    PRIOR = 0
-    """Priors of mounts, posture and T-pose. Their assumed sigmas are used unchanged."""
-    MEASUREMENT = 1
-    """Measured camera poses."""
-    JOINT_GAP = 2
-    """Gaps of joints, and the distances between the anchors of a hinge and the following joint."""
-    JOINT_ROTATION = 3
-    """Priors of joint rotations."""
-    NAMED_MOUNT = 4
-    """Priors of mount orientations that are assumed from the camera's name only."""
+The rotation prior has a constant and a transient part. The constant part is one posture bias for the whole
+capture. It has the fraction `POSTURE_BIAS_SHARE` of the sigma. The transient part varies within the capture.
+The squares of the two fractions add up to 1.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,8 +55,8 @@ class LinearisedCalibration:
         mount_columns: By camera, indices (12,) of the columns that belong to the camera's mount.
         mount_jacobian: By camera, (6,12) derivative of the right perturbation of joint_from_cam with respect
             to the 12 unknowns of the mount. The perturbation is a rotation, then a translation.
-        row_types: (R,) `RowType` of each row.
         first_joint_factor: Index of the first joint factor in the graph.
+        t_pose: (K,) True for the ticks in a T-pose.
     """
 
     linear: LinearisedGraph
@@ -80,8 +64,8 @@ class LinearisedCalibration:
     world_from_bone: FloatArray
     mount_columns: Mapping[str, IntArray]
     mount_jacobian: Mapping[str, FloatArray]
-    row_types: IntArray
     first_joint_factor: int
+    t_pose: BoolArray
 
     def reduced(self, common_jacobian: FloatArray | None = None) -> ReducedSystem:
         """Eliminate the bone poses of all ticks, so that only the unknowns of the mounts remain.
@@ -127,27 +111,23 @@ class LinearisedCalibration:
         leverage = pose_leverage + np.einsum("ri,ij,rj->r", jacobian, covariance, jacobian)
         return ReducedSystem(jacobian=jacobian, covariance=covariance, redundancy=1.0 - leverage)
 
-    def variance_factor(self, reduced: ReducedSystem, row_type: RowType, prior: float = 1.0) -> float:
-        """Return the variance factor of one row type: the actual variance divided by the assumed variance.
+    def rotation_rows(self, ticks: IntArray) -> IntArray:
+        """Return the indices of the rows of all joint rotation priors at some ticks."""
+        joints = np.arange(sum(bone.parent >= 0 for bone in self.body.bones))
+        factors = self.first_joint_factor + self.body.factors_per_tick * ticks[:, None] + joints
+        return np.asarray((self.linear.first_row[factors][..., None] + np.arange(3)).ravel())
 
-        Args:
-            reduced: The reduced system of this linearisation.
-            row_type: Type of the rows.
-            prior: Expected variance factor. It dominates the result if the redundancy of the rows is low. A
-                value below 1 is needed for rows with enlarged sigmas. The graph enlarges sigmas if several
-                samples share one error.
+    def row_variances(self) -> FloatArray:
+        """Return the variance (R,) of each row, as a fraction of the variance that the graph assumes.
 
-        Returns:
-            The variance factor of the rows.
+        The graph uses joint rotation priors with widened sigmas. The result restores the original sigmas,
+        reduced to the transient part, because only this part differs between samples. A T-pose has a prior of
+        its own.
         """
-        rows = self.row_types == row_type
-        # A camera pose has six degrees of freedom. The graph represents it by four points with twelve rows.
-        # Six of the twelve rows are therefore superfluous. They add to the redundancy, but their residuals
-        # are zero.
-        idle = 0.5 * rows.sum() if row_type == RowType.MEASUREMENT else 0.0
-        redundancy = max(float(reduced.redundancy[rows].sum()) - idle, 0.0)
-        squares = float((self.linear.rhs[rows] ** 2).sum())
-        return (_PRIOR_REDUNDANCY * prior + squares) / (_PRIOR_REDUNDANCY + redundancy)
+        out = np.ones(self.linear.matrix.shape[0])
+        rows = self.rotation_rows(np.flatnonzero(~self.t_pose))
+        out[rows] = (TRANSIENT_SHARE / JOINT_PRIOR_SCALE) ** 2
+        return out
 
     def posture_bias_jacobian(self) -> Any:
         """Return the change of the residuals that each error mode of the posture bias causes at one sigma.
@@ -160,12 +140,11 @@ class LinearisedCalibration:
             self.linear, self.body, self.first_joint_factor, self.world_from_bone, modes
         )
 
-    def error_modes(self, reduced: ReducedSystem, factors: FloatArray, body_modes: ErrorModes) -> ErrorModes:
+    def error_modes(self, reduced: ReducedSystem, body_modes: ErrorModes) -> ErrorModes:
         """Return the error modes of the mounts.
 
         Args:
             reduced: The reduced system of this linearisation.
-            factors: (5,) variance factor of each `RowType`.
             body_modes: Error modes of the assumed body.
 
         Returns:
@@ -174,7 +153,7 @@ class LinearisedCalibration:
         """
         gain = reduced.covariance @ reduced.jacobian.T
         change = block_diag(*self.mount_jacobian.values())
-        noise = change @ (gain * factors[self.row_types]) @ gain.T @ change.T
+        noise = change @ (gain * self.row_variances()) @ gain.T @ change.T
         values, vectors = np.linalg.eigh(0.5 * (noise + noise.T))
         white = vectors * np.sqrt(np.maximum(values, 0.0))
         count = len(white)
@@ -198,7 +177,10 @@ class LinearisedCalibration:
         shifts = joint_residual_jacobian(
             self.linear, self.body, self.first_joint_factor, self.world_from_bone, body_modes
         )
-        shifts = sparse.diags_array((self.row_types != RowType.PRIOR).astype(np.float64)) @ shifts
+        # The prior of a T-pose does not refer to the rest pose.
+        counts = np.ones(self.linear.matrix.shape[0])
+        counts[self.rotation_rows(np.flatnonzero(self.t_pose))] = 0.0
+        shifts = sparse.diags_array(counts) @ shifts
         follow = block_diag(*self.mount_jacobian.values()) @ np.asarray(shifts.T @ gain.T).T
         return replace(body_modes, mounts=self._by_camera(follow))
 
@@ -221,42 +203,3 @@ class ReducedSystem:
     jacobian: FloatArray
     covariance: FloatArray
     redundancy: FloatArray
-
-
-def row_types(
-    linear: LinearisedGraph,
-    first_joint_factor: int,
-    end_joint_factor: int,
-    t_pose_factors: IntArray,
-    named_factors: IntArray,
-) -> IntArray:
-    """Return the `RowType` of each row of a linearised calibration graph.
-
-    Args:
-        linear: Jacobian of the graph, with the columns of all bones before the columns of the mounts.
-        first_joint_factor: Index of the first joint factor.
-        end_joint_factor: Index of the last joint factor plus one.
-        t_pose_factors: Indices of the joint factors at ticks in a T-pose. The assumed sigmas of the rotation
-            priors of these factors are used unchanged.
-        named_factors: Indices of the factors of mount orientations that are assumed from the camera's name
-            only.
-
-    Returns:
-        (R,) the `RowType` of each row.
-    """
-    height = np.diff(linear.first_row)
-    factor = np.repeat(np.arange(len(height)), height)
-    row_in_factor = np.arange(len(factor)) - linear.first_row[factor]
-    first_mount = linear.columns[mount_keys(0)[0]]
-    entries = linear.matrix.tocoo()
-    of_bones = np.bincount(entries.row, entries.col < first_mount, len(factor)) > 0
-    of_mounts = np.bincount(entries.row, entries.col >= first_mount, len(factor)) > 0
-    out = np.full(len(factor), RowType.JOINT_ROTATION, dtype=np.int64)
-    out[of_bones & of_mounts] = RowType.MEASUREMENT
-    out[of_mounts & ~of_bones] = RowType.PRIOR
-    is_joint = (factor >= first_joint_factor) & (factor < end_joint_factor)
-    out[(factor >= end_joint_factor) | np.isin(factor, t_pose_factors)] = RowType.PRIOR
-    out[np.isin(factor, named_factors)] = RowType.NAMED_MOUNT
-    # A joint factor has three rows for the rotation, then three rows for the gap. A hinge factor has one row.
-    out[is_joint & ((height[factor] == 1) | (row_in_factor >= 3))] = RowType.JOINT_GAP
-    return out

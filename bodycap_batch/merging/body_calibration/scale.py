@@ -20,7 +20,6 @@ Other modules estimate scales for other purposes. These scales are not used in t
 - ``body/provisional_scale.py``: the provisional scale, the initial value of the calibration.
 - ``map_alignment/similarity_refinement.py`` and ``map_alignment/scale_sources.py``: the scale of the main map
   while other maps are aligned to it. It uses the limbs' reach, the floor and the sources given in the job.
-- ``limb_scales.py``: a separate scale for each limb, a diagnostic of the report.
 """
 
 from __future__ import annotations
@@ -176,16 +175,13 @@ def _nearest_solution(
     return min((x for x in mounts if (x - centre) * offset > 0.0), key=lambda x: abs(x - centre - offset))
 
 
-def scale_from_bones(
-    estimate: ScaleEstimate, *, is_measured: bool, has_height: bool, clock_sigma: float = 0.0
-) -> ScaleSource:
-    """Return the scale from the bones with the uncertainty of their lengths and of the clocks.
+def scale_from_bones(estimate: ScaleEstimate, *, is_measured: bool, has_height: bool) -> ScaleSource:
+    """Return the scale from the bones with the uncertainty of their lengths.
 
     Args:
         estimate: The scale at which the calibration graph has the lowest cost.
         is_measured: True if the bone lengths of the subject were measured.
         has_height: True if the skeleton was scaled to the subject's height.
-        clock_sigma: Sigma of the scale's logarithm that the sigmas of the clocks cause.
 
     Returns:
         The scale from the bones.
@@ -193,7 +189,7 @@ def scale_from_bones(
     name, lengths_sigma = "skeleton", 0.0
     if not is_measured:
         name, lengths_sigma = "height" if has_height else MEAN_STATURE, PROPORTION_SIGMA
-    sigma_log = float(np.hypot(np.hypot(estimate.sigma_log, lengths_sigma), clock_sigma))
+    sigma_log = float(np.hypot(estimate.sigma_log, lengths_sigma))
     return ScaleSource(name=name, scale=estimate.scale, sigma_log=sigma_log)
 
 

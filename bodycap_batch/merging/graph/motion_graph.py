@@ -32,13 +32,17 @@ from bodycap_batch.merging.graph.foot_contact import FootContact
 from bodycap_batch.merging.graph.joint_covariance import JointUncertainty, SolvedGraph, joint_covariance
 from bodycap_batch.merging.graph.joint_distance_limits import DistanceLimit
 from bodycap_batch.merging.graph.motion_prior import add_motion_prior
-from bodycap_batch.merging.graph.optimiser import gauss_newton_then_lm
+from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.model.geometry import interpolate_pose, invert, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel
 
 ON_TICK_TOLERANCE_NS = 1_000_000
 """Maximum time (nanoseconds) between a measurement and a tick whose state the measurement uses. A measurement
 at a larger distance gets a separate state. In a millisecond, a hand at 3 m/s moves 3 mm."""
+
+_GAP_M = 0.001
+"""Sigma (metres) of the gap at a joint. The skeleton of the result has no gaps, and takes only the rotations
+of this graph. Evidence: docs/decisions/merging.md."""
 
 _TOLERANCE = 1e-4
 """Minimum relative decrease of the error per step. The solver stops after a smaller decrease. Convergence is
@@ -150,7 +154,7 @@ class MotionGraph:
         """
         if error_modes is not None:
             step("solving")
-        values, count = gauss_newton_then_lm(
+        values, count = levenberg_marquardt(
             self._graph, self.initial_values(), iterations=iterations, step=step, tolerance=_TOLERANCE
         )
         poses = np.array(
@@ -237,7 +241,7 @@ class MotionGraph:
 
     def _add_joints(self) -> None:
         before = self._graph.size()
-        joints = JointFactors(self._bones, hinges(self._skeleton, tuple(self._bones)))
+        joints = JointFactors(self._bones, hinges(self._skeleton, tuple(self._bones)), gap_m=_GAP_M)
         for tick in range(len(self._times)):
             joints.add(self._graph, tick)
         self._factor_counts["joints"] = int(self._graph.size() - before)

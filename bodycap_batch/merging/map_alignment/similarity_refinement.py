@@ -10,14 +10,9 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body_calibration.calibration_covariance import (
-    measurement_jacobian,
-    rescale_sigmas,
-    scale_jacobian,
-    variance_factors,
-)
+from bodycap_batch.merging.body_calibration.calibration_covariance import measurement_jacobian, scale_jacobian
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
-from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration, RowType
+from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.model.geometry import Similarity, so3_exp
 
@@ -94,8 +89,7 @@ class MapAlignmentProblem:
         for slack in _SLACK_SCHEDULE:
             self._calibration.slack_factor = slack
             self._descend()
-        mounts, derivatives = self._linearised()
-        rescale_sigmas(self._calibration, mounts, mounts.reduced(derivatives))
+        self._calibration.leave_out_map_errors()
         self._descend()
         self._covariance = self._step(0.0).covariance
 
@@ -167,9 +161,7 @@ class MapAlignmentProblem:
         influence = np.vstack([solved.jacobian, source_rows])
         rhs = np.append(mounts.linear.rhs, -self._source_residuals())
         normal = influence.T @ influence
-        variance = variance_factors(self._calibration.samples, mounts, solved)[
-            np.append(mounts.row_types, np.full(len(source_rows), RowType.PRIOR))
-        ]
+        variance = np.append(mounts.row_variances(), np.ones(len(source_rows)))
         gain = _solve_normal_equations(normal, influence.T)
         # A systematic bias of the posture changes both mounts and maps.
         by_bias = (mounts.posture_bias_jacobian().T @ gain[:, : -len(source_rows)].T).T

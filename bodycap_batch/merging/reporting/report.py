@@ -41,7 +41,6 @@ from bodycap_batch.model.merge_report import (
     FloorReport,
     HingeReport,
     InvertedCamerasReport,
-    LimbScalesReport,
     MergeReport,
     MountReport,
     MountSlipReport,
@@ -238,18 +237,6 @@ def _scale_report(calibration: BodyCalibration) -> ScaleReport:
         ),
         trunk_over_floor_m=calibration.height_over_floor_m,
         known_to=describe_scale(calibration),
-        limbs=_limbs_report(calibration),
-    )
-
-
-def _limbs_report(calibration: BodyCalibration) -> LimbScalesReport | None:
-    if not calibration.limbs:
-        return None
-    chi2, freedom = chi_square(calibration.limbs)
-    return LimbScalesReport(
-        alone=_source_reports(calibration.limbs, calibration.scale.metres_per_unit),
-        chi2=round(chi2, 3),
-        degrees_of_freedom=freedom,
     )
 
 

@@ -9,7 +9,8 @@ from bodycap_batch.clocks.container_times import ContainerTime
 from bodycap_batch.clocks.estimate import ClockEstimate, ClockEstimates, Recording, SoundEvidence
 from bodycap_batch.clocks.joint_offsets import JointClock
 from bodycap_batch.clocks.motion_evidence import add_motion
-from bodycap_batch.clocks.motion_offsets import MotionClocks, MotionOffset
+from bodycap_batch.clocks.motion_offsets import MotionClocks, MotionCurve
+from bodycap_batch.clocks.motion_signals import CameraPath, motion_signals
 from bodycap_batch.clocks.pair_offsets import PairOffset
 
 REFERENCE = ClockEstimate(camera="torso", offset_s=0.0, sigma_s=0.0, source="common")
@@ -25,7 +26,7 @@ def sound(offset_s: float, sigma_s: float = 0.002) -> ClockEstimate:
 
 
 def moved(
-    offset_s: float | None, sigma_s: float = 0.02, pairs: tuple[MotionOffset, ...] = ()
+    offset_s: float | None, sigma_s: float = 0.02, curves: tuple[MotionCurve, ...] = ()
 ) -> MotionClocks:
     clocks = {}
     if offset_s is not None:
@@ -36,7 +37,7 @@ def moved(
             drift_measured=False,
         )
     reasons = {} if clocks else {"palm": "it repeats"}
-    return MotionClocks(reference="torso", clocks=clocks, pairs=pairs, reasons=reasons)
+    return MotionClocks(reference="torso", clocks=clocks, curves=curves, reasons=reasons)
 
 
 def added(estimate: ClockEstimate, motion: MotionClocks, evidence: SoundEvidence = EMPTY, **stated_s: float):
@@ -128,8 +129,15 @@ def test_a_stated_offset_is_compared_with_the_best_one(height: float, first: str
     # The score is 10 everywhere and higher at the right offset of 0.8 s.
     score = 10.0 + (height - 10.0) * np.exp(-0.5 * ((lags_s - sign * 0.8) / 0.1) ** 2)
     second = "palm" if first == "torso" else "torso"
-    pair = MotionOffset(first=first, second=second, curve_lags_s=lags_s, curve=score)
-    motion = moved(None, pairs=(pair,))
+    still = np.tile(np.eye(4), (30, 1, 1))
+    path = CameraPath(camera=first, role="", times_ns=np.arange(30) * 33_000_000, map_from_cam=still)
+    signals = motion_signals(path)
+    assert signals is not None
+    curve = MotionCurve(
+        first=first, second=second, signals=(signals, signals), weights_hz=(), limb_lag_s=0.0,
+        lags_s=lags_s, common_s=0.0 * lags_s, score=score,
+    )  # fmt: skip
+    motion = moved(None, curves=(curve,))
     assert added(NONE, motion, palm=0.8).against_stated == ""
     wrong = added(NONE, motion, palm=-0.8).against_stated
     assert ("an offset of about 0.8 s fits much better" in wrong) is (height == 20.0)

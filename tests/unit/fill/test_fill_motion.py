@@ -202,17 +202,6 @@ def test_aimless_movements_of_trunk_and_arms_are_not_taken_for_certain_steps() -
     assert report.is_sure.mean() < 0.2
 
 
-def test_the_pelvis_yaws_more_in_a_walk_with_a_wide_arm_swing() -> None:
-    ranges = []
-    for gain in (0.5, 2.0):
-        motion, solved = walking(8.0, swing=gain)
-        hips = fill(motion, solved).motion.local_rotation[60:180, 0]
-        yaw = np.arctan2(hips[:, 1, 0], hips[:, 0, 0])
-        ranges.append(float(np.degrees(np.ptp(yaw))))
-    assert ranges[1] > ranges[0] + 3.0
-    assert ranges[1] < 40.0
-
-
 def test_feet_stand_still_on_the_floor_and_never_below_it() -> None:
     motion, solved = walking(8.0)
     result = fill(motion, solved)

@@ -11,12 +11,9 @@ from numpy.testing import assert_allclose
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.calibration_covariance import (
     measurement_jacobian,
-    rescale_sigmas,
     scale_jacobian,
-    variance_factors,
 )
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
-from bodycap_batch.merging.body_calibration.mount_covariance import RowType
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.merging.map_alignment.align import align_cameras
@@ -24,8 +21,7 @@ from bodycap_batch.merging.map_alignment.initial_alignment import align_map
 from bodycap_batch.model.geometry import Similarity, so3_exp
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import run_case
-from tests.bench.posed import posed
-from tests.bench.simulation import ARMS
+from tests.bench.simulation import ARMS, PALMS
 from tests.calibrations import calibration_of
 from tests.stages.walker import ROLES, make_inputs, make_walk, record
 
@@ -120,51 +116,15 @@ def test_the_cost_follows_the_scale_as_predicted(arms):
     assert abs(right @ shrink) > 20.0 * end
 
 
-def test_what_fits_better_than_believed_counts_more(arms):
-    samples, calibration, metric = arms
-    calibration.solve(metric)
-    mounts = calibration.linearised()
-    left = variance_factors(samples, mounts, mounts.reduced())[RowType.MEASUREMENT]
-    rescale_sigmas(calibration, mounts, mounts.reduced())
-    found = calibration.samples
-    calibration.set_samples(samples)
-    assert left < 0.9
-    assert_allclose(found.sigma_map, np.sqrt(left) * samples.sigma_map)
-    assert_allclose(found.sigma_rad, np.sqrt(left) * samples.sigma_rad)
-    # What is not the map's error stays as large as it was, whatever share it now has.
-    assert_allclose(
-        found.white_noise_share * found.sigma_map**2, samples.white_noise_share * samples.sigma_map**2
-    )
-
-
-def test_what_no_residual_can_contradict_is_as_believed(arms):
-    samples, calibration, metric = arms
-    calibration.solve(metric)
-    mounts = calibration.linearised()
-    silent = replace(mounts, linear=replace(mounts.linear, rhs=np.zeros_like(mounts.linear.rhs)))
-    free = replace(mounts.reduced(), redundancy=np.zeros(len(mounts.row_types)))
-    # Samples that share the map's error were weighed down for it; that does not make the map bend more.
+def test_errors_that_samples_share_do_not_count_in_an_alignment():
+    samples, calibration, _ = calibration_of(SynthOptions(seconds=4.0, cameras=PALMS, poses_only=True))
+    # Samples share the errors of the map, so that they are weighted down in the calibration of one map.
     assert samples.correlated_samples > 1.5
-    assert_allclose(variance_factors(samples, silent, free)[[RowType.MEASUREMENT, RowType.JOINT_GAP]], 1.0)
-
-
-def test_a_mounts_name_is_believed_better_than_it_is_weighed(arms):
-    samples, calibration, metric = arms
-    inputs = posed(SynthOptions(seconds=1.0, cameras=ARMS, poses_only=True)).inputs
-    calibration.solve(metric)
-    mounts = calibration.linearised()
-    # 15 degrees an axis against 15 in all; three differences of three rows for each of five cameras.
-    assert variance_factors(samples, mounts, mounts.reduced())[RowType.NAMED_MOUNT] == pytest.approx(
-        1.0 / 3.0
-    )
-    assert (mounts.row_types == RowType.NAMED_MOUNT).sum() == 5 * 9
-    # A job that knows it to 20 degrees only has said so, and no name.
-    told = {
-        mount.camera: replace(mount, sigma_rad=np.radians(20.0), by_name=False) for mount in inputs.mounts
-    }
-    stated = CalibrationGraph(inputs.skeleton, mounts.body.bones, samples, told, metric, lambda: None)
-    stated.solve(metric, iterations=1)
-    assert not (stated.linearised().row_types == RowType.NAMED_MOUNT).any()
+    calibration.leave_out_map_errors()
+    found = calibration.samples
+    assert_allclose(found.sigma_map, np.sqrt(samples.white_noise_share) * samples.sigma_map)
+    assert_allclose(found.sigma_rad, np.sqrt(samples.white_noise_share) * samples.sigma_rad)
+    assert found.white_noise_share == 1.0
 
 
 @pytest.mark.slow

@@ -27,7 +27,7 @@ from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record
 
 def test_a_graph_without_factors_has_no_covariance(walk):
     graph, bones, _ = _graph(walk)
-    values, _ = levenberg_marquardt(graph.graph, graph.initial_values(), iterations=1)
+    values, _ = levenberg_marquardt(graph.graph, graph.initial_values(), iterations=1, step=lambda: None)
     loose = replace(graph.solved_graph(values), graph=gtsam.NonlinearFactorGraph())
     poses = np.tile(np.eye(4), (round(FPS), len(bones), 1, 1))
     unchanged = np.zeros((len(bones), 3, 0))
@@ -127,7 +127,7 @@ def test_without_error_modes_the_covariance_is_the_marginal_of_gtsam(walk):
 def _optimised(graph):
     from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 
-    return levenberg_marquardt(graph.graph, graph.initial_values(), iterations=60)
+    return levenberg_marquardt(graph.graph, graph.initial_values(), iterations=60, step=lambda: None)
 
 
 @pytest.mark.parametrize("what", ["mount", "scale", "rest", "offset", "off the ticks"])

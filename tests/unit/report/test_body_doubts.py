@@ -44,12 +44,9 @@ def test_swings_about_the_rest_pose_are_doubted_less_than_a_rare_mean(
 
 
 @pytest.mark.parametrize(("squares", "grade"), [(3.0, Grade.GOOD), (9.0, Grade.FAIR), (20.0, Grade.POOR)])
-@pytest.mark.parametrize("limbs", [False, True])
-def test_contradictory_scales_lower_the_grade(squares: float, grade: Grade, limbs: bool) -> None:
-    scales = {"chi2": squares, "degrees_of_freedom": 1}
-    scale = {"limbs": {**scales, "alone": [{"name": "left arm"}, {"name": "right arm"}]}} if limbs else scales
-    name = "Scales of the limbs" if limbs else "Sources of the scale"
-    assert _criterion({"scale": scale}, name).grade is grade
+def test_contradictory_scales_lower_the_grade(squares: float, grade: Grade) -> None:
+    scale = {"chi2": squares, "degrees_of_freedom": 1}
+    assert _criterion({"scale": scale}, "Sources of the scale").grade is grade
 
 
 @pytest.mark.parametrize(("turn_deg", "grade"), [(25.0, Grade.GOOD), (45.0, Grade.FAIR), (85.0, Grade.POOR)])

@@ -41,9 +41,7 @@ def _orientations(times, rate=_rate):
 def _picture(orientation, times, noise=0.0005, ratio=1.0, seed=0):
     turn = (orientation[:-1].inv() * orientation[1:]).as_rotvec() * ratio
     turn = turn + np.random.default_rng(seed).normal(0, noise, turn.shape)
-    return PictureRotation(
-        start_s=times[:-1], end_s=times[1:], turn_rad=turn, spread_rad=np.full(len(turn), 1e-3)
-    )
+    return PictureRotation(start_s=times[:-1], end_s=times[1:], turn_rad=turn)
 
 
 def _gyro(seconds, turned, bias, delay, rate_hz=200.0, drift=0.0):
