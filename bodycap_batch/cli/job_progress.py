@@ -33,7 +33,8 @@ runs with three cameras, keyframes and map took 21 and 37 % of the task time."""
 _STEPS: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "keyframes": {
         "frames searched for hands": (0.0, 0.45),
-        "searching what moves by itself": (0.45, 0.75),
+        "steps to the lens": (0.45, 0.7),
+        "searching what moves by itself": (0.7, 0.75),
         "frames": (0.75, 1.0),
     },
     "map": {

@@ -111,6 +111,10 @@ def _percent(value: float) -> str:
     return format_percent(value, 1)
 
 
+def _sigma_percent(value: float) -> str:
+    return f"± {_percent(value)}"
+
+
 def _frames_table(metrics: Mapping[str, Any]) -> Table:
     rows = []
     paths = {name: metric_path("cameras", name) for name in metrics["cameras"]}
@@ -409,8 +413,8 @@ def _scale_source_cells(merge: Mapping[str, Any], path: str) -> tuple[Cell, ...]
     metrics = {"merge": merge}
     return (
         Cell(text=str(metric_at(metrics, f"{path}.name"))),
-        metric_cell(metrics, f"{path}.relative_sigma", "± {:.1%}"),
-        metric_cell(metrics, f"{path}.off", "{:+.1%}"),
+        metric_cell(metrics, f"{path}.relative_sigma", _sigma_percent),
+        metric_cell(metrics, f"{path}.off", "{:+.1f} %", 100.0),
     )
 
 
@@ -521,4 +525,4 @@ def headline_figures(metrics: Mapping[str, Any]) -> Iterable[tuple[str, Cell]]:
         if worst is not None:
             path = metric_path("merge", "cameras", worst[0], "longest_gap_s")
             yield "longest gap", metric_cell(metrics, path, "{:.2f} s")
-        yield "metric scale", metric_cell(metrics, "merge.scale.relative_sigma", "± {:.1%}")
+        yield "metric scale", metric_cell(metrics, "merge.scale.relative_sigma", _sigma_percent)

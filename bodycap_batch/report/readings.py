@@ -375,7 +375,7 @@ def read_scale(metrics: Metrics) -> Reading | None:
         value=float(sigma),
         metric="merge.scale.relative_sigma",
         words={
-            "percent": f"{sigma:.1%}",
+            "percent": format_percent(sigma, 1),
             "height": f"{100.0 * _BODY_HEIGHT_M * sigma:.0f} cm",
             "action": as_sentence(f"{action}{t_pose}"),
             "how": as_sentence("; ".join(how)) if action else "",

@@ -128,14 +128,18 @@ def regions_and_lens(camera: CaptureCamera, context: StageContext) -> TrackFindi
         if done % _PROGRESS_FRAMES == 0:
             context.progress(done, total, "frames searched for hands")
 
+    def show_lens(done: int, total: int) -> None:
+        context.check_cancelled()
+        context.progress(done, total, "steps to the lens")
+
     tracks = track_video(camera, show)
     if is_on(Mechanism.FIXED_REGIONS):
         regions = find_fixed_regions(tracks, camera.times_ns)
         record_act(Mechanism.FIXED_REGIONS, int(regions.any()))
     tracks = tracks.outside(regions)
-    context.progress(0, 0, "searching what moves by itself")
     if wants_lens:
-        lens = estimate_lens(tracks, camera.times_ns)
+        lens = estimate_lens(tracks, camera.times_ns, show_lens)
+    context.progress(0, 0, "searching what moves by itself")
     if is_on(Mechanism.MOVING_REGIONS) and (lens is not None or not camera.camera.refine):
         alone = find_moving_tracks(tracks, camera.camera if lens is None else lens.lens, camera.times_ns)
         found = find_moving_regions(tracks, alone)
@@ -144,7 +148,7 @@ def regions_and_lens(camera: CaptureCamera, context: StageContext) -> TrackFindi
         moving = found if is_enough else moving
         tracks = tracks.outside(found) if is_enough else tracks
         if lens is not None and is_enough:
-            lens = estimate_lens(tracks, camera.times_ns)
+            lens = estimate_lens(tracks, camera.times_ns, show_lens)
     return TrackFindings(fixed=regions, moving=moving, lens=lens, tracks=tracks)
 
 
