@@ -85,6 +85,17 @@ CAMERA_RULES = (
         priority=1.6,
     ),
     Rule(
+        name="Links of the video",
+        read=readings.read_links,
+        bounds=Bounds(good=0.02, fair=0.05),
+        finding="{camera}: the video contradicts {percent} of the compared frames{where}",
+        rationale="Points are followed through the video without any map. They show how the camera turned "
+        "and moved from frame to frame, and where a path folds, leaps or changes its scale.",
+        action="Turn more slowly, keep near and far things with texture in view, and point the camera away "
+        "from the wearer's own body.",
+        priority=1.8,
+    ),
+    Rule(
         name="Links within the map",
         read=readings.at("models.0.weakest_link"),
         bounds=Bounds(good=0.08, more_is_better=True),

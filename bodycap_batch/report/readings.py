@@ -190,6 +190,27 @@ def read_path_uncertainty(metrics: Metrics) -> Reading | None:
     return Reading(value=share, words={"camera": name, "percent": f"{100 * share:.2g} %"})
 
 
+def read_links(metrics: Metrics) -> Reading | None:
+    """Read the largest share of a camera's frames, in all maps, that the tracks of its video contradict."""
+    shares = {
+        name: sum(path["contradicted"] for path in paths) / compared
+        for name, paths in metrics.get("mapping", {}).get("links", {}).items()
+        if (compared := sum(path["compared"] for path in paths))
+    }
+    name, share = _largest(shares.items(), float)
+    if share is None:
+        return None
+    numbers = {frame: n for n, frame in enumerate(dict.fromkeys(each["frame"] for each in metrics["models"]))}
+    where = [
+        "frames {} to {}".format(*path["contradicted_frames"])
+        + (f" in map_{number}" if (number := numbers.get(path["frame"], 0)) else "")
+        for path in metrics["mapping"]["links"][name]
+        if path["contradicted"]
+    ]
+    words = {"camera": name, "where": f" ({'; '.join(where)})" if where else ""}
+    return Reading(value=share, metric=metric_path("mapping", "links", name), words=words)
+
+
 def read_main_share(metrics: Metrics) -> Reading | None:
     """Read the share of the keyframes that are in the main map, if a video is in several maps."""
     counts = [model.get("keyframes", {}) for model in metrics.get("models", ())]
