@@ -96,18 +96,6 @@ CAMERA_RULES = (
         priority=1.8,
     ),
     Rule(
-        name="Links within the map",
-        read=readings.at("models.0.weakest_link"),
-        bounds=Bounds(good=0.08, more_is_better=True),
-        finding="two parts of the map are held together by {percent} of their common points",
-        rationale="It is the smallest conductance of a cut through the map. If few points link two parts, "
-        "their relative place can be wrong although the error in pixels is small. Of eleven results of "
-        "real captures below 6 %, eight had a part in a wrong place; rendered walks with errors of "
-        "millimetres have 8.6 % or more.",
-        action=_MORE_TEXTURE,
-        priority=1.6,
-    ),
-    Rule(
         name="Pieces of the map",
         read=readings.read_main_share,
         bounds=Bounds(good=0.5, more_is_better=True),

@@ -30,7 +30,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.overrides import Overrides
@@ -38,7 +37,6 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.evaluate.association import interpolate_truth
 from bodycap_batch.evaluate.picture_check import poses_of_frames, read_delivered
 from bodycap_batch.evaluate.track_check import TrackedVideo, check_with_tracks, count_frames
-from bodycap_batch.export.map_links import weakest_link
 from bodycap_batch.export.metrics import path_uncertainty
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.job_places import capture_of_results, find_job
@@ -107,19 +105,9 @@ class GradedResult:
 
 
 def with_missing_figures(metrics: dict[str, Any], results: Path) -> dict[str, Any]:
-    """Add the weakest link and the uncertainty of the paths, if an earlier version did not write them."""
+    """Add the uncertainty of the paths, if an earlier version did not write it."""
     if not metrics["models"] or not (results / "colmap").is_dir():
         return metrics
-    if "weakest_link" not in metrics["models"][0]:
-        folder = min((results / "colmap").glob("*/"), key=lambda path: int(path.name))
-        scene = pycolmap.Reconstruction(str(folder))
-        seen = [
-            (number, element.image_id)
-            for number, point in enumerate(scene.points3D.values())
-            for element in point.track.elements
-        ]
-        point, keyframe = np.array(seen, dtype=np.int64).reshape(-1, 2).T
-        metrics["models"][0]["weakest_link"] = weakest_link(point, keyframe)
     stored = sorted(
         (results.parent / "store" / "artefacts").glob("*/*/"), key=lambda each: each.stat().st_mtime
     )
