@@ -2,11 +2,12 @@
 
 What is right is known from the truth of the capture (``--captures``), or else from a stored answer of
 `bodycap evaluate RESULT --video CAPTURE --json`: ``NAME.json`` in the folder ``--evaluated``, or ``ev.json``
-beside the results. A result is wrong if more than 2 % of its judged frames are wrong. A result that the
-pictures call wrong counts as right if its only map agrees with that of another result of the same capture
-that the pictures confirm completely: within 5 % of the path's diagonal and 5 degrees. Results with equal
-paths count once. The capture of a result is the longest name in the name of its folder: ``r7_eth_desk`` is
-one of ``eth_desk``.
+beside the results. A result is wrong if more than 2 % of its judged frames are wrong. The pictures show
+neither slow bends nor, if a camera hardly moves, leaps. So results that the pictures confirm completely are
+compared with each other: within 10 % of the path's diagonal and 5 degrees. The one with which most others
+agree, at least two, is the reference of its capture, and decides about all results with poses at its times.
+Results with equal paths count once. The capture of a result is the longest name in the name of its folder:
+``r7_eth_desk`` is one of ``eth_desk``.
 
 Figures that results of earlier versions lack in ``metrics.json`` are computed from the stored map and paths,
 and from the videos in ``--captures``; the latter are kept in the folder ``--links``.
@@ -64,6 +65,13 @@ _MIN_JUDGED = 0.5
 """Minimum share of the delivered frames that must be right or wrong. Evidence: none."""
 _MAX_GAP_S = 0.05
 """Maximum distance (seconds) of two poses between which a pose is interpolated, to compare two results."""
+_LEAST = 3
+"""Minimum number of poses that a similarity is fitted to."""
+_MAX_CONFIRMED = 6
+"""Maximum number of results among which the reference of a capture is chosen. Origin: each pair of them is
+compared, which takes half a second."""
+_MIN_VOTES = 2
+"""Minimum number of results that agree with a reference. Evidence: none."""
 _CONFIRMED = 0.95
 """Minimum share of right frames of a result with which others are compared. None of its frames is wrong."""
 
@@ -154,35 +162,48 @@ def _counts(results: Path, name: str, options: argparse.Namespace) -> tuple[int,
     return None
 
 
-def _agrees(results: Path, confirmed: Sequence[Path]) -> bool:
-    """Return whether the only map of a result agrees with that of a result that the pictures confirm."""
-    if any((results / "trajectories").glob("map_*")):
-        return False
-    mine = {file.name: read_tum(file) for file in (results / "trajectories").glob("*.tum")}
-    for other in (each / "trajectories" for each in confirmed):
-        parts = [
-            (name, path, *interpolate_truth(read_tum(other / name), path.times_ns, _MAX_GAP_S))
-            for name, path in mine.items()
-            if (other / name).exists()
-        ]
-        found = [(np.full(both.sum(), name), path, true, both) for name, path, true, both in parts]
-        if sum(len(each[0]) for each in found) < _MIN_JUDGED * sum(
-            len(each.times_ns) for each in mine.values()
-        ):
+def compared(results: Path, other: Path) -> tuple[int, int] | None:
+    """Return how many poses of a result agree with those of another one, and how many do not.
+
+    The path of each camera has a similarity of its own. Poses in further maps are not compared.
+
+    Returns:
+        None if fewer than half of the poses have a pose of the other result at their time.
+    """
+    posed, found = 0, [0, 0]
+    for file in (results / "trajectories").glob("*.tum"):
+        mine = read_tum(file)
+        posed += len(mine.times_ns)
+        if not (other / "trajectories" / file.name).exists():
             continue
-        true = np.concatenate([true[both] for _, _, true, both in found])
-        # Lengths without a unit: in those of a path whose diagonal is 20 times the limit of the centre.
-        true[:, :3, 3] *= 20.0 * RIGHT_M / max(float(np.linalg.norm(np.ptp(true[:, :3, 3], axis=0))), 1e-9)
+        theirs = read_tum(other / "trajectories" / file.name)
+        true, both = interpolate_truth(theirs, mine.times_ns, _MAX_GAP_S)
+        if np.count_nonzero(both) < _LEAST:
+            continue
+        # Lengths have no unit: they become those of a path whose diagonal is ten times the limit.
+        true[:, :3, 3] *= 10.0 * RIGHT_M / max(float(np.linalg.norm(np.ptp(true[both, :3, 3], axis=0))), 1e-9)
+        names = np.full(np.count_nonzero(both), file.stem)
         paths = Paths(
-            camera=np.concatenate([camera for camera, *_ in found]),
-            times_ns=np.concatenate([path.times_ns[both] for _, path, _, both in found]),
-            mine=np.concatenate([path.world_from_cam[both] for _, path, _, both in found]),
-            true=true,
+            camera=names, times_ns=mine.times_ns[both], mine=mine.world_from_cam[both], true=true[both]
         )
         figures = truth_figures(paths)
-        if figures is not None and figures.wrong <= MAX_WRONG * (figures.right + figures.wrong):
-            return True
-    return False
+        if figures is not None:
+            found = [found[0] + figures.right, found[1] + figures.wrong]
+    return (found[0], found[1]) if posed and sum(found) >= _MIN_JUDGED * posed else None
+
+
+def _agrees(counts: tuple[int, int] | None) -> bool:
+    return counts is not None and counts[1] <= MAX_WRONG * sum(counts)
+
+
+def reference_of(confirmed: Sequence[Path]) -> Path | None:
+    """Return the result with which most others agree; None if fewer than two others do."""
+    votes = {
+        each: sum(_agrees(compared(other, each)) for other in confirmed if other != each)
+        for each in confirmed
+    }
+    best = max(votes, key=lambda each: votes[each], default=None)
+    return best if best is not None and votes[best] >= _MIN_VOTES else None
 
 
 def links_of(results: Path, capture: Path) -> dict[str, list[dict[str, Any]]]:
@@ -233,7 +254,7 @@ def _half_of(capture: Path | None, name: str) -> int:
 def graded(options: argparse.Namespace) -> Iterator[GradedResult]:
     """Yield each stored result that has paths and of which something is known; equal paths once."""
     digests, known = set[str](), list[tuple[Path, Path | None, tuple[int, int, int]]]()
-    for folder in options.results:
+    for folder in [*options.results, *options.others]:
         results = folder / "out" if (folder / "out").is_dir() else folder
         if not (results / "metrics.json").exists() or (digest := digest_of_results(results)) in digests:
             continue
@@ -241,16 +262,24 @@ def graded(options: argparse.Namespace) -> Iterator[GradedResult]:
         if counts is not None and counts[2]:
             digests.add(digest)
             known.append((results, _capture_of(folder.name, options.captures), counts))
-    for results, capture, counts in known:
-        right, wrong, delivered = counts
-        if capture is not None and wrong > MAX_WRONG * (right + wrong) and not _truths(capture):
-            confirmed = [
+    references = dict[Path, Path | None]()
+    for capture in {each for _, each, _ in known if each is not None and not _truths(each)}:
+        references[capture] = reference_of(
+            [
                 each
-                for each, other, (own_right, own_wrong, own) in known
-                if other == capture and not own_wrong and own_right >= _CONFIRMED * own
-            ]
-            if _agrees(results, confirmed):
-                right, wrong = delivered, 0
+                for each, other, (right, wrong, delivered) in known
+                if other == capture and not wrong and right >= _CONFIRMED * delivered
+            ][:_MAX_CONFIRMED]
+        )
+    for results, capture, counts in known:
+        if not {results, results.parent} & set(options.results):
+            continue
+        right, wrong, delivered = counts
+        reference = None if capture is None else references.get(capture)
+        if reference is not None and (found := compared(results, reference)) is not None:
+            is_whole = sum(found) >= _CONFIRMED * delivered and not any(results.glob("trajectories/map_*"))
+            if not _agrees(found) or is_whole:
+                right, wrong = found
         metrics = with_missing_figures(json.loads((results / "metrics.json").read_bytes()), results)
         metrics = _with_links(metrics, results, options)
         verdict = judge(metrics, None)
@@ -320,6 +349,14 @@ def main(arguments: Sequence[str]) -> int:
         "--captures", nargs="*", type=Path, default=[], metavar="DIR", help="folders of captures with truth"
     )
     parser.add_argument("--evaluated", type=Path, metavar="DIR", help="folder of stored evaluations")
+    parser.add_argument(
+        "--others",
+        nargs="*",
+        type=Path,
+        default=[],
+        metavar="RESULT",
+        help="further results of the same captures, which only help to decide what is right",
+    )
     parser.add_argument(
         "--links", type=Path, metavar="DIR", help="folder for what the videos show about the paths"
     )

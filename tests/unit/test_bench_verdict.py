@@ -68,17 +68,23 @@ def test_an_evaluation_of_another_folder_replaces_that_beside_the_results(
     assert counts_of(capsys.readouterr().out, half)["good"] == ["1", "0", "0", "100%"]
 
 
-def test_a_result_that_agrees_with_a_confirmed_one_is_right(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The check by pictures calls some right frames wrong; those of another gauge do not differ."""
-    lines = [f"{n} {n * n / 9} {n} {np.sin(n)} 0 0 0 1" for n in range(20)]
-    folders = [stored(tmp_path, "a_walk", error_px=0.5, wrong=0, path="\n".join(lines) + "\n")]
-    for name, shift, scale in (("b_walk", 0.0, 3.0), ("c_walk", 20.0, 3.0)):
-        moved = [f"{n} {scale * n * n / 9 + (shift if n > 9 else 0)} {scale * n} {scale * np.sin(n)} 0 0 0 1"
-                 for n in range(20)]  # fmt: skip
-        folders.append(stored(tmp_path, name, error_px=0.5, wrong=5, path="\n".join(moved) + "\n"))
+def test_results_that_agree_decide_what_is_right(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The check by pictures calls some right frames wrong, and some wrong ones right."""
+    folders, time = [], np.arange(20)
+    for name, wrong, bend, scale in (
+        ("a_walk", 0, 0.0, 1.0), ("b_walk", 0, 0.01, 3.0), ("c_walk", 0, 0.0, 0.2),
+        ("d_walk", 5, 0.0, 3.0), ("e_walk", 0, 1.0, 1.0),
+    ):  # fmt: skip
+        centres = scale * np.column_stack(
+            [time**2 / 9 + bend * np.maximum(0, time - 9) ** 2, time, np.sin(time)]
+        )
+        text = "".join(f"{n} {x} {y} {z} 0 0 0 1\n" for n, (x, y, z) in enumerate(centres))
+        folders.append(stored(tmp_path, name, error_px=0.5, wrong=wrong, path=text))
+        found = {"torso": {"right": 20 - wrong, "wrong": wrong, "delivered": 20}}
+        (tmp_path / name / "ev.json").write_text(json.dumps(found))
     (tmp_path / "captures" / "walk").mkdir(parents=True)
-    verdict.main([*map(str, folders), "--captures", str(tmp_path / "captures")])
-    truths = {line.split()[0]: line.split()[1] for line in capsys.readouterr().out.splitlines()[:3]}
-    assert truths == {"a_walk": "right", "b_walk": "right", "c_walk": "wrong"}
+    judged, others = map(str, folders[3:]), map(str, folders[:3])
+    verdict.main([*judged, "--others", *others, "--captures", str(tmp_path / "captures")])
+    lines = capsys.readouterr().out.splitlines()
+    truths = {line.split()[0]: line.split()[1] for line in lines[: lines.index("")]}
+    assert truths == {"d_walk": "right", "e_walk": "wrong"}
