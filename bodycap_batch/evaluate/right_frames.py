@@ -31,8 +31,8 @@ _LENS_ERROR = 0.02
 _MAX_CHAIN_SIGMA_DEG = 5.0
 """Maximum standard deviation (degrees) of a chain of rotations across lost frames."""
 _MAX_READOUT_TURN_DEG = 2.0
-"""Maximum turn (degrees) during the readout of a frame whose points are used for positions. Evidence: with
-turns of 2.5 to 3.9 degrees, 8 of 28 triples of a right path (a palm of `roll131`) were wrong."""
+"""Maximum turn (degrees) during the readout of a frame whose points are used for positions. Evidence:
+docs/decisions/report.md."""
 _MOVING_PERCENTILE = 75.0
 """Percentile of the displacements of matches that stands for the room."""
 _MIN_SHIFT_PX = 6.0

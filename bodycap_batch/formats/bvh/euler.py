@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bodycap_batch.core.arrays import FloatArray
 
@@ -26,6 +25,8 @@ def rotation_from_angles(axes: str, angles_rad: FloatArray) -> FloatArray:
     Returns:
         The rotations (T,3,3). They are the identity for K = 0.
     """
+    from scipy.spatial.transform import Rotation
+
     out = np.broadcast_to(np.eye(3), (len(angles_rad), 3, 3)).copy()
     for column, axis in enumerate(axes):
         out = out @ Rotation.from_euler(axis, angles_rad[:, [column]]).as_matrix()
