@@ -96,18 +96,6 @@ CAMERA_RULES = (
         priority=1.8,
     ),
     Rule(
-        name="Pieces of the map",
-        read=readings.read_main_share,
-        bounds=Bounds(good=0.5, more_is_better=True),
-        finding="the video of {cameras} gave {maps} maps that could not be joined; {inside} of {every} "
-        "keyframes are in the main map",
-        rationale="If most of a video does not fit the main map, its places look alike, or its lens is not "
-        "known. Of twelve real results with less than half of the keyframes in the main map, five had a "
-        "part in a wrong place.",
-        action="Let the camera see the same places: walk in a loop, and turn more slowly.",
-        priority=1.6,
-    ),
-    Rule(
         name="Matches that contradict the map",
         read=readings.at("mapping.repair.contradicted_share"),
         bounds=Bounds(good=0.02),

@@ -211,25 +211,6 @@ def read_links(metrics: Metrics) -> Reading | None:
     return Reading(value=share, metric=metric_path("mapping", "links", name), words=words)
 
 
-def read_main_share(metrics: Metrics) -> Reading | None:
-    """Read the share of the keyframes that are in the main map, if a video is in several maps."""
-    counts = [model.get("keyframes", {}) for model in metrics.get("models", ())]
-    split = {name for name in (counts[0] if counts else ()) if any(name in count for count in counts[1:])}
-    if not split:
-        return None
-    inside = sum(counts[0][name] for name in split)
-    every = sum(count.get(name, 0) for count in counts for name in split)
-    return Reading(
-        value=inside / every,
-        words={
-            "cameras": " and ".join(sorted(split)),
-            "inside": inside,
-            "every": every,
-            "maps": len(counts),
-        },
-    )
-
-
 def read_unconfirmed(metrics: Metrics) -> Reading | None:
     """Read how many points were left out because no later view confirms them, per point of the maps."""
     removed, kept = metrics.get("mapping", {}).get("unconfirmed_points"), metrics["total"].get("points")
