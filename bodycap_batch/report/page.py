@@ -56,7 +56,7 @@ def render_page(context: Mapping[str, Any], data: Mapping[str, Any]) -> str:
     )
 
 
-def render_template(name: str, **context: Any) -> str:
+def render_template(template: str, /, **context: Any) -> str:
     """Render a page with the style of the report as one HTML document."""
     import jinja2
 
@@ -68,7 +68,7 @@ def render_template(name: str, **context: Any) -> str:
         lstrip_blocks=True,
     )
     environment.filters["code"] = _with_code
-    text = environment.get_template(name).render(**context, style=_template("style.css"))
+    text = environment.get_template(template).render(**context, style=_template("style.css"))
     return text if text.endswith("\n") else f"{text}\n"
 
 
