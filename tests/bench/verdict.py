@@ -31,11 +31,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bodycap_batch.evaluate.association import interpolate_truth
 
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.overrides import Overrides
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.evaluate.association import interpolate_truth
 from bodycap_batch.evaluate.picture_check import poses_of_frames, read_delivered
 from bodycap_batch.evaluate.track_check import TrackedVideo, check_with_tracks, count_frames
 from bodycap_batch.export.metrics import path_uncertainty

@@ -106,7 +106,7 @@ def test_why_a_finished_job_would_do_nothing(done: Bench) -> None:
             {"map": {"features": 1024}},
             "map",
             "features: 512 -> 1024",
-            ["registration", "links", "merge", "fill", "export", "report", "preview"],
+            ["registration", "merge", "fill", "export", "report", "preview"],
         ),
         ({"height_m": 1.8}, "check", "the body: height_m changed", None),
         ({"export": {"units": "m"}}, "export", 'units: "cm" -> "m"', ["report"]),
