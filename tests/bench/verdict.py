@@ -31,13 +31,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bodycap_batch.evaluate.association import interpolate_truth
 
 from bodycap_batch.config.job import load_job
 from bodycap_batch.config.overrides import Overrides
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.evaluate.picture_check import poses_of_frames, read_delivered
 from bodycap_batch.evaluate.track_check import TrackedVideo, check_with_tracks, count_frames
+from bodycap_batch.evaluate.trajectories import interpolate_truth
 from bodycap_batch.export.metrics import path_uncertainty
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.job_places import capture_of_results, find_job
@@ -63,8 +63,6 @@ _JUDGE = (
 )
 _MIN_JUDGED = 0.5
 """Minimum share of the delivered frames that must be right or wrong. Evidence: none."""
-_MAX_GAP_S = 0.05
-"""Maximum distance (seconds) of two poses between which a pose is interpolated, to compare two results."""
 _LEAST = 3
 """Minimum number of poses that a similarity is fitted to."""
 _MAX_CONFIRMED = 6
@@ -177,7 +175,7 @@ def compared(results: Path, other: Path) -> tuple[int, int] | None:
         if not (other / "trajectories" / file.name).exists():
             continue
         theirs = read_tum(other / "trajectories" / file.name)
-        true, both = interpolate_truth(theirs, mine.times_ns, _MAX_GAP_S)
+        true, both = interpolate_truth(theirs, mine.times_ns)
         if np.count_nonzero(both) < _LEAST:
             continue
         # Lengths have no unit: they become those of a path whose diagonal is ten times the limit.
